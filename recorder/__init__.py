@@ -1,4 +1,4 @@
-"""Recording and reading of logs, and their display in viewers.
+"""Recording, reading and display of logs.
 
 Arrows show how data flows through the modules:
 

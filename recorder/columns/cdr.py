@@ -1,8 +1,9 @@
 """Field positions in CDR messages of any ROS 2 type.
 
-Messages of the same type and length nearly always have equal string and sequence lengths. The
-`Layout` of an example message combines a NumPy structured dtype with these lengths. Messages that
-match the layout are read as one array; rosbags decodes all others, with the same values.
+If two messages of a type have equal lengths, their strings and sequences nearly always have equal
+lengths, too. A `Layout`, created from an example message, contains these lengths and a NumPy
+structured dtype. Messages that match the layout are read as one array; rosbags decodes all others,
+with the same values.
 
 A CDR message starts with a 4-byte encapsulation header, whose second byte is the byte order. After
 the header, each number is aligned to its size, relative to the end of the header. A string is a
@@ -49,17 +50,17 @@ ROS_TO_NUMPY = {
 MAX_PADDING_BYTES = 3
 # First two bytes of the encapsulation header of plain CDR; the last two have no effect.
 BIG_ENDIAN, LITTLE_ENDIAN = b"\0\0", b"\0\1"
-# Messages with more fields than this, nested ones included, are decoded one by one.
+# Messages with more fields than this, including nested fields, are decoded one by one.
 _MAX_PARTS = 256
 _MAX_LAYOUTS = 64
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Positions of the wanted fields in messages with equal string and sequence lengths.
+    """Positions of the requested fields in messages whose strings and sequences have equal lengths.
 
     Attributes:
-        dtype: Structured dtype of the wanted fields and of `constants`; all other bytes of a
+        dtype: Structured dtype of the requested fields and of `constants`; all other bytes of a
             message are padding.
         constants: Values that are equal in all messages of the layout: the byte order, and the
             length of each string and sequence.
@@ -153,7 +154,7 @@ class MessageType:
         return walk.layout()
 
     def _pass(self, walk: _Walk, description: Any, path: str, wanted: Collection[str] = ()) -> None:
-        """Skip one field; record the positions of wanted paths in it."""
+        """Move past one field, and record the positions of the paths in `wanted`."""
         kind, what = description
         name = path if path in wanted else None
         match kind:
@@ -164,7 +165,7 @@ class MessageType:
             case Nodetype.NAME if name is not None and what in TIME_TYPES:
                 walk.take_time(name, wanted)
             case Nodetype.NAME:
-                # Build the paths of nested fields only if a wanted path is among them.
+                # Build the paths of nested fields only if one of them is in `wanted`.
                 within = wanted if any(each.startswith(f"{path}.") for each in wanted) else ()
                 for inner, found in self._definitions.types[what][1]:
                     self._pass(walk, found, f"{path}.{inner}" if within else path, within)
@@ -198,7 +199,7 @@ class _Walk:
         self._fields: dict[str, tuple[Any, int]] = {"_encapsulation": ("<u2", 0)}
 
     def take(self, code: str, count: int, name: str | None, *, scalar: bool = False) -> None:
-        """Skip `count` numbers or one string; record the position under `name`."""
+        """Move past `count` numbers or one string, and record the position under `name`."""
         self._parts += 1
         if self._parts > _MAX_PARTS:
             raise _NoLayout
@@ -214,7 +215,7 @@ class _Walk:
         self.position += count * dtype.itemsize
 
     def take_time(self, name: str, wanted: Collection[str]) -> None:
-        """Skip a time; record it as one field, and also record `sec` and `nanosec` if wanted."""
+        """Move past a time and record it as one field, and `sec` and `nanosec` if requested."""
         self.position += -(self.position - ENCAPSULATION_BYTES) % 4
         start, self.position = self.position, self.position + 8
         if self.position > len(self._data):
@@ -226,7 +227,7 @@ class _Walk:
                 self._fields[f"{name}.{part}"] = (code, start + 4 * number)
 
     def take_texts(self, name: str, count: int) -> None:
-        """Skip an array of strings; record it as one structured field with one item per string."""
+        """Move past an array of strings; record it as a structured field, one item per string."""
         start, codes, offsets = self.position, [], []
         for _ in range(count):
             size = self.length()
@@ -270,7 +271,7 @@ class _NoLayout(Exception):
 
 
 def message_type(schema: Schema) -> MessageType:
-    """Return the type of a schema; each schema is parsed once.
+    """Return the message type of a schema. Each schema is parsed only once.
 
     Raises:
         LogError: The encoding is neither `ros2msg` nor `ros2idl`, or the definition cannot be used.

@@ -18,30 +18,32 @@ from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.message_rows import RECORD_HEADER_BYTES
 
-# This limits memory: 32 KB of zstd data can decompress to 1 GiB. Ordinary writers write smaller
-# chunks.
+# Maximum size of a decompressed chunk. It limits the memory of a reader, because 32 KB of zstd data
+# can decompress to 1 GiB. Ordinary writers write smaller chunks.
 MAX_CHUNK_BYTES = 256 * 2**20
 
 _CHUNK_START = struct.Struct("<BQQQQII")
-# Parts of a ChunkIndex record: start, map entries, middle, name of the compression, end.
+# A ChunkIndex record consists of the start, the map entries, the middle, the name of the
+# compression, and the end.
 _INDEX_START, _INDEX_MAP_ENTRY = struct.Struct("<QQQQI"), struct.Struct("<HQ")
 _INDEX_MIDDLE, _INDEX_END = struct.Struct("<QI"), struct.Struct("<QQ")
 _ZSTD = zstandard.ZstdCompressionParameters.from_level
-# A record of numbers is most similar to the records just before it, so a small hash table is faster
-# than the table of zstd level 1 and finds more matches. The low bits of floats are random; the fast
-# strategy stores them uncompressed if a target length is set. Compared with level 1, files are 2 to
-# 9 % larger, are written in 20 to 50 % less time, and are read in 33 to 50 % less time.
+# Settings for short records of numbers. Each record is most similar to the records just before it.
+# A small hash table is therefore faster than the large table of zstd level 1, and it finds more
+# matches. The low bits of floats are random; zstd stores them uncompressed if a target length is
+# set. Compared with level 1, files are 2 to 9 % larger, are written in 20 to 50 % less time, and
+# are read in 33 to 50 % less time.
 SHORT_RECORDS = _ZSTD(1, hash_log=10, target_length=1)
-# Images need the large hash table of level 1, because they are similar to images much earlier in
-# the chunk; their bytes are not random, so they need no target length.
+# Settings for images. An image is similar to images much earlier in the chunk, so it needs the
+# large hash table of level 1. Its bytes are not random, so no target length is needed.
 LONG_RECORDS = _ZSTD(1)
-# Messages of different lengths are mostly display messages. They repeat so much that a slower
-# search halves their size.
+# Settings for messages of different lengths. Most of these are display messages, whose contents
+# repeat: a slower search halves their size.
 MIXED_RECORDS = _ZSTD(12)
-# Long messages that are rare, such as a static scene, use a higher level: it takes 0.1 s and makes
-# them a fifth smaller.
+# Settings for long messages that are rare, such as a static scene. The higher level takes 0.1 s and
+# reduces the size by a fifth.
 RARE_RECORDS = _ZSTD(16)
-# Messages that are longer than this are mostly images.
+# Messages of one length that are longer than this are mostly images, and use `LONG_RECORDS`.
 LONG_MESSAGE_BYTES = 2**11
 # Messages of different lengths use `RARE_RECORDS` if their mean size is larger than this.
 RARE_MESSAGE_BYTES = 2**14
@@ -60,7 +62,7 @@ def _compressor(
 
 
 class Compressors:
-    """Compression functions for chunk records; not thread-safe, since they share memory.
+    """Compression functions for chunk records. They share memory, so they are not thread-safe.
 
     Attributes:
         chunk_name: Name of the compression in Chunk records.
@@ -212,13 +214,13 @@ _NOTHING = (-1, memoryview(b""))
 
 
 class Scratch:
-    """Reusable memory into which one thread decompresses chunk after chunk.
+    """Memory that one thread reuses for each chunk it decompresses.
 
     The first access to new memory costs as much as the decompression itself, so chunks whose
     records are used only briefly share memory.
 
     Attributes:
-        kept: Offset and records of the chunk that was decompressed last, set by the caller.
+        kept: Offset and records of the last decompressed chunk; the caller sets them.
     """
 
     def __init__(self) -> None:
@@ -235,7 +237,7 @@ class Scratch:
         """Return `size` bytes of memory, which the next call reuses."""
         self.kept = _NOTHING
         if len(self._memory) < size:
-            # Release the old memory first, so that both are never allocated at once.
+            # Release the old memory before the new memory is allocated, to limit the peak memory.
             self._memory = np.empty(0, np.uint8)
             self._memory = np.empty(size, np.uint8)
         return self._memory.data[:size]

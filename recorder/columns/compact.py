@@ -34,20 +34,20 @@ from mcaprl.recorder.columns.summary import Summary
 SMALL_CHUNK_BYTES = 2**16
 """Chunks with fewer bytes of uncompressed records than this are merged."""
 _MERGED_BYTES = 2**20
-# If compaction removes fewer chunks than this, rewriting the file is not worth the time.
+# Compaction must remove at least this many chunks to be worth the time.
 _MIN_CHUNKS_SAVED = 8
-# Maximum number of bytes to copy for each chunk that compaction removes. Copying more bytes takes
-# more time than readers save.
+# Maximum number of copied bytes for each chunk that compaction removes. Copying more bytes would
+# take more time than readers save.
 _MAX_BYTES_PER_CHUNK = 2**20
-# If a Chunk, Message or MessageIndex record is between two chunks that the summary lists, the
-# summary is incomplete.
+# The summary is incomplete if a record with one of these opcodes is between two chunks that the
+# summary lists.
 _CHUNK_RECORDS = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX)
 
 
 def compact(
     path: Path, file: FileIO, summary: Summary, data_end: int, compressors: Compressors
 ) -> None:
-    """Replace a finished file by one with larger chunks, if it has many small ones.
+    """Rewrite a finished file with larger chunks if it has many small chunks.
 
     An error while writing leaves the original unchanged.
 
@@ -78,15 +78,15 @@ def compact(
 
 
 def groups_of(chunks: Iterable[ChunkIndex]) -> list[list[ChunkIndex]]:
-    """Group the source chunks: each group becomes one chunk of the compacted file, in file order.
+    """Group the source chunks, so that each group becomes one chunk of the compacted file.
 
-    A merged chunk takes the place of its last source chunk, so that it comes after all top-level
-    records that it needs.
+    Groups are in file order. A merged chunk takes the place of its last source chunk, so that it
+    comes after all top-level records that it needs.
     """
     chunks = list(chunks)
     kinds = _kinds(chunks)
     groups: list[list[ChunkIndex]] = []
-    # The last group of each kind, and the total size of its records in bytes.
+    # By kind: the last group of this kind, and the total size of the group's records in bytes.
     current: dict[int, tuple[list[ChunkIndex], int]] = {}
     for chunk in chunks:
         size = chunk.uncompressed_size
@@ -105,7 +105,7 @@ def groups_of(chunks: Iterable[ChunkIndex]) -> list[list[ChunkIndex]]:
 
 
 def _kinds(chunks: Iterable[ChunkIndex]) -> dict[int, int]:
-    """Return a kind number for each channel; channels that share a chunk have the same number."""
+    """Return a kind number for each channel. Channels that share a chunk get the same number."""
     kinds: dict[int, int] = {}
     for ids in {tuple(chunk.message_index_offsets) for chunk in chunks}:
         connected = {kinds.get(channel_id, channel_id) for channel_id in ids}

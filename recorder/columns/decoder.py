@@ -29,7 +29,7 @@ _MAX_LENGTHS = 16
 _MAX_LAYOUTS = 8
 
 Columns = dict[str, NDArray[Any]]
-"""Arrays of equal length by field name, with strings as `str` and arrays of strings as lists."""
+"""Arrays of equal length by field name. Strings are `str`, and arrays of strings are lists."""
 Rows = slice | NDArray[np.int64]
 """Selection of rows of a column."""
 
@@ -77,7 +77,7 @@ class Decoder:
         }
 
     def fill(self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows) -> None:
-        """Decode the messages of the index entries into rows of the columns."""
+        """Decode the messages that `index` lists, and store them in these rows of the columns."""
         if self._put_alike(columns, records, index, rows):
             return
         if isinstance(rows, slice):
@@ -98,7 +98,7 @@ class Decoder:
     def _put_by_length(
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: NDArray[np.int64]
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
-        """Copy messages of equal length together; return the index entries and rows that remain."""
+        """Copy messages of equal length at once; return index entries and rows of the rest."""
         if int(index["offset"].max()) > len(records) - MESSAGE_HEADER.itemsize:
             return index, rows
         lengths = gather(records, index, MESSAGE_HEADER)["length"]
@@ -125,7 +125,7 @@ class Decoder:
         among: NDArray[np.bool_],
         wanted: Collection[str],
     ) -> NDArray[np.bool_]:
-        """Return a mask of the messages in `among` that have the layout of its first message."""
+        """Return a mask of the messages in `among` that have the same layout as the first one."""
         alike = np.zeros(len(index), bool)
         places = np.flatnonzero(among)
         if len(places):
@@ -170,7 +170,7 @@ class Decoder:
         return self._laid_out(records, index, layout)
 
     def _length(self, records: memoryview, index: NDArray[Any]) -> int:
-        """Return the length of the first message; -1 if there is none."""
+        """Return the length of the first message; -1 if there are no messages."""
         offset = int(index["offset"][0])
         if offset + MESSAGE_HEADER.itemsize > len(records):
             return -1
@@ -212,7 +212,7 @@ class Decoder:
         }
 
     def _lists_of_texts(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Convert structured values, with one item per string, to lists of strings."""
+        """Convert structured values that have one item per string to lists of strings."""
         texts = [self._texts(values[part]) for part in values.dtype.names or ()]
         lists = np.empty(len(values), object)
         lists[:] = [[text[row] for text in texts] for row in range(len(values))]
@@ -220,7 +220,7 @@ class Decoder:
 
     def _texts(self, values: NDArray[Any]) -> list[str]:
         try:
-            # Often all strings are equal: decode only the first.
+            # Often all strings are equal. In this case, only the first one is decoded.
             if (values == values[0]).all():
                 return [bytes(values[0]).decode()] * len(values)
             return [text.decode() for text in values.tolist()]
@@ -231,7 +231,7 @@ class Decoder:
 
 
 def _nanoseconds(times: NDArray[Any]) -> NDArray[np.int64]:
-    """Return times with the fields `sec` and `nanosec` as nanoseconds."""
+    """Convert times with the fields `sec` and `nanosec` to nanoseconds."""
     found: NDArray[np.int64] = times["sec"].astype(np.int64)
     found *= 10**9
     found += times["nanosec"]
@@ -239,7 +239,7 @@ def _nanoseconds(times: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def _value_at(message: Any, path: str) -> Any:
-    """Return a field by its dotted path; a time as nanoseconds."""
+    """Return the value of the field with this dotted path; times are converted to nanoseconds."""
     found = message
     for name in path.split("."):
         found = getattr(found, name)

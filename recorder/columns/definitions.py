@@ -1,4 +1,4 @@
-"""Definitions of ROS types, from a file or else from a ROS distribution."""
+"""Definitions of ROS types, from a file or, if the file lacks them, from a ROS distribution."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Definitions:
 
     @cached_property
     def _store(self) -> Typestore:
-        """Type store that generates the code for decoding messages, which takes milliseconds."""
+        """Type store of rosbags. Creating the store takes milliseconds: it generates code."""
         store = get_typestore(Stores.EMPTY)
         new = {key: found for key, found in self.types.items() if key not in store.fielddefs}
         store.register(new)

@@ -26,10 +26,11 @@ _COPIED_BYTES = 2**20
 def create(path: Path, *, overwrite: bool) -> FileIO:
     """Create and lock a file and the missing folders of its path.
 
-    Readers of a file that is overwritten keep the old contents.
+    If a file is overwritten, processes that have it open still read the old contents.
 
     Raises:
-        OutputExistsError: The file exists, and `overwrite` is not set; or it is not a regular file.
+        OutputExistsError: The file exists and `overwrite` is not set, or the path is not a regular
+            file.
         LogError: The file cannot be created, or another writer has locked it.
     """
     check_target(path, overwrite=overwrite)

@@ -65,7 +65,7 @@ def message_record(channel_id: int, sequence: int, time_ns: int, data: bytes) ->
 
 
 def are_messages(rows: NDArray[Any], channel_id: int) -> bool:
-    """Return whether all rows are messages of the channel with the length of their dtype."""
+    """Return whether all rows are messages of this channel with the length that the dtype has."""
     size = rows.dtype.itemsize
     head = _HEAD.pack(Opcode.MESSAGE, size - RECORD_HEADER_BYTES, channel_id)
     words, expected = rows.view(_words(size)), np.frombuffer(head, _words(_HEAD.size))[0]
@@ -108,7 +108,7 @@ def message_index(file: memoryview, offset: int, channel_id: int) -> NDArray[Any
 
 
 class MessageRange:
-    """Messages of one channel in one chunk or outside of chunks; `len()` is their number.
+    """Messages of one channel, either in one chunk or outside of chunks; `len()` counts them.
 
     Attributes:
         chunk: Chunk with the messages; None for unchunked messages.
@@ -127,7 +127,7 @@ class MessageRange:
 
     @cached_property
     def index(self) -> NDArray[Any]:
-        """Entries of `INDEX_ENTRY`, one for each message, read at the first access.
+        """Array of `INDEX_ENTRY`, one entry for each message; read from the file at first use.
 
         Raises:
             CorruptLogError: The index is damaged.
@@ -165,7 +165,7 @@ def gather(records: memoryview, index: NDArray[Any], dtype: np.dtype[Any]) -> ND
 
 
 def windows(data: memoryview, offsets: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return copies of the `dtype` items at byte offsets; each must end within the data."""
+    """Return copies of the `dtype` items at these byte offsets; all must be within the data."""
     size = dtype.itemsize
     first = np.frombuffer(data, np.dtype((np.void, size)), 1)
     every = np.lib.stride_tricks.as_strided(first, (len(data) - size + 1,), (1,))
@@ -182,5 +182,5 @@ def _are_adjacent(offsets: NDArray[Any], size: int, end: int) -> bool:
 
 @lru_cache(maxsize=2)
 def adjacent_offsets(first: int, last: int, size: int) -> NDArray[np.uint64]:
-    """Return the offsets of adjacent messages, cached because full chunks of a topic share them."""
+    """Return the offsets of adjacent messages; cached, because full chunks have equal offsets."""
     return np.arange(first, last + 1, size, dtype=np.uint64)

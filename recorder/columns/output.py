@@ -43,7 +43,7 @@ class OutputFile:
         return is_at(self._file.fileno(), path)
 
     def abandon(self) -> None:
-        """Close the file without a summary; do nothing if it is closed."""
+        """Close the file without a summary. Closing twice is harmless."""
         with contextlib.suppress(OSError):
             release(self._file)
 
@@ -125,7 +125,8 @@ class OutputFile:
             with HoldSignals():
                 if sum(map(len, parts)) <= _JOINED_BYTES:
                     parts = (b"".join(parts),)
-                # Compute the CRC first: it loads the pages of a mapped source faster than `write`.
+                # Compute the CRC before writing: it loads the pages of a mapped source faster than
+                # `write` does.
                 crc = self._crc
                 for part in parts:
                     crc = crc32(part, crc)

@@ -61,7 +61,7 @@ from mcaprl.remote import RemotePath, as_path
 # Number of bytes at the start and at the end of a remote file that are fetched when it is opened.
 _HEAD_BYTES, _TAIL_BYTES = 2**16, 2**18
 _SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
-# Bytes of a MessageIndex record before its entries.
+# Number of bytes in a MessageIndex record before its entries.
 _INDEX_HEAD_BYTES = RECORD_HEADER_BYTES + 6
 _START_OF = attrgetter("chunk_start_offset")
 _TOP_LEVEL = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
@@ -170,7 +170,8 @@ class McapReader:
             LogError: The file was truncated or written to.
         """
         if self._remote is not None:
-            # The local copy of a remote file also changes when parts are fetched: do not check it.
+            # The local copy of a remote file changes whenever parts are fetched, so it is not
+            # checked.
             return
         try:
             now, before = os.stat(self.path), self._state
@@ -217,16 +218,16 @@ class McapReader:
     def message_ranges(self, channel: Channel) -> list[MessageRange]:
         """Return the positions of the messages of a channel, in file order.
 
-        Only chunks without an index are decompressed. If the summary confirms the number of
-        messages, the index of a chunk with a single channel is read at its first access: reading a
-        few rows of a large file then needs only a few indexes.
+        Only chunks without an index are decompressed. If the index lengths agree with the message
+        count in the summary, the index of a chunk with a single channel is not read yet, but when
+        it is first used. Reading a few rows of a large file therefore needs only a few indexes.
 
         Raises:
             CorruptLogError: An index is damaged, or the indexes and the summary disagree.
         """
         if channel.id not in self._ranges:
             if self._remote is not None:
-                # Fetch the indexes of all chunks with several channels together, to avoid one
+                # Fetch the indexes of all chunks with several channels at once, to avoid one
                 # request for each chunk.
                 places = [one for one in self.chunks if len(one.message_index_offsets) > 1]
                 starts = [one.chunk_start_offset + one.chunk_length for one in places]
@@ -266,7 +267,7 @@ class McapReader:
         return ranges
 
     def records_of(self, messages: MessageRange, scratch: Scratch | None = None) -> memoryview:
-        """Return the bytes that contain the messages: a chunk's records, or the whole file.
+        """Return the bytes that contain these messages: the records of a chunk, or the whole file.
 
         Raises:
             CorruptLogError: The chunk is damaged.
@@ -281,8 +282,8 @@ class McapReader:
 
         Args:
             chunk: Element of `chunks`.
-            scratch: Memory for the records. They are valid until it is used again. Each file needs
-                its own scratch memory.
+            scratch: Memory for the records. The records are valid until this memory is used again.
+                Each file needs its own scratch memory.
 
         Raises:
             CorruptLogError: The chunk is damaged.
@@ -471,7 +472,7 @@ class McapReader:
                 described = self._described_channels()
 
     def _described_channels(self) -> set[int]:
-        """Return the ids of the known channels whose schema is known, too."""
+        """Return the ids of the channels in `channels` whose schema is in `schemas`."""
         # The schema id 0 means no schema.
         schemas = {0, *self.schemas}
         return {number for number, one in self.channels.items() if one.schema_id in schemas}

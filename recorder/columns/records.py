@@ -76,7 +76,7 @@ def map_unchanged(path: Path) -> tuple[memoryview, os.stat_result]:
             found = mmap.mmap(descriptor, state.st_size, access=mmap.ACCESS_READ)
         finally:
             os.close(descriptor)
-    # ValueError: The file was truncated after `fstat`.
+    # `mmap` raises ValueError if the file was truncated after `fstat`.
     except (OSError, ValueError) as error:
         raise LogError(
             f"cannot read {path}: {getattr(error, 'strerror', None) or error}"
@@ -208,7 +208,7 @@ def only(
 
 
 def _uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
-    """Return the message indexes of a chunk of messages of equal length; None for others."""
+    """Return the message indexes of a chunk; None if its records are not messages of one length."""
     if len(chunk) < MESSAGE_HEADER.itemsize or chunk[0] != Opcode.MESSAGE:
         return None
     size = RECORD_HEADER_BYTES + RECORD_HEADER.unpack_from(chunk)[1]

@@ -26,7 +26,7 @@ LOG_TIME = "log_time"
 
 
 class _Selected(NamedTuple):
-    """Messages of a chunk, their decoder, and their rows in the columns."""
+    """Selected messages of a chunk, with their decoder and their rows in the columns."""
 
     decoder: Decoder
     messages: MessageRange
@@ -57,7 +57,8 @@ class Topic:
         self.parts = [(decoder, part) for decoder, ranges in by_decoder for part in ranges]
         self._counts = np.array([len(part) for _, part in self.parts], np.int64)
         self._stops = np.cumsum(self._counts)
-        # The scratch memory retains the last chunk, whose other columns may be read next.
+        # The scratch memory keeps the last chunk, because the next call may read other columns of
+        # it.
         self._scratch, self._reading = Scratch(), threading.Lock()
 
     def __len__(self) -> int:
@@ -94,7 +95,7 @@ class Topic:
 
     @cached_property
     def chunks_rise(self) -> bool:
-        """Whether one channel has all messages, in chunks that ascend in time without overlap."""
+        """Whether one channel has all messages, in chunks that follow each other in time."""
         chunks = [part.chunk for _, part in self.parts if part.chunk is not None]
         return (
             self.channels == 1

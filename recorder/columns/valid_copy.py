@@ -1,4 +1,4 @@
-"""Copies of MCAP files: the valid records of a damaged one, or selected messages of a valid one."""
+"""Copies of MCAP files: valid records of a damaged file, or selected messages of a valid file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mcaprl.recorder.columns.records import contents_of, map_file, only, parse_r
 from mcaprl.recorder.columns.salvage import Damage, ValidRecord, intact_summary, valid_records
 from mcaprl.recorder.columns.writer import COMPRESSIONS, McapWriter
 
-# Unchunked messages are written in chunks of this size.
+# Messages outside of chunks are written in chunks of this number of bytes.
 _UNCHUNKED_BYTES = 2**20
 
 RestoreMetadata = Callable[[list[Metadata], Iterable[Channel]], list[Metadata]]
@@ -73,8 +73,8 @@ def copy_messages(
     Args:
         reader: Reader of the file; all its messages are in chunks.
         target: Path of the new file; an existing one is replaced.
-        actions_of: Function that returns the action for each message of one channel in one chunk,
-            given the message index: `DROP`, `KEEP`, or a larger number, which is passed to `edit`.
+        actions_of: Function of the message index of one channel in one chunk. It returns an action
+            for each message: `DROP`, `KEEP`, or a larger number, which is passed to `edit`.
         edit: Function that changes a message in place. Its arguments are the channel, the bytes of
             the chunk from the start of the message's payload, and the action.
 
@@ -185,7 +185,7 @@ class _Copy:
         self._unchunked, self._scratch = bytearray(), Scratch()
 
     def take(self, offset: int, opcode: int, content: memoryview) -> None:
-        """Write a chunk or attachment; collect an unchunked message; skip any other record."""
+        """Write a chunk or attachment; collect an unchunked message; ignore all other records."""
         if opcode == Opcode.CHUNK:
             self.flush()
             self._take_chunk(offset, len(content))

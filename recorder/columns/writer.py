@@ -238,7 +238,7 @@ class McapWriter(OutputFile):
             self._summary.counts[channel_id] += count
 
     def close(self) -> None:
-        """Write the summary, merge small chunks, and close the file; do nothing if it is closed."""
+        """Write the summary, merge small chunks, and close the file. Closing twice is harmless."""
         if self.closed:
             return
         try:

@@ -1,1 +1,1 @@
-"""Logs made of parts of other logs: joined, split, filtered by episodes, and cut by time."""
+"""Edits that create logs from parts of other logs: join, split, filter by episode, cut by time."""

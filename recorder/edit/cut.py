@@ -1,4 +1,4 @@
-"""Copies of selected episodes of a log, as one new log or as several."""
+"""Copies of selected episodes of a log, written to one new log or to several."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mcaprl.recorder.format.selected_copy import Source, copy_selected
 from mcaprl.recorder.mapping.expression import Column, Expression
 
 _NS_PER_S = 10**9
-# Expressions compare numbers as float64, which cannot represent all larger integers.
+# Expressions compare numbers as float64, which cannot represent all integers above this limit.
 _LARGEST_EXACT = 2**53
 
 

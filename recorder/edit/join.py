@@ -71,9 +71,9 @@ def merge_logs(
 
 
 def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
-    """Return the metadata of the joined log; None if no log has metadata.
+    """Return the metadata of the joined log; None if none of the logs has metadata.
 
-    A field that may differ between logs is empty if it differs, as in a dataset of several logs.
+    Some fields may differ between the logs. Such a field is empty if it does differ.
 
     Raises:
         SpaceError: The spaces differ.
@@ -94,12 +94,12 @@ def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
         _check_same(first.path, metadata, log.path, other)
     _check_types(logs, are_described=True)
     common = LogMetadata.common([one for _, one in described_ones])
-    # Older logs lack the environment's module in the id; the longest id includes it.
+    # In older logs, the id lacks the environment's module. The longest id includes the module.
     return replace(common, env_id=max((one.env_id for _, one in described_ones), key=len))
 
 
 def _strings(logs: Sequence[FinishedLog], metadata: LogMetadata) -> dict[str, str]:
-    """Return the logs' metadata record if all logs have the same one; else encode `metadata`."""
+    """Return the metadata record of the logs if it is the same in all; else encode `metadata`."""
     found = [log.reader.metadata.get(METADATA_NAME) for log in logs if log.has_steps]
     first = found[0]
     if first is not None and all(one == first for one in found):
@@ -124,8 +124,9 @@ def _check_types(logs: Sequence[FinishedLog], *, are_described: bool) -> None:
 
     Args:
         logs: Logs of episodes.
-        are_described: Whether the logs have metadata. If so, `/rl/step` is not compared, because
-            its type follows from the spaces, and the metadata of other channels must be equal.
+        are_described: Whether the logs have metadata. If so, the type of `/rl/step` is not
+            compared, because it follows from the spaces. The metadata of the other channels must
+            then be equal.
     """
     known: dict[str, tuple[Path, object]] = {}
     for log in logs:
@@ -145,7 +146,7 @@ def _check_types(logs: Sequence[FinishedLog], *, are_described: bool) -> None:
 
 
 def _delays(logs: Sequence[FinishedLog], metadata: LogMetadata | None, *, shift: bool) -> list[int]:
-    """Return the delay of each log: the nanoseconds that are added to its times.
+    """Return the delay of each log: the number of nanoseconds to add to the times of the log.
 
     Raises:
         LogError: Episodes of two logs overlap in time, and `shift` is not set.
@@ -159,7 +160,7 @@ def _delays(logs: Sequence[FinishedLog], metadata: LogMetadata | None, *, shift:
                 raise LogError(
                     f"the episodes of {log.path} overlap in time with those of"
                     f" {_overlapped(logs[:number], log)}; pass --shift (shift=True in Python) to"
-                    f" delay {log.path} until after the end of the logs before it"
+                    f" delay {log.path} until the earlier logs have ended"
                 )
             delay = end + max(gap, 1) - first
         if log.has_steps:
@@ -205,7 +206,10 @@ def _leave_out_repeated(logs: Sequence[FinishedLog], sources: Sequence[Source]) 
 
 
 def _repeated(source: Source, other: Source) -> dict[int, Times]:
-    """Return the log times of messages that are in both sources, by the channel id in `other`."""
+    """Find the messages that are in both sources.
+
+    The result contains the log_times of these messages in `other`, by the channel id in `other`.
+    """
     by_new = {new: old for old, new in source.ids.items()}
     found = {}
     for old, new in other.ids.items():
@@ -232,7 +236,7 @@ def _repeated(source: Source, other: Source) -> dict[int, Times]:
 
 
 def _payloads(reader: McapReader, channel: Channel, times: Times) -> dict[int, list[bytes]]:
-    """Return the payloads of a channel's messages at these log_times, by log_time."""
+    """Return the payloads of the messages at each of these log_times."""
     found: dict[int, list[bytes]] = {}
     for part in reader.message_ranges(channel):
         index = part.index[np.isin(part.index["log_time"].astype(np.int64), times)]

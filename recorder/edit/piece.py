@@ -92,7 +92,9 @@ def slice_log(
 
 
 def _window_of_steps(log: FinishedLog, steps: Bounds) -> tuple[int, int]:
-    """Return the first and last log_time of a part; `steps` are counted over all episodes.
+    """Return the first and last log_time of a part.
+
+    The bounds in `steps` count the transitions of all episodes.
 
     Raises:
         UsageError: A bound is not an integer, or no transition is between the bounds.
@@ -117,7 +119,9 @@ def _window_of_steps(log: FinishedLog, steps: Bounds) -> tuple[int, int]:
 
 
 def _window_of_time(log: FinishedLog, time: Bounds | None) -> tuple[int, int]:
-    """Return the first and last log_time of a part; `time` is seconds since the first message.
+    """Return the first and last log_time of a part.
+
+    The bounds in `time` are seconds since the first message.
 
     Raises:
         UsageError: No message is in this part.
@@ -134,7 +138,7 @@ def _window_of_time(log: FinishedLog, time: Bounds | None) -> tuple[int, int]:
 
 
 def _pieces(log: FinishedLog, low: int, high: int) -> list[_Piece]:
-    """Return the parts of episodes between two log_times that have at least one transition."""
+    """Return the part of each episode between two log_times, if it has at least one transition."""
     if not log.has_steps:
         return []
     first = int(np.searchsorted(log.times, low))
@@ -150,7 +154,7 @@ def _pieces(log: FinishedLog, low: int, high: int) -> list[_Piece]:
 def _without_single_records(
     log: FinishedLog, pieces: list[_Piece], low: int, high: int
 ) -> tuple[int, int]:
-    """Narrow the time range so that it excludes records that belong to no copied transition."""
+    """Narrow the time range to exclude records that do not belong to any copied transition."""
     firsts, first, last = log.firsts, pieces[0], pieces[-1]
     before, after = firsts[first.episode] + first.start - 1, firsts[last.episode] + last.stop + 1
     if before >= 0:
@@ -163,7 +167,7 @@ def _without_single_records(
 def _shorten(
     log: FinishedLog, pieces: list[_Piece], source: Source
 ) -> list[tuple[int, int, bytes]]:
-    """Let `source` change the records of shortened episodes; return their new summaries.
+    """Make `source` change the records of shortened episodes; return their new summaries.
 
     Raises:
         LogError: Another program or version wrote the messages of `/rl/step` or `/rl/episode`.
@@ -173,7 +177,7 @@ def _shorten(
     firsts, times = log.firsts, log.times
     starts = [int(times[firsts[one.episode] + one.start]) for one in pieces]
     ends = [int(times[firsts[one.episode] + one.stop]) for one in pieces]
-    # The last transition has the end flags; it precedes the final record.
+    # The end flags are set in the last transition, the record before the final record.
     lasts = [int(times[firsts[one.episode] + one.stop - 1]) for one in pieces]
 
     def change(channel: Channel, time_ns: int, payload: memoryview) -> None:

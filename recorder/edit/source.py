@@ -21,7 +21,7 @@ from mcaprl.recorder.format.writing import finished_state
 from mcaprl.recorder.record.display import CAMERA_INFO, SCENE, SCENE_STATIC, TF, TF_STATIC
 from mcaprl.remote import as_path
 
-# Topics on which each message is valid until the next message on the same topic.
+# Topics on which each message is valid until the next message of the topic.
 _STATES = (SCENE, SCENE_STATIC, TF, TF_STATIC, CAMERA_INFO, PHASE_TOPIC)
 _LAST_TIME = np.iinfo(np.int64).max
 
@@ -130,7 +130,7 @@ class FinishedLog:
     def need_steps(self) -> None:
         """Raise NoStepsError if the file has no `/rl/step`."""
         if self._log is None:
-            raise NoStepsError(f"{self.path} has no topic {STEP_TOPIC}, hence no episodes")
+            raise NoStepsError(f"{self.path} has no topic {STEP_TOPIC} and therefore no episodes")
 
     def summaries(self) -> list[EpisodeSummary]:
         """Return the summary of each episode.
@@ -149,7 +149,7 @@ class FinishedLog:
         return min(starts, default=0), max(ends, default=0)
 
     def spans_of(self, episodes: NDArray[np.int64]) -> Times:
-        """Return (S, 2) first and last log_times of the time ranges with the episodes' messages.
+        """Return the time ranges of the episodes' messages: (S, 2) first and last log_times.
 
         The messages of an episode are those from its first record up to the next episode. Messages
         before the first episode belong to the first one. The ranges of adjacent episodes are
@@ -166,13 +166,14 @@ class FinishedLog:
         return np.stack([starts[episodes[begins]], stops[episodes[ends]]], axis=1)
 
     def states(self, spans: Times) -> dict[int, Times]:
-        """Return the times of the messages that are still valid at the start of each span.
+        """Return the times of the messages that are still valid at the start of each time range.
 
-        These are the latest messages of the display topics that are not repeated at each step,
-        such as the static scene, and of topics that ROS calls latched or transient local.
+        Display topics that are not repeated at each step, such as the static scene, have such
+        messages. So have the topics that ROS calls latched or transient local. On these topics, the
+        last message before a range is still valid.
 
         Args:
-            spans: (S, 2) first and last log_times of the S time ranges that are kept.
+            spans: (S, 2) first and last log_times of the S copied time ranges.
 
         Returns:
             Times by channel id.

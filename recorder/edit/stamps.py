@@ -1,4 +1,4 @@
-"""Change of the times inside of messages when the log_times of a log are delayed."""
+"""Delay of the times inside of messages, for logs whose log_times are delayed."""
 
 from __future__ import annotations
 
@@ -17,9 +17,11 @@ from mcaprl.recorder.format.reading import ROS_TO_NUMPY, McapReader, definitions
 _NS_PER_S = 10**9
 _TIME = "builtin_interfaces/msg/Time"
 _HEAD_BYTES = 4
-# Stamps this far outside of a file's log_times are on another clock, or not set.
+# A time in a message that is more than this many nanoseconds outside of the file's log_times
+# belongs to another clock or is not set.
 _MARGIN_NS = 10 * _NS_PER_S
-# Byte offset of the start and end times in `/rl/episode`: after CDR header and `total_reward`.
+# Byte offset of the start and end times in a message of `/rl/episode`. The CDR header and
+# `total_reward` precede them.
 _EPISODE_TIMES = 12
 _SIZES = {name: int(code[-1]) for name, code in ROS_TO_NUMPY.items()}
 _MAX_SECONDS = 2**31 - 1
@@ -29,8 +31,9 @@ Fields = Mapping[str, Any]
 class Delay:
     """Callable that adds a delay to the times inside of messages.
 
-    It changes the times of `/rl/episode`, and the fields of type `builtin_interfaces/Time` with
-    values in the range of the file's log_times, extended by 10 s on each side.
+    It changes the times of `/rl/episode` and the fields of type `builtin_interfaces/Time`. A field
+    is changed only if its value is in the range of the file's log_times, extended by 10 s on each
+    side.
     """
 
     def __init__(self, reader: McapReader, span: tuple[int, int], delay_ns: int) -> None:
@@ -69,7 +72,7 @@ class Delay:
             ) from error
 
     def _change_of(self, channel: Channel) -> Callable[[memoryview], None] | None:
-        """Return the function that changes the messages of a channel; None if they have no time."""
+        """Return the function that delays the times in messages; None if they have no times."""
         schema = self._reader.schemas.get(channel.schema_id)
         if (
             schema is None
@@ -77,8 +80,8 @@ class Delay:
             or schema.encoding not in ("ros2msg", "ros2idl")
         ):
             raise LogError(
-                f"{self._reader.path}: the times inside of the messages of {channel.topic} cannot"
-                f" be moved, because their encoding is {channel.message_encoding!r}, not 'cdr'"
+                f"{self._reader.path}: the times in the messages of {channel.topic} cannot"
+                f" be delayed, because their encoding is {channel.message_encoding!r}, not 'cdr'"
             )
         name = full_name(schema.name)
         if name == EPISODE_TYPE:
@@ -175,7 +178,10 @@ class _Walk:
 
 @lru_cache(maxsize=256)
 def _flat(descriptions: tuple[Any, ...]) -> tuple[int, int] | None:
-    """Return the bytes per field and number of fields if all are numbers of one size, else None."""
+    """Return the bytes per field and the number of fields.
+
+    Return None if not all fields are numbers of the same size.
+    """
     names = {what[0] if kind == Nodetype.BASE else None for kind, what in descriptions}
     sizes = {_SIZES.get(name or "") for name in names}
     if len(sizes) != 1 or None in sizes:

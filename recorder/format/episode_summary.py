@@ -21,7 +21,7 @@ class EpisodeSummary(NamedTuple):
     Attributes:
         episode: Index of the episode in its recording, from 0.
         length: Number of transitions.
-        total_reward: Sum of the rewards, added up in order.
+        total_reward: Sum of the rewards, added from the first to the last.
         terminated: Whether the last transition led to a terminal state.
         truncated: Whether the episode was truncated.
         start_time_ns: log_time of the first record, nanoseconds.

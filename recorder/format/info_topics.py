@@ -58,7 +58,7 @@ def info_array(values: Sequence[Any] | NDArray[Any]) -> NDArray[Any] | None:
 
 
 class InfoTopics:
-    """Writer of infos to a log; the topic of an info is added with its first value.
+    """Writer of infos to a log. The topic of an info is created when its first value is written.
 
     A recording that is appended to a log uses the log's existing topics.
 
@@ -68,7 +68,7 @@ class InfoTopics:
     """
 
     def __init__(self, log: LogWriter) -> None:
-        """Read which infos the log already has."""
+        """Find the infos that the log already has."""
         self._log = log
         self._channels = _channels_of(log)
         self._topics = {one.topic for one in log.mcap.channels.values()}

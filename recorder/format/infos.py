@@ -1,11 +1,11 @@
 """Infos of an environment: the values of each info are messages on a topic `/rl/info/<name>`.
 
-A message has the log_time of the observation that the environment returned with the info; there is
-no message where the info is missing. Scalars are messages of std_msgs; arrays are flattened to the
-field `data` of `mcaprl_msgs/msg/Info...`. The channel's metadata contains the name and the shape of
-the info. In the topic, dots of the name become slashes, and characters other than letters, digits
-and `_` become `_`. If the name has such characters, or a dot that is not between two words, the
-CRC-32 of the name is appended to the topic.
+A message has the log_time of the observation that the environment returned with the info. No
+message is written if the info is missing. Scalars are messages of std_msgs; arrays are flattened to
+the field `data` of `mcaprl_msgs/msg/Info...`. The channel's metadata contains the name and the
+shape of the info. In the topic, dots of the name become slashes, and characters other than letters,
+digits and `_` become `_`. If the name has such characters, or a dot that is not between two words,
+the CRC-32 of the name is appended to the topic.
 """
 
 from __future__ import annotations

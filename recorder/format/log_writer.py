@@ -165,7 +165,8 @@ class LogTopics:
             topic: Name of the topic.
             shape: (height, width) or (height, width, channels).
             encoding: `mono8`, `rgb8`, `rgba8` or `16UC1`.
-            most: Maximum number of rows; fewer are allocated if they would not fit into a chunk.
+            most: Maximum number of rows; fewer rows are allocated if this number does not fit into
+                a chunk.
         """
         assert encoding is not None, f"{topic} has no images"
         channel = self.add_channel(topic, "sensor_msgs/msg/Image")
@@ -249,9 +250,10 @@ class LogWriter(LogTopics):
             source: Finished log whose records are copied to the start of a new file.
 
         Raises:
-            SpaceError: A log cannot contain these spaces; no file is created then.
+            SpaceError: A log cannot contain these spaces. No file is created.
             OutputExistsError: The file exists, and neither `overwrite` nor `append` is set.
-            LogError: The file cannot be created; or it cannot be appended to, and stays unchanged.
+            LogError: The file cannot be created, or cannot be appended to. An existing file stays
+                unchanged.
         """
         strings = metadata.to_strings()
         # Raise SpaceError before a file is created.

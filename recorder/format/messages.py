@@ -1,9 +1,9 @@
 """ROS 2 messages of variable length: episodes, log lines, markers, frames.
 
-Topics with such messages have few of them or are read only by viewers, so rosbags encodes the
-messages. The messages that are written at the end of an episode are encoded here without rosbags,
-to save time, because the environment waits until they are written.
-Transitions and images are encoded as fixed-size rows (`schema`).
+Most of these messages are rare or are read only by viewers, so rosbags encodes them. The messages
+at the end of an episode are encoded here without rosbags, because this is faster and the
+environment waits until they are written. Transitions and images are encoded as fixed-size rows
+(`schema`).
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ MAX_SEED = 2**64 - 2
 """Largest seed that can be stored."""
 INFO, WARN = 20, 30
 """Levels of log lines."""
-# CDR: the encapsulation header, then the fields, aligned relative to the end of the header.
+# In CDR, the fields follow the encapsulation header, and are aligned relative to the end of this
+# header.
 _ENCAPSULATION = b"\0\1\0\0"
 _EPISODE_START, _LOG_START = struct.Struct("<dqqqdII??"), struct.Struct("<IIB")
 

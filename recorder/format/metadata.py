@@ -62,7 +62,7 @@ SAME_WHEN_APPENDED = (
     "step_duration_ns",
 )
 DEFAULT_STEP_DURATION_NS = 100_000_000
-# Arguments that concern rendering or vectorization and do not describe one environment.
+# Arguments for rendering or vectorization. They do not describe one environment.
 _NOT_OF_ONE_ENV = (
     "render_mode",
     "num_envs",
@@ -208,9 +208,10 @@ class LogMetadata:
 
     @classmethod
     def common(cls, parts: Sequence[LogMetadata]) -> LogMetadata:
-        """Return one description of several logs; values that differ are reset to the defaults.
+        """Return metadata that describes several logs; fields that differ have the default value.
 
-        The spaces of all logs must be equal. `behavior_prob` is `ESTIMATED` if it is in any log.
+        The spaces of all logs must be equal. `behavior_prob` is `ESTIMATED` if any of the logs has
+        this value.
         """
         first, *others = parts
         blank = cls(first.observation_space, first.action_space)
@@ -320,11 +321,12 @@ def _texts(strings: Mapping[str, str], name: str) -> tuple[str, ...]:
 
 
 def _one_of(env: Any) -> Any:
-    """Return the first sub-environment of a `SyncVectorEnv` with unchanged spaces; else `env`."""
+    """Return a sub-environment of a vector environment if it describes `env`; else `env`."""
     if not isinstance(env, gym.vector.VectorEnv):
         return env
     inner = env.unwrapped
-    # Vector wrappers may change the spaces; then a sub-environment does not describe `env`.
+    # A vector wrapper may have changed the spaces. In this case, a sub-environment does not
+    # describe `env`.
     same = inner.single_observation_space == env.single_observation_space and (
         inner.single_action_space == env.single_action_space
     )
@@ -345,7 +347,8 @@ def installed_versions() -> dict[str, str]:
 
 @lru_cache(maxsize=1)
 def _installed_versions() -> tuple[tuple[str, str], ...]:
-    # Cached: reading each version from a file would dominate the time to open a log.
+    # The result is cached, because reading each version from a file would take most of the time to
+    # open a log.
     found = {"mcaprl": __version__}
     for package in _VERSIONED:
         try:

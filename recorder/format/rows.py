@@ -19,7 +19,8 @@ from mcaprl.recorder.format.topics import BYTES_PER_CHUNK, IMAGE_FRAME, MIN_ROWS
 
 Write = Callable[[NDArray[Any]], None]
 """Function that writes message records of one channel as one chunk."""
-# Values of a final record in all fields except its observation, `episode` and `step`.
+# Values that all final records share. They set all fields except the observation, `episode` and
+# `step`.
 _FINAL = {
     "action": 0,
     "reward": 0.0,
@@ -50,7 +51,8 @@ class TopicRows:
         Args:
             text: ROS 2 definition of the message.
             channel_id: Channel of the topic.
-            most: Maximum number of rows; fewer are allocated if they would not fit into a chunk.
+            most: Maximum number of rows; fewer rows are allocated if this number does not fit into
+                a chunk.
             write: Function that writes rows as one chunk.
         """
         dtype = message_dtype(text)
@@ -70,7 +72,7 @@ class TopicRows:
 
     @property
     def itemsize(self) -> int:
-        """Bytes of one row."""
+        """Number of bytes of one row."""
         return self._rows.itemsize
 
     def blank(self, *shape: int) -> Self:
@@ -139,7 +141,7 @@ class StepRows(TopicRows):
             fields[name][where] = False
 
     def finish(self, where: Any) -> None:
-        """Make rows final; their observation, episode and step stay unchanged."""
+        """Turn rows into final records; their observation, episode and step stay unchanged."""
         for name, value in _FINAL.items():
             self.fields[name][where] = value
 

@@ -117,7 +117,7 @@ def telemetry_message(values: Iterable[float]) -> bytes:
 
 
 def action_constants(names: Mapping[int, str]) -> dict[str, int]:
-    """Return the ROS constants of actions, with which a viewer displays `BRAKE (0)` for 0.
+    """Return ROS constants that name the actions; viewers then display `BRAKE (0)` for 0.
 
     Names are converted to upper case; text in parentheses is removed, and characters other than
     letters and digits become underscores. Names without letters have no constant.
@@ -194,7 +194,7 @@ def message_dtype(text: str) -> np.dtype[Any] | None:
     try:
         return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": end})
     except (ValueError, OverflowError):
-        # A field name is repeated, or the size overflows.
+        # NumPy raises these errors if a field name is repeated or the size overflows.
         return None
 
 

@@ -41,7 +41,7 @@ _MAX_CHANNEL_ID = 2**16 - 1
 _NO_TIMES: Times = np.empty(0, np.int64)
 _LAST_TIME = np.iinfo(np.int64).max
 ALL_TIMES: Times = np.array([[0, _LAST_TIME]], np.int64)
-"""Span of all log_times."""
+"""Time range that contains all log_times."""
 # A Message record up to its payload; see `MESSAGE_HEADER`.
 _HEADER = struct.Struct("<BQHIQQ")
 
@@ -73,7 +73,7 @@ class Source:
     delay_ns: int = 0
 
     def keeps(self, channel_id: int, times: Times) -> NDArray[np.bool_]:
-        """Return which messages of a channel are kept, given their times."""
+        """Return a mask of the messages of a channel that are kept, given their times."""
         kept = within(self.spans, times)
         if channel_id in self.also:
             kept |= np.isin(times, self.also[channel_id])
@@ -95,7 +95,7 @@ class Copied:
 
     Attributes:
         whole: Number of chunks that were copied without decompressing them.
-        rewritten: Number of chunks of which the kept messages were written as a new chunk.
+        rewritten: Number of chunks whose kept messages were written as a new chunk.
         messages: Number of messages.
     """
 
@@ -127,7 +127,7 @@ class NewTopics:
 
         Args:
             reader: Reader of the file.
-            metadata: Metadata that replaces the channel metadata in the file, by topic.
+            metadata: Channel metadata by topic. It replaces the channel metadata of the file.
 
         Raises:
             LogError: There are more channels than a file can have.
@@ -210,7 +210,7 @@ def copy_selected(
 
 
 def within(spans: Times, times: Times) -> NDArray[np.bool_]:
-    """Return which times are in one of the spans, given as (S, 2) first and last times."""
+    """Return a mask of the times that are in one of the time ranges `spans`, of shape (S, 2)."""
     if not len(spans):
         return np.zeros(len(times), np.bool_)
     span = np.searchsorted(spans[:, 0], times, side="right") - 1
@@ -236,7 +236,7 @@ def _in_time_order(sources: Sequence[Source]) -> Iterator[tuple[Source, ChunkInd
 
 
 class _Copy:
-    """Writer of the kept messages of chunks."""
+    """Writer that copies the kept messages of chunks."""
 
     def __init__(self, writer: McapWriter) -> None:
         self.copied = Copied()
@@ -282,7 +282,7 @@ class _Copy:
         return span >= 0 and end <= int(spans[span, 1])
 
     def _is_outside(self, source: Source, start: int, end: int, ids: Sequence[int]) -> bool:
-        """Return whether the times of a chunk show that none of its messages is kept."""
+        """Return whether a chunk's time range shows that none of its messages is kept."""
         spans = source.spans
         following = int(np.searchsorted(spans[:, 1], start))
         if following < len(spans) and int(spans[following, 0]) <= end:
@@ -291,7 +291,7 @@ class _Copy:
         return not any(((start <= times) & (times <= end)).any() for times in also)
 
     def _embeds_topics(self, source: Source) -> bool:
-        """Return whether chunks contain channels whose ids differ in the new file.
+        """Return whether chunks may contain Channel records whose id differs in the new file.
 
         Most other writers store each channel in the chunk of its first message.
         """
@@ -353,7 +353,7 @@ def _taken(
     """Copy the messages in `indexes`, with the ids, times and changes for the new file.
 
     Returns:
-        Message records in the order of the chunk; and their index by new channel id.
+        Message records in the order of the chunk, and their message indexes by new channel id.
     """
     wanted = sorted(
         (offset, channel_id, time_ns)
@@ -376,7 +376,7 @@ def _taken(
 
 
 def _renew(source: Source, view: memoryview, place: int, channel_id: int, time_ns: int) -> None:
-    """Set id and times of the message at byte `place`; pass it to `source.change` if needed."""
+    """Set channel id and times of the message at byte `place`; call `source.change` if needed."""
     if source.change is not None and source.changes(channel_id, time_ns, time_ns):
         _, length = RECORD_HEADER.unpack_from(view, place)
         payload = view[place + MESSAGE_HEADER.itemsize : place + RECORD_HEADER_BYTES + length]

@@ -203,7 +203,7 @@ def nest(leaves: tuple[Leaf, ...], arrays: Sequence[Any]) -> Any:
 
 
 def space_to_json(space: spaces.Space[Any]) -> str:
-    """Write a space as JSON text; `space_from_json` reads back an equal space.
+    """Convert a space to JSON text, from which `space_from_json` creates an equal space.
 
     Raises:
         SpaceError: A log cannot store the space or a part of it.
@@ -357,7 +357,8 @@ def _elements(plain: dict[str, Any]) -> int:
 
 def _numbers(bounds: NDArray[Any]) -> Any:
     """Return bounds for JSON. Equal bounds become one number, and infinities become strings."""
-    # Image spaces have many bounds, which are nearly always equal: build no list of equal bounds.
+    # An image space has many bounds, but these are nearly always equal. No list is built for equal
+    # bounds.
     if bounds.size and (bounds == bounds.flat[0]).all():
         return _number(bounds.flat[0].item())
     flat = [_number(value) for value in bounds.ravel().tolist()]

@@ -8,7 +8,7 @@ LEARNER_TOPIC = "/rl/learner"
 LOG_TOPIC = "/rosout"
 PHASE_TOPIC = "/rl/phase"
 RUNNING = "running"
-"""Phase of a running episode; at the end, the phase becomes the reason of the end."""
+"""Phase of a running episode. At its end, the phase changes to the reason of the end."""
 # Maximum number of /rl/step rows, of images, and of bytes in one chunk.
 STEPS_PER_CHUNK = 8192
 IMAGES_PER_CHUNK = 100

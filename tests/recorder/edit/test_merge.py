@@ -338,7 +338,7 @@ def test_messages_without_cdr_are_not_moved(tmp_path: Path) -> None:
     sensor_log(tmp_path / "camera.mcap", [1], at_ns=10**18)
     mcaprl.merge([a, tmp_path / "camera.mcap"], tmp_path / "b.mcap")
     with pytest.raises(
-        LogError, match=r"/camera/1 cannot be moved, because their encoding is 'json'"
+        LogError, match=r"/camera/1 cannot be delayed, because their encoding is 'json'"
     ):
         mcaprl.merge([a, tmp_path / "b.mcap"], tmp_path / "out.mcap", shift=True)
     assert not (tmp_path / "out.mcap").exists()
