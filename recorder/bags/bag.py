@@ -1,4 +1,4 @@
-"""A bag: topics and their messages, in any supported format and encoding."""
+"""Bag of any supported format: its topics and their messages in any supported encoding."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ class TopicInfo:
         type_name: Message type, such as `nav_msgs/msg/Odometry`.
         encoding: Encoding of the messages: `cdr`, `ros1`, `protobuf` or `json`.
         count: Number of messages.
-        first_ns: log_time of the first message; 0 without messages.
-        last_ns: log_time of the last message; 0 without messages.
+        first_ns: log_time of the first message; 0 if there are no messages.
+        last_ns: log_time of the last message; 0 if there are no messages.
         fields: Kind of each leaf field by its dotted path, such as `float64`, `float32[36]`,
             `uint8[]`, `string` or `time`; empty if unknown.
         constants: Constants of the type, by name.
-        problem: Reason why the messages cannot be read; empty if they can.
+        problem: Reason why the messages cannot be read; empty if they can be read.
     """
 
     name: str
@@ -88,7 +88,7 @@ class Bag(Protocol):
             topic: Name of the topic.
             fields: Dotted paths of fields; `publish_time` is the time of publication in
                 nanoseconds.
-            rows: Indices into `times` of the wanted messages, in output order; default: all.
+            rows: Indices into `times` of the messages to read, in output order; default: all.
 
         Raises:
             LogError: A message cannot be read.
@@ -112,7 +112,8 @@ class _Topic:
         if len(self._given) == 1:
             return list(self._given)
         used = [each for each in self._given if len(each.times_ns)] or list(self._given[:1])
-        # The files of a split bag cover successive time ranges: sort them by their first messages.
+        # The files of a split bag cover successive time ranges, so they are sorted by their first
+        # messages.
         return sorted(used, key=lambda each: each.times_ns[0] if len(each.times_ns) else 0)
 
     @cached_property
@@ -250,8 +251,8 @@ def open_bag(data: str | Path | Sequence[str | Path]) -> Bag:
     cannot be read, its `problem` is not empty; all other topics can still be read.
 
     Args:
-        data: A file, a folder, a glob, or a sequence of these. If several files have a topic, the
-            file whose first message is the earliest comes first.
+        data: A file, a folder, a glob, or a sequence of these. If several files have the same
+            topic, the messages of the file with the earliest first message come first.
 
     Raises:
         LogError: A file is missing, damaged, or not a bag.

@@ -122,7 +122,7 @@ class ProtobufDecoder:
             ) from error
 
     def _collect(self, descriptor: Any, prefix: str, parents: tuple[str, ...]) -> None:
-        """Collect the leaf fields and enum constants; skip a message type nested in itself."""
+        """Collect the leaf fields and enum constants; skip types that are nested in themselves."""
         for field in descriptor.fields:
             path = f"{prefix}{field.name}"
             inner = field.message_type
@@ -188,7 +188,7 @@ class JsonDecoder:
 def value_at(message: Any, path: str) -> Any:
     """Return a field of a decoded message by its dotted path; None if it is missing.
 
-    A time or duration becomes nanoseconds.
+    Times and durations are converted to nanoseconds.
     """
     found = message
     for name in path.split("."):
@@ -199,7 +199,7 @@ def value_at(message: Any, path: str) -> Any:
 
 
 def _nanoseconds(value: Any) -> Any:
-    """Return a time as nanoseconds, and any other value unchanged."""
+    """Convert a time to nanoseconds; return any other value unchanged."""
     for second, rest in (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec")):
         if isinstance(value, dict):
             if value.keys() == {second, rest}:
@@ -213,7 +213,7 @@ def column_of(values: Sequence[Any], kind: str) -> NDArray[Any]:
     """Return the values of a field as a column; see `bag.Stream`.
 
     Args:
-        values: Value of each message; None where it is missing.
+        values: Value of the field in each message; None if a message lacks the field.
         kind: Kind of the field as in `bag.TopicInfo`; empty if unknown.
     """
     if kind == "bytes" or kind.startswith(("uint8[", "byte[", "octet[")):

@@ -49,8 +49,8 @@ def open_files(path: Path, opened: ExitStack) -> list[McapFile | RosbagFile]:
         return [_open(path, "", opened)]
     metadata = _metadata(path)
     if str(metadata.get("compression_mode") or "").lower() == "message":
-        # Messages are compressed one by one; `RosbagFile` decompresses them only if it opens the
-        # folder instead of a file.
+        # Each message of this bag is compressed separately. `RosbagFile` decompresses the messages
+        # only if it opens the folder instead of a file.
         folder = RosbagFile(path)
         opened.callback(folder.close)
         return [folder]

@@ -1,4 +1,4 @@
-"""Topics of MCAP files, whichever program wrote them."""
+"""Topics of MCAP files that any program wrote."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class McapFile:
             sources.append(_McapTopic(reader, channel, distribution))
 
     def close(self) -> None:
-        """Do nothing: the file is mapped into memory."""
+        """Do nothing: a file that is mapped into memory need not be closed."""
 
 
 class _McapTopic:

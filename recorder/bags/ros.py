@@ -1,4 +1,8 @@
-"""Decoder of ROS messages, with definitions from a bag or else from a ROS distribution."""
+"""Decoder of ROS messages.
+
+The definitions of the types come from the bag. If the bag has none, they come from a ROS
+distribution.
+"""
 
 from __future__ import annotations
 

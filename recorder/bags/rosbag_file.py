@@ -20,7 +20,7 @@ _ENCODINGS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.ID
 
 
 class RosbagFile:
-    """A ROS 1 bag, a rosbag2 database, or a folder of them with `metadata.yaml`.
+    """A ROS 1 bag, a rosbag2 database, or a rosbag2 folder with `metadata.yaml`.
 
     Attributes:
         path: Path of the file or folder.
@@ -71,7 +71,7 @@ class _RosbagTopic:
         encoding = "ros1" if is_ros1 else "cdr"
         text = found.data.encode()
         self.definition = Definition(connection.msgtype, encoding, known, text, distribution)
-        # Position of the next message, and the iterator that yields this message next.
+        # Position of the next message, and the iterator that will yield this message.
         self._next = 0
         self._pass: Iterator[tuple[Connection, int, bytes]] = iter(())
 
@@ -86,7 +86,8 @@ class _RosbagTopic:
             for _, time_ns, data in self._pass:
                 self._next += 1
                 if self._next > row:
-                    # ROS 1 bags and rosbag2 databases before Jazzy store no publication time.
+                    # ROS 1 bags and the rosbag2 databases of distributions before Jazzy store no
+                    # publication time.
                     yield RawMessage(time_ns, data)
                     break
 

@@ -30,7 +30,7 @@ class Definition:
 
 
 class RawMessage(NamedTuple):
-    """A message that is not decoded."""
+    """A message as the bytes that the file contains."""
 
     publish_ns: int
     data: bytes

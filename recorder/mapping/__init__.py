@@ -1,1 +1,1 @@
-"""Reading of any robot's bag as a dataset, by a mapping of its topics."""
+"""Conversion of any robot's bag to a dataset. A mapping assigns the topics of the bag."""

@@ -19,7 +19,7 @@ class Actions(NamedTuple):
 
     Attributes:
         space: Action space.
-        values: (N,) int64, or (N, K) float32 for a Box; 0 where missing.
+        values: (N,) int64, or (N, K) float32 for a Box; 0 where the command is missing.
         missing: (N,) bool: whether there is no command.
         far: (N,) bool: whether the command is far from every named command, or outside the Box.
         meanings: Names of the discrete actions; empty if they have none.
@@ -98,9 +98,10 @@ def _discrete(
 def _nearest(
     commands: NDArray[np.float64], named: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the index of the named command nearest to each command, and its distance.
+    """Return the index of the named command nearest to each command, and their distance.
 
-    The distance is the largest difference of any field, divided by the field's range in `named`.
+    The difference in each field is divided by the field's range in `named`. The largest of these
+    ratios is the distance.
     """
     span = np.ptp(named, axis=0)
     span = np.where(span > 0, span, 1.0)

@@ -16,8 +16,9 @@ class Matches(NamedTuple):
     """The messages that match N steps.
 
     Attributes:
-        rows: (N,) index of the message in the sorted messages; `NONE` where there is none.
-        age_s: (N,) time of the step minus time of the message, seconds; NaN where there is none.
+        rows: (N,) index of the message in the sorted messages; `NONE` for a step without a message.
+        age_s: (N,) time of the step minus time of the message, seconds; NaN for a step without a
+            message.
     """
 
     rows: NDArray[np.int64]
@@ -84,8 +85,9 @@ def interpolated(
     A step before the first or after the last message has no value.
 
     Returns:
-        Values (N,) or (N, K), NaN where missing; and matches. Their `rows` are the messages before
-        the steps, and `age_s` is the age of the nearer of the two interpolated messages.
+        Values (N,) or (N, K), which are NaN where missing, and the matches. `rows` of the matches
+        are the messages before the steps. `age_s` is the age of the nearer of the two messages
+        between which a value is interpolated.
     """
     low = np.searchsorted(times_ns, steps_ns, side="right") - 1
     exact = (low >= 0) & (times_ns[np.maximum(low, 0)] == steps_ns) if len(times_ns) else low >= 0

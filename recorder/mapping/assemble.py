@@ -36,7 +36,7 @@ class _Observations(NamedTuple):
 
 
 def assembled(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> Dataset:
-    """Return the dataset of the kept episodes of all runs; `kept` has at least one episode.
+    """Return the dataset of the kept episodes of all runs; `kept` must not be empty.
 
     Raises:
         UsageError: A reward is not a number, or an observation is a text.
@@ -187,9 +187,10 @@ def _names(name: str, quantity: Quantity, count: int) -> list[str]:
 
 
 def _stacked(lengths: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Return indexes of the `count` frames to stack at each frame, (frames, count), oldest first.
+    """Return the indexes of the `count` frames that are stacked at each frame.
 
-    At the beginning of an episode, its first frame is repeated.
+    The shape is (frames, count), with the oldest frame first. At the beginning of an episode, its
+    first frame is repeated.
     """
     firsts = np.repeat(np.cumsum(lengths + 1) - lengths - 1, lengths + 1)
     here = np.arange(len(firsts))[:, np.newaxis]
@@ -205,5 +206,5 @@ def _repeated(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
 
 
 def _common_space(found: list[spaces.Space[Any]]) -> spaces.Space[Any]:
-    """Return the largest Discrete space of the runs, or their Box, which is equal in all runs."""
+    """Return the largest Discrete space of the runs; Box spaces are equal in all runs."""
     return max(found, key=lambda space: int(getattr(space, "n", 0)))

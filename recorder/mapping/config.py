@@ -66,8 +66,8 @@ class Quantity(_Part):
     )
     missing: float | None = Field(
         default=None,
-        description="Number that replaces missing values; without it, steps at which an observed"
-        " value is missing are left out.",
+        description="Number that replaces missing values. Without it, a step is left out if an"
+        " observed value is missing.",
     )
     scale: float = Field(default=1.0, description="Factor of the value.")
     offset: float = Field(default=0.0, description="Number added after scaling.")
@@ -94,7 +94,7 @@ class Quantity(_Part):
         if given == ["image"] and self.align == "linear":
             raise ValueError("images cannot be interpolated: use last or nearest")
         if self.clip is not None and self.clip[0] >= self.clip[1]:
-            raise ValueError("clip is the lowest value, then the highest")
+            raise ValueError("clip must be the lowest value, then the highest value")
         return self
 
 
@@ -116,14 +116,15 @@ class Action(_Part):
     )
     names: dict[str, int] = Field(
         default={},
-        description="Action numbers: for a string field by its values, otherwise by action name.",
+        description="Number of each action by its name. For a string field, the names are the"
+        " values of the field.",
     )
     actions: dict[str, list[float]] = Field(
-        default={}, description="Named commands; the nearest one is the action."
+        default={}, description="Named commands. The action is the nearest named command."
     )
     edges: list[list[float]] = Field(
         default=[],
-        description="Bin edges of each field, increasing; an action is a combination of bins, one"
+        description="Bin edges of each field, increasing. An action is a combination of bins, one"
         " for each field.",
     )
     box: Limits | None = Field(
@@ -132,8 +133,8 @@ class Action(_Part):
     far: Positive = Field(
         default=0.25,
         description="Distance to the nearest named command above which a command is counted as far."
-        " The distance is the largest difference of any field, divided by the range of the field in"
-        " the named commands.",
+        " The difference in each field is divided by the field's range in the named commands. The"
+        " largest of these ratios is the distance.",
     )
     align: Literal["during", "last", "nearest"] = Field(
         default="during",
@@ -171,16 +172,16 @@ class Episodes(_Part):
 
     begin: str | None = Field(
         default=None,
-        description="Condition whose rising edge begins an episode; default: the next step with an"
-        " observation and an action.",
+        description="Condition whose rising edge begins an episode. Without it, an episode begins"
+        " at the next step with an observation and an action.",
     )
     end: str | None = Field(default=None, description="Condition that truncates the episode.")
     terminated: str | None = Field(default=None, description="Condition of a terminal state.")
     truncated: str | None = Field(default=None, description="Condition that truncates the episode.")
     reasons: dict[str, str] = Field(
         default={},
-        description="Conditions by end reason; the first one that is true at the end of an episode"
-        " determines its reason.",
+        description="Conditions by end reason. The first condition that is true at the end of an"
+        " episode determines the reason of the episode.",
     )
     gap_s: Positive = Field(
         default=2.0, description="Longest gap, in seconds, in an observed topic within an episode."
@@ -242,7 +243,7 @@ class Mapping(_Part):
 
     @property
     def quantities(self) -> dict[str, Quantity]:
-        """All named quantities, observed ones first."""
+        """All named quantities, beginning with the observed quantities."""
         return {**self.observation, **self.fields}
 
 

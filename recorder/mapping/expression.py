@@ -1,4 +1,4 @@
-"""Expressions: arithmetic over named columns, and nothing else of Python.
+"""Expressions: Python arithmetic and comparisons with named columns, and no other Python code.
 
 An expression is parsed by `ast` and evaluated for all rows at once. It may contain numbers,
 strings for comparison, names, elements such as `pose[0]`, `+ - * / // % **`, comparisons, `and`,

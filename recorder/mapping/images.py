@@ -55,7 +55,7 @@ class ImageReader:
         self._fields = _image_fields(bag.topics[topic])
 
     def read(self, rows: NDArray[np.int64]) -> Image:
-        """Return the images of N messages as (N, H, W, C); a repeated message is decoded once.
+        """Return the images of N messages as (N, H, W, C); repeated messages are decoded only once.
 
         Args:
             rows: (N,) positions of the messages in the topic.
@@ -106,7 +106,7 @@ class ImageReader:
         if quantity.range_m is not None and pixels.dtype == np.float32:
             low, high = quantity.range_m
             share = np.clip((pixels - low) / (high - low), 0.0, 1.0)
-            # As in the sims, pixels without a surface have the largest value.
+            # Pixels without a surface get the largest value, as in the depth images of the sims.
             pixels = np.where(pixels > 0, np.rint(255 * share), 255).astype(np.uint8)
         return pixels if pixels.ndim == 3 else pixels[..., np.newaxis]
 

@@ -89,8 +89,8 @@ def values_of(
         run: Messages of the topic between two resets of the clock.
         steps_ns: (N,) times of the steps.
         transforms: Tree of frames, for a transform.
-        ends_ns: (N,) ends of the steps, to use the last message before each end; None to align
-            with the times of the steps.
+        ends_ns: (N,) ends of the steps. If given, each step uses the last message before its end;
+            if None, `quantity.align` applies.
 
     Raises:
         UsageError: A field is not a number.
@@ -170,7 +170,7 @@ def _shaped(
     missing: NDArray[np.bool_],
     age_s: NDArray[np.float64],
 ) -> Values:
-    """Scale, wrap and clip values, and replace missing ones."""
+    """Scale, wrap and clip values, and replace missing values."""
     found = found * quantity.scale + quantity.offset
     if quantity.wrap_angle or (quantity.as_ == "yaw" and quantity.align == "linear"):
         found = (found + math.pi) % (2 * math.pi) - math.pi

@@ -21,7 +21,7 @@ class FieldPath(NamedTuple):
     Attributes:
         topic: Name of the topic.
         field: Dotted path of the field in the message; empty for the message as a whole.
-        elements: Index or slice of an array; None for the field as it is.
+        elements: Index or slice of an array; None for the whole field.
     """
 
     topic: str
@@ -29,7 +29,7 @@ class FieldPath(NamedTuple):
     elements: int | slice | None
 
     def select(self, column: NDArray[Any]) -> NDArray[Any]:
-        """Select elements of a column (N, K); without an index or slice, return all of the column.
+        """Select elements of a column (N, K); without an index or slice, return the whole column.
 
         Raises:
             UsageError: The field is not an array, or is shorter than the index.
@@ -68,7 +68,7 @@ def topic_of(bag: Bag, name: str) -> str:
 
 
 def field_path(bag: Bag, text: str) -> FieldPath:
-    """Resolve the path of a field: its topic is the longest topic name at the start of the text.
+    """Resolve the path of a field. Its topic is the longest topic name that the text begins with.
 
     Raises:
         UsageError: There is no such topic or field; the message names the nearest ones.

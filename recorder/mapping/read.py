@@ -1,4 +1,4 @@
-"""Reading of a bag as a dataset, by a mapping."""
+"""Reading of a bag as a dataset, as a mapping specifies."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from mcaprl.recorder.mapping.summary import FieldReport, MappingReport
 
 
 class MappedBag(NamedTuple):
-    """A bag that was read by a mapping.
+    """A bag that was read with a mapping.
 
     Attributes:
         dataset: Transitions of the bag.
-        report: What was found and what was left out.
+        report: Statistics of what was read and of what was left out.
     """
 
     dataset: Dataset

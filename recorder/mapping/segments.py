@@ -107,7 +107,7 @@ def _segment(marks: Marks, first: int, last: int, cut: int, limit: int) -> Segme
 
 
 def _edges(condition: Flags) -> Flags:
-    """Return where a condition becomes true."""
+    """Return a mask of the steps at which a condition becomes true."""
     found: Flags = condition.copy()
     found[1:] &= ~condition[:-1]
     return found

@@ -30,7 +30,7 @@ class Steps(NamedTuple):
         probs: (N,) probability of the action; NaN if unknown.
         rewards: (N,) reward of each step's action; may depend on the next step.
         episodes: Episodes that the steps form.
-        reasons: (N,) whether the condition of an end reason is true, by reason.
+        reasons: (N,) flags by end reason: whether the condition of this reason is true.
     """
 
     times_ns: NDArray[np.int64]
@@ -43,7 +43,7 @@ class Steps(NamedTuple):
 
 
 class StepReader:
-    """Reader of the steps of a bag, run by run; a run is the time between two clock resets."""
+    """Reader that returns the steps of a bag run by run; a run is the time between clock resets."""
 
     def __init__(self, plan: Plan) -> None:
         """Read the transforms, if the mapping uses them."""
@@ -165,7 +165,7 @@ class StepReader:
         return found
 
     def _usable(self, quantities: dict[str, Values], count: int) -> NDArray[np.bool_]:
-        """Return whether each step has all observations, none of them older than `gap_s`."""
+        """Return a mask of the steps that have all observations, none older than `gap_s`."""
         usable = np.ones(count, bool)
         for name, quantity in self._mapping.observation.items():
             if quantity.missing is None or quantity.image is not None:

@@ -68,7 +68,7 @@ class TopicStream:
 
     @cached_property
     def runs(self) -> list[Run]:
-        """Messages between resets of the clock; one empty run if there are no messages."""
+        """Runs of messages between resets of the clock; one empty run without messages."""
         times_ns = self.times_ns
         resets = np.flatnonzero(np.diff(times_ns) < -self._gap_ns) + 1
         found = []

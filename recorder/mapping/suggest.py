@@ -124,7 +124,7 @@ def _others(topics: Iterable[TopicInfo], observed: list[_Entry]) -> Iterator[tup
 
 
 def _command(topics: Iterable[TopicInfo]) -> TopicInfo | None:
-    """Return the topic that is most likely the command: by its name, then by its type."""
+    """Return the topic that most likely contains the commands, by its name or else its type."""
 
     def likelihood(info: TopicInfo) -> int:
         text = f"{info.name} {info.type_name}".lower()

@@ -22,8 +22,8 @@ class FieldReport:
     Attributes:
         topic: Topic that contains the quantity.
         missing: Share of the steps without a value.
-        median_age_s: Median age of the value at its step, seconds; NaN if there is none.
-        max_age_s: Largest age, seconds; NaN if there is none.
+        median_age_s: Median age of the value at its step, seconds; NaN if no step has a value.
+        max_age_s: Largest age, seconds; NaN if no step has a value.
     """
 
     topic: str

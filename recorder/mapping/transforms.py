@@ -145,7 +145,7 @@ def _edge(child: str, rows: list[tuple[str, int, list[float], list[float], bool]
 def _at(
     edge: _Edge, steps_ns: NDArray[np.int64], align: str, tolerance_s: float | None
 ) -> tuple[Floats, Floats, Floats]:
-    """Return positions, quaternions and ages of an edge at the times of steps."""
+    """Return the pose of a frame in its parent at the times of steps: position, rotation, age."""
     if edge.is_static:
         count = len(steps_ns)
         still = (np.tile(each[-1], (count, 1)) for each in (edge.positions, edge.quaternions))

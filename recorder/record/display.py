@@ -45,11 +45,14 @@ from mcaprl.recorder.record.tracks import Tracks
 SCENE, SCENE_STATIC, TRACKS = "/scene", "/scene/static", "/scene/tracks"
 TF, TF_STATIC, TELEMETRY = "/tf", "/tf_static", "/telemetry"
 DEPTH, CAMERA_INFO = "/camera/depth", "/camera/camera_info"
-# Display messages are written when they exceed this size or the episode ends.
+# Buffered display messages are written when their total size exceeds this number of bytes, and at
+# the end of an episode.
 _CHUNK_BYTES = 2**20
-# Minimum bytes of display messages between two messages of tracks, per byte of the tracks.
+# The message with the tracks is written again only after display messages of at least this many
+# times its size.
 _BYTES_PER_TRACKS = 4
-# Shapes of a body move with its frame at each step; other moving shapes are written at this period.
+# Period at which moving shapes are written, simulated time. Shapes that are fixed to a moving frame
+# follow this frame at each step.
 _SCENE_PERIOD_NS = 100_000_000
 
 
@@ -114,7 +117,8 @@ class Display:
         self._shown: ShownTopics | None = None
         self._tracks, self._bytes_since_tracks = Tracks(), 0
         self._static: dict[str, bytes] = {}
-        # Latest shapes that are not in a message yet; they are written at the end of the episode.
+        # Latest shapes that are not in a message yet. If no later message contains them, they are
+        # written at the end of the episode.
         self._pending: tuple[int, Sequence[Shape]] | None = None
         # Frames at the latest step. They are written at the next step, because one message contains
         # them and the poses up to that step.

@@ -62,8 +62,8 @@ class EpisodeInfos:
                 refused[name] = "two entries of the info have this name"
             elif array is None:
                 refused[name] = (
-                    "a log stores flags, texts, integers, float32 and float64, and arrays of one"
-                    " shape, but no mixture of these"
+                    "a log stores flags, texts, integers, float32, float64, and arrays of one"
+                    " shape, but not a mixture of these"
                 )
             else:
                 found[name] = ([start_ns + step * step_ns for step in steps[:count]], array)

@@ -1,4 +1,4 @@
-"""A Foxglove layout for a log: its screens Drive, Learning and Data.
+"""Foxglove layout of a log, with the screens Drive, Learning and Data.
 
 The classic form (`configById`, `layout`, `globalVariables`, `userNodes`, `playbackConfig`) opens in
 Foxglove and in Lichtblick. The screens are the tabs of one panel. Each screen has few panels, so
@@ -35,7 +35,7 @@ _WORLD = "map"
 _STILL = (_WORLD, "follow-none")
 _NONE: Sequence[str] = ()
 _SPEED = "speed_m_s"
-# Suffixes of the telemetry names in the first plot; the speed has a gauge instead.
+# Suffixes of the telemetry names in the first plot. The speed is shown by a gauge instead.
 _WATCHED = ("offset_m", "steering_rad", "distance_m")
 # Values for environments without `view_settings`.
 _CAMERA_M, _TILT_DEG, _AROUND_M, _DEPTH_M, _HIGHEST_M_S = 22.0, 73.0, 100.0, (0.0, 50.0), 30.0
@@ -80,7 +80,7 @@ def layout_of(
 
 
 def layout_bytes(layout: dict[str, Any]) -> bytes:
-    """Return a layout as JSON without spaces: attachments are not compressed."""
+    """Return a layout as JSON without spaces, because attachments are not compressed."""
     return json.dumps(layout, separators=(",", ":")).encode()
 
 
@@ -175,7 +175,11 @@ class _Screens:
         return self._put("3D!scene", panels.three_d("scene", shown, camera, followed))
 
     def _above(self) -> Node:
-        """Add the view from above: the whole world, or the vehicle's surroundings by default."""
+        """Add the view from above.
+
+        It shows the whole world if the log contains its size, otherwise the surroundings of the
+        vehicle.
+        """
         view = self.metadata.view
         height_m = view.get("world_m", _AROUND_M)
         camera = {
@@ -268,7 +272,7 @@ class _Screens:
         return [self._put("Indicator!state", panel)]
 
     def _actions(self) -> tuple[Node, float]:
-        """Add a panel of recent logged and policy actions; return it and its share of height."""
+        """Add a panel of recent logged and policy actions; return its node and share of height."""
         title = f"actions of the last {_LAST_S} s"
         if not self.metadata.action_names():
             paths = series.action_series(self.metadata)

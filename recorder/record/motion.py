@@ -1,4 +1,4 @@
-"""Motion of frames within a step, as the few poses that viewers interpolate between.
+"""Motion of frames within a step, reduced to a few poses between which viewers interpolate.
 
 A message of `/tf` at the log_time of a step contains the poses of the frames from that time until
 the end of the step, each with its own stamp. A viewer interpolates between two poses, so it needs
@@ -21,7 +21,7 @@ Moment = tuple[int, Sequence[Frame]]
 
 _TOLERANCE_M = 0.04
 _TOLERANCE_ROTATION = 0.01
-"""Largest error of a quaternion component; for small angles, a rotation of 0.02 rad."""
+"""Maximum error of a quaternion component. For small angles, it is a rotation of 0.02 rad."""
 
 
 def motion_transforms(moments: Sequence[Moment], *, thins: bool = True) -> bytes:

@@ -58,7 +58,7 @@ def plot(title: str, paths: Mapping[str, str], *, values: bool = False, **option
 
 
 def points_by_index(title: str, paths: Mapping[str, str]) -> Panel:
-    """Return a plot of arrays in the latest message: one point per element, over its index."""
+    """Return a plot of arrays in the latest message, with one point for each element."""
     panel = plot(title, paths, xAxisVal="index", isSynced=False)
     for series in panel["paths"]:
         series |= {"showLine": False, "lineSize": 4}
@@ -90,7 +90,7 @@ def state_transitions(title: str, paths: Mapping[str, str], last_s: float | None
 
 
 def share_of_transitions(rows: int) -> float:
-    """Return the share of a screen's height that shows this number of rows, 0.45 at most."""
+    """Return the share of a screen's height that this number of rows needs, at most 0.45."""
     return min(0.45, (rows * _TRANSITIONS_ROW_PX + _TRANSITIONS_REST_PX) / _SCREEN_PX)
 
 

@@ -125,8 +125,8 @@ class MotionSource(Protocol):
     def motion(self) -> Sequence[tuple[float, Sequence[Frame]]]:
         """Return the moving frames at moments within the last step, in order of time.
 
-        Each element consists of the seconds before the end of the step, more than 0, and the
-        frames at that moment. The sequence is empty after `reset`.
+        Each element is a pair: the number of seconds before the end of the step, which is more than
+        0, and the frames at that moment. The sequence is empty after `reset`.
         """
 
 
@@ -157,8 +157,8 @@ class PinholeSource(Protocol):
 def marker_array(shapes: Iterable[Shape]) -> bytes:
     """Encode shapes as one `visualization_msgs/msg/MarkerArray`.
 
-    The first marker deletes all earlier ones, so that a viewer which seeks to this message shows
-    only these shapes. Stamps are 0, so that equal shapes encode to equal messages. A stamp of 0
+    The first marker deletes all earlier markers, so that a viewer shows only these shapes after it
+    seeks to this message. Stamps are 0, so that equal shapes encode to equal messages. A stamp of 0
     refers to the latest transform of the frame.
     """
     markers = [_marker(action=_DELETE_ALL), *map(_shape_marker, shapes)]

@@ -64,7 +64,8 @@ class EpisodeLog:
             SpaceError, OutputExistsError, LogError: Raised by `LogWriter`.
         """
         self._description = description
-        # Relative paths refer to the initial working directory, even if the process leaves it.
+        # A relative path refers to the current working directory, even if the process changes it
+        # later.
         self._folder = Path.cwd()
         self.step_ns = description.step_duration_ns
         first_ns = time.time_ns() if start_time_ns is None else start_time_ns
@@ -118,9 +119,10 @@ class EpisodeLog:
                 raise UsageError(f"seed {seed}: a seed must be from 0 to 2**64 - 2")
 
     def begin(self, display: Display) -> None:
-        """Write the first display messages of the next episode; if the file is full, to a new file.
+        """Begin the next episode, and write its first display messages.
 
-        The layout is written with the first episode.
+        If the current file is full, the episode begins a new file. The layout is written with the
+        first episode.
         """
         mcap, start_ns, parts = self.log.mcap, self.next_start_ns, self._parts
         has_episodes = self.episodes > self._first_in_file
@@ -153,7 +155,7 @@ class EpisodeLog:
         truncated: bool,
         reason: str,
     ) -> EpisodeSummary:
-        """Return the summary of an episode that ends now and is the next episode of the log."""
+        """Return the summary of the episode that ends now; its number is `episodes`."""
         return EpisodeSummary(
             episode=self.episodes,
             length=episode.steps,
@@ -173,7 +175,7 @@ class EpisodeLog:
         """Update the episode count and the next start time; call this after writing an episode.
 
         Raises:
-            LogError: The file was removed or replaced; the log is then closed.
+            LogError: The file was removed or replaced. The log is closed in this case.
         """
         self.next_start_ns = summary.end_time_ns + self.step_ns
         self.episodes += 1

@@ -133,7 +133,7 @@ class StepColumns:
         self.store_reward: Store = self._rewards.append
 
     def store_behavior_prob(self, prob: float) -> None:
-        """Store the probability of the latest action, and NaN for earlier actions without one."""
+        """Store the probability of the latest action; earlier actions without one get NaN."""
         unknown = len(self._rewards) - len(self._probs)
         if unknown:
             self._probs.extend([math.nan] * unknown)
@@ -299,11 +299,11 @@ def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
         # Lists have no dtype, so their conversion causes no warning.
         if array.ndim and isinstance(value, np.ndarray):
             warnings.warn(
-                f"{where} is {array.dtype}; converted to its space's {leaf.dtype}",
+                f"{where} is {array.dtype}; it is converted to {leaf.dtype}, as its space declares",
                 stacklevel=2,
             )
     elif not np.array_equal(cast, array):
-        raise SpaceError(f"{where} is {value!r:.60}, which does not fit its space's {leaf.dtype}")
+        raise SpaceError(f"{where} is {value!r:.60}; its space declares {leaf.dtype}")
     return cast
 
 

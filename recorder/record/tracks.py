@@ -14,7 +14,8 @@ _MAX_TRACKS = 32
 _MAX_POINTS = 64
 _RAISED_M = 0.2
 _MIN_WIDTH_M = 0.05
-# Tracks are wide enough for a view of the whole world. Marks are wider than tracks.
+# A track is 1/250 of the world's size wide, so that it is visible in a view of the whole world. A
+# mark is five times as wide as a track.
 _WIDTHS_PER_WORLD, _WIDTHS_PER_MARK = 250, 5
 _LOW_RETURN, _HIGH_RETURN = np.array([0.30, 0.25, 0.80]), np.array([0.98, 0.85, 0.25])
 _FAILED: Quad = (0.90, 0.10, 0.10, 1.0)

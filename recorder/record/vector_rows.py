@@ -13,8 +13,8 @@ import numpy as np
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.rows import StepRows, TopicRows
 
-# Limits of the initial capacity: steps, and bytes per environment. The capacity doubles when an
-# episode needs more.
+# Limits of the initial capacity: number of steps, and number of bytes per environment. The capacity
+# doubles when an episode needs more.
 _FIRST_CAPACITY = 64
 _FIRST_BYTES = 2**20
 
@@ -41,7 +41,7 @@ class OpenRows(Generic[Rows]):
             self._rows = self._rows.grown(max(2 * self.capacity, step + 1))
 
     def put(self, field: str, environments: Any, steps: Any, values: Any) -> None:
-        """Set a field at the given steps of environments.
+        """Set a field in the rows of these environments and steps.
 
         Args:
             field: Name of the message field.

@@ -39,7 +39,8 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
     An episode is on disk when the `step` that ends it returns, in every autoreset mode. An episode
     interrupted by `reset`, `close` or an error is recorded as truncated, with the reason
-    `interrupted`. Apply this wrapper last: the effects of wrappers around it are not recorded.
+    `interrupted`. Make this wrapper the outermost one: the effects of wrappers around it are not
+    recorded.
 
     Attributes:
         behavior_probs: (N,) probabilities of the next actions under the behavior policy. Set them
@@ -123,10 +124,11 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._action_leaf = action_leaf(self.action_space)
         self._every = np.arange(count)
         self._open = [OpenEpisode("", math.nan) for _ in range(count)]
-        # For each environment: transitions in its open episode, and whether an episode is open.
+        # For each environment: number of transitions in its open episode, and whether an episode is
+        # open.
         self._steps = np.zeros(count, np.int64)
         self._running = np.zeros(count, np.bool_)
-        # Whether each environment resets itself in the next step.
+        # For each environment: whether it resets itself in the next step.
         self._due = np.zeros(count, np.bool_)
         self._full_at = 0
 
@@ -278,7 +280,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         truncated: NDArray[np.bool_],
         infos: dict[str, Any],
     ) -> None:
-        """End the episodes of these environments; in same-step mode, begin the next ones."""
+        """End these environments' episodes; in same-step mode, begin their next episodes."""
         same_step = self._autoreset is AutoresetMode.SAME_STEP
         ended = infos.get("final_info", {}) if same_step else infos
         for number in numbers.tolist():
@@ -302,7 +304,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         return [convert(final) for convert in self._converters_of_one]
 
     def _interrupt(self, numbers: NDArray[np.int64]) -> None:
-        """Record unfinished episodes as truncated, and drop those without a transition."""
+        """Record unfinished episodes as truncated, and drop episodes without a transition."""
         with HoldSignals():
             for number in numbers.tolist():
                 if self._running[number] and self._steps[number] and not self._recording.closed:
@@ -340,7 +342,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             self._infos[number].warn()
 
 
-# Public import path, for reprs and pickles.
+# Reprs and pickles contain this public import path.
 RecordVecMcap.__module__ = "mcaprl"
 
 

@@ -38,8 +38,8 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
     """A wrapper that records every transition of an environment to an MCAP file.
 
     An episode is on disk when the `step` that ends it returns. An episode interrupted by `reset`,
-    `close` or an error is recorded as truncated, with the reason `interrupted`. Apply this wrapper
-    last: the effects of wrappers around it, such as a TimeLimit, are not recorded.
+    `close` or an error is recorded as truncated, with the reason `interrupted`. Make this wrapper
+    the outermost one: the effects of wrappers around it, such as a TimeLimit, are not recorded.
 
     Attributes:
         behavior_prob: Probability of the next action under the behavior policy. Set it before each
@@ -90,7 +90,8 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
                 strings and arrays are not recorded and cause a warning.
             step_duration_s: Simulated seconds between two observations; default: the environment's
                 `step_duration_s`, else 1 / `render_fps`, else 0.1.
-            start_time_ns: log_time of the first message, since the Unix epoch; default: now.
+            start_time_ns: log_time of the first message, in nanoseconds since the Unix epoch;
+                default: now.
 
         Raises:
             SpaceError: The log format does not support the environment's spaces.
@@ -291,5 +292,5 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             self._infos.warn()
 
 
-# Public import path, for reprs and pickles.
+# Reprs and pickles contain this public import path.
 RecordMcap.__module__ = "mcaprl"

@@ -65,7 +65,7 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
 
 
 def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: int) -> None:
-    """Check each chunk, and then the log if all chunks are valid.
+    """Check each chunk. If all chunks are valid, check the log.
 
     Args:
         reader: Reader of the file.
@@ -80,7 +80,8 @@ def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: i
         try:
             log = EpisodeCheck(reader)
         except (LogError, SpaceError) as error:
-            # Raise the error only after the check of the chunks, which works for any MCAP file.
+            # Chunks of any MCAP file can be checked. The error is therefore raised only after their
+            # check.
             refusal = error
     for chunk, read in _decompressed(reader, threads):
         try:
@@ -101,7 +102,10 @@ def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: i
 def _decompressed(
     reader: McapReader, threads: int
 ) -> Iterator[tuple[ChunkIndex, Callable[[], memoryview]]]:
-    """Yield each chunk and a function that returns its records, valid until the next chunk."""
+    """Yield each chunk and a function that returns its records.
+
+    The records are valid until the caller requests the next chunk.
+    """
     if threads == 1:
         scratch = Scratch()
         for chunk in reader.chunks:
@@ -110,7 +114,7 @@ def _decompressed(
     chunks = iter(reader.chunks)
     with ThreadPoolExecutor(threads) as pool:
         ahead = deque[tuple[ChunkIndex, Future[memoryview]]]()
-        # The buffers limit memory use: one for each thread, and one for the caller.
+        # There is one buffer for each thread and one for the caller, which limits memory use.
         scratches = cycle([Scratch() for _ in range(threads + 1)])
         while True:
             for chunk in islice(chunks, threads + 1 - len(ahead)):

@@ -40,13 +40,13 @@ _FIELDS = ("action", "reward", "terminated", "truncated", *COUNTERS)
 IMPOSSIBLE_ACTION = "leave the episode out of training"
 """Advice for an action outside of the action space; the file itself is not damaged."""
 _IMAGE_FIELDS = ("height", "width", "encoding", "step", "data")
-# Decoder, message range, and the place of its values: rows of the step columns, or the image leaf
-# of the observation space.
+# A decoder, a message range, and the destination of its values. The destination is the rows of the
+# step columns, or the image leaf of the observation space.
 _Place = tuple[Decoder, MessageRange, slice | Leaf]
 
 
 class EpisodeCheck:
-    """Checker of a log, which collects values of each chunk and finally validates the episodes."""
+    """Checker of a log. It collects values of each chunk, and validates the episodes at the end."""
 
     def __init__(self, reader: McapReader) -> None:
         """Find the topics.
@@ -120,12 +120,13 @@ class EpisodeCheck:
             missing = int((~np.isin(times[:frames], topic.times)).sum())
             if missing or len(topic) != len(self._steps):
                 yield Problem(
-                    f"{len(topic)} images for {len(self._steps)} records, {missing} without image",
+                    f"{len(topic)} images for {len(self._steps)} records; {missing} records have no"
+                    " image",
                     leaf.topic,
                 )
 
     def _schema_fits(self) -> bool:
-        """Return whether `/rl/step` has one channel, whose schema matches the metadata's spaces."""
+        """Return whether `/rl/step` has one channel, with a schema that matches the metadata."""
         channels = self._reader.channels_of(STEP_TOPIC)
         assert self._metadata is not None
         spaces = (self._metadata.observation_space, self._metadata.action_space)

@@ -62,7 +62,7 @@ class Recovery:
 
     @property
     def has_losses(self) -> bool:
-        """Whether anything in the old file is missing in the new one."""
+        """Whether the new file lacks anything that is in the old file."""
         return bool(self.damages or self.dropped or self.ended or self.strays)
 
     def to_json(self) -> dict[str, Any]:
@@ -101,7 +101,7 @@ def recover_log(
     """Write the valid part of `source` to `target` as a valid log.
 
     Args:
-        source: MCAP file, damaged or not; not changed.
+        source: MCAP file, which may be damaged. It is not changed.
         target: Path of the new file.
         keep_unfinished: Whether to keep the whole transitions of episodes without an end, and mark
             these episodes as truncated. By default, these episodes are dropped.
@@ -127,7 +127,7 @@ def recover_log(
 def _keep_whole_episodes(
     copied: Path, result: Path, recovery: Recovery, keep_unfinished: bool
 ) -> None:
-    """Move a valid MCAP file to `result`, or write only its whole episodes there.
+    """Write `result`: the whole file `copied`, or only its whole episodes if others are incomplete.
 
     Raises:
         LogError: There is nothing to keep, or the new log has a problem.
@@ -167,7 +167,7 @@ def _is_complete(source: str) -> bool:
 def _restore_metadata(
     damages: Shortlist[Damage], metadata: list[Metadata], channels: Iterable[Channel]
 ) -> list[Metadata]:
-    """Replace the metadata record with the copy in the channel of `/rl/step`, if there is one."""
+    """Replace the metadata record by its copy in the channel of `/rl/step`, if there is a copy."""
     for channel in channels:
         if channel.topic == STEP_TOPIC and "format_version" in channel.metadata:
             records = [record for record in metadata if record.name == METADATA_NAME]

@@ -39,7 +39,7 @@ from mcaprl.recorder.format.writing import DROP, KEEP, copy_messages
 _FIELDS = ("reward", "episode", "step", "terminated", "truncated", "final")
 # Prefix of topics whose messages belong to episodes; other topics are copied unchanged.
 _EPISODE_TOPICS = "/rl/"
-# A larger gap in the episode numbers is regarded as the start of another recording.
+# If the gap between two episode numbers is larger than this, a new recording is assumed to start.
 _MAX_GAP = 10**6
 
 Place = tuple[int, int]
@@ -189,8 +189,8 @@ class _Run:
 
     Attributes:
         start: Row of the first record.
-        last: Row of the last record before the first one that lacks an image; the last record of
-            the run if no image is missing.
+        last: Row of the last record that has all its images and has no earlier record without
+            images.
         records: Number of records, including records without their images.
         begins: Whether the run begins with step 0.
         is_whole: Whether the run is a whole episode.
@@ -266,7 +266,7 @@ def _message_dtype(schema: Schema) -> np.dtype[Any] | None:
 
 
 def _with_images(reader: McapReader, times: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return whether each record has exactly one image on each image topic."""
+    """Return a mask of the records that have exactly one image on each image topic."""
     metadata, complete = described(reader), np.ones(len(times), np.bool_)
     for leaf in observation_leaves(metadata.observation_space) if metadata else ():
         if leaf.encoding is not None:
@@ -285,7 +285,7 @@ def _listed_episodes(reader: McapReader) -> dict[int, int]:
 
 
 def _missing(columns: Columns, listed: Iterable[int]) -> Iterator[DroppedEpisode]:
-    """Yield episodes without records: their numbers are in `listed` or in gaps of the numbering."""
+    """Yield the episodes without records: their number is in `listed`, or is skipped in the log."""
     known = np.unique(columns["episode"]).astype(np.int64)
     gaps = np.diff(known)
     between = [
@@ -319,7 +319,7 @@ def _by_place(
 
 
 def _is_inside(plan: EpisodePlan, log_times: NDArray[np.uint64]) -> NDArray[np.bool_]:
-    """Return whether each time is within a kept episode."""
+    """Return a mask of the times that are within a kept episode."""
     if not plan.episodes:
         return np.zeros(len(log_times), np.bool_)
     times = log_times.astype(np.int64)

@@ -40,7 +40,7 @@ def annotated_copy(source: Path, out: Path, *, overwrite: bool = False) -> Itera
 
     Raises:
         OutputExistsError: The file exists and `overwrite` is not set.
-        LogError: The log is damaged, unfinished or not an mcaprl log; or `out` cannot be written.
+        LogError: The log is damaged, unfinished or not an mcaprl log, or `out` cannot be written.
     """
     reader = McapReader(source)
     with replacing(out, LogError, overwrite=overwrite) as unfinished:

@@ -23,7 +23,7 @@ class ViewerServer:
     """
 
     def __init__(self) -> None:
-        """Create a server without channels, which does not listen before `start`.
+        """Create a server without channels. It does not listen until `start` is called.
 
         Raises:
             MissingExtraError: foxglove-sdk is not installed.
@@ -59,7 +59,7 @@ class ViewerServer:
         Args:
             name: Name of the server, as viewers display it.
             port: Port to listen on; 0 selects a free port.
-            origins: Additional origins of web pages that may connect.
+            origins: Origins of additional web pages that may connect.
             **options: Further arguments of `foxglove.start_server`.
 
         Raises:

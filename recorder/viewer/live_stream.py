@@ -62,10 +62,10 @@ MAX_STEPS = 2_000
 """Maximum number of steps shown per episode; messages take about 20 kB per step in memory."""
 # Topics whose latest message is sent to each new viewer.
 _KEPT_TOPICS = (SCENE, SCENE_STATIC, TRACKS, TF, TF_STATIC, PHASE_TOPIC)
-# Minimum duration of a step for which poses within the step are sent.
+# Poses within a step are sent only if the step takes at least this long.
 _SHORTEST_MOTION_NS = 10_000_000
 _ROW = slice(1)
-"""Slice that selects the only row of a `TopicRows`; each topic of fixed-size messages has one."""
+"""Slice that selects the single row of the `TopicRows` of a topic with fixed-size messages."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class LiveStep:
 
 @dataclass
 class Pace:
-    """A limit on the time spent on frames. In a frame, one episode is sent to viewers.
+    """A limit on the time spent on frames. A frame is the work of sending one episode to viewers.
 
     Attributes:
         share: Maximum fraction of the run time that is spent on frames.
@@ -164,7 +164,7 @@ class LiveStream(ViewerServer):
             training: Labels of the learner's metrics, by name.
             name: Name of the server, as viewers display it.
             port: Port on 127.0.0.1; 0 selects a free port.
-            origins: Additional origins of web pages that may connect.
+            origins: Origins of additional web pages that may connect.
             speed: Simulated seconds per second.
             pace: Limit on the time spent on episodes and metrics. `pace.period_s` is the minimum
                 time between two scenes, two depth images, or two messages with metrics.

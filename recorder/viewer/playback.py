@@ -105,7 +105,7 @@ class Track:
 
 
 class _Place(NamedTuple):
-    """Location of a message in the file; if the message is in no chunk, `chunk_start` is -1."""
+    """Location of a message in the file; `chunk_start` is -1 if the message is not in a chunk."""
 
     time_ns: int
     channel: Channel
@@ -114,7 +114,7 @@ class _Place(NamedTuple):
 
 
 class _TopicIndex:
-    """Index of one channel's messages: those of each chunk, sorted by time."""
+    """Index of one channel's messages, which are sorted by time within each chunk."""
 
     def __init__(self, reader: McapReader, channel: Channel) -> None:
         self.channel = channel
@@ -210,7 +210,7 @@ class Player:
         return sorted(due, key=lambda message: message.time_ns)
 
     def _played(self, found: Callable[[Track, int], _Messages]) -> list[Played]:
-        """Return the messages that `found` yields for each log, at times of the player's clock."""
+        """Return the messages that `found` yields for each log; times are on the player's clock."""
         return [
             Played(number, channel.id, time_ns + shift, data)
             for number, (track, shift) in enumerate(zip(self.tracks, self.shifts_ns, strict=True))

@@ -53,7 +53,7 @@ class LiveServer(ViewerServer):
             episode_starts_ns: Start of each episode on the player's clock, nanoseconds.
             name: Name of the server, as viewers display it.
             port: Port to listen on; 0 selects a free port.
-            origins: Additional origins of web pages that may connect.
+            origins: Origins of additional web pages that may connect.
 
         Raises:
             MissingExtraError: foxglove-sdk is not installed.

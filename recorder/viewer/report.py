@@ -1,4 +1,4 @@
-"""Reports about a dataset: a PNG with histograms and an HTML page. Extra: `report`."""
+"""Reports about a dataset: a PNG with histograms, and an HTML page. They need extra `report`."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def _card(kind: str, episode: Episode, track: Positions, places: Positions, comm
 
 
 def _thumbnail(episode: Episode, track: Positions, places: Positions) -> str:
-    """Plot an episode's track on top of all positions; without a track, the cumulative reward."""
+    """Plot an episode's track on top of all positions, or its cumulative reward without a track."""
     figure, axes = new_figure((3.2, 2.2))
     if len(track):
         stride = max(1, len(places) // 4000)

@@ -1,4 +1,4 @@
-"""Steps of an annotated log where the TD error is large, or a policy would act differently."""
+"""Steps of an annotated log at which the TD error is large or a policy would act differently."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHOWN = 5
 
 @dataclass(frozen=True)
 class Surprise:
-    """A step with a large TD error, or at which a policy would take another action.
+    """A step with a large TD error, or with an action that a policy would not take.
 
     Attributes:
         file: Path of the log.
@@ -82,7 +82,7 @@ def _surprises(columns: Columns) -> Iterator[_Ranked]:
 
 
 def _disagreements(columns: Columns) -> Iterator[_Ranked]:
-    """Yield the disagreements of lowest advantage, or of lowest entropy if Q-values are missing."""
+    """Yield the disagreements with the lowest advantage, or entropy if Q-values are missing."""
     differs = ~columns["agrees"].astype(bool)
     has_values = bool(np.isfinite(columns["advantage"]).any())
     numbers = columns["advantage"] if has_values else columns["entropy"]

@@ -143,7 +143,7 @@ def verify(
 
 
 def _needed(episodes: tuple[Episode, ...], only: int | None) -> tuple[Episode, ...]:
-    """Return episode `only` and the episodes that its start depends on; if None, all episodes."""
+    """Return `only` and the episodes that its start depends on; all episodes if `only` is None."""
     if only is None:
         return episodes
     first = only

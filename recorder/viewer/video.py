@@ -26,7 +26,7 @@ _GAP_PX = 6
 
 
 def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
-    """Before images are rendered, check that a video or contact sheet can be written.
+    """Check that a video or contact sheet can be written, before its images are rendered.
 
     Args:
         path: Path of the output.

@@ -37,7 +37,7 @@ def test_a_good_mapping_has_defaults(tmp_path: Path) -> None:
     ("old", "new", "expected"),
     [
         ("clip:", "clap:", ":5: observation.speed.clap: unknown key; nearest: clip"),
-        ("clip: [0, 1]", "clip: [1, 0]", ":3: observation.speed: clip is the lowest value"),
+        ("clip: [0, 1]", "clip: [1, 0]", ":3: observation.speed: clip must be the lowest value"),
         (
             "clip: [0, 1]",
             "clip: [a, 1]",

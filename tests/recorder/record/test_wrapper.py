@@ -209,7 +209,7 @@ def test_episode_ends_before_an_exception(log_path: Path) -> None:
 def test_another_dtype_is_cast_with_one_warning(log_path: Path) -> None:
     rows = [(np.array([0.1, 0.2]), 0.0, False, False), (two(1, 2), 1.0, True, False)]
     env = mcaprl.RecordMcap(scripted(rows), log_path)
-    with pytest.warns(UserWarning, match="converted to its space's float32"):
+    with pytest.warns(UserWarning, match="converted to float32, as its space declares"):
         env.reset()
     env.step(0)
     env.close()

@@ -187,7 +187,7 @@ def test_metadata_with_other_spaces_is_reported(good: Path) -> None:
 def test_missing_images_are_reported(good: Path) -> None:
     """Images are missing, or their size differs from the metadata."""
     (problem,) = check_log(rewritten(good, leave_out="/rl/observation/eye"))
-    assert problem.what == "11 images for 15 records, 4 without image"
+    assert problem.what == "11 images for 15 records; 4 records have no image"
     other = spaces.Dict({**SPACE.spaces, "eye": spaces.Box(0, 255, (16, 4 + 4), np.uint8)})
     strings = LogMetadata(other, spaces.Discrete(2)).to_strings()
     (problem,) = check_log(rewritten(good, strings=strings))
