@@ -23,7 +23,8 @@ from mcaprl.sims.spec import SimCatalog, SimSpec
 SIMS: Final = SimCatalog((lane.SPEC, racer.SPEC, powerline.SPEC, highway.SPEC))
 """Gymnasium id of each sim by short name, including sims of installed packages."""
 
-# Name of the attribute that stores the module to import for an environment; read by recorders.
+# Environments have an attribute of this name: the module to import before they are made again.
+# Recorders write the attribute's value to the log.
 _ENV_MODULE: Final = "env_module"
 
 
@@ -87,7 +88,7 @@ def _set_module(envs: Iterable[gym.Env[Any, Any]], env_id: str) -> None:
 
 
 def _resolve(name: str) -> tuple[str, SimSpec | None]:
-    """Return the Gymnasium id for a name, and the `SimSpec` of this id (None if no sim has it)."""
+    """Return the Gymnasium id of a name, and its `SimSpec`; the spec is None if it is not a sim."""
     env_id = SIMS.get(name, name)
     is_known_to_gymnasium = env_id in gym.registry or ":" in env_id
     return env_id, SIMS.find(env_id, loads=not is_known_to_gymnasium)

@@ -72,7 +72,10 @@ def level_axes(yaw_rad: float) -> Floats:
 
 
 def fronts(mesh: Floats) -> Floats:
-    """Return the (T, 4) planes n . p = d of triangles: the front-facing unit normal n, and d."""
+    """Return the planes of triangles, (T, 4). A row contains n and d of the equation n . p = d.
+
+    The unit normal n points to the front of the triangle.
+    """
     ahead = np.cross(mesh[:, 1] - mesh[:, 0], mesh[:, 2] - mesh[:, 0])
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     return np.column_stack([ahead, (ahead * mesh[:, 0]).sum(axis=1)])
@@ -87,7 +90,7 @@ def draw(
     focal_px: float,
     inverse_z: Floats,
 ) -> None:
-    """Render a mesh into `inverse_z`, (height, width) 1/m, with 0 where no triangle is visible.
+    """Render a mesh into the image `inverse_z`.
 
     Args:
         mesh: (T, 3, 3) triangles, visible from the side where their corners run counter-clockwise.
@@ -95,7 +98,7 @@ def draw(
         eye_m: (3,) position of the camera.
         axes: (3, 3) the camera's x, y and z axes as rows, in the mesh's coordinates.
         focal_px: Focal length; the optical axis meets the middle of the image.
-        inverse_z: Output image.
+        inverse_z: (height, width) output, 1/m; 0 where no triangle is visible.
     """
     inverse_z[:] = 0.0
     corners, polygon = np.empty((3, 3)), np.empty((4, 3))
@@ -282,7 +285,7 @@ def draw_wires(
     focal_y_px: float,
     inverse_z: Floats,
 ) -> None:
-    """Draw straight wires into `inverse_z`, (height, width) 1/m; nearer surfaces hide them.
+    """Draw straight wires into the image `inverse_z`. Nearer surfaces hide the wires.
 
     A wire is one pixel wide at any distance. It covers one pixel in each column that it crosses. If
     it is steeper than 45 degrees in the image, it covers one pixel in each row instead.

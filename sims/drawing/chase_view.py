@@ -23,19 +23,19 @@ Floats = NDArray[np.float64]
 
 SIZE_PX = (960, 540)
 BACK_M, ABOVE_M, AHEAD_M = 15.0, 6.5, 7.0
-"""Distance of the camera behind the body, its height above the body, and distance from the body
-forward to the point that the camera looks at."""
+"""The camera is `BACK_M` behind the body and `ABOVE_M` above it. The camera looks at the point
+`AHEAD_M` in front of the body."""
 FAR_M = 400.0
 _FOCAL_PX = 0.9 * SIZE_PX[0]
 _NEAR_M = 0.3
 _WIDEST_PX = 24.0
-"""Maximum width of a stroke, so that one close to the camera does not hide everything."""
+"""Maximum width of a stroke; a wide stroke close to the camera would hide everything."""
 _SKY: Color = (0.55, 0.68, 0.80, 1.0)
 _SUN = (0.36, 0.28, 0.89)
 _FLAT_M = 0.15
 _INK, _PLATE = (255, 255, 255), (20, 22, 26)
 _DOT = np.array([[0.0, 0.0, -1e-3], [0.0, 0.0, 1e-3]])
-"""Ends of a stroke of almost no length, which is drawn as a dot."""
+"""Two ends that are almost the same point. A stroke between them is drawn as a dot."""
 _ROUND = np.array([(math.cos(a), math.sin(a)) for a in np.arange(12) * math.pi / 6]) / 2
 
 

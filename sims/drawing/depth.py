@@ -49,7 +49,7 @@ def decode_depth(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def encode_nearness(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Encode meters as bytes as AirSim's examples do: 255 / max(1, d), rounded down.
+    """Encode meters as bytes by the formula of AirSim's examples: 255 / max(1, d), rounded down.
 
     Infinity is 0. Half of the codes cover distances of 1 to 2 m.
     """
@@ -61,7 +61,7 @@ class Overlaps(NamedTuple):
     """Weights that downsample a row of old pixels to a shorter row of new pixels."""
 
     first: NDArray[np.int64]
-    """(new,) index of the first old pixel that overlaps each new one."""
+    """(new,) index of the first old pixel that overlaps each new pixel."""
     weights: Floats
     """(new, K) fraction of each new pixel that old pixel `first` + k covers, for k < K."""
 

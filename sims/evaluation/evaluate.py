@@ -104,7 +104,7 @@ def evaluate(
     on_policy: Callable[[str], None] = lambda name: None,
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> PolicyScore:
-    """Evaluate one policy, or one per training seed, greedily on the same episodes.
+    """Evaluate greedy actions of a policy; all training seeds get the same episodes.
 
     Args:
         env: Environment.

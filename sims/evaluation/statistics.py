@@ -130,7 +130,7 @@ def improvement_interval(first: Floats, second: Floats, *, seed: int = 0) -> tup
 
 
 def _improvement(firsts: Floats, seconds: Floats) -> Floats:
-    """Return the (R,) probabilities of improvement for each row of returns (R, N) and (R, M)."""
+    """Return (R,) probabilities of improvement, one for each row of returns (R, N) and (R, M)."""
     pairs = firsts.shape[1] * seconds.shape[1]
     parts = []
     step = max(1, _PAIRS_AT_ONCE // pairs)

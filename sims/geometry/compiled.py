@@ -66,13 +66,13 @@ def _compiled(function: AnyFunction, **options: Any) -> AnyFunction:
     try:
         machine_code = numba.njit(cache=True, **options)(function)
     except RuntimeError:
-        _Announcer.lasts = "in each process, as no cache folder can be written: set NUMBA_CACHE_DIR"
+        _Announcer.lasts = "again in each process: no cache folder is writable; set NUMBA_CACHE_DIR"
         machine_code = numba.njit(**options)(function)
     return cast(AnyFunction, machine_code)
 
 
 class _Announcer(event.Listener):  # type: ignore[misc]
-    """Listener that announces the first compilation, so that the user knows what takes long."""
+    """Listener that announces the first compilation, because it takes several seconds."""
 
     lasts: ClassVar[str] = "once"
     is_silent: ClassVar[bool] = False

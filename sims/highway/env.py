@@ -277,7 +277,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         self._place, self._along_m = places[self._lane], places[0].along_m
 
     def _moved_m(self, before_m: float) -> float:
-        """Return the distance, meters, that the car moved along the first lane from `before_m`."""
+        """Return how far, in meters, the car moved along the first lane since `before_m`."""
         moved_m, length_m = self._along_m - before_m, self.courses[0].length_m
         if self.courses[0].is_closed:
             moved_m = (moved_m + length_m / 2) % length_m - length_m / 2

@@ -34,7 +34,8 @@ LANES = 32
 """Number of cars in a block."""
 _STEERING, _COS, _SIN, _BRAKING = 4, 9, 10, 11
 _REWARD, _END, _SEEN, _BLOCK_NUMBERS = 12, 13, 14, 26
-"""Indices of a car's values in a block (0 to 8 are the fields of `Car`), and their number."""
+"""Indices of a car's values in a block, and the number of values. Indices 0 to 8 are the fields
+of `Car`."""
 
 
 @compiled

@@ -123,8 +123,9 @@ def barriers() -> tuple[tuple[Box, ...], tuple[Box, ...]]:
     """Return the barriers for a car on the first square, and those for a car on the second.
 
     Both ends of the shared leg are crossings. Barriers close the streets of the other square there,
-    so that the street to take is visible: without them, the shared leg looks the same on both
-    squares, but its end is a right turn on the first square and a left turn on the second.
+    so that the street to take is visible. Without the barriers, the shared leg would look the same
+    on both squares, but the car must turn right at its end on the first square, and left on the
+    second.
     """
     (x0, y0), (x1, _) = CORNERS_M[:2]
     aside_m = RAIL_OFFSET_M + RAIL_THICKNESS_M / 2

@@ -38,7 +38,7 @@ _HUGE = 1e12
 
 @compiled
 def world_at(along_m: float) -> int:
-    """Return the `WORLDS_M` index of the obstacles for a car at a distance along the path."""
+    """Return the index in `WORLDS_M` for a car at this distance along the path."""
     return 1 if along_m % _LENGTH_M < SECOND_SQUARE_M else 2
 
 

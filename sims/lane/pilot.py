@@ -33,10 +33,10 @@ PURSUIT_S = 0.4
 CORNER_SPEED_M_S = 7.0
 CORNER_BRAKE_M_S2 = 1.5
 CORNER_EARLY_M = 2.0
-"""Speed limit: within 2 m of a corner, the corner speed; farther away, the speed from which a
-deceleration of 1.5 m/s^2 reaches the corner speed 2 m before the corner."""
+"""The pilot brakes with 1.5 m/s^2, so that the car reaches the corner speed 2 m before the
+corner."""
 HORIZON = 12
-"""Number of decisions (3 s by default) for which a plan must not end the episode."""
+"""Number of decisions in a plan (3 s by default). The episode must not end during a plan."""
 
 
 @compiled

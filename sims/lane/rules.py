@@ -245,7 +245,7 @@ def seen_from(car: Car) -> Numbers:
 def _ahead(
     car: Car, heading: Heading, leg: Leg, after: Leg, rest_m: float, lookahead_m: float
 ) -> tuple[float, float]:
-    """Return the path point at a lookahead distance: forward and left, divided by the distance."""
+    """Return a path point ahead as (forward, left) of the car, divided by `lookahead_m`."""
     x_m, y_m = course_point_ahead(leg, after, rest_m, lookahead_m)
     forward_m, left_m = in_body_frame(x_m - car.x_m, y_m - car.y_m, heading.cos, heading.sin)
     forward, left = forward_m / lookahead_m, left_m / lookahead_m

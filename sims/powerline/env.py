@@ -87,8 +87,8 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     `start="anywhere"`: half of the episodes start as with `"line"`. The other half start at a
     random position on the line, except its last 20 m, with an offset of up to 1 m. The drone flies
     along the line at 0 to 5 m/s; the velocity is rounded to 0.5 m/s on each axis.
-    `reset(options={"pose": (x_m, y_m, z_m)})`, optionally with the velocity in m/s as three more
-    numbers, starts at that pose; the velocity is also the first command.
+    `reset(options={"pose": (x_m, y_m, z_m)})` starts at that pose. Three more numbers set the
+    velocity in m/s, which is also the first command.
 
     ## Episode End
 

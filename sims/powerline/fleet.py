@@ -103,9 +103,9 @@ class PowerlineFleet(Fleet):
         return flight_at(self._flights[i])
 
     def drones_from(self, before: Flight) -> list[Drone]:
-        """In a fleet of one drone, return its states after each 0.05 s of its last decision.
+        """Return the states of the fleet's only drone after each 0.05 s of its last decision.
 
-        The decision began in the state `before`; the last returned state is the current one. If the
+        The decision began in the state `before`. The last returned state is the current one. If the
         episode ended during the decision, the drone keeps its state for the rest of the decision.
         """
         after = self.flight(0)

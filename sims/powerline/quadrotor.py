@@ -51,7 +51,7 @@ DRAG_PER_S = 0.25
 VELOCITY_GAIN_PER_S = 2.5
 INTEGRAL_GAIN_PER_S2 = 1.5
 REFERENCE_GAIN_PER_S = VELOCITY_GAIN_PER_S + DRAG_PER_S
-"""Rate at which the reference velocity approaches the command, as the drone does in still air."""
+"""Rate at which the reference velocity approaches the command: the drone's rate in still air."""
 MAX_INTEGRAL_M_S2 = 2.0
 MAX_ACCELERATION_M_S2 = 6.0
 ATTITUDE_GAIN_PER_S = 12.0

@@ -203,7 +203,7 @@ def _distance(start: Floats, direction: Floats, walls: Floats) -> float:
     edge = walls[:, 2:] - walls[:, :2]
     to_wall = walls[:, :2] - start
     cross = direction[0] * edge[:, 1] - direction[1] * edge[:, 0]
-    # Infinity results in the distance 0, so that a parallel wall is ignored.
+    # A parallel wall gets the distance 0, and the mask `met` excludes this distance.
     cross[cross == 0.0] = math.inf
     distance = (to_wall[:, 0] * edge[:, 1] - to_wall[:, 1] * edge[:, 0]) / cross
     share = (to_wall[:, 0] * direction[1] - to_wall[:, 1] * direction[0]) / cross
@@ -240,7 +240,7 @@ def _drivable(controls: Floats) -> bool:
 
 
 def _apart(center: Floats) -> bool:
-    """Return whether points far apart along the line are a track's width apart in the image."""
+    """Return whether the track nowhere comes too close to another part of itself in the image."""
     along = _along(center)
     places = np.arange(0.0, along[-1], HALF_WIDTH_PX / 2)
     points = _at(center, along, places)

@@ -85,8 +85,8 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     `start="line"`: (50, 300) pixels, facing down in the image, with an offset of up to 3 pixels and
     0.05 rad. The car is at rest. On a random track, the car starts at the start
     of the track's path.
-    `reset(options={"pose": (x_m, y_m, yaw_rad)})`, optionally with the speed in m/s as a fourth
-    number, starts at that pose.
+    `reset(options={"pose": (x_m, y_m, yaw_rad)})` starts at that pose; the speed in m/s may follow
+    as a fourth number.
 
     ## Episode End
 

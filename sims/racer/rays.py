@@ -143,7 +143,7 @@ def floored_ray_length(
 def measure(
     walls: NDArray[np.float64], car: Car, classic: bool, lengths_px: NDArray[np.float64]
 ) -> None:
-    """Write the lengths (18,) of the car's rays; classic lengths are measured from its center."""
+    """Write the lengths (18,) of the car's rays. Classic lengths begin at the car's center."""
     rays = np.empty((4, RAYS))
     write_rays(car, classic, rays)
     if classic:

@@ -104,7 +104,7 @@ def read_pose(options: dict[str, Any], names: Sequence[str], least: int) -> list
 
 
 def pose_from(options: dict[str, Any], slowest_m_s: float, fastest_m_s: float) -> Pose:
-    """Read the start of a ground vehicle: (x_m, y_m, yaw_rad), optionally with speed_m_s.
+    """Read the start of a ground vehicle: (x_m, y_m, yaw_rad) or (x_m, y_m, yaw_rad, speed_m_s).
 
     Raises:
         UsageError: There is another option, the pose is malformed, or the speed is out of range.

@@ -98,8 +98,8 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         self._n_actions = len(fleet.action_meanings)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
         self._is_watched = render_mode == "human"
-        # Set only if `_is_watched`: the current state; and for the last step, the state before it
-        # and the action.
+        # The current state, and the state before the last step with that step's action. They are
+        # set only if `_is_watched` is true.
         self._now: Any = None
         self._last_step: tuple[Any, int] | None = None
 
@@ -152,7 +152,10 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
 
     @property
     def trail(self) -> list[tuple[float, ...]]:
-        """Last one or more positions of the vehicle; those before the first read may be missing."""
+        """Last positions of the vehicle, at least one.
+
+        The first read starts the collection, so earlier positions may be missing.
+        """
         if not self._trail:
             self._is_watched = True
             self._trail.append(self.place)

@@ -63,6 +63,6 @@ def test_without_a_writable_cache_each_process_compiles(package: Path, tmp_path:
     for _ in range(2):
         (line,) = run(package, nowhere)
         assert line == (
-            "compiling the sim for this machine, in each process,"
-            " as no cache folder can be written: set NUMBA_CACHE_DIR"
+            "compiling the sim for this machine, again in each process:"
+            " no cache folder is writable; set NUMBA_CACHE_DIR"
         )
