@@ -1,9 +1,10 @@
 """Export of a trained policy as one ONNX file for a robot.
 
-Inputs are the parts of the observation as the environment returns them, named as in `/rl/step`
-(`observation`, `camera`, ...), with a leading batch axis; a policy with frame stacks of k expects
-(B, k, *shape), oldest first. Outputs are `action` (B,) int64, a value of the action space, and
-`scores` (B, A); the action has the largest score. The file includes the normalization.
+The inputs are the parts of an observation as the environment returns them, with a leading batch
+axis. They have the same names as in `/rl/step` (`observation`, `camera`, ...). A policy with frame
+stacks of k expects inputs (B, k, *shape), oldest frame first. The outputs are `action` (B,) int64,
+a value of the action space, and `scores` (B, A); the action has the largest score. The file
+includes the normalization.
 """
 
 from __future__ import annotations

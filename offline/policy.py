@@ -89,8 +89,8 @@ class Policy:
         frame_stack: Number of successive observations in one input; see `act`.
         encoder: Encoder of observations as tensors.
         scores: Networks that score actions.
-        reward_scale: Divisor of the rewards in the training; Q-values are those of the rewards as
-            they were logged.
+        reward_scale: Divisor of the rewards in the training. `q_values` returns values in units of
+            the logged rewards, without this divisor.
     """
 
     name: str
@@ -106,7 +106,7 @@ class Policy:
     _seen: deque[Observations] = field(default_factory=deque, init=False, repr=False)
 
     def begin(self) -> None:
-        """Drop the stored frames; the next observations start new episodes."""
+        """Drop the stored frames. The next observations start new episodes."""
         self._seen.clear()
 
     def act(self, observations: Any) -> NDArray[np.int64]:
@@ -176,7 +176,7 @@ class Policy:
         return self._encode(_flatten(observations)).stacked(self.frame_stack)
 
     def _stack_onto_stored(self, now: Observations) -> Observations:
-        """Store observations; return the stacks that end with them, padded with the oldest."""
+        """Store observations; return stacks of the last k, padded with copies of the oldest."""
         if self._seen and len(self._seen[-1]) != len(now):
             self.begin()
         self._seen.extend([now] * (1 if self._seen else self.frame_stack))
@@ -291,7 +291,7 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
 
 
 def _image_input(image: ImageInput, number: int, weights: dict[str, Tensor]) -> ImageInput:
-    """Return the input with its stored normalization, which is removed from `weights`."""
+    """Return the input with its normalization. Remove the normalization from `weights`."""
     if _IMAGE_SHIFT.format(number) not in weights:
         return image
     shift = weights.pop(_IMAGE_SHIFT.format(number)).numpy()

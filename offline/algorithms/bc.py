@@ -35,7 +35,7 @@ class BC(Learner):
         return {"logits": (self.n_actions,)}
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the cross entropy, and the accuracy of the most likely action."""
+        """Return the cross entropy, and whether the most likely action is the logged action."""
         logits_tm1 = self.outputs("logits", batch.observations)
         correct = logits_tm1.argmax(1) == batch.actions
         return {"accuracy": correct.float(), "loss": cross_entropy(logits_tm1, batch.actions)}

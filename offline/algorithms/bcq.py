@@ -5,8 +5,8 @@
 G clones the behavior policy. Neither the target nor the policy selects actions that are unlikely
 according to G.
 
-Departures from the paper: Q and G are separate networks even for images; the target network is
-synced at intervals instead of averaged; the departures of `dqn` also apply.
+Departures from the paper: Q and G are separate networks even for images. The target network is
+synced at intervals instead of averaged. The departures that `dqn` lists also apply.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@
 
 The second term is a penalty that keeps the greedy policy close to the logged actions.
 
-Departures from the paper: values are means unless `n_quantiles` is above 1 (the paper's Atari
-agent uses quantiles); alpha is fixed instead of tuned by a Lagrange multiplier; the target is that
-of Double DQN.
+Departures from the paper: by default, the network learns mean values; with `n_quantiles` above 1,
+it learns quantiles, like the paper's Atari agent. The weight alpha is fixed instead of tuned by a
+Lagrange multiplier. The target is that of Double DQN.
 """
 
 from __future__ import annotations

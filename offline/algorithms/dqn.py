@@ -7,8 +7,8 @@
 Q is the learning network. Q' is the target network, which is synced every `target_interval`
 updates.
 
-Departures from the papers: the data are a fixed log, so there is no exploration; Adam replaces
-RMSProp; the learning rate decays to almost 0, because no new data arrive. Both algorithms
+Departures from the papers: the data are a fixed log, so there is no exploration. Adam replaces
+RMSProp. The learning rate decays to almost 0, because no new data arrive. Both algorithms
 overestimate actions that are not in the log, so they are baselines for CQL.
 """
 
@@ -51,7 +51,7 @@ class DQNConfig(BootstrapConfig):
         self._require("hidden", bool(self.hidden) or not self.dueling, "not empty if dueling")
 
     def architecture_for(self, channels: Iterable[int]) -> Architecture:
-        """Return the network's architecture, given the channels of each image in a single frame."""
+        """Return the architecture for images that have these numbers of channels in one frame."""
         return replace(super().architecture_for(channels), dueling=self.dueling)
 
 
@@ -90,8 +90,8 @@ class DQN(Learner):
     def validate(self, batch: Batch) -> dict[str, Tensor]:
         """Return the values of the logged actions, and their absolute TD errors.
 
-        The targets come from the learning network, because the time since the last update of the
-        target network differs from one validation to the next.
+        The learning network computes the targets. The target network would be up to date in one
+        validation and outdated in the next.
         """
         q_a_tm1 = chosen(mean_values(self.outputs("q", batch.observations)), batch.actions)
         target_tm1 = self.targets(batch, self.outputs("q", batch.next_observations))

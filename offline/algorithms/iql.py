@@ -6,12 +6,12 @@
         pi      behavior cloning, each action weighted with exp(beta A(s, a))
         A(s, a) Q'(s, a) - V(s)
 
-Q' is the minimum of two target networks, one for each of two networks Q that learn from the same
-targets. The target networks are synced every `target_interval` updates.
+Two networks Q learn from the same targets. Each has a target network, and Q' is the minimum of the
+two target networks. They are synced every `target_interval` updates.
 
-Departures from the paper: discrete actions, so the policy is a classifier and Q has one output per
-action; target networks are synced at intervals instead of averaged; Huber loss for Q. Optionally,
-advantages are divided by their root mean square, because their size differs between tasks.
+Departures from the paper: actions are discrete, so the policy is a classifier and Q has one output
+per action. Target networks are synced at intervals instead of averaged. Q is trained with the Huber
+loss. Advantages can be divided by their root mean square, because their size differs between tasks.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class IQLConfig(BootstrapConfig):
 
 
 class IQL(Learner):
-    """Implicit Q-learning: expectile values and a policy by advantage-weighted behavior cloning."""
+    """Implicit Q-learning: values by expectile regression, policy by weighted behavior cloning."""
 
     name = "iql"
     config_type = IQLConfig
@@ -80,7 +80,7 @@ class IQL(Learner):
         return {"logits": per_action, "q": per_action, "q_twin": per_action, "v": (1,)}
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the losses of V, Q and the policy, which share no weights."""
+        """Return the losses of V, Q and the policy. The three share no weights."""
         q_a_tm1 = torch.minimum(
             *(chosen(self.target_networks[name].outputs(batch), batch.actions) for name in _TWINS)
         )

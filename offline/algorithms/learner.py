@@ -19,16 +19,16 @@ from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
 
 ActsBy = Literal["q_values", "logits", "filtered_q_values"]
-"""Outputs by which a trained policy selects actions; see `policy`."""
+"""Kinds of network outputs from which a trained policy selects actions; see `policy`."""
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class NotFiniteError(ArithmeticError):
-    """Exception for a term of the loss that is NaN or infinite.
+    """A term of the loss is NaN or infinite.
 
     Attributes:
-        update: Number of the update in which this happened, from 1.
+        update: Number of the update that computed the term, from 1.
     """
 
     def __init__(self, message: str, update: int) -> None:
@@ -41,7 +41,7 @@ class Learner(ABC):
     """Training of K seeds on one dataset; a subclass defines the networks and losses.
 
     All randomness comes from the seeds. The same seed, data and machine produce the same weights,
-    whichever other seeds are trained in parallel. Networks are on the device of the buffer.
+    no matter which other seeds are trained in parallel. Networks are on the device of the buffer.
 
     Attributes:
         name: Name of the algorithm in commands and in `mcaprl.train`.
@@ -94,7 +94,7 @@ class Learner(ABC):
 
     @abstractmethod
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the terms (R,) to log, by name; the last one is `loss`, which is minimized.
+        """Return the terms (R,) to log, by name. The last term, `loss`, is minimized.
 
         `loss` is backpropagated to every weight that it depends on, so compute targets under
         `torch.no_grad()`.
@@ -103,13 +103,13 @@ class Learner(ABC):
     def validate(self, batch: Batch) -> dict[str, Tensor]:
         """Return metrics (R,) of a held-out batch, by name.
 
-        Algorithms with Q-values return `q`, the value of the logged action, and `td_error`, its
-        absolute difference from the target, both in units of the logged rewards.
+        Algorithms with Q-values return two metrics in units of the logged rewards: `q`, the value
+        of the logged action, and `td_error`, the absolute difference between `q` and the target.
         """
         return self.losses(batch)
 
     def update(self) -> dict[str, Tensor]:
-        """Run one gradient step on one random batch per seed, and sync target networks when due.
+        """Run one gradient step on one random batch per seed; sync target networks if it is time.
 
         Returns:
             The terms of `losses`, without gradients.
@@ -153,7 +153,7 @@ class Learner(ABC):
         return self.target_networks[name]
 
     def seed_means(self, terms: Mapping[str, Tensor]) -> list[dict[str, float]]:
-        """Return each seed's mean of terms (R,), which have the rows of all seeds."""
+        """Return the mean of each term for each seed; the terms (R,) contain rows of all seeds."""
         means = {
             name: term.view(len(self.seeds), -1).mean(1).tolist() for name, term in terms.items()
         }
@@ -164,7 +164,7 @@ class Learner(ABC):
         return allowed_only(self.models[name](observations), observations.mask)
 
     def in_reward_units(self, values: Tensor) -> Tensor:
-        """Return values (R,) in units of the logged rewards, which a batch contains scaled."""
+        """Convert values (R,) from a batch's scaled rewards to units of the logged rewards."""
         return values * self.buffer.reward_scale
 
     def all_models(self) -> dict[str, Model]:
@@ -220,7 +220,7 @@ class Learner(ABC):
             }
 
     def _not_finite(self, seed_means: Sequence[Mapping[str, float]]) -> NotFiniteError:
-        """Return an error for the first term, in the order of `losses`, that is not finite."""
+        """Return an error that names the first term of `losses` that is not finite."""
         for seed, means in zip(self.seeds, seed_means, strict=True):
             for name, value in means.items():
                 if not math.isfinite(value):

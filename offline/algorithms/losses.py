@@ -73,7 +73,7 @@ def expected_sarsa_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, pi_t: Te
 
 
 def square_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:
-    """Return half the squared error (B,) of Q(s, a); the mean target minimizes it."""
+    """Return half the squared error (B,) of Q(s, a); it is smallest at the mean target."""
     _check_actions(q_tm1, a_tm1)
     _check_shape("target_tm1", target_tm1, (len(q_tm1),))
     return 0.5 * (chosen(q_tm1, a_tm1) - target_tm1).square()
@@ -99,9 +99,9 @@ def huber_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor
 def quantile_regression(z_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:
     """Return the quantile Huber loss (B,) between N quantiles of Z(s, a) and N target samples.
 
-    Quantile i, at tau_i = (i + 1/2) / N, has weight tau_i for samples above it and weight
-    1 - tau_i for samples below. See "Distributional Reinforcement Learning with Quantile
-    Regression", equation 10, https://arxiv.org/abs/1710.10044.
+    Quantile i belongs to the probability tau_i = (i + 1/2) / N. Samples above the quantile have
+    the weight tau_i, and samples below it 1 - tau_i. See "Distributional Reinforcement Learning
+    with Quantile Regression", equation 10, https://arxiv.org/abs/1710.10044.
     """
     _check_actions(z_tm1, a_tm1)
     n_quantiles = z_tm1.shape[2]
@@ -135,8 +135,8 @@ def square_penalty(logits_tm1: Tensor) -> Tensor:
 def expectile_regression(v_tm1: Tensor, target_tm1: Tensor, expectile: float) -> Tensor:
     """Return the asymmetric square loss |expectile - 1{u < 0}| u^2 (B,), u = target - V(s).
 
-    At expectile 0.5, the mean target minimizes the loss; toward 1, the minimum approaches the
-    largest target.
+    At expectile 0.5, the best V(s) is the mean target. As the expectile approaches 1, the best V(s)
+    approaches the largest target.
     See "Offline Reinforcement Learning with Implicit Q-Learning", equation 5,
     https://arxiv.org/abs/2110.06169.
     """
@@ -146,7 +146,7 @@ def expectile_regression(v_tm1: Tensor, target_tm1: Tensor, expectile: float) ->
 
 
 def allowed_only(outputs: Tensor, mask: Tensor | None) -> Tensor:
-    """Return outputs (B, A) or (B, A, N) with minus infinity for actions that are not allowed.
+    """Set outputs (B, A) or (B, A, N) of actions that are not allowed to minus infinity.
 
     `mask` (B, A), bool, marks the allowed actions; None allows all.
     """

@@ -1,8 +1,8 @@
 """K networks of the same shape, one per seed, trained in parallel, and their target networks.
 
-The P weights of each network are a row of one matrix (K, P), a leaf of autograd, so the optimizer,
-the target network and a checkpoint each handle one tensor. Batches contain the rows of all seeds,
-ordered by seed: R = K * B rows.
+The P weights of each network are a row of one matrix (K, P), which is a leaf tensor of autograd.
+Therefore, the optimizer, the target network and a checkpoint each handle one tensor. Batches
+contain the rows of all seeds, ordered by seed: R = K * B rows.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from mcaprl.offline.batches.observations import Observations
 _ALIGNMENT = 16
 """Number of floats in a vector register.
 
-Rows of weights are padded to a multiple of it, so that the results of a seed do not depend on K.
+Rows of weights are padded to a multiple of this number, so that the results of a seed do not depend
+on the number of seeds K.
 """
 _ROWS_AT_ONCE = 1024
 
 
 class Model(ABC):
-    """K networks whose weights are one matrix, a leaf of autograd.
+    """K networks whose weights are rows of one matrix, which is a leaf tensor of autograd.
 
     Attributes:
         networks: K networks; their parameters share memory with `weights`.
@@ -74,7 +75,7 @@ class AnyModel(Model):
         return torch.cat([self._apply(network, row, part) for network, row, part in seeds])
 
     def _apply(self, network: Network, row: Tensor, observations: Observations) -> Tensor:
-        """Apply one network with the weights in `row`, so that gradients reach the matrix."""
+        """Apply one network with the weights in `row`; gradients flow back to the weight matrix."""
         parts = zip(self._names, self._shapes, row.split_with_sizes(self._sizes), strict=False)
         weights = {name: part.view(shape) for name, shape, part in parts}
         return cast(Tensor, functional_call(network, weights, (observations,)))
@@ -124,8 +125,8 @@ def build_model(networks: Sequence[Network]) -> Model:
 class TargetNetwork:
     """Copy of a model that is trained; the copy is updated at intervals.
 
-    Between two updates the outputs are constant. They are computed for the whole dataset after each
-    update and then looked up, if this is faster than a forward pass for each batch.
+    Between two updates, the outputs do not change. If it is faster than a forward pass for each
+    batch, the outputs for the whole dataset are computed once after each update and then looked up.
 
     Attributes:
         model: K target networks.

@@ -1,6 +1,6 @@
 """Transitions as tensors, packed once and sampled at random.
 
-Each observation is stored once, as a frame; transitions refer to frames by index. The indexes and
+Each observation is stored once, as a frame. Transitions refer to frames by index. The indexes and
 the n-step returns are computed when the data are packed. Frame stacks are built when a batch is
 read.
 """
@@ -124,7 +124,7 @@ class TransitionBuffer:
             dataset: Dataset with discrete actions.
             packing: Settings for building transitions; default: single steps and single frames.
             encoder: Encoder of other data, whose normalization is reused; default: a new one.
-            reward_scale: Divisor of the rewards; default: that of `packing.scale_rewards`.
+            reward_scale: Divisor of the rewards; default: see `packing.scale_rewards`.
             weights: (E,) relative sampling weight of each transition of an episode; default: all
                 equal.
 
@@ -252,8 +252,8 @@ class TransitionBuffer:
 def return_spread(dataset: Dataset, gamma: float) -> float:
     """Return the standard deviation of the discounted returns of all transitions.
 
-    Returns end with the episode, also where it was truncated. The result is 0 if a reward is not
-    finite.
+    A return ends at the end of the episode, even if the episode was truncated. The result is 0 if a
+    reward is not finite.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         spread = float(returns_to_go(dataset.rewards, dataset.episode_lengths, gamma).std())

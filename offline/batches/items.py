@@ -90,7 +90,7 @@ class Items:
         return len(self._starts)
 
     def batch(self, items: NDArray[np.int64]) -> Arrays:
-        """Gather items by index (B,); see `mcaprl.torch.TransitionDataset` for the arrays."""
+        """Return the items (B,) as arrays; `mcaprl.torch.TransitionDataset` lists the arrays."""
         rows = self._starts[items]
         return self._transitions(rows) if self.options.length is None else self._sequences(rows)
 
@@ -133,7 +133,7 @@ class Items:
         return {**found, "mask": mask}
 
     def _observed(self, frames: NDArray[np.int64], firsts: NDArray[np.int64]) -> Any:
-        """Gather observations or, if configured, stacks of successive ones along a new axis."""
+        """Gather observations; if configured, stack successive observations along a new axis."""
         count = self.options.frame_stack
         if count > 1:
             ages = np.arange(count - 1, -1, -1)
@@ -147,8 +147,8 @@ def n_step_returns(
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Compute n-step returns, which stop at the end of an episode.
 
-    A return that ends with termination has no bootstrap value; one that ends with truncation
-    bootstraps from the last next observation.
+    A return that ends with a termination has no bootstrap value. A return that ends with a
+    truncation bootstraps from the last next observation.
 
     Args:
         dataset: Dataset with N transitions.
@@ -156,9 +156,10 @@ def n_step_returns(
         gamma: Discount per step.
 
     Returns:
-        Frame indexes (2, N) of each transition's observation and of the observation up to n steps
-        later; and an array (2, N): the discounted sum of the rewards between these two
-        observations, and the discount of the value of the later observation.
+        Two arrays. The first, (2, N), contains for each transition the frame indexes of its
+        observation and of the observation up to n steps later. The second, (2, N), contains the
+        discounted sum of the rewards between these two observations, and the discount of the value
+        of the later observation.
     """
     n_rows, lengths = len(dataset), dataset.episode_lengths
     rows = np.arange(n_rows)
@@ -179,7 +180,7 @@ def n_step_returns(
 def returns_to_go(
     rewards: NDArray[np.float64], lengths: NDArray[np.int64], gamma: float
 ) -> NDArray[np.float32]:
-    """Return the discounted sum of the rewards from each transition (N,) to its episode's end."""
+    """Return the discounted sums (N,) of the rewards from each transition to its episode's end."""
     found = rewards.astype(np.float64)
     ends = np.cumsum(lengths)
     for age in range(1, int(lengths.max(initial=0))):

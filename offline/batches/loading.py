@@ -26,9 +26,9 @@ Tensors = dict[str, Any]
 
 
 class TransitionDataset(torch.utils.data.Dataset[Tensors]):
-    """Map-style dataset of the transitions of logs, or of sequences of them.
+    """Map-style dataset of the transitions of logs, or of sequences of transitions.
 
-    An item is a dict of tensors; `dataset[rows]` with a sequence of B rows is a batch, in which
+    An item is a dict of tensors. `dataset[rows]` with a sequence of B integers is a batch, in which
     each tensor has B rows. Without `length`, an item contains one transition:
 
         observation         in the space's dtype; a dict for a Dict space
@@ -41,15 +41,15 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
         behavior_prob       float32, NaN if unknown
 
     With `length` L, an item is a sequence of L transitions of one episode, with single rewards.
-    Each tensor has a further axis of length L after that of the batch; rows after the end of the
-    episode are 0. There is no `discount`; in addition there are:
+    Each tensor has a further axis of length L after the batch axis. Rows after the end of the
+    episode are 0. An item has no `discount`, but it has these additional tensors:
 
         mask                bool, whether the row is a transition of the episode
         return_to_go        float32, discounted sum of the rewards from this transition on
         step                int64, number of the transition in its episode
 
     With `frame_stack` n, observations have a further axis of length n before the axes of their
-    shape, the last observation last.
+    shape. The stack is ordered by time; the newest observation is last.
     """
 
     def __init__(
@@ -103,14 +103,14 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
         return batch if chosen.ndim else _row(batch, 0)
 
     def __getitems__(self, rows: Sequence[int]) -> list[Tensors]:
-        """Return several items, gathered at once; `DataLoader` calls this."""
+        """Return several items that are gathered at once. `DataLoader` calls this method."""
         batch = self[rows]
         return [_row(batch, k) for k in range(len(rows))]
 
     def loader(
         self, batch_size: int, *, shuffle: bool = True, drop_last: bool = False, **options: Any
     ) -> torch.utils.data.DataLoader[Tensors]:
-        """Return a DataLoader of batches that are gathered at once instead of item by item.
+        """Return a DataLoader that gathers each batch at once instead of item by item.
 
         Args:
             batch_size: Number of items of a batch.
@@ -145,7 +145,7 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
                 )
             return {"paths": self._paths, "options": self._items.options}
         if self._shared is None:
-            # From here on this process uses the shared memory, too: without a reference to it,
+            # This process also uses the shared memory from now on. Without a reference to it,
             # PyTorch would free the memory before a worker has opened it.
             self._shared = _Shared(
                 frames=tuple(_shared(leaf) for leaf in columns.frames),

@@ -69,7 +69,7 @@ class Observations:
         return [self.like(parts) for parts in zip(*columns, strict=True)]
 
     def stacked(self, count: int) -> Observations:
-        """Return stacks of `count` successive observations, each with the mask of the last one."""
+        """Return stacks of `count` successive observations; a mask is that of the last one."""
         if count == 1:
             return self
         rows = self.vector.shape[0] // count
@@ -126,8 +126,8 @@ class ObservationEncoder:
     def normalize_to(self, observations: Any) -> None:
         """Normalize all inputs to mean 0 and standard deviation 1 over these observations.
 
-        Each number has its own scale; all pixels of an image share one. Constant inputs keep their
-        scale and become 0.
+        Each number has its own scale; all pixels of an image share one scale. A constant input
+        keeps its default scale and becomes 0.
         """
         self.center_images(observations)
         self.shift, scale = np.zeros_like(self.shift), self.scale
@@ -178,7 +178,8 @@ class ObservationEncoder:
         if self.mask is None:
             return None
         allowed = np.asarray(self.mask.of(observations)).astype(bool)
-        # After an episode's end, a mask may allow no action. Allow all: the values are never used.
+        # After an episode's end, a mask may allow no action. Then allow all actions, because the
+        # values of that state are never used.
         return torch.from_numpy(allowed | ~allowed.any(1, keepdims=True))
 
 

@@ -23,7 +23,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 from mcaprl.recorder.dataset.open import find_logs
 
-# Approximate number of parts in a block: several, so that a block mixes distant episodes.
+# Approximate number of parts in a block. With several parts, a block mixes distant episodes.
 _PARTS_PER_BLOCK = 8
 
 
@@ -55,12 +55,12 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
 
     Pass it to `DataLoader(stream, batch_size=None, num_workers=K)`, or iterate it directly. An
     epoch contains each item once over all workers and ranks. All workers of all ranks have the same
-    number of batches, unless there are fewer items than workers, or `batch_size` is 1. Parts of the
-    logs are read in random order, several parts at a time as one block of `buffer` items, which is
-    shuffled. The order depends only on `seed`, the epoch, and the numbers of workers and ranks.
+    number of batches. Exceptions are epochs with fewer items than workers, and a `batch_size` of 1.
+    Parts of the logs are read in random order. Several parts form a block of `buffer` items, which
+    are shuffled. The order depends only on `seed`, the epoch, and the numbers of workers and ranks.
 
-    An iteration in the process of the training loop advances the epoch at its end. With workers,
-    call `set_epoch` before each epoch.
+    Without workers, each complete iteration advances the epoch. With workers, call `set_epoch`
+    before each epoch.
     """
 
     def __init__(
@@ -112,7 +112,8 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         part_items = max(buffer // _PARTS_PER_BLOCK, 1)
         self._parts = self._source.parts(self._options, part_items)
         self._count = sum(part.items for part in self._parts)
-        # Epoch, and number of its batches to skip; in shared memory, so that workers see changes.
+        # The epoch, and the number of its batches to skip. They are in shared memory, so that
+        # workers see changes.
         self._position = torch.zeros(2, dtype=torch.int64)
         self._position.share_memory_()  # type: ignore[no-untyped-call]
         self._done = 0
@@ -123,12 +124,12 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         return int(self._position[0])
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch that the next iteration yields from its first batch on."""
+        """Choose the epoch of the next iteration, which starts at the epoch's first batch."""
         self._position[:] = torch.tensor([epoch, 0])
         self._done = 0
 
     def state_dict(self, batches: int | None = None) -> dict[str, int]:
-        """Return the state from which `load_state_dict` continues.
+        """Return the state with which `load_state_dict` continues the epoch.
 
         Args:
             batches: Number of batches that the training loop has received since the start of this
@@ -139,7 +140,7 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         return {"seed": self._seed, "epoch": self.epoch, "batches": done}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Continue after the last batch that is counted in a state.
+        """Continue the epoch of a state after the batches that the state counts.
 
         The rest of the epoch is the same as in the interrupted run if the options and the numbers
         of workers and ranks are the same.
@@ -175,7 +176,7 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         yield from _cut(blocks, self._sizes(shard, shards), mine)
 
     def _sizes(self, shard: int, shards: int) -> list[int]:
-        """Return the sizes of a shard's batches; all shards have equally many batches."""
+        """Return the sizes of a shard's batches; all shards have the same number of batches."""
         count = self._count * (shard + 1) // shards - self._count * shard // shards
         fewest, most = self._count // shards, -(-self._count // shards)
         if self._drop_last:
@@ -226,7 +227,7 @@ class _Source:
         self._logs: dict[int, LogReader] = {}
 
     def parts(self, options: ItemOptions, size: int) -> list[_Part]:
-        """Divide the episodes into parts of `size` or more items; a log's last part may have fewer.
+        """Divide the episodes into parts of at least `size` items, except the last part of a log.
 
         Raises:
             LogError: There are no episodes.
@@ -303,7 +304,7 @@ def _cut(blocks: Iterator[_Rows], sizes: list[int], skipped: int) -> Iterator[Te
 
 
 def _grouped(shares: list[_Share], size: int) -> Iterator[list[_Share]]:
-    """Yield blocks of successive shares with at least `size` items; the last may have fewer."""
+    """Group successive shares into blocks of at least `size` items; the last may have fewer."""
     group, items = list[_Share](), 0
     for share in shares:
         group.append(share)
@@ -316,7 +317,7 @@ def _grouped(shares: list[_Share], size: int) -> Iterator[list[_Share]]:
 
 
 def _rank_of(rank: int | None, world_size: int | None) -> tuple[int, int]:
-    """Return rank and world size; default: those of `torch.distributed`, or 0 and 1.
+    """Return rank and world size: as given, else from `torch.distributed`, else 0 and 1.
 
     Raises:
         UsageError: Only one of the two is given, or the rank is outside the world size.

@@ -1,11 +1,11 @@
 """Estimation of the probabilities with which an unknown policy chose the actions of a log.
 
-A classifier of the actions (behavior cloning) is fitted to a part of the episodes and predicts the
-others, so no episode's probabilities come from a network that was trained on it (cross-fitting).
-The predictions are calibrated on episodes that the network was not trained on: the temperature
-follows Guo et al., "On Calibration of Modern Neural Networks", https://arxiv.org/abs/1706.04599.
-A share of the uniform distribution is added, because many behavior policies choose some actions at
-random.
+A classifier of the actions (behavior cloning) is trained on a part of the episodes and predicts the
+actions of the other episodes. Thus no episode's probabilities come from a network that was trained
+on this episode (cross-fitting). The predictions are calibrated by a temperature, on episodes that
+the network was not trained on: Guo et al., "On Calibration of Modern Neural Networks",
+https://arxiv.org/abs/1706.04599. A share of the uniform distribution is added, because many
+behavior policies choose some actions at random.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ UPDATES: Final = 2_000
 _VALIDATED: Final = 0.15
 """Share of a fold's training episodes on which the predictions are calibrated."""
 _CHECKS = 20
-"""Number of times that the network is scored during its training; the best weights are used."""
+"""Number of times that the network is scored during its training. The best weights are used."""
 _TEMPERATURES = np.geomspace(0.25, 4.0, 17)
 _UNIFORM_SHARES = np.array([0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0])
 _SMALLEST = 1e-6
@@ -46,8 +46,9 @@ class FoldScore:
     Attributes:
         episodes: Number of episodes that were predicted.
         log_likelihood: Mean log probability of the actions taken.
-        marginal: `log_likelihood` if the action frequencies of the training episodes are predicted.
-        uniform: `log_likelihood` if equal probabilities of all allowed actions are predicted.
+        marginal: `log_likelihood` of a prediction that is always the action frequencies of the
+            training episodes.
+        uniform: `log_likelihood` of equal probabilities for all allowed actions.
         temperature: Divisor of the network's logits.
         uniform_share: Share of the uniform distribution in the prediction.
     """
@@ -62,7 +63,7 @@ class FoldScore:
 
 @dataclass(frozen=True)
 class ReliabilityRange:
-    """Calibration of the predictions (one per step and action) in a range of probabilities.
+    """Calibration in one range of predicted probabilities; each step has a prediction per action.
 
     Attributes:
         low, high: Range (low, high].
@@ -86,8 +87,8 @@ class BehaviorEstimate:
         dataset: The dataset with the estimates in `behavior_probs`, marked as estimated.
         folds: Quality for each fold.
         reliability: Predicted and observed frequencies, by range of the predicted probability.
-        calibration_error: Mean distance of predicted and observed frequency, weighted by the number
-            of predictions.
+        calibration_error: Mean absolute difference between predicted and observed frequency,
+            weighted by the number of predictions.
         log_likelihood: Mean log probability of the actions taken.
     """
 
@@ -222,7 +223,7 @@ def _fitted(
     validated: NDArray[np.bool_],
     on_update: Callable[[], None],
 ) -> tuple[Floats, FoldScore]:
-    """Train a network; return the predictions (N, A) of its best weights, and their score."""
+    """Train a network; return its best predictions (N, A), and the score of these predictions."""
     buffer, updates = learner.buffer, learner.config.updates
     actions = buffer.actions.numpy()
     checks = set(np.linspace(0, updates, _CHECKS + 1).round().astype(int).tolist())
@@ -254,7 +255,11 @@ def _fitted(
 
 
 def _calibrated(logits: Floats, actions: NDArray[np.int64]) -> tuple[float, float, float]:
-    """Return the best mean log probability, and its temperature and uniform share."""
+    """Find the temperature and uniform share with the best mean log probability.
+
+    Returns:
+        Mean log probability, temperature and uniform share.
+    """
     candidates = []
     for temperature in _TEMPERATURES.tolist():
         own = _probabilities(logits, temperature, 0.0)[np.arange(len(actions)), actions]

@@ -1,4 +1,4 @@
-"""Evidence that a log alone gives for or against trained policies, for choosing among them.
+"""Scores of trained policies, computed from a log alone, to choose one of the policies.
 
 Fitted Q evaluation (FQE) estimates the value of each policy. The log's episodes are divided into
 two halves, and the model that is trained on one half evaluates the policies on the other. All
@@ -7,7 +7,8 @@ policies share the initial weights and the batches, which reduces the noise of t
     FQE for selecting policies    Paine et al., https://arxiv.org/abs/2007.09055
 
 FQE overestimates policies whose actions are rare in the log. A pessimistic evaluation ends an
-episode at such an action, with a value that is exceeded by 99 % of the returns in the log:
+episode at such an action. The episode then gets a low value: 99 % of the returns in the log are
+higher.
 
     Pessimistic model             Kidambi et al., https://arxiv.org/abs/2005.05951
 
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
 FOLDS: Final = 2
 LIKELY: Final = 0.1
-"""Fraction of the largest probability under the clone that makes an action likely."""
+"""An action is likely if its probability is at least this fraction of the largest probability."""
 LOW_PERCENTILE: Final = 1.0
 _SYNCS_PER_HORIZON: Final = 6.0
 
@@ -94,7 +95,7 @@ def fqe_config(gamma: float, updates: int, hidden: tuple[int, ...] = (64, 64)) -
 
 
 class EvidenceCollector:
-    """Evaluator of many policies on one log, side by side."""
+    """Evaluator of several policies on one log in parallel."""
 
     def __init__(
         self,
@@ -204,7 +205,7 @@ class EvidenceCollector:
         )
 
     def _own_values(self, policy: Actor) -> tuple[float | None, float | None]:
-        """Return the policy's own mean value of first states, and its relative Bellman error."""
+        """Return `own_value` and `bellman_error` of a policy; see `Evidence`."""
         try:
             q, q_t = (
                 by_rows(policy.q_values, observations)
@@ -220,6 +221,6 @@ class EvidenceCollector:
 
 
 def _likely(probabilities: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
-    """Return whether actions (N, A) are at least `LIKELY` times as likely as the most likely."""
+    """Return whether each action (N, A) has at least `LIKELY` times the largest probability."""
     likely: NDArray[np.bool_] = probabilities >= LIKELY * probabilities.max(1, keepdims=True)
     return likely

@@ -27,7 +27,7 @@ from mcaprl.offline.algorithms.models import outputs_of_buffer
 from mcaprl.offline.batches.buffer import Batch, Packing, TransitionBuffer
 
 SYNCS_PER_HORIZON = 5.0
-"""Number of syncs per effective horizon 1 / (1 - gamma) below which Q has not converged."""
+"""Minimum number of syncs per effective horizon 1 / (1 - gamma) after which Q can converge."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class FQEConfig(TrainingConfig):
 
     @property
     def enough_syncs(self) -> bool:
-        """Whether rewards can have propagated through the effective horizon.
+        """Whether there are enough syncs to propagate rewards through the effective horizon.
 
         After k syncs, Q is at most (1 - gamma^k) / (1 - gamma) times the largest reward.
         """
@@ -87,8 +87,8 @@ class FQE(Learner):
             seeds: Seeds of the weights and batches of each of K policies. Equal seeds give equal
                 initial weights and batches, which reduces the noise of differences.
             pi_t: Probabilities (K, N, A) of each policy in each next state.
-            fixed_v_t: Values (K, N) of next states that are not learned, NaN where they are;
-                default: all are learned.
+            fixed_v_t: Values (K, N) of next states that are fixed instead of learned; NaN for
+                learned values. Default: all are learned.
         """
         super().__init__(config, buffer, seeds)
         self._pi_t = pi_t.flatten(0, 1)
@@ -126,7 +126,7 @@ class FQE(Learner):
 
 
 def return_bounds(rewards: Tensor, gamma: float) -> tuple[float, float]:
-    """Return bounds on the discounted return of episodes with rewards in the range of `rewards`."""
+    """Return the lowest and highest possible discounted return, from the range of `rewards`."""
     steps = 1 / (1 - gamma) if gamma < 1 else float("inf")
     low, high = float(rewards.min()), float(rewards.max())
     return min(low, low * steps) if low else 0.0, max(high, high * steps) if high else 0.0

@@ -143,9 +143,10 @@ def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
     """Return the effective number of episodes of an estimate.
 
     For TIS and WIS, this is the size at the last step. For the others, it is the harmonic mean over
-    steps, weighted with the discounts, because the variances of the steps add up. PDIS and DR do
-    not normalize, so one huge weight, even in a late step, determines their value. For them, the
-    result is at most the effective sample size of the discounted sums of each episode's weights.
+    steps, weighted with the discounts, because the variances of the steps add up. PDIS and DR are
+    not normalized, so one huge weight, even in a late step, determines the estimate. For PDIS and
+    DR, each episode's weights are also summed with their discounts. The result is at most the
+    effective sample size of these sums.
     """
     sizes = effective_sample_sizes(episodes)
     if estimator in WHOLE_EPISODE:
@@ -161,8 +162,9 @@ def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
 def mean_weight(estimator: str, episodes: EpisodeTable) -> RatioEstimate | None:
     """Return the mean importance weight of an unbiased estimator; its expectation is 1.
 
-    A mean well below 1 shows that the log does not cover the policy's actions: rare episodes with
-    large weights are missing. Return None for the weighted estimators, which divide by this mean.
+    A mean far below 1 shows that the log does not cover the policy's actions: rare episodes with
+    large weights are missing. The result is None for the weighted estimators, because they divide
+    by this mean.
     """
     if estimator not in UNBIASED:
         return None

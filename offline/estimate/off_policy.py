@@ -1,7 +1,7 @@
 """Off-policy evaluation: estimates of a policy's value from a log, with intervals and verdicts.
 
-Values are discounted returns of whole episodes. Estimators with a model (FQE, DR, WDR) include the
-rewards missing after a truncation; the others do not.
+Values are discounted returns of whole episodes. A truncated episode lacks its later rewards.
+Estimators with a model (FQE, DR, WDR) include an estimate of these rewards; the others do not.
 """
 
 from __future__ import annotations
@@ -62,8 +62,9 @@ class Estimate:
         estimator: `FQE` or one of `importance.ESTIMATORS`.
         value: Discounted return; None if it cannot be computed.
         interval: 95 % bootstrap-t interval over episodes; None for FQE or if `value` is None.
-        effective_sample_size: Number of the policy's own episodes that would be as informative.
-        verdict: `ok`, or `refused: ` or `no interval: ` and the reason. FQE is never `ok`.
+        effective_sample_size: Number of episodes of the policy itself that would give an equally
+            precise estimate.
+        verdict: `ok`, or `refused: ` or `no interval: ` with a reason. FQE is never `ok`.
             A verdict based on estimated behavior probabilities ends with `BY_ESTIMATES`.
     """
 
@@ -207,8 +208,8 @@ class OffPolicyEvaluator:
     ) -> tuple[Floats, Floats, Floats]:
         """Return Q of the actions taken, V of the states, and V of the next states, (N,) each.
 
-        Cross-fitting: the model that evaluates an episode is trained on the other half of the log,
-        because a model's values of its training episodes are biased.
+        The model that evaluates an episode is trained on the other half of the log (cross-fitting),
+        because a model's values for its own training episodes are biased.
         """
         fold = np.repeat(self._fold, self._lengths)
         actions = self._buffer.actions.numpy()
@@ -276,9 +277,9 @@ class OffPolicyEvaluator:
     def _fqe_estimate(self, name: str, v: Floats, weights: Floats) -> Estimate:
         """Return the model's mean value of the first states.
 
-        The estimate has no interval and is never trusted, because most of its error is the model's
-        bias, which a log does not show. The model is trained on single steps, so the effective
-        sample size counts steps, divided by the mean length of an episode.
+        The estimate has no interval and is never trusted. Most of its error is the model's bias,
+        which cannot be computed from a log. The model is trained on single steps, so the effective
+        sample size is the number of steps divided by the mean length of an episode.
         """
         first = v[np.cumsum(self._lengths) - self._lengths]
         steps = weights.sum() ** 2 / max((weights**2).sum(), 1e-300)
@@ -294,7 +295,7 @@ class OffPolicyEvaluator:
         return Estimate(name, "FQE", float(first.mean()), None, size, verdict)
 
     def _padded(self, column: NDArray[Any], fill: float) -> Floats:
-        """Return a column of steps as rows (E, T), one per episode, padded with `fill`."""
+        """Split the values of all steps into rows (E, T), one per episode, padded with `fill`."""
         table = np.full((len(self._lengths), int(self._lengths.max()) + 1), fill)
         steps = np.arange(table.shape[1]) < self._lengths[:, None]
         table[steps] = column

@@ -10,9 +10,10 @@ The bootstrap-t instead divides the error of each resampling by its standard err
 
     Efron and Tibshirani, "An introduction to the bootstrap", 1993, section 12.5
 
-That standard error is itself an estimate, with few degrees of freedom if a few episodes contribute
-most of it. The interval is therefore widened by the ratio of the quantiles of Student's t and the
-normal distribution. The more unequal the episodes' contributions, the fewer degrees of freedom:
+The standard error is also estimated from the episodes. If a few episodes contribute most of it, it
+has few degrees of freedom. The interval is therefore widened by the ratio of two quantiles: that of
+Student's t and that of the normal distribution. The number of degrees of freedom follows from the
+contributions of the episodes:
 
     Satterthwaite, "An approximate distribution of estimates of variance components", Biometrics
     Bulletin 2, 1946
@@ -37,7 +38,7 @@ _RESAMPLES_AT_ONCE = 64
 class RatioEstimate:
     """Estimate sum_k w_k (mean a_k / mean b_k), where the means are over E episodes.
 
-    With several pairs of arrays a and b, the ratios of all pairs are added for each k.
+    If there are several pairs of arrays a and b, their ratios are added for each k.
 
     Attributes:
         weights: Weights w (K,).
@@ -64,7 +65,7 @@ class RatioEstimate:
     def errors(self, counts: Floats) -> Floats:
         """Return the standard errors (B,) of `values(counts)`, by the delta method.
 
-        One of E episodes changes the estimate by sum_k w_k (a_k - q_k b_k) / (E mean b_k), where
+        A single episode changes the estimate by sum_k w_k (a_k - q_k b_k) / (E mean b_k), where
         q_k is the ratio mean a_k / mean b_k.
         """
         parts = [
@@ -76,8 +77,8 @@ class RatioEstimate:
     def interval(self, counts: Floats) -> tuple[float, float]:
         """Return the 95 % bootstrap-t interval, widened for few degrees of freedom.
 
-        Resamplings in which all episodes are equal have no standard error and are excluded; if
-        most are excluded, the percentile interval is returned.
+        A resampling in which all episodes are equal has no standard error and is excluded. If most
+        resamplings are excluded, the method returns the percentile interval.
 
         Args:
             counts: Number of times (B, E) that each resampling contains each episode.
@@ -99,8 +100,8 @@ class RatioEstimate:
     def degrees_of_freedom(self) -> float:
         """Return the degrees of freedom of the standard error, at least 1.
 
-        They are (sum_i m_i^2)^2 / sum_i m_i^4 - 1, where m_i is the change of the estimate due to
-        episode i. If all changes are equal, there are E - 1.
+        The number is (sum_i m_i^2)^2 / sum_i m_i^4 - 1, where m_i is the change of the estimate due
+        to episode i. If all changes are equal, the number is E - 1.
         """
         once = np.ones((1, len(self.pairs[0][0])))
         shares = self._changes(once)[:, 0] ** 2

@@ -123,9 +123,9 @@ def normalized_entropy(probabilities: NDArray[np.float32]) -> NDArray[np.float32
 
 
 def by_rows(function: Callable[[Any], NDArray[Any]], observations: Any) -> NDArray[Any]:
-    """Apply a function of B observations to slices of N observations, and join the results.
+    """Apply a function to N observations in slices of limited size, and join the results.
 
-    The slices have a limited size, which bounds the memory of networks on images.
+    The limit bounds the memory that networks need for images.
     """
     part = next(iter(observations.values())) if isinstance(observations, dict) else observations
     starts = range(0, len(part), _ROWS_AT_ONCE)
@@ -153,7 +153,7 @@ def _rows(observations: Any, start: int, stop: int) -> Any:
 
 
 def _with_last(observations: Any, next_observations: Any) -> Any:
-    """Append the last next observation to the observations of all steps: (T + 1, ...)."""
+    """Return the observations of all steps, followed by the last next observation: (T + 1, ...)."""
     if isinstance(observations, dict):
         return {k: _with_last(observations[k], next_observations[k]) for k in observations}
     return np.concatenate([observations, next_observations[-1:]])

@@ -1,8 +1,8 @@
 """Checkpoints: a resumed run has the same result as an uninterrupted one.
 
 `checkpoint.safetensors` contains one seed's tensors (weights, target network, optimizer,
-generator) and, in its header, the number of updates and the run's identity. Both are in one file,
-because a kill between two writes would leave them inconsistent.
+generator). Its header contains the number of updates and the run's identity. All are in one file,
+because two files would be inconsistent if the process were killed between the two writes.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ _LEARNED, _HELD_OUT = COLORS[:2]
 
 
 def draw_curves(folder: Path) -> Path:
-    """Write RUN/curves.png from the metrics of all seeds; thick lines are means over seeds.
+    """Write RUN/curves.png from the metrics of all seeds. Thick lines are means over seeds.
 
     Returns:
         Path of the image.

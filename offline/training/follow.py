@@ -17,7 +17,8 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import find_logs, open_logs
 
 CHECK_INTERVAL = 500
-"""Number of updates between two checks of the logs; new episodes require packing all data again."""
+"""Number of updates between two checks of the logs. After each check that finds new episodes, all
+data are packed again."""
 _POLL_S = 0.2
 
 
@@ -86,11 +87,11 @@ def _state_of(path: Path) -> tuple[int, int, int]:
 def with_more_data(
     learner: Learner, dataset: Dataset, held_out_episodes: NDArray[np.int64]
 ) -> Learner:
-    """Return a learner with the same state for the grown dataset.
+    """Return a learner for the grown dataset, with the weights and state of `learner`.
 
     Args:
         learner: Learner to continue.
-        dataset: Dataset of the learner with more episodes appended.
+        dataset: Dataset of the learner, followed by new episodes.
         held_out_episodes: Numbers of the held-out episodes.
     """
     weights = np.ones(len(dataset.episodes))

@@ -19,8 +19,8 @@ from mcaprl.sims.evaluation.statistics import mean_interval
 class MetricsWriter:
     """Writer of metrics to CSV and TensorBoard, one row per call.
 
-    The CSV has columns `update`, `learning_rate` and the algorithm's terms. Values are those of one
-    batch, not running averages, so the same seed writes the same file.
+    The CSV has the columns `update`, `learning_rate` and the algorithm's terms. Each value comes
+    from one batch and is not a running average, so the same seed writes the same file.
     """
 
     def __init__(self, folder: Path, first_update: int) -> None:
@@ -28,8 +28,8 @@ class MetricsWriter:
 
         Args:
             folder: Existing folder.
-            first_update: First update of this session, starting at 1; rows that an earlier session
-                wrote for this or later updates are dropped.
+            first_update: Number of this session's first update, counted from 1. Rows of an earlier
+                session for this or later updates are dropped.
 
         Raises:
             TrainingError: A file cannot be written.
@@ -84,7 +84,7 @@ class OfflineSummary(RunSummary):
 
 
 def describe_seeds(summaries: Sequence[OfflineSummary]) -> list[str]:
-    """Return a line for each seed, and one with means and 95 % intervals over seeds."""
+    """Return a line for each seed, and a line with means and 95 % intervals over seeds."""
     lines = []
     for summary in summaries:
         done = summary.steps - summary.resumed_at
@@ -106,7 +106,7 @@ def describe_seeds(summaries: Sequence[OfflineSummary]) -> list[str]:
 
 
 def _rows_before(path: Path, update: int) -> list[str]:
-    """Return the header and the rows of earlier updates, except incomplete rows of a killed run."""
+    """Return the header and the complete rows of earlier updates; a kill can cut off a row."""
     if update == 1 or not path.exists():
         return []
     header, *rows = path.read_text().splitlines(keepends=True)

@@ -87,8 +87,8 @@ def train(
         UsageError: There is no such device.
         OutputExistsError: `out` exists and is not empty.
         SpaceError: The algorithm does not support these observations or actions.
-        TrainingError: The loss is NaN or infinite; `out` cannot be written, is being written by
-            another training, or contains a run with other data or settings; or there is no run to
+        TrainingError: The loss is NaN or infinite. Or `out` cannot be written, another training
+            writes to it, or it contains a run with other data or settings. Or there is no run to
             resume.
     """
     if seeds < 1 or seed < 0:
@@ -200,7 +200,7 @@ class _Run:
     def _train_to_next_stop(
         self, learner: Learner, metrics: list[MetricsWriter]
     ) -> list[dict[str, float]]:
-        """Run updates until metrics or a checkpoint is due; write metrics, and a due checkpoint."""
+        """Train until metrics or a checkpoint must be written, and write them."""
         config = learner.config
         while True:
             terms = self._update(learner)
@@ -223,7 +223,7 @@ class _Run:
         return values
 
     def _with_new_episodes(self, learner: Learner) -> Learner:
-        """Add new episodes every `CHECK_INTERVAL` updates; return the learner to continue with."""
+        """Add new episodes every `CHECK_INTERVAL` updates; return the old or a replaced learner."""
         if self.follow is None or learner.step % CHECK_INTERVAL or not self.follow.grow():
             return learner
         return with_more_data(learner, self.follow.dataset, self.held_out_episodes)
@@ -240,7 +240,7 @@ class _Run:
             save_checkpoint(folder, learner, seed, self.identity)
 
     def _update(self, learner: Learner) -> dict[str, Tensor]:
-        """Run one update; if the loss is not finite, raise an error that names the checkpoints."""
+        """Run one update. If the loss is not finite, raise an error with the last checkpoints."""
         try:
             return learner.update()
         except NotFiniteError as error:
@@ -263,7 +263,7 @@ class _Run:
 
 
 def _earlier_scales(folder: Path) -> tuple[ObservationEncoder | None, float | None]:
-    """Return encoder and reward scale of the run in a folder; None for both if there is no run."""
+    """Return the encoder and the reward scale of the run in a folder, or None and None."""
     policies = policy_files(folder)
     if not policies:
         return None, None
@@ -272,7 +272,7 @@ def _earlier_scales(folder: Path) -> tuple[ObservationEncoder | None, float | No
 
 
 def _fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
-    """Return a hash of the data, and of the weights unless all weights are equal."""
+    """Return a hash of the data. The hash includes the weights if they are not all equal."""
     if len(set(weights.tolist())) < 2:
         return dataset.fingerprint
     return hashlib.sha256(dataset.fingerprint.encode() + weights.tobytes()).hexdigest()

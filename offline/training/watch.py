@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 MAX_ROWS = 256
 """Number of transitions per validation, spread evenly over the held-out episodes."""
 MIN_HORIZON_FRACTION = 0.3
-"""Value of `horizon_fraction` below which values hardly distinguish good from bad actions."""
+"""Below this `horizon_fraction`, the values of good and bad actions hardly differ."""
 MAX_EXCESS = 2.0
-"""Ratio of a mean value to the largest possible return; a higher ratio counts as divergence."""
+"""Values diverge if their mean is more than this multiple of the largest possible return."""
 _CUT_OFF = 0.05
-"""A return is NaN if the first reward missing after a truncation has a larger discount."""
+"""Largest discount of the first reward after a truncation; if it is larger, the return is NaN."""
 
 
 class HeldOut:
@@ -66,7 +66,7 @@ class HeldOut:
 
 
 def choose_held_out(n_episodes: int, fraction: float) -> NDArray[np.int64]:
-    """Choose about `fraction` of the episodes: at least one if there are ten or more, never all.
+    """Choose about `fraction` of the episodes; at least one of ten or more episodes, never all.
 
     The choice depends only on the number of episodes, so it is the same for all seeds.
     """
@@ -88,8 +88,8 @@ def monte_carlo_returns(
         gamma: Discount.
 
     Returns:
-        One sum for each transition of these episodes; NaN where rewards after a truncation would
-        have a weight above 5 %.
+        One sum for each transition of these episodes. The sum is NaN if rewards after a truncation
+        are missing and would have a discount above 5 %.
     """
     returns = []
     ends = np.cumsum(dataset.episode_lengths)
