@@ -44,7 +44,7 @@ LOG_INTERVAL = 1_000
 """Number of environment steps between two rows of scalars, and between two progress reports."""
 EVALUATIONS_NAME = "evaluations"
 CENTERING_STEPS = 2_000
-"""Number of random steps, taken before training, that yield the image statistics."""
+"""Number of random steps before training; their images determine the image normalization."""
 
 
 class Agent:
@@ -125,10 +125,10 @@ class Agent:
         )
 
     def start_from(self, data: Dataset | None, policy: Any) -> None:
-        """Start with logged transitions in the replay buffer, with a policy's weights, or both.
+        """Fill the replay buffer with logged transitions, copy a policy's weights, or do both.
 
-        With data, the agent takes no random steps before learning. With a policy, it explores with
-        the final epsilon from the start, and takes `learning_starts` steps before learning.
+        With data, the agent takes no random steps before learning. With a policy, the agent always
+        explores with the final epsilon, and takes `learning_starts` steps before learning.
 
         Args:
             data: Logged transitions, if any.

@@ -33,8 +33,8 @@ class Algorithm:
     """Classes of an algorithm.
 
     Attributes:
-        config_type: Dataclass of its settings.
-        model_type: SB3 class of its model.
+        config_type: Dataclass of the algorithm's settings.
+        model_type: SB3 class of the algorithm's model.
     """
 
     config_type: type[OnlineConfig]
@@ -90,7 +90,8 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
             policy = NetworkDQNPolicy
     if algorithm.model_type is not A2C:
         policy_kwargs["optimizer_kwargs"] = {"fused": True}
-    # SB3's models share no constructor signature; `Any` hides the arguments from type checks.
+    # The constructors of SB3's models have different signatures, so the type checker cannot check
+    # the arguments.
     model_type: Any = algorithm.model_type
     model: BaseAlgorithm = model_type(
         policy,
@@ -103,7 +104,7 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
     )
     encoder = "nature" if architecture is None else architecture.encoder
     if encoder == "nature" and _has_images(env.observation_space):
-        # Its convolutions take 25 % less time in channels-last format; results do not change.
+        # Convolutions take 25 % less time in channels-last format; results do not change.
         cast(Any, model.policy).to(memory_format=torch.channels_last)
     if isinstance(config, DoubleDQNConfig):
         cast(DoubleDQN, model).alpha = config.alpha
@@ -133,7 +134,10 @@ def own_architecture(config: OnlineConfig, space: spaces.Space[Any]) -> Architec
 
 
 def _arguments(config: OnlineConfig, space: spaces.Space[Any]) -> dict[str, Any]:
-    """Return SB3's constructor arguments; DQN on images or stacks gets a `FrameReplayBuffer`."""
+    """Return the arguments for SB3's constructor.
+
+    DQN uses a `FrameReplayBuffer` if it observes images or stacks.
+    """
     arguments = config.arguments()
     if getattr(config, "image_shift", 0) and not _has_images(space):
         raise UsageError("image_shift is for images, but the observations have none")

@@ -1,9 +1,9 @@
 """Checkpoints from which a killed run resumes.
 
 `checkpoint.safetensors` contains weights, target network, optimizer, replay buffer and generators.
-Its header contains the counters, the curve so far and the task. All are in one file, because a kill
-between two writes would leave them inconsistent. A resumed run starts new episodes, because
-Gymnasium has no interface for the state of an environment.
+Its header contains the counters, the curve so far and the task. All are in one file, because two
+files would be inconsistent if the process were killed between the two writes. A resumed run starts
+new episodes, because Gymnasium has no interface to save the state of an environment.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def save_checkpoint(
         model: Model between two rollouts.
         task: Task of the run.
         extra: JSON object for `load_checkpoint` to return.
-        best: Bytes of the best policy's file so far, for `load_checkpoint` to return; empty if
-            there is none.
+        best: Contents of the best policy's file so far, for `load_checkpoint` to return; empty if
+            there is no such file.
 
     Raises:
         TrainingError: The file cannot be written.

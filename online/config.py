@@ -1,4 +1,4 @@
-"""Settings of the online algorithms; defaults not mentioned here are Stable-Baselines3's."""
+"""Settings of the online algorithms; all other settings have Stable-Baselines3's defaults."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class DQNConfig(OnlineConfig):
         return {
             **super().arguments(),
             **{name: getattr(self, name) for name in same},
-            # SB3 never reaches `sys.maxsize`; a callback updates the target network by episodes.
+            # `sys.maxsize` disables SB3's own target updates; a callback makes them instead.
             **({"target_update_interval": sys.maxsize} if self.target_update_episodes else {}),
             "buffer_size": min(self.buffer_size, self.steps + self.envs),
             # SB3 counts calls of `step`; each call steps every environment.

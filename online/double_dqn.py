@@ -2,8 +2,9 @@
 
     https://arxiv.org/abs/1509.06461    target r + gamma Q'(s', argmax_a Q(s', a))
 
-With `n_steps` n, the target is the sum of n discounted rewards plus gamma^n times that value. SB3's
-replay buffer returns the sum and gamma^n; n is smaller if the episode ends earlier.
+With `n_steps` n, the target is the sum of n discounted rewards, plus gamma^n times the value Q' n
+steps later. SB3's replay buffer returns the sum and gamma^n. If the episode ends earlier, n is
+smaller.
 
 With `alpha` above 0, CQL's penalty is added to the loss, as in `offline/algorithms/cql.py`:
 
@@ -26,9 +27,9 @@ class WarmDQN(DQN):
     """SB3's DQN with an option for pretrained weights.
 
     Attributes:
-        skips_random_steps: Whether the policy's actions, not random ones, fill the buffer before
-            learning starts. Learning from too few transitions would destroy the pretrained weights
-            (https://arxiv.org/abs/2412.07762).
+        skips_random_steps: Whether the steps before learning follow the policy instead of taking
+            random actions. These steps are needed, because learning from too few transitions would
+            destroy the pretrained weights (https://arxiv.org/abs/2412.07762).
     """
 
     skips_random_steps = False
@@ -41,9 +42,9 @@ class WarmDQN(DQN):
 
 
 class DoubleDQN(WarmDQN):
-    """SB3's DQN with the Double DQN target and, optionally, CQL's penalty.
+    """SB3's DQN with the Double DQN target and an optional penalty of CQL.
 
-    Its `.zip` files also load as `DQN`.
+    `DQN.load` also loads the `.zip` files of this class.
 
     Attributes:
         alpha: Weight of CQL's penalty on actions that are not in the replay buffer; 0 disables it.

@@ -1,4 +1,7 @@
-"""Evaluation during training, in separate environments; random scores 0, the pilot scores 1."""
+"""Evaluation during training, in separate environments.
+
+Scores are scaled so that random actions have the score 0 and the sim's pilot has the score 1.
+"""
 
 from __future__ import annotations
 
@@ -58,9 +61,9 @@ def measure_scale(env: gym.Env[Any, Any], *, episodes: int, seed: int) -> Scale:
 
 
 class Evaluation(EvalCallback):
-    """SB3's EvalCallback on the same episodes each time, so that checkpoints are comparable.
+    """SB3's EvalCallback, with the same episodes each time, so that checkpoints are comparable.
 
-    All episodes run at once, one in each environment of a separate batch.
+    All episodes run at the same time, one in each environment of a separate batch.
     """
 
     def __init__(
@@ -127,7 +130,7 @@ class Evaluation(EvalCallback):
         return going_on
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
-        """Record the end of an episode; SB3 calls this after each step of the evaluation."""
+        """Record the end of an episode. SB3 calls this method after each step of the evaluation."""
         super()._log_success_callback(locals_, globals_)
         if locals_["done"]:
             episode = locals_["info"]["episode"]
@@ -171,7 +174,7 @@ class FirstEpisodes(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         return self._observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step all environments and record those in their first episode."""
+        """Step all environments; record the environments that are in their first episode."""
         result = self.env.step(actions)
         observations, rewards, terminated, truncated, infos = result
         numbers = np.flatnonzero(self._open)
@@ -195,7 +198,10 @@ class FirstEpisodes(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         return result
 
     def dataset(self) -> Dataset:
-        """Return the episodes, ordered by environment; behavior probabilities are 1 (greedy)."""
+        """Return the episodes, ordered by environment.
+
+        Behavior probabilities are 1, because the actions are greedy.
+        """
         environments = np.concatenate([step.environments for step in self._steps])
         order = np.argsort(environments, kind="stable")
         columns = {
@@ -212,7 +218,7 @@ class FirstEpisodes(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
 
 def _rows(values: Any, numbers: NDArray[np.int64]) -> Any:
-    """Return a copy of the rows with these indices, from an array or each array in a dict."""
+    """Return a copy of the rows with these indices, of an array or of each array in a dict."""
     if isinstance(values, dict):
         return {key: _rows(part, numbers) for key, part in values.items()}
     return values[numbers]

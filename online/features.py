@@ -23,7 +23,7 @@ from mcaprl.online.frames import parts_of, parts_of_space
 
 
 class Parts(NamedTuple):
-    """Batch of observations as `Trunk` receives it: one joined vector, and images."""
+    """Batch of observations in the form that `Trunk` accepts: one joined vector, and images."""
 
     vector: Tensor
     images: tuple[Tensor, ...]
@@ -32,7 +32,7 @@ class Parts(NamedTuple):
 class NetworkFeatures(BaseFeaturesExtractor):
     """Layers of a `Trunk` as a features extractor of SB3.
 
-    The network receives all images, channels first, and the other parts joined as one vector. The
+    The inputs are all images, with channels first, and one vector that joins the other parts. The
     normalization of the images is saved with the weights.
     """
 
@@ -64,7 +64,7 @@ class NetworkFeatures(BaseFeaturesExtractor):
 
 
 class NetworkDQNPolicy(DQNPolicy):
-    """SB3's policy of DQN, whose last layers may be those of a dueling network."""
+    """SB3's policy for DQN with this package's network, which may be a dueling network."""
 
     def make_q_net(self) -> QNetwork:
         """Create a network with random weights."""
@@ -89,7 +89,7 @@ def policy_arguments(architecture: Architecture) -> dict[str, Any]:
 
 
 def inputs_of(space: spaces.Space[Any]) -> tuple[list[str], list[ImageInput]]:
-    """Return the keys of vectors in a channels-first space, and an `ImageInput` for each image."""
+    """Return the keys of the vectors, and an `ImageInput` for each image; channels are first."""
     vectors, images = [], []
     for key, part in parts_of_space(space).items():
         if is_image_space(part):

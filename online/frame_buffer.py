@@ -1,13 +1,13 @@
 """Replay buffer that stores each image once, with n-step returns for any observations.
 
-SB3's buffers store every observation twice, as the next observation of one step and the observation
-of the following step: 7 GB for 500,000 depth images of 84x84. Here, the next observation is read
-from the following row, and only the last observation of an episode is stored separately. Each frame
-of stacked observations is also stored once, and images may be stored at the smaller size to which
-the network averages them.
+SB3's buffers store every observation twice: as the next observation of one step, and as the
+observation of the following step. This needs 7 GB for 500,000 depth images of 84x84. Here, the next
+observation is read from the following row, and only the last observation of an episode is stored
+separately. Each frame of stacked observations is also stored once. If the network first averages
+images to a smaller size, they can be stored at this size.
 
-The images of a batch may be shifted at random, which keeps a network from learning single images by
-heart ("Image Augmentation Is All You Need", https://arxiv.org/abs/2004.13649).
+The images of a batch may be shifted at random, which reduces overfitting ("Image Augmentation Is
+All You Need", https://arxiv.org/abs/2004.13649).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class FrameReplayBuffer(BaseBuffer):
     """Replacement for SB3's replay buffers (plain, dict and n-step) that needs half the memory.
 
     The buffer has R rows, each with one step of N environments. *shape is the shape of a single
-    frame. In stacks, copies of the oldest stored frame replace overwritten frames.
+    frame. If a frame of a stack was overwritten, a copy of the oldest stored frame replaces it.
 
     Attributes:
         frames: Observations (R, N, *shape) by key; "" is the key of observations without keys.
@@ -111,9 +111,9 @@ class FrameReplayBuffer(BaseBuffer):
         """Append a step of each environment.
 
         Args:
-            obs: Observations (N, *shape), equal to `next_obs` of the previous step unless that step
-                ended an episode. Only the newest frame of a stack is read.
-            next_obs: Next observations (N, *shape), the last one of an ended episode.
+            obs: Observations (N, *shape): the first of an episode, or `next_obs` of the previous
+                step. Only the newest frame of a stack is read.
+            next_obs: Next observations (N, *shape). If an episode ended, its last observation.
             action: Actions (N,).
             reward: Rewards (N,).
             done: (N,) flags of ended episodes.
@@ -159,7 +159,7 @@ class FrameReplayBuffer(BaseBuffer):
         self._free = sorted(set(range(slots)) - set(self.final_of[self.final_of >= 0].tolist()))
 
     def _free_slot(self) -> int:
-        """Return a free index of `finals`, whose length is doubled first if it is full."""
+        """Return a free index of `finals`. If `finals` is full, double its length first."""
         if not self._free:
             count = len(next(iter(self.finals.values())))
             self.finals = {
@@ -190,7 +190,7 @@ class FrameReplayBuffer(BaseBuffer):
     def _shifted(self, parts: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """Return observations whose images (B, channels, height, width) are shifted at random.
 
-        All images have the same shift; the pixels at the edge fill the gap.
+        All images have the same shift. Copies of the pixels at the edge fill the gap.
         """
         if not self._image_shift:
             return parts
@@ -289,7 +289,7 @@ class FrameReplayBuffer(BaseBuffer):
 
 
 def shifted(images: NDArray[Any], down: int, right: int) -> NDArray[Any]:
-    """Return images (..., height, width) shifted by pixels; the edge is repeated in the gap."""
+    """Shift images (..., height, width) by pixels; copies of the edge pixels fill the gap."""
     height, width = images.shape[-2:]
     rows = np.clip(np.arange(height) - down, 0, height - 1)
     columns = np.clip(np.arange(width) - right, 0, width - 1)

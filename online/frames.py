@@ -1,4 +1,4 @@
-"""Frame stacking: several successive observations as one, for example to show velocities.
+"""Frame stacking: several successive observations form one, which then shows velocities.
 
 Frames are joined oldest first, along the channels of images and the last axis of other arrays, as
 in `offline/`. Frames before an episode's first observation are copies of that observation.
@@ -35,7 +35,7 @@ def whole_of(parts: dict[str, Any]) -> Any:
 
 
 def stack_axis(space: spaces.Space[Any]) -> int:
-    """Return the negative index of the axis along which the frames of an observation are joined."""
+    """Return the axis along which frames are joined, as a negative index."""
     if is_image_space(space) and is_image_space_channels_first(cast(spaces.Box, space)):
         return -3
     return -1
@@ -106,7 +106,7 @@ class FrameMemory:
         return self.stacked()
 
     def begin_one(self, row: int) -> None:
-        """Start a new episode in one row, with the newest observation of that row as its first."""
+        """Start a new episode in one row. Its first observation is the newest one of that row."""
         for part in self.frames.values():
             part[row] = part[row, -1:]
 
@@ -136,7 +136,7 @@ class StackedVecEnv(VecEnvWrapper):
         return cast(VecEnvObs, self._memory.begin(self.venv.reset()))
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all environments; each `terminal_observation` is also a stack."""
+        """Step all environments, and stack all observations, also each `terminal_observation`."""
         observations, rewards, dones, infos = self.venv.step_wait()
         self._memory.see(observations)
         for row in np.flatnonzero(dones).tolist():

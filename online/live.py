@@ -236,7 +236,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             total_reward=self._return_so_far,
             terminated=terminated,
             truncated=truncated,
-            # `LiveStream.end_episode` replaces the start and end times, which are 0 here.
+            # The start and end times are 0 here; `LiveStream.end_episode` replaces them.
             start_time_ns=0,
             end_time_ns=0,
             reason=reason_of(None if reasons is None else reasons[WATCHED], terminated),
@@ -247,7 +247,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
 
 def _values(model: BaseAlgorithm, action: NDArray[Any]) -> dict[str, Any]:
-    """Return the learner's values in the watched environment, as fields of `values_schema`."""
+    """Return the learner's values for the watched environment, as fields of `values_schema`."""
     observation = _row(model._last_obs, slice(WATCHED, WATCHED + 1))
     tensor: Any = model.policy.obs_to_tensor(observation)[0]
     start = int(cast(spaces.Discrete, model.action_space).start)

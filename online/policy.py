@@ -1,4 +1,4 @@
-"""Policies in `.zip` files of Stable-Baselines3; nothing in a file is unpickled or executed."""
+"""Policies in `.zip` files of Stable-Baselines3, which are read without unpickling."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _POLICY_TYPES: Final[dict[str, tuple[type[BasePolicy], ...]]] = {
     "q-network": (DQNPolicy, CnnPolicy, MultiInputPolicy),
     "actor-critic": (ActorCriticPolicy, ActorCriticCnnPolicy, MultiInputActorCriticPolicy),
 }
-"""SB3's policy classes for vectors, images and dicts; a file that names another is refused."""
+"""SB3's policy classes for vectors, images and dicts. Files with other classes are refused."""
 _ACTIVATIONS: Final[dict[str, type[torch.nn.Module]]] = {
     "ReLU": torch.nn.ReLU,
     "Tanh": torch.nn.Tanh,
@@ -133,7 +133,7 @@ class OnlinePolicy:
         return probabilities
 
     def _predicted(self, observations: Any, deterministic: bool) -> Any:
-        """Return the network's actions for observations, stacked with the stored ones if needed."""
+        """Return the network's actions; stack the observations with earlier ones if needed."""
         memory = self._memory
         if memory is not None:
             seen, now = (

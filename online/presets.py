@@ -49,7 +49,7 @@ _AUTONOMYSIM: Final[dict[str, Any]] = {
     "steps": 500_000,
     "envs": 1,
     "learning_rate": 2.5e-4,
-    # No hidden layers: the output layer follows the 512 features of SB3's `NatureCNN`.
+    # There are no hidden layers. The output layer follows the 512 features of SB3's `NatureCNN`.
     "hidden": (),
     "encoder": "nature",
     "center_images": False,

@@ -96,15 +96,15 @@ def _keep(path: Path, kept: Path) -> None:
 
 
 class ActionDescriber:
-    """Callback for each step that passes the probabilities of the actions to the recorder."""
+    """Callback that passes the probabilities of each step's actions to the recorder."""
 
     def __init__(self, recorder: RecordVecMcap, model: BaseAlgorithm) -> None:
         """Prepare to pass the probabilities of the actions of `model` to `recorder`."""
         self._recorder, self._model = recorder, model
         self._were_greedy = False
         if isinstance(model, DQN):
-            # SB3 runs the network only for greedy actions, which a hook detects. A second forward
-            # pass at each step to find the greedy action would cost more than recording.
+            # SB3 runs the network only if it selects greedy actions, so a hook can detect this. A
+            # second forward pass at each step would take longer than recording.
             model.q_net.register_forward_hook(self._on_forward)
 
     def __call__(self, actions: NDArray[Any]) -> None:

@@ -44,7 +44,7 @@ class Task:
         sim_options: Mapping[str, Any] | None = None,
         **settings: Any,
     ) -> Task:
-        """Return a task with the settings in `SIM_SETTINGS`, or else SB3's defaults.
+        """Return a task with the settings that `SIM_SETTINGS` has for the sim, else SB3's defaults.
 
         Args:
             sim: Short name or Gymnasium id.
@@ -64,7 +64,7 @@ class Task:
     def of_preset(
         cls, name: str, sim_options: Mapping[str, Any] | None = None, **settings: Any
     ) -> Task:
-        """Return a task with published settings, some of which may be replaced.
+        """Return a task with the published settings of a preset, some of them replaced.
 
         Raises:
             UnknownNameError: There is no such preset.
@@ -80,7 +80,7 @@ class Task:
 
         Args:
             folder: Folder of the run.
-            **settings: Settings that the user gave again; they must be equal to those of the run.
+            **settings: Settings that the user repeats; they must have the same values in the run.
 
         Raises:
             TrainingError: The folder has no online run.

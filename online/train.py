@@ -94,8 +94,8 @@ def train(
         OutputExistsError: `out` or `record` exists.
         SpaceError: The algorithm does not support these observations or actions.
         PolicyError: The networks of `policy` and the agent differ.
-        TrainingError: `out` cannot be written, is in use by another training process, or contains a
-            run of another task; or there is no run to resume.
+        TrainingError: `out` cannot be written, another training process uses it, or it contains a
+            run of another task. Or there is no run to resume.
     """
     if seeds < 1 or seed < 0:
         raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")

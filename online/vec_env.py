@@ -33,7 +33,7 @@ class BatchedVecEnv(VecEnv):
     """
 
     def __init__(self, env: Any) -> None:
-        """Adapt `env`, which has to reset itself in the step that ends an episode.
+        """Adapt `env`, which must reset an environment in the step that ends its episode.
 
         Args:
             env: `VectorEnv` with `metadata["autoreset_mode"]` SAME_STEP, whose `reset` accepts a
@@ -108,7 +108,7 @@ class BatchedVecEnv(VecEnv):
         return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of the batch; its environments have no separate attributes."""
+        """Set an attribute of the batch. Its environments have no separate attributes."""
         setattr(self.env, attr_name, value)
 
     def env_method(

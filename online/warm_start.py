@@ -27,16 +27,16 @@ from mcaprl.online.frames import (
 from mcaprl.recorder.dataset.dataset import Dataset
 
 _CHECKED = 64
-"""Number of observations for which copied weights must produce the same values."""
+"""Number of observations on which the copied network must produce the same values."""
 
 
 def fill_buffer(model: BaseAlgorithm, dataset: Dataset) -> int:
     """Copy logged transitions into the empty replay buffer of a model.
 
-    The buffer has a column of successive steps for each environment, so the log is split into one
-    part for each environment, all of equal length. An episode that continues beyond the end of a
-    part counts as truncated at that end. If the log has more transitions than the buffer can store,
-    the last ones are copied.
+    The buffer has a column of successive steps for each environment. Therefore, the log is split
+    into parts of equal length, one for each environment. An episode that continues beyond the end
+    of a part counts as truncated at that end. If the log has more transitions than the buffer can
+    store, only the last ones are copied.
 
     Args:
         model: Fresh model.

@@ -1,11 +1,11 @@
 """Stable-Baselines3's `.zip` files: written for plain SB3, read without executing code from them.
 
-SB3 writes an algorithm as a zip of `data` (JSON in which some values are pickled), `policy.pth`
-(weights) and more. SB3's loader unpickles; this module reads only the plain values and the weights.
-Files of this package also contain `mcaprl.json`, a full description of the policy, which SB3
-ignores. For files of plain SB3, the description is derived from the names of the weights and from
-the plain text that SB3 stores with each pickled space or class; dict observations are not supported
-in these files.
+SB3 writes an algorithm as a zip file with the members `data` (JSON in which some values are
+pickled), `policy.pth` (weights) and others. SB3's loader unpickles these values; this module reads
+only the plain values and the weights. Files of this package also contain `mcaprl.json`, a full
+description of the policy, which SB3 ignores. For files of plain SB3, the description is derived
+from the names of the weights, and from the plain text that SB3 stores with each pickled space or
+class. Dict observations are not supported in files of plain SB3.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def _check_size(weights: io.BytesIO, most: int) -> None:
 
 
 def _are_weights(found: object) -> bool:
-    """Return whether an object is a dict of tensors with enough storage for all their elements."""
+    """Return whether an object is a dict of tensors, each with enough storage for its elements."""
     return isinstance(found, dict) and all(
         isinstance(tensor, Tensor)
         and tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
