@@ -14,7 +14,7 @@ PURSUIT_M = 10.0
 ROOM_M = 30.0
 """Free distance ahead below which the pilot changes to the lane with the most free distance."""
 BESIDE_M = 9.0
-"""A car that is less than this distance behind the pilot also blocks its lane."""
+"""A car that follows at less than this distance also blocks its lane."""
 
 
 class HighwayPilot(ScriptedPilot[HighwayLaneEnv]):
