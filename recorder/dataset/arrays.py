@@ -114,7 +114,7 @@ def _registered_spaces(
 
 
 def with_fresh_times(columns: Transitions, start_ns: int, step_ns: int) -> Transitions:
-    """Replace the log_times: start at `start_ns`, and increase by `step_ns` per frame."""
+    """Replace the log_times by times that start at `start_ns` and increase by `step_ns`."""
     times = start_ns + np.arange(len(columns.log_time_ns)) * step_ns
     first, lengths = columns.first_frames.tolist(), columns.lengths.tolist()
     episodes = tuple(
@@ -196,7 +196,7 @@ def exactly(where: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[An
     with np.errstate(all="ignore"):
         cast = array.astype(dtype)
     if not np.array_equal(cast, array, equal_nan=dtype.kind == "f" and array.dtype.kind == "f"):
-        raise SpaceError(f"{where} is {array.dtype} and does not fit the space's {dtype} exactly")
+        raise SpaceError(f"{where} is {array.dtype} and cannot be converted exactly to {dtype}")
     return cast
 
 
@@ -217,5 +217,5 @@ def _last_steps(
 
 
 def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the bytes of each row; unlike floats, the bytes of two NaN values compare as equal."""
+    """Return the bytes of each row. Bytes of equal NaN values compare as equal, unlike floats."""
     return np.frombuffer(array.tobytes(), np.uint8).reshape(len(array), -1)

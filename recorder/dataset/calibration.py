@@ -23,7 +23,7 @@ from mcaprl.recorder.format.probability import is_impossible
 EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 0.8, 1.0)
 """Edges of the probability ranges (low, high]."""
 _STANDARD_ERRORS = 4.0
-"""Largest accepted excess of the mean of 1 / p over the number of actions, in standard errors."""
+"""The mean of 1 / p may exceed the number of actions by this many standard errors."""
 _LEAST_CHANCE = 1e-6
 """Lower limit for the chance that a log contains an action of its smallest probability.
 

@@ -159,7 +159,7 @@ class Conversions:
     def to_npz(
         self, path: str | Path, *, lossy: bool = False, overwrite: bool = False
     ) -> list[str]:
-        """Write NumPy arrays in one .npz file.
+        """Write the dataset as NumPy arrays in one .npz file.
 
         Args:
             path: Path of the file.
@@ -179,7 +179,7 @@ class Conversions:
 
     @staticmethod
     def from_npz(path: str | Path) -> Dataset:
-        """Read NumPy arrays in one .npz file.
+        """Read a dataset from the NumPy arrays in an .npz file.
 
         Raises:
             LogError: The files are missing, damaged or of another format.

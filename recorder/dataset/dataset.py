@@ -77,9 +77,9 @@ class Dataset(Conversions):
             behavior_probs: (N,) probability of each action under the behavior policy; default: NaN
                 (unknown).
             env_id: Gymnasium id of the environment.
-            observation_space: Space of the observations; default: that of the environment if
+            observation_space: Space of the observations; default: the environment's space if
                 `env_id` is registered, else unbounded Boxes with the arrays' shapes and dtypes.
-            action_space: Space of the actions; default: that of the environment if `env_id` is
+            action_space: Space of the actions; default: the environment's space if `env_id` is
                 registered, else Discrete up to the largest integer action, or an unbounded Box.
 
         Raises:
@@ -123,7 +123,7 @@ class Dataset(Conversions):
 
     @cached_property
     def metadata(self) -> dict[str, str]:
-        """The log's metadata: strings by name."""
+        """Metadata of the log, as strings by name."""
         return self._description.to_strings()
 
     @cached_property
@@ -268,7 +268,7 @@ class Dataset(Conversions):
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of the spaces and transitions; file names and compression do not affect it."""
+        """SHA-256 of the spaces and transitions, independent of file names and compression."""
         columns = self._transitions
         digest = hashlib.sha256(space_to_json(self.observation_space).encode())
         digest.update(space_to_json(self.action_space).encode())
@@ -324,7 +324,8 @@ class Dataset(Conversions):
     def split(self, fraction: float, *, seed: int = 0) -> tuple[Dataset, Dataset]:
         """Split the episodes at random into two datasets.
 
-        Both keep the order of the episodes. With two or more episodes, neither is empty.
+        Both parts keep the order of the episodes. If there are two or more episodes, neither part
+        is empty.
 
         Args:
             fraction: Share of the episodes in the first part, between 0 and 1 (exclusive).
@@ -365,7 +366,9 @@ class Dataset(Conversions):
         *,
         tensors: Literal["columns", "lists"] = "columns",
     ) -> pyarrow.Table:
-        """Return a PyArrow table with one row per transition or per episode. Extra: `tables`.
+        """Return a PyArrow table with one row per transition or per episode.
+
+        This method requires the extra `tables`.
 
         Args:
             table: `transitions` or `episodes`.
@@ -393,7 +396,7 @@ class Dataset(Conversions):
     def to_pandas(
         self, table: Literal["transitions", "episodes"] = "transitions"
     ) -> pandas.DataFrame:
-        """Return a pandas DataFrame; see `to_arrow`. Extra: `tables`."""
+        """Return a pandas DataFrame; see `to_arrow`. Requires the extra `tables`."""
         return self.to_arrow(table).to_pandas()
 
     def __len__(self) -> int:
@@ -422,5 +425,5 @@ class Dataset(Conversions):
         return str(self.sources[0]) if self.sources else repr(self)
 
 
-# Public import path, for reprs and pickles.
+# Reprs and pickles contain this public import path.
 Dataset.__module__ = "mcaprl"

@@ -86,7 +86,7 @@ class Episode:
         )
 
 
-# Public import path, for reprs and pickles.
+# Reprs and pickles contain this public import path.
 Episode.__module__ = "mcaprl"
 
 

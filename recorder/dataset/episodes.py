@@ -143,7 +143,7 @@ class EpisodeTopic:
 def summaries(
     path: object, columns: Columns, lengths: NDArray[np.int64], recorded: list[EpisodeSummary]
 ) -> tuple[EpisodeSummary, ...]:
-    """Return one summary per episode; compute those that are not in `recorded`.
+    """Return one summary per episode; compute the summaries that are not in `recorded`.
 
     `lengths` (E,) contains the number of transitions of each episode, and `recorded` contains the
     summaries from `/rl/episode`.
@@ -172,7 +172,7 @@ def summaries(
 def summaries_of_records(
     columns: Columns, finals: NDArray[np.int64], lengths: NDArray[np.int64]
 ) -> Iterator[EpisodeSummary]:
-    """Compute the summaries of the episodes with final records at the rows `finals` (E,).
+    """Compute the summaries of the episodes whose final records are in the rows `finals` (E,).
 
     Fields that the records do not contain keep their defaults.
     """

@@ -1,11 +1,12 @@
 """Logs of other writers, without metadata: spaces are inferred from `/rl/step`.
 
-Such a log needs a topic `/rl/step` of CDR messages with the fields of `schema.py`, of any numeric
-type and in any order; other fields are ignored, and `behavior_prob` is optional. Vectors are in
-`observation`, or in `observation_<key>` for each key of a Dict space; images are on topics
-`/rl/observation/<key>`, with the log_times of the step records. The inferred spaces are unbounded
-Boxes; for integer actions, the space is Discrete up to the largest action. If there are both
-`observation` and `observation_<key>` fields, `observation` becomes the key `state`.
+Such a log needs a topic `/rl/step` of CDR messages. The messages have the fields that `schema.py`
+describes, in any order and with any numeric types. The field `behavior_prob` is optional, and other
+fields are ignored. Vectors are in `observation`, or in `observation_<key>` for each key of a Dict
+space; images are on topics `/rl/observation/<key>`, with the log_times of the step records. The
+inferred spaces are unbounded Boxes; for integer actions, the space is Discrete up to the largest
+action. If there are both `observation` and `observation_<key>` fields, `observation` becomes the
+key `state`.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ def _out_of_range(dataset: Dataset) -> Iterator[Problem]:
         if len(wrong):
             first = int(wrong[0])
             yield Problem(
-                f"{_count(len(wrong), 'element')} of {leaf.name} outside its space",
+                f"values of {_count(len(wrong), 'element')} of {leaf.name} are outside its space",
                 f"{_name(dataset, leaf, first)} has values from {column.low[first]:.4g} to"
                 f" {column.high[first]:.4g}, but bounds {low[first]:.4g} to {high[first]:.4g}",
                 "observations that are scaled by the bounds of the space are out of range",

@@ -69,7 +69,7 @@ class LogReader:
         """Metadata of the log; inferred from the first episode if another program wrote the log.
 
         Raises:
-            LogError: As for `read`, if the metadata is inferred.
+            LogError: The metadata must be inferred, and the first episode cannot be read.
         """
         return self._metadata or self.read(np.zeros(1, np.int64))._description
 
@@ -92,16 +92,16 @@ class LogReader:
         """Return the log_time of each record of the finished episodes, episode by episode.
 
         Raises:
-            LogError: As for `lengths`.
+            LogError: Records are missing or out of order, or the log has no finished episode.
         """
         times, frames = self._steps.times, int(self.lengths.sum()) + len(self.lengths)
         return (times if self._order is None else times[self._order])[:frames]
 
     def episode_summaries(self) -> list[EpisodeSummary]:
-        """Return the summary of each episode, read from `/rl/episode` if it has all of them.
+        """Return the summary of each episode, read from `/rl/episode` if it lists all episodes.
 
         Raises:
-            LogError: As for `read`.
+            LogError: Chunks are damaged, or records or fields are missing.
         """
         lengths = self.lengths
         ends = self.record_times()[np.cumsum(lengths + 1) - 1]
@@ -279,7 +279,7 @@ def _steps_of(reader: McapReader) -> Topic:
     if not channels:
         topics = ", ".join(sorted(channel.topic for channel in reader.channels.values())) or "none"
         raise NoStepsError(
-            f"{reader.path} has no topic {STEP_TOPIC}, hence no transitions (topics: {topics});"
+            f"{reader.path} has no topic {STEP_TOPIC} and thus no transitions (topics: {topics});"
             " to read a robot's bag, pass a mapping: --mapping (mapping= in Python)"
         )
     for schema in map(reader.schema_of, channels):

@@ -1,8 +1,8 @@
 """Manifest of a folder of logs: the files of one recording, written when all of them are complete.
 
 `manifest.json` is a JSON object with `manifest_version` ("1") and `files`, a list of objects with
-the `name`, `episodes`, `steps` and `size_bytes` of each log in its folder. Servers that cannot
-list a folder need it, and it shows that no file is missing.
+the `name`, `episodes`, `steps` and `size_bytes` of each log in its folder. A manifest is needed to
+read a folder from a server that cannot list folders. It also shows whether a file is missing.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def write_manifest(folder: Path, files: Sequence[LogFile]) -> Path:
     """Write the manifest of a folder, and return its path.
 
     Raises:
-        LogError: It cannot be written.
+        LogError: The manifest cannot be written.
     """
     path = folder / MANIFEST_NAME
     content = {"manifest_version": _VERSION, "files": [asdict(file) for file in files]}
@@ -78,7 +78,7 @@ def _content(name: str | Path) -> bytes:
 
 def _parsed(values: dict[str, Any]) -> LogFile:
     name = str(values["name"])
-    # A manifest from elsewhere must not name files outside its folder.
+    # The manifest may come from an untrusted source, so it must not name files outside its folder.
     if name != PurePosixPath(name).name or not name.endswith(".mcap") or "\\" in name:
         raise ValueError(f"{name!r} is not the name of a log in its folder")
     return LogFile(name, *(int(values[key]) for key in ("episodes", "steps", "size_bytes")))

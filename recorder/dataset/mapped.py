@@ -60,7 +60,7 @@ class ImageFile:
 
 
 class MappedImages:
-    """An array of (F, *shape) uint8 images on disk; indexing reads images, `rows` does not.
+    """An array of (F, *shape) uint8 images on disk; indexing reads images, `rows` selects them.
 
     Attributes:
         shape: Shape of the corresponding array.

@@ -34,8 +34,8 @@ def open_logs(
     """Read logs, or a selection of their columns and episodes.
 
     The CRCs of all chunks that are read are checked. If a log was cut off or is still being
-    written, its finished episodes are read, with a warning. If there are several logs, those
-    without a finished episode are skipped, with a warning.
+    written, its finished episodes are read, with a warning. If there are several logs, logs without
+    a finished episode are skipped, with a warning.
 
     Args:
         data: A file, a folder of `.mcap` files, its `manifest.json`, a glob, a URL, or a sequence

@@ -59,7 +59,7 @@ class Statistics:
 
     @property
     def mean_return(self) -> float:
-        """Mean return over episodes; NaN if there are none."""
+        """Mean return over episodes; NaN if there are no episodes."""
         return float(self.returns.mean()) if len(self.returns) else float("nan")
 
 

@@ -39,8 +39,8 @@ def transition_table(
 ) -> Any:
     """Return a table with one row per transition, with its observation and next observation.
 
-    The column `info.<name>` contains the info that came with the next observation; null if there
-    was none.
+    The column `info.<name>` contains the info that came with the next observation. It is null if
+    the environment returned no info.
 
     With `tensors="lists"`, columns share their memory with the dataset where Arrow stores the
     values in the same way. This is always the case for actions, rewards and probabilities.
@@ -166,7 +166,7 @@ def _shapes(columns: Transitions, leaves: Sequence[Leaf]) -> dict[str, tuple[int
 
 
 def step_columns(columns: Transitions) -> dict[str, NDArray[Any]]:
-    """Return the columns (N,) of a table of transitions that are numbers or flags, by name."""
+    """Return the numeric and boolean columns (N,) of a table of transitions, by name."""
     lengths = columns.lengths
     return {
         "episode": np.repeat(np.arange(len(lengths)), lengths),

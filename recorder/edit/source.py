@@ -130,7 +130,7 @@ class FinishedLog:
     def need_steps(self) -> None:
         """Raise NoStepsError if the file has no `/rl/step`."""
         if self._log is None:
-            raise NoStepsError(f"{self.path} has no topic {STEP_TOPIC} and therefore no episodes")
+            raise NoStepsError(f"{self.path} has no topic {STEP_TOPIC} and thus no episodes")
 
     def summaries(self) -> list[EpisodeSummary]:
         """Return the summary of each episode.

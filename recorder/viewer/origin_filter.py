@@ -142,7 +142,7 @@ class OriginFilter:
 
 
 async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Copy bytes until one side closes, with backpressure."""
+    """Copy bytes until one side closes; wait if the receiver is slow."""
     try:
         while data := await reader.read(_BLOCK_BYTES):
             writer.write(data)

@@ -1,4 +1,4 @@
-"""Conversion of arrays per episode, as most formats store them, to a dataset."""
+"""Conversion of the arrays of each episode, which most formats store, to a dataset."""
 
 from __future__ import annotations
 

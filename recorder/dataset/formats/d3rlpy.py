@@ -219,7 +219,7 @@ def _flags(episode: Mapping[str, Any]) -> tuple[NDArray[np.float32], NDArray[np.
 def _dataset_of(
     episodes: Sequence[Mapping[str, Any]], action_space: spaces.Space[Any] | None, where: object
 ) -> Dataset:
-    """Convert d3rlpy's episodes to a dataset; infer the spaces, except a given `action_space`."""
+    """Convert d3rlpy's episodes to a dataset; infer the spaces, except `action_space` if given."""
     if not episodes:
         raise LogError(f"{where} has no episodes")
     frames = [_frames(episode) for episode in episodes]

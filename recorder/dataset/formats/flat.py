@@ -1,4 +1,4 @@
-"""Datasets from flat arrays of transitions, under the names that other tools use."""
+"""Datasets from flat arrays of transitions with the names that other tools use."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def image_settings(shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
-    """Return the arguments of `create_dataset` for images (N, H, W, C): chunks of whole images."""
+    """Return arguments of `create_dataset` that store (N, H, W, C) in chunks of whole images."""
     frame_bytes = math.prod(shape[1:]) * dtype.itemsize
     rows = max(1, min(shape[0], _CHUNK_BYTES // frame_bytes))
     return {"chunks": (rows, *shape[1:]), "compression": "lzf"}
@@ -218,7 +218,7 @@ def _identifier(parent: Any, name: str) -> Any:
 
 
 def _objects(array: Any, place: str) -> NDArray[Any]:
-    """Read an array of strings, or of arrays of different lengths."""
+    """Read an array whose elements are strings, or arrays of different lengths."""
     if import_extra("h5py", EXTRA).check_string_dtype(array.dtype) is None:
         return np.asarray(array[()])
     try:

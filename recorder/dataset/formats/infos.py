@@ -45,7 +45,7 @@ def infos_of(dataset: Dataset) -> Mapping[str, Any]:
 
 
 def stored_infos(infos: Mapping[str, Any]) -> tuple[dict[str, StoredInfo], list[str]]:
-    """Return the infos to store by name, and one sentence for each that is left out."""
+    """Return the infos to store by name, and one sentence for each info that is left out."""
     found, lost = {}, []
     for name, values in infos.items():
         stored = _stored(values)
@@ -64,7 +64,7 @@ def masked(
     Args:
         values: (F, *shape) stored values.
         is_missing: (F,) bool; whether the row has no info.
-        dtype: Data type of the info; default: that of the values.
+        dtype: Data type of the info; default: the dtype of the values.
     """
     dtype = values.dtype if dtype is None else dtype
     mask = np.broadcast_to(is_missing.reshape(-1, *[1] * (values.ndim - 1)), values.shape)

@@ -85,7 +85,7 @@ def _check_follows(here: Any, there: Any, where: str) -> None:
 
 
 def _bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the bytes of an array; unlike floats, the bytes of two NaN values compare as equal."""
+    """Return the bytes of an array. Bytes of equal NaN values compare as equal, unlike floats."""
     return np.frombuffer(array.tobytes(), np.uint8)
 
 

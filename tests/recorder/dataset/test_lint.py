@@ -67,8 +67,8 @@ def test_a_valid_dataset_has_no_findings() -> None:
         (
             changed("next_observations", (5, 1), 1.5),
             "problem",
-            "1 element of observation outside its space (observation[1] has values from 0.07143 to"
-            " 1.5, but bounds 0 to 1)",
+            "values of 1 element of observation are outside its space (observation[1] has values"
+            " from 0.07143 to 1.5, but bounds 0 to 1)",
         ),
         ({"rewards": np.zeros(6)}, "problem", "every reward is 0 (all steps)"),
         (

@@ -131,7 +131,7 @@ def default_features() -> list[Feature]:
 
 
 def feature_of(name: str, leaf: Leaf, names: Sequence[str] = (), *, video: bool = False) -> Feature:
-    """Return the feature of a leaf of a space.
+    """Return the feature that stores a leaf of a space.
 
     Args:
         name: Name of the feature.
@@ -220,7 +220,7 @@ def _stack(name: str, images: list[NDArray[Any]]) -> NDArray[Any]:
 
 
 def _numbers(name: str, column: Any) -> NDArray[Any]:
-    """Return the numbers of a column of nested lists, flattened."""
+    """Return the numbers in a column of nested lists as a flat array."""
     types = import_extra("pyarrow", "tables").types
     while True:
         if column.null_count:

@@ -231,7 +231,7 @@ def _frame_times(times: NDArray[np.int64], part: _Part, step_ns: int) -> NDArray
 
 
 def _options(files: Files, episode: int) -> str:
-    """Return reset options with the tasks of an episode, as JSON; empty if it has no tasks."""
+    """Return an episode's tasks as JSON of reset options; empty if the episode has no tasks."""
     tasks = list(files.episodes[episode].get("tasks") or ())
     if not tasks:
         return ""

@@ -84,7 +84,7 @@ def _of_numbers(numbers: NDArray[np.float64]) -> Stats:
     """Return the statistics (D,) of rows (N, D)."""
     limit = max(_MAX_ELEMENTS // numbers.shape[1], 1)
     few = numbers if len(numbers) <= limit else numbers[_spread(len(numbers), limit)]
-    # NaN and infinite values have no finite mean; NumPy warns about them.
+    # NumPy warns about NaN and infinite values, which have no finite mean.
     with np.errstate(all="ignore"):
         quantiles = np.quantile(few, list(QUANTILES.values()), axis=0)
         return {

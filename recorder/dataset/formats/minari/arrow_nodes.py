@@ -108,7 +108,7 @@ def _infos_below(struct: Any, path: tuple[str, ...]) -> Iterator[tuple[str, NDAr
 
 
 def _plain_array(values: list[Any]) -> NDArray[Any]:
-    """Convert lists or strings to an array; it is empty if their lengths or types differ."""
+    """Convert lists or strings to an array, which is empty if their lengths or types differ."""
     if any(value is None for value in values):
         return np.empty(0)
     try:
