@@ -72,7 +72,8 @@ __all__ = [
     "verify",
 ]
 
-# These names are imported on first use: their modules import the log writer, torch or numba.
+# These names are imported on first use, because their modules import the log writer, torch or
+# numba.
 __getattr__ = lazy_attributes(
     __name__,
     {f"mcaprl.api.{name}": [name] for name in ("annotate", "estimate", "evaluate", "record")}

@@ -1,4 +1,4 @@
-"""Errors caused by data or by a user's request. Messages state the problem, place and remedy.
+"""Errors caused by data or by a user's request. Messages name the problem, place and remedy.
 
 McaprlError
 ├── UsageError            the request is invalid                       (exit code 2)
@@ -59,7 +59,7 @@ class UnknownNameError(UsageError):
         self._arguments = (kind, name, names, more)
 
     def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, str, list[str], list[str]]]:
-        """Return the constructor arguments for pickle; by default, pickle passes the message."""
+        """Return the constructor's arguments for pickle, which would otherwise pass the message."""
         return type(self), self._arguments
 
 

@@ -31,7 +31,7 @@ _STYLE: Final = {
     "legend.frameon": False,
     "font.size": 9,
 }
-# A `$` in a text from data does not begin a formula.
+# Texts from data may contain `$`, which must not begin a formula.
 _LITERAL: Final = {"text.parse_math": False}
 _MAX_LABEL: Final = 200
 _MAX_TICK_LABEL: Final = 40

@@ -1,9 +1,9 @@
 """Locks on files and folders, and atomic replacement of files.
 
-A file is written in a hidden work folder beside its target, `.NAME.part`, which is locked while its
-writer runs. When the file is complete and synced to disk, it replaces the target atomically. If the
-writer is killed, the target has either its old or its new content, and the next writer removes the
-work folder.
+A file is written in a hidden work folder beside its target. This folder, `.NAME.part`, is locked
+while its writer runs. When the file is complete and synced to disk, it replaces the target
+atomically. If the writer is killed, the target has either its old or its new content. The next
+writer removes the work folder.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _TAKEN = "{} is being written by another process; wait until it ends, or choose 
 
 
 def try_lock(descriptor: int) -> bool:
-    """Lock an open file or folder for this process; return False if another one has locked it.
+    """Lock an open file or folder; return False if another process has locked it.
 
-    The lock is advisory and ends when the file is closed. Systems without `flock`, such as Windows
-    and some network file systems, have no locks.
+    The lock is advisory and ends when the file is closed. On systems without `flock`, such as
+    Windows and some network file systems, nothing is locked, and the result is True.
     """
     if sys.platform != "win32":
         try:
@@ -84,7 +84,7 @@ def check_target(path: Path, *, overwrite: bool) -> None:
     """Check that a path is new, or belongs to a regular file that may be replaced.
 
     Raises:
-        OutputExistsError: The file exists, and `overwrite` is not set; or the path is that of a
+        OutputExistsError: The file exists and `overwrite` is not set, or the path belongs to a
             symbolic link, folder, device or FIFO.
         LogError: Another writer has locked the file.
     """
@@ -108,7 +108,7 @@ def check_target(path: Path, *, overwrite: bool) -> None:
 
 @contextmanager
 def locked_file(path: Path) -> Iterator[None]:
-    """Lock a file against other writers, unless it does not exist or cannot be read.
+    """Lock a file against other writers. Do nothing if it does not exist or cannot be read.
 
     Raises:
         LogError: Another writer has locked the file.
@@ -129,7 +129,7 @@ def locked_file(path: Path) -> Iterator[None]:
 
 
 def open_at_once(path: Path) -> int:
-    """Open a file for reading without waiting for the writer of a FIFO."""
+    """Open a file for reading; if it is a FIFO, do not wait for its writer."""
     return os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
 
 
@@ -187,7 +187,7 @@ def remove_leftover(path: Path) -> None:
 
 
 def _remove_unlocked(parent: Path, prefix: str) -> None:
-    """Remove the work folders that killed concurrent writers left."""
+    """Remove the work folders of concurrent writers that were killed."""
     for folder in parent.iterdir():
         if folder.name.startswith(prefix) and folder.name.endswith(".part"):
             with suppress(OSError, LogError), locked_folder(folder):
@@ -219,8 +219,8 @@ def replacing(
 ) -> Iterator[Path]:
     """Yield a path in a work folder; move the file written there to `path` at the end.
 
-    The content is synced to disk before the move. If the body raises, or the file was locked or
-    created by another writer in the meantime, `path` is left as it was.
+    The content is synced to disk before the move. `path` is left as it was if the body raises an
+    error, or if another writer has locked or created the file in the meantime.
 
     Args:
         path: File to create or replace; missing folders are created.
@@ -261,7 +261,8 @@ def replacing_folder(
 ) -> Iterator[Path]:
     """Yield an empty folder in a work folder; move it to `path` at the end.
 
-    The files are synced to disk before the move. If the body raises, `path` is left as it was.
+    The files are synced to disk before the move. If the body raises an error, `path` is left as it
+    was.
 
     Args:
         path: Folder to create or replace.
@@ -331,7 +332,7 @@ def size_of(path: Path) -> int:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON; refuse nesting that is deeper than any file of this package needs.
+    """Parse JSON; refuse texts that are nested more deeply than the files of this package.
 
     Raises:
         ValueError: The text is not JSON, or is nested too deeply.
@@ -351,7 +352,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def json_text(value: Any) -> str:
-    """Return indented JSON; NaN and infinities, which JSON does not have, become null."""
+    """Return indented JSON. NaN and infinities become null, because JSON cannot express them."""
     return json.dumps(_finite(value), indent=2)
 
 

@@ -9,13 +9,13 @@ from typing import Any
 
 
 def lazy_attributes(package: str, sources: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a package that imports its public names on first use.
+    """Return a function `__getattr__` that imports a package's public names on first use.
 
     Args:
         package: Name of the package.
         sources: Dict from the full name of each module to the public names that the module defines.
-            If a name is the last part of the module's own name, as `torch` in `mcaprl.torch`, the
-            name refers to the module.
+            If a name equals the last part of the module's name, such as `torch` in `mcaprl.torch`,
+            it refers to the module.
     """
     modules = {name: module for module, names in sources.items() for name in names}
 

@@ -3,7 +3,7 @@
 image  -> convolutions -> layer -+
 vector -----------------> layer -+-> layers -> outputs
 
-Two encoders of images are available, which `ENCODERS` describes. `nature` has the convolutions of
+`ENCODERS` lists the two encoders of images. `nature` has the convolutions of
 "Human-level control through deep reinforcement learning" (https://doi.org/10.1038/nature14236).
 `compact` first averages squares of pixels, so that the image's shorter edge has about 42 pixels; it
 has two small convolutions. A gradient step takes a fraction of the time of a step with `nature`.
@@ -30,7 +30,7 @@ _MAX_IMAGES = 10_000
 """Maximum number of images, evenly spaced, for computing a mean image."""
 _IMAGES_AT_ONCE = 256
 _SMALLEST_VARIANCE = 1e-6
-"""Largest variance of pixels (0 to 255) at which images count as equal; because of rounding errors,
+"""Images count as equal up to this variance of their pixels (0 to 255). Because of rounding errors,
 the computed variance of equal images may be above 0."""
 
 
@@ -114,7 +114,7 @@ class Architecture:
         return self.channels or ENCODERS[self.encoder].channels
 
     def features(self, image_shape: Sequence[int]) -> int:
-        """Return how many features the convolutions output for an image (height, width, ...)."""
+        """Return the number of features of the convolutions for an image (height, width, ...)."""
         return ENCODERS[self.encoder].pixels(image_shape) * self.all_channels[-1]
 
 
@@ -157,7 +157,7 @@ class NetworkSettings(Settings):
         self._require("channels", fits or not self.channels, allowed)
 
     def architecture_for(self, channels: Iterable[int]) -> Architecture:
-        """Return the network's architecture, given the channels of each image before stacking."""
+        """Return the architecture for images that have these numbers of channels in one frame."""
         encoder = choose_encoder(self.encoder, self.channels, channels)
         return Architecture(self.hidden, self.channels, self.layer_norm, encoder=encoder)
 
@@ -185,8 +185,8 @@ class ImageInput:
     def normalized_to(self, images: NDArray[np.uint8]) -> ImageInput:
         """Return the input with the mean image as shift and the standard deviation as scale.
 
-        All pixels of the images (N, height, width) or (N, height, width, channels) share one scale,
-        so pixels that hardly change stay small.
+        All pixels of the images (N, height, width) or (N, height, width, channels) share one scale.
+        Pixels that hardly change therefore keep small values.
         """
         used = np.linspace(0, len(images) - 1, min(len(images), _MAX_IMAGES)).astype(np.int64)
         total = np.zeros(self.shape)
@@ -275,7 +275,7 @@ class Network(Trunk):
 
     @torch.no_grad()
     def scale_outputs(self, factor: float) -> None:
-        """Multiply all outputs by a factor: they are linear in the weights of the last layers."""
+        """Multiply all outputs by a factor, by scaling the weights of the last layers."""
         for layer in last_layers(self.head):
             layer.weight.mul_(factor)
             layer.bias.mul_(factor)
@@ -284,7 +284,7 @@ class Network(Trunk):
 class Convolutions(nn.Module):
     """Convolutions of an encoder: images (B, height, width, channels) to features (B, n_features).
 
-    An image is averaged over squares of pixels first, unless it has the averaged size already.
+    Images are first averaged over squares of pixels, except images that already have this size.
 
     Attributes:
         shift: Tensor (channels, height, width) that is subtracted from the averaged pixels.
@@ -328,7 +328,7 @@ class Convolutions(nn.Module):
         return cast(Tensor, self.layers((pixels - self.shift) / self.scale))
 
     def _averaged(self, pixels: Tensor) -> Tensor:
-        """Average squares of pixels; this takes a fifth of the time of torch's average pooling."""
+        """Average squares of pixels, in a fifth of the time that torch's average pooling takes."""
         pool = self._pool
         height, width = (edge // pool * pool for edge in pixels.shape[-2:])
         rows = pixels[..., 0:height:pool, :]

@@ -10,7 +10,7 @@ from typing import Literal, Protocol, TypeVar
 
 Severity = Literal["problem", "note"]
 LISTED = 10
-"""Maximum number of listed findings of one kind; further ones are only counted."""
+"""Maximum number of listed findings of one kind; further findings are only counted."""
 # Descriptions contain texts from the file, so the number of kinds must be limited, too.
 _MAX_KINDS = 100
 _OTHERS = "other findings"

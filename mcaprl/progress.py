@@ -58,7 +58,7 @@ def terminal_bar(description: str, total: int | None) -> Iterator[Advance]:
 
 
 class _ProgressLines:
-    """Progress that is printed as lines to stderr; short operations print no line."""
+    """Progress that is printed to stderr line by line; short operations print nothing."""
 
     def __init__(self, description: str, total: int | None) -> None:
         self._description, self._total = description, total

@@ -24,7 +24,7 @@ from mcaprl.errors import LogError, UsageError, import_extra
 from mcaprl.files import write_atomically
 
 CACHE_VARIABLE = "MCAPRL_CACHE"
-"""Environment variable with the folder in which fetched parts are kept for later commands."""
+"""Name of the environment variable for the folder that keeps fetched parts for later commands."""
 BLOCK_BYTES = 2**16
 # Blocks at most `_LEAST_GAP` apart are fetched together; ranges above `_MOST_BYTES` are divided.
 _LEAST_GAP, _MOST_BYTES = 2 * BLOCK_BYTES, 8 * 2**20
@@ -52,7 +52,7 @@ class RemoteFile:
     """
 
     def __init__(self, url: str) -> None:
-        """Ask for the size of the file, and create the local file.
+        """Request the size of the remote file, and create the local file.
 
         Raises:
             LogError: There is no such file, or it cannot be reached.
@@ -115,10 +115,10 @@ class RemoteFile:
                 write_atomically(self._blocks_path, np.packbits(self._has).tobytes(), LogError)
 
     def check_unchanged(self) -> None:
-        """Check that the remote file is still the one that was opened.
+        """Check that the remote file has not changed since it was opened.
 
         Raises:
-            LogError: It has changed, or cannot be reached.
+            LogError: The file has changed, or cannot be reached.
         """
         with _Errors(f"cannot read {self.url}"):
             facts = self._system.info(self._path)
@@ -164,7 +164,7 @@ class RemotePath(type(Path())):  # type: ignore[misc]
 
 
 def as_path(name: str | Path, *, whole: bool = False) -> Path:
-    """Return the path of a local file, or of the local copy of a remote one.
+    """Return the path of a local file, or of the local copy of a remote file.
 
     Args:
         name: Path, or URL.
@@ -204,7 +204,7 @@ def find_remote(url: str) -> list[RemotePath]:
 
 
 def upload(path: str | Path, url: str) -> None:
-    """Copy a file to a URL; the name of the copy ends with `.part` until it is complete.
+    """Copy a file to a URL. Until the copy is complete, its name ends with `.part`.
 
     Args:
         path: Local file.
@@ -290,7 +290,7 @@ def _divided(start: int, stop: int) -> list[Range]:
 
 
 def _version_of(facts: dict[str, Any]) -> str:
-    """Return an identifier of a file's version: the ETags and times that the server reports."""
+    """Return the ETags and times that the server reports for a file; they identify its version."""
     names = ("ETag", "etag", "mtime", "LastModified", "last_modified", "created", "generation")
     return " ".join(str(facts[name]) for name in names if facts.get(name) is not None)
 

@@ -38,7 +38,7 @@ Curve = dict[str, NDArray[np.float64]]
 class RunSummary:
     """Result of training one seed.
 
-    The first training of a run is a session, and so is each resumption of the run.
+    A session is the first training of a run, or a training that resumes it.
 
     Attributes:
         folder: Folder of the seed, RUN/seed-K.
@@ -132,7 +132,7 @@ def open_run(folder: Path, identity: RunIdentity, resume: bool, **source: Any) -
     Args:
         folder: Folder of the run.
         identity: Identity of the run.
-        resume: Whether to continue the run in the folder, even if it ended before its first write.
+        resume: Whether to continue the run in the folder, even if it has not written a file yet.
         **source: Further entries of `config.json`.
 
     Raises:
@@ -204,7 +204,7 @@ def policy_files(path: Path) -> list[Path]:
     """Return the existing policy files of a run, sorted by seed.
 
     Args:
-        path: Run folder, folder of one seed, or a file, which is returned as it is.
+        path: Run folder, folder of one seed, or a policy file, whose path is returned unchanged.
     """
     if path.is_file():
         return [path]
@@ -233,12 +233,12 @@ def read_curve(path: Path) -> Curve:
 
 
 def read_curves(run: Path, name: str) -> list[Curve]:
-    """Read the file NAME, `metrics.csv` or `curve.csv`, of each seed that has it."""
+    """Read `metrics.csv` or `curve.csv` of each seed that has this file."""
     return [read_curve(path) for path in sorted(run.glob(f"seed-*/{name}"))]
 
 
 def _leftovers(folder: Path) -> list[Path] | None:
-    """Return the files of a run without a checkpoint; None if the folder contains other files."""
+    """Return the files of a run without a checkpoint, or None if there are other files."""
     if not folder.exists():
         return []
     if not folder.is_dir():
@@ -252,6 +252,6 @@ def _leftovers(folder: Path) -> list[Path] | None:
 
 def _is_leftover(path: Path) -> bool:
     if path.is_dir():
-        # Work folder of a file that a killed run was about to write.
+        # This is the work folder of a file that a killed run was writing.
         return path.name.startswith(".") and path.name.endswith(".part")
     return path.name in (CONFIG_NAME, METRICS_NAME) or path.name.startswith("events.out.tfevents")

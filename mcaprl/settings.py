@@ -1,6 +1,6 @@
 """Settings of algorithms: frozen dataclasses that validate themselves, with help for each field.
 
-The string under a field describes the field and is the help of its command-line option.
+The string below a field describes the field. It is also the help of the command-line option.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def flag(name: str) -> str:
 
 
 def field_help(config_type: type) -> dict[str, str]:
-    """Return a dict from the field names of a dataclass to help texts, inherited fields first."""
+    """Return the help texts of a dataclass by the names of the fields, inherited fields first."""
     assert is_dataclass(config_type)
     lines: dict[str, str] = {}
     for base in reversed(config_type.__mro__):

@@ -23,7 +23,7 @@ _Kind = Literal["message", "done", "interrupted", "error"]
 _STOPS = [
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 ]
-# Signal that ends a worker: not SIGINT, which background processes ignore; Windows has no SIGTERM.
+# Signal that ends a worker. Background processes ignore SIGINT, and Windows has no SIGTERM.
 _END = signal.SIGINT if sys.platform == "win32" else signal.SIGTERM
 
 
@@ -31,7 +31,7 @@ class WorkerEndedError(Exception):
     """A worker ended before its task was done.
 
     Attributes:
-        index: Index of its request.
+        index: Index of the worker's request.
         cause: Cause of the end, such as `was killed by SIGKILL`.
     """
 
@@ -66,7 +66,8 @@ def run_workers(
         Exception: The task of a worker raised it.
     """
     context = multiprocessing.get_context("spawn")
-    # Only this process has the write end `held`, so the pipe closes when this process ends.
+    # Only this process has `held`, the write end of the pipe. Therefore, the pipe closes when this
+    # process ends.
     ours, held = context.Pipe(duplex=False)
     processes = []
     open_pipes: dict[Connection, int] = {}
@@ -99,7 +100,7 @@ def run_workers(
     finally:
         held.close()
         for messages in open_pipes:
-            # Drain the pipe: a worker that is blocked on a full pipe would not end.
+            # Drain the pipe, because a worker that is blocked on a full pipe would not end.
             with suppress(EOFError, OSError):
                 while True:
                     messages.recv_bytes()
@@ -110,7 +111,7 @@ def run_workers(
 def _work(
     task: Callable[[T, Callable[[Any], None]], None], request: T, parent: Connection, to: Connection
 ) -> None:
-    """Run a task; send its messages, and finally its outcome."""
+    """Run a task; send its messages, and then its outcome."""
     outcome: tuple[_Kind, Any]
     try:
         for number in _STOPS:
@@ -160,7 +161,7 @@ def _interrupt_once(*_: Any) -> None:
 
 
 def _ignore_stops() -> None:
-    # SIG_IGN is not used: with it, Python prints an error for a signal that has already arrived.
+    # Do not use SIG_IGN, because Python then prints an error for a signal that has already arrived.
     for number in _STOPS:
         signal.signal(number, _ignore)
 
@@ -171,11 +172,11 @@ def _ignore(*_: Any) -> None:
 
 @contextmanager
 def _signals_blocked() -> Iterator[None]:
-    """Block signals in this thread and the processes it starts; the processes unblock them."""
+    """Block signals in this thread and in new processes, which unblock them when they are ready."""
     if sys.platform == "win32":
         yield
         return
-    # The resource tracker unblocks the signals when it starts, so start it first.
+    # Start the resource tracker first, because it unblocks the signals when it starts.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
     try:

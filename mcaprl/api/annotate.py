@@ -30,7 +30,8 @@ class Annotation:
         out: Path of the copy.
         steps: Number of steps of the log.
         topics: Topic of each policy's values, by the policy's path.
-        scene: Numbers of episodes and steps that the scene was added to; None without a scene.
+        scene: Number of episodes and number of steps to which the scene was added; None without a
+            scene.
     """
 
     out: Path
@@ -56,7 +57,7 @@ def annotate(
 ) -> Annotation:
     """Copy a log, and add values of policies or the scene of the sim to each step.
 
-    With a mapping, `file` is a bag, which is first converted to a log, as `convert` does.
+    With a mapping, `file` is a bag, which is first converted to a log as by `convert`.
 
     Args:
         file: Path of the log.
@@ -77,7 +78,7 @@ def annotate(
         UsageError: Nothing is requested, the log already has a requested topic, or `gamma` is out
             of range.
         UnknownNameError: There is no such policy.
-        PolicyError: A policy was trained on spaces other than the log's.
+        PolicyError: A policy was trained on other spaces than those of the log.
         LogError: The log cannot be read, or the sim does not reproduce it.
         OutputExistsError: `out` exists.
     """

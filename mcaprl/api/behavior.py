@@ -27,9 +27,9 @@ def estimate_behavior(
     """Estimate the probability of each logged action under the policy that took it.
 
     Most robots do not log these probabilities, but estimators with importance weights need them.
-    The episodes are split into folds. For each fold, a classifier is trained on the other folds,
-    except for some of their episodes, on which the classifier is calibrated. It then predicts the
-    actions of the fold.
+    The episodes are split into folds. For each fold, a classifier is trained on most episodes of
+    the other folds and calibrated on the rest of them. The classifier then predicts the actions of
+    the fold.
 
     Args:
         data: Dataset, file, folder or glob of logs, or several of them; actions are discrete.
@@ -43,7 +43,7 @@ def estimate_behavior(
         progress: Function that opens a progress bar.
 
     Returns:
-        The dataset with the estimates, which are marked as such, and their calibration.
+        The dataset with the estimates, which are marked as estimates, and their calibration.
 
     Raises:
         SpaceError: The actions are not discrete.

@@ -1,4 +1,4 @@
-"""The options of commands that can run on a Ray cluster."""
+"""Options of the commands that can run on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ClusterOptions:
     address: str | None
 
     def check(self, **others: int | None) -> None:
-        """Check these options, and numbers that require Ray, by the name of their argument.
+        """Check the options. Also check numbers that require Ray; they have their argument's name.
 
         Raises:
             UsageError: An option is given without `ray`, or a number is below 1.
@@ -38,7 +38,7 @@ class ClusterOptions:
                 raise UsageError(f"{flag(name)} requires --ray")
 
     def connected(self) -> AbstractContextManager[Any]:
-        """Connect to the cluster for the duration of the context; errors as `ray.cluster`."""
+        """Connect to the cluster within the context; raise the same errors as `ray.cluster`."""
         from mcaprl.ray.cluster import cluster
 
         return cluster(self.address, workers=self.workers)

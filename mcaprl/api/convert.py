@@ -88,9 +88,9 @@ def convert(
         upload: URL to which the written file is copied when it is complete.
 
     Raises:
-        UsageError: The format to write is not clear; or the mapping does not fit the bag, and the
-            message names file, line and key.
-        LogError: The source cannot be read, or has no episode; or `out` cannot be written.
+        UsageError: The format to write is not clear, or the mapping does not fit the bag. In the
+            second case, the message names file, line and key.
+        LogError: The source cannot be read, it has no episode, or `out` cannot be written.
         SpaceError: The format cannot hold a space or dtype, and `lossy` is not set.
         OutputExistsError: `out` exists.
         MissingExtraError: The packages of an extra are not installed.
@@ -143,7 +143,7 @@ def suggest_mapping(bag: Paths) -> str:
 
 
 def _plain(observation: Any, k: int) -> Any:
-    """Return observation k of a batch as JSON types; a text describes each image."""
+    """Return observation k of a batch as JSON types; images are replaced by a description."""
     if isinstance(observation, dict):
         return {name: _plain(part, k) for name, part in observation.items()}
     row = observation[k]

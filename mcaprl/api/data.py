@@ -45,8 +45,9 @@ def open_data(
     Args:
         data: A file, a folder of `.mcap` files, its `manifest.json`, a glob, or a sequence of
             these. The logs must have the same spaces; their episodes are concatenated in the order
-            of the files. Or one dataset of another tool; see docs/formats.md. With a mapping: MCAP
-            files of any writer, rosbag2 folders and databases, or ROS 1 bags.
+            of the files. `data` can also be one dataset of another tool; see docs/formats.md. With
+            a mapping, `data` can be MCAP files of any writer, rosbag2 folders and databases, or ROS
+            1 bags.
         mapping: Mapping that says which topics and fields of a bag are observations, actions,
             rewards and episode ends; see docs/bags.md. None for logs of this package.
         trust_code: Whether the mapping may name a Python function, which is imported.
@@ -57,9 +58,9 @@ def open_data(
         episodes: Index, slice or indexes of the episodes to read, counted over all logs and
             returned in the logs' order. Default: all episodes.
         images: Storage of image observations: `memory`, `mapped` or `auto`. `mapped` leaves images
-            on disk and reads them when they are indexed. If the log is compressed, this needs an
-            uncompressed copy of the images, which is written once beside the log. `auto` is
-            `mapped` if the images would take more than half of the free memory, else `memory`.
+            on disk and reads them when they are indexed. For a compressed log, `mapped` writes an
+            uncompressed copy of the images beside the log once. `auto` is `mapped` if the images
+            would take more than half of the free memory, else `memory`.
         threads: Number of threads that read chunks of a file.
 
     Raises:
@@ -135,14 +136,14 @@ def opened(
     trust_code: bool = False,
     threads: int = 1,
 ) -> Dataset:
-    """Return a dataset unchanged, or read it from paths; see `open_data`."""
+    """Return a dataset unchanged, or read it from paths with `open_data`."""
     if isinstance(data, Dataset):
         return data
     return open_data(data, mapping=mapping, trust_code=trust_code, threads=threads)
 
 
 def named(data: Data) -> str:
-    """Return the text by which tables identify the data.
+    """Return the name of the data in tables.
 
     >>> named("lane.mcap"), named(["a.mcap", "b.mcap"])
     ('lane.mcap', 'a.mcap, b.mcap')

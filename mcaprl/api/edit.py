@@ -17,22 +17,23 @@ def merge(logs: Paths, out: str | Path, *, shift: bool = False, overwrite: bool 
 
     The episodes of the new log are in the order of their times. The logs must be finished, and have
     the same spaces, environment, names of observations and actions, and step duration. Other
-    metadata fields are empty in the new log if they differ between the logs. A message that several
-    logs contain with the same time and bytes is written once.
+    metadata fields are empty in the new log if they differ between the logs. If several logs
+    contain a message with the same time and bytes, it is written once.
 
     Args:
         logs: Two or more logs: files, folders or globs.
         out: Path of the new log.
-        shift: Whether a log whose episodes overlap in time with those of earlier logs is delayed
-            to begin after those logs end. The timestamps inside its messages are delayed, too.
+        shift: Whether to delay a log whose episodes overlap in time with episodes of earlier logs.
+            The log then begins after the earlier logs end. The timestamps inside its messages are
+            delayed, too.
         overwrite: Whether an existing file is replaced.
 
     Raises:
         UsageError: There are fewer than two logs.
         OutputExistsError: `out` exists.
         SpaceError: The spaces differ.
-        LogError: A log cannot be read; the environment, names or step duration differ; or episodes
-            of two logs overlap in time and `shift` is not set.
+        LogError: A log cannot be read. Or the environment, names or step duration differ. Or
+            episodes of two logs overlap in time, and `shift` is not set.
     """
     return merge_logs(logs, out, shift=shift, overwrite=overwrite)
 
@@ -46,10 +47,11 @@ def split(
     seed: int | None = None,
     overwrite: bool = False,
 ) -> list[Edited]:
-    """Copy the episodes of a log to several logs, each episode to one of them.
+    """Divide the episodes of a log among several new logs.
 
-    A message belongs to the episode during or after which it was logged. Messages that remain valid
-    for later episodes, such as the static scene, are copied to each new log that needs them.
+    A message is copied with the episode during which or after which it was logged. Messages that
+    remain valid for later episodes, such as the static scene, are copied to each new log that needs
+    them.
 
     Args:
         log: Path of the log.
@@ -106,12 +108,12 @@ def slice(
     truncated with the reason `interrupted`.
 
     Args:
-        log: Path of the log; with `time`, of any finished MCAP file.
+        log: Path of the log; with `time`, any finished MCAP file.
         out: Path of the new log.
-        steps: Half-open range (start, stop) of transitions, counted from 0 over all episodes. None
-            as a bound is the start or end of the log.
-        time: Half-open range (start, stop) in seconds since the first message of the log. None as
-            a bound is the start or end of the log.
+        steps: Half-open range (start, stop) of transitions, counted from 0 over all episodes. A
+            bound of None is the start or end of the log.
+        time: Half-open range (start, stop) in seconds since the first message of the log. A bound
+            of None is the start or end of the log.
         overwrite: Whether an existing file is replaced.
 
     Raises:

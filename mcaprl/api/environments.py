@@ -59,7 +59,7 @@ def sim_of(
 
 
 def _check_needs_no_trust(dataset: Dataset, path: Path, sim: str | None) -> None:
-    """Refuse a log that names a module to import, or arguments for an unknown environment."""
+    """Raise an error if making the environment of the log would need `trust_env`."""
     if sim is None and ":" in dataset.env_id:
         module = dataset.env_id.partition(":")[0]
         raise UsageError(
@@ -77,7 +77,7 @@ def _check_needs_no_trust(dataset: Dataset, path: Path, sim: str | None) -> None
 
 
 def check_episode(dataset: Dataset, episode: int | None, path: Path) -> None:
-    """Check that a log has an episode with this index; None is accepted.
+    """Check that a log has an episode with this index, or that the index is None.
 
     Raises:
         UsageError: The log has fewer episodes.

@@ -83,15 +83,15 @@ def estimate(
     """Estimate the discounted returns of policies from logs, with each estimator.
 
     Args:
-        policies: `random` or the path of a trained run, or a list; each seed of a run is one
-            policy.
+        policies: `random`, the path of a trained run, or a list of these. Each seed of a run is
+            one policy.
         data: Dataset, file, folder or glob of logs, or several of them.
         gamma: Discount of the returns.
         epsilon: Probability of a random action instead of the policy's.
         updates: Number of gradient steps of the model that FQE, DR and WDR use. The classifier
             that estimates the behavior probabilities is trained with at most 2,000 steps.
-        estimate_behavior: Whether the behavior probabilities are estimated from the actions, as by
-            `mcaprl.estimate_behavior`, instead of taken from the logs.
+        estimate_behavior: Whether `mcaprl.estimate_behavior` estimates the behavior probabilities
+            from the actions. Otherwise, the logged probabilities are used.
         seed: Seed of the model and of the resampling.
         threads: Number of threads of PyTorch and of the reader.
         mapping: Mapping of another robot's bag; see `open`.
@@ -101,7 +101,7 @@ def estimate(
     Raises:
         UsageError: A policy has no action probabilities, or a number is out of range.
         UnknownNameError: There is no such policy.
-        PolicyError: A policy was trained on spaces other than the logs'.
+        PolicyError: A policy was trained on other spaces than those of the logs.
         LogError: The logs cannot be read.
     """
     from mcaprl.offline.estimate.fqe import FQEConfig
@@ -147,7 +147,7 @@ def estimate(
 
 
 def _policies(names: Sequence[str], dataset: Dataset) -> dict[str, StochasticPolicy | None]:
-    """Load the policies; return a dict by their names in tables. The value of `random` is None."""
+    """Load the policies, and return them by their names in tables; `random` has the value None."""
     shown = policy_names(names)
     found: dict[str, StochasticPolicy | None] = {}
     for name in dict.fromkeys(names):

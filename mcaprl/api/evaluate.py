@@ -111,8 +111,8 @@ def evaluate(
     Random actions and the sim's pilot are always evaluated, too.
 
     Args:
-        policies: `pilot`, `random` or the path of a trained policy, or a list; each seed of a run
-            is evaluated.
+        policies: `pilot`, `random`, the path of a trained policy, or a list of these. Each seed of
+            a run is evaluated.
         sim: Short name of a sim, or a Gymnasium id.
         episodes: Number of episodes for each policy and training seed.
         seed: Seed of the episodes.
@@ -123,8 +123,8 @@ def evaluate(
         record: Output log of the episodes of `policies`.
         report: Output folder of the HTML report, images and JSON.
         overwrite: Whether an existing log is replaced.
-        ray: Whether the episodes run on Ray workers, which see the policies; the results are the
-            same.
+        ray: Whether the episodes run on Ray workers. The results are the same. All workers must be
+            able to read the policies.
         workers: Number of Ray workers; default: number of CPUs of the cluster.
         address: Address of a Ray cluster, `HOST:PORT` or `auto`; default: RAY_ADDRESS, else a
             local cluster for this call.
@@ -231,7 +231,7 @@ def _behavior(data: str, env: gym.Env[Any, Any], record: Path | None) -> LoggedR
 
 
 def _normalized(mean_return: float, scores: Sequence[PolicyScore]) -> float | None:
-    """Return a mean return on the scale where random is 0 and the pilot is 1."""
+    """Scale a mean return so that random is 0 and the pilot is 1."""
     random = next((s.mean_return for s in scores if s.policy == "random"), math.nan)
     pilot = next((s.mean_return for s in scores if s.policy == "pilot"), math.nan)
     score = (mean_return - random) / (pilot - random or math.nan)
@@ -259,7 +259,7 @@ def _write_report(
 
 
 def learning_curves(names: Sequence[str]) -> list[Figure]:
-    """Return the learning curves of runs; ignore names that belong to no run.
+    """Return the learning curves of runs; ignore names that do not belong to a run.
 
     A name is the path of a run folder, or of a folder or policy file in a run folder.
     Online runs are compared in one figure; an offline run has one figure for each term of its loss.

@@ -30,7 +30,7 @@ class Part:
         seed: Seed of the evaluation.
         is_batched: Whether the sim steps several environments at once.
         policy: Name or path of the policy.
-        index: Index of its training seed.
+        index: Index of the policy's training seed.
         first: Number of the first episode.
         episodes: Number of episodes.
     """
@@ -52,9 +52,10 @@ def results_on_ray(
     options: ClusterOptions,
     advance: Advance,
 ) -> dict[str, list[list[EpisodeResult]]]:
-    """Return the episodes of each training seed of each policy, run by Ray workers.
+    """Run the episodes of each policy and training seed on Ray workers, and return them.
 
-    The division into parts does not depend on the workers, so neither do the results.
+    The number of workers has no effect on the results, because the episodes are always divided into
+    the same parts.
 
     Args:
         request: Sim and seed.
@@ -69,7 +70,7 @@ def results_on_ray(
     """
     from mcaprl.ray.workers import WorkerDiedError, run_tasks
 
-    # Paths are absolute, because workers have other working directories.
+    # Workers have other working directories, so all paths must be absolute.
     paths = {name: Path(name).absolute() for name in found if name not in SCRIPTED}
     parts, keys = [], []
     for name, candidates in found.items():

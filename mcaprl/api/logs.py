@@ -84,7 +84,7 @@ class LogInfo:
 
     @property
     def title(self) -> str:
-        """Path of the first log, and the number of the others."""
+        """Path of the first log, and the number of other logs."""
         more = f" and {len(self.sources) - 1} more" if len(self.sources) > 1 else ""
         return f"{self.sources[0]}{more}"
 
@@ -240,9 +240,9 @@ def check(
 ) -> CheckResult:
     """Read logs completely; validate structure, CRCs, indexes, episodes and metadata.
 
-    With a mapping, the bag is read by the mapping. Possible problems are then missing or outdated
-    values, commands that are far from every named action, and episodes that are too short. They are
-    reported only if they affect many steps.
+    With a mapping, the bag is read by the mapping. The function then also reports missing or
+    outdated values, commands that are far from every named action, and episodes that are too short,
+    if they affect many steps.
 
     Args:
         data: File, folder or glob of logs, or several of them. A path without logs is
@@ -287,8 +287,8 @@ def recover(
     Args:
         file: MCAP file, damaged or not; it is not changed.
         out: Path of the new log.
-        keep_unfinished: Whether unfinished episodes are kept up to their last complete
-            transition, marked truncated.
+        keep_unfinished: Whether unfinished episodes are kept up to their last complete transition.
+            They are marked as truncated.
         overwrite: Whether an existing file is replaced.
 
     Returns:

@@ -33,8 +33,8 @@ def as_names(policies: Names) -> list[str]:
 class TrainedPolicy(Policy, Protocol):
     """Loaded policy with NumPy inputs and outputs; B is the batch size, A the number of actions.
 
-    A policy that stacks k > 1 frames stores the observations of its last k calls of `act` since
-    `begin`. Its other methods accept stacks (B, k, *shape) with the oldest frame first.
+    A policy that stacks k > 1 frames stores the observations of the last k calls of `act` since
+    `begin`. The other methods of such a policy accept stacks (B, k, *shape), oldest frame first.
     """
 
     @property
@@ -101,8 +101,8 @@ def load_policies(path: str | Path) -> list[TrainedPolicy]:
 def export(run: str | Path, out: str | Path, *, overwrite: bool = False) -> TrainedPolicy:
     """Write a trained policy as ONNX, which ONNX Runtime runs without this package.
 
-    Inputs are the parts of the observation by their names in the log; outputs are `action` and
-    `scores`.
+    The inputs are the parts of an observation, with the same names as in the log. The outputs are
+    `action` and `scores`.
 
     Args:
         run: Run folder, or folder of one seed.
@@ -126,7 +126,7 @@ def export(run: str | Path, out: str | Path, *, overwrite: bool = False) -> Trai
 
 
 def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
-    """Return the policies that a name refers to: one, or one per training seed of a run.
+    """Return the policies that a name refers to; a run has one policy per training seed.
 
     Args:
         name: `pilot`, a path, or `random`, for which the result is [None].
@@ -135,7 +135,7 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
     Raises:
         UnknownNameError: There is no such policy.
         UsageError: The sim has no pilot.
-        PolicyError: The path contains no policy, or a policy whose spaces differ from `env`'s.
+        PolicyError: The path contains no policy, or the policy's spaces differ from those of `env`.
     """
     if name == "random":
         return [None]
@@ -161,7 +161,7 @@ def trained_policies(name: str, dataset: Dataset) -> list[TrainedPolicy]:
     Raises:
         UsageError: The policy is scripted.
         UnknownNameError: There is no such path.
-        PolicyError: The path contains no policy, or one trained on spaces other than the log's.
+        PolicyError: The path contains no policy, or the policy's spaces differ from the log's.
     """
     if name in SCRIPTED:
         raise UsageError(
@@ -177,7 +177,7 @@ def trained_policies(name: str, dataset: Dataset) -> list[TrainedPolicy]:
 
 
 def policy_names(names: Sequence[str]) -> dict[str, str]:
-    """Return names for tables: the last part of each path, or the path if that is not unique.
+    """Return names for tables: the last part of each path, or the whole path if two are equal.
 
     >>> policy_names(["random", "a/run", "b/run", "b/other"])
     {'random': 'random', 'a/run': 'a/run', 'b/run': 'b/run', 'b/other': 'other'}
@@ -195,7 +195,7 @@ def is_policy(path: Path) -> bool:
 
 
 def _existing(name: str, others: Sequence[str]) -> Path:
-    """Return a name as a path if it exists; otherwise, raise an error that lists nearby runs."""
+    """Return the path of a policy; if it does not exist, raise an error that lists nearby runs."""
     path = Path(name)
     if path.exists():
         return path

@@ -9,7 +9,7 @@ from mcaprl.settings import flag
 
 
 def check_least(least: int, **numbers: int | None) -> None:
-    """Check that numbers are not below a bound; None is accepted.
+    """Check that numbers are at least `least`; skip numbers that are None.
 
     >>> check_least(1, episodes=None, envs=0)
     Traceback (most recent call last):
@@ -20,7 +20,7 @@ def check_least(least: int, **numbers: int | None) -> None:
         **numbers: Numbers by the name of their argument.
 
     Raises:
-        UsageError: A number is smaller.
+        UsageError: A number is below `least`.
     """
     for name, number in numbers.items():
         if number is not None and number < least:
@@ -28,7 +28,7 @@ def check_least(least: int, **numbers: int | None) -> None:
 
 
 def check_fraction(**numbers: float | None) -> None:
-    """Check that numbers are from 0 to 1; None is accepted.
+    """Check that numbers are from 0 to 1; skip numbers that are None.
 
     Raises:
         UsageError: A number is outside the range, or NaN.

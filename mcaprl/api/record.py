@@ -83,7 +83,7 @@ def record(
         steps: Number of steps; exclusive with `episodes`.
         seed: Seed of the recording.
         envs: Number of processes. With more than one, a script needs
-            `if __name__ == "__main__"`, since each process imports the script.
+            `if __name__ == "__main__"`, because each process imports the script.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
         sim_options: Other arguments of the environment.
@@ -96,9 +96,9 @@ def record(
         rotate_mb: Size in MB after which a new file is started; None for one file.
         upload: URL to which the log is copied when it is complete: a file such as
             `s3://bucket/lane.mcap`, or the folder of several files. The local files remain.
-        ray: Whether Ray workers record, into a folder that all of them see. Each log appears in
-            it when it is complete, and `manifest.json` when all are. The episodes do not depend
-            on the workers.
+        ray: Whether Ray workers record the episodes. `out` is then a folder that all workers must
+            see. Each log appears in the folder when it is complete. `manifest.json` appears when
+            all logs are complete. The number of workers has no effect on the episodes.
         workers: Number of Ray workers; default: number of CPUs of the cluster.
         address: Address of a Ray cluster, `HOST:PORT` or `auto`; default: RAY_ADDRESS, else a
             local cluster for this call.

@@ -62,7 +62,7 @@ def record_file(
                 seed=request.seed,
                 episodes=request.episodes,
                 steps=request.steps,
-                # Appended episodes continue the numbers, and thus the seeds, of the earlier ones.
+                # Appended episodes continue the numbering, which determines the seeds.
                 first_episode=request.first_episode + recorder.episodes,
                 on_action=set_probability,
                 on_episode=on_episode,
@@ -70,7 +70,7 @@ def record_file(
 
 
 def try_request(request: FileRequest) -> None:
-    """Create and remove the file of a request, without episodes.
+    """Create the file of a request without episodes, and remove it again, to find errors early.
 
     Raises:
         McaprlError: The sim, the policy or another argument is not valid.

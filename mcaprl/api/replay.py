@@ -87,8 +87,8 @@ def replay(
         speed: Simulated seconds per second.
         loop: Whether the replay restarts at the end.
         port: Port on 127.0.0.1; 0 for any free port.
-        allow_origin: Origin, or several, of web pages that may connect, besides pages on this
-            machine, Foxglove and Lichtblick.
+        allow_origin: Origin of other web pages that may connect, or a list of origins. Pages on
+            this machine, Foxglove and Lichtblick may always connect.
         on_open: Function called with the address once viewers can connect.
         stop: Event that ends the replay.
 
@@ -191,7 +191,10 @@ def render(
     trust_env: bool = False,
     progress: ProgressBar = no_progress,
 ) -> Rendering:
-    """Render one episode of a log from the logged scene; if the log has no scene, with the sim.
+    """Render one episode of a log.
+
+    The images show the logged scene. If the log has no scene, the sim repeats the episode and
+    renders the images.
 
     Args:
         file: Path of the log.

@@ -63,7 +63,7 @@ def _divided(whole: FileRequest, parts: int) -> list[FileRequest]:
             out=whole.out / f"shard-{number:0{digits}d}.mcap",
             episodes=None if whole.episodes is None else end - start,
             steps=None if whole.steps is None else end - start,
-            # With `steps`, the number of episodes is unknown: reserve 2**20 numbers per shard.
+            # With `steps`, the number of episodes is unknown, so reserve 2**20 numbers per shard.
             first_episode=start if whole.episodes is not None else number << 20,
         )
         for number, (start, end) in shares
@@ -73,9 +73,10 @@ def _divided(whole: FileRequest, parts: int) -> list[FileRequest]:
 
 @contextmanager
 def _new_folder(whole: FileRequest, first: FileRequest) -> Iterator[None]:
-    """Lock the folder of the shards, and remove an earlier recording; errors as `record_shards`.
+    """Lock the folder of the shards, and remove an earlier recording.
 
-    A trial recording lets an invalid request fail before any file is removed.
+    Before any file is removed, a trial recording checks that the request is valid. Raise the same
+    errors as `record_shards`.
     """
     if whole.out.is_file():
         raise OutputExistsError(f"{whole.out} exists and is a file: choose the name of a folder")
@@ -85,7 +86,7 @@ def _new_folder(whole: FileRequest, first: FileRequest) -> Iterator[None]:
         for path in old:
             with locked_file(path):
                 path.unlink()
-        # The manifest of an earlier recording lists other files.
+        # Also remove the manifest of an earlier recording, because it lists other files.
         (whole.out / MANIFEST_NAME).unlink(missing_ok=True)
         yield
 
@@ -99,7 +100,8 @@ def record_on_ray(
 ) -> list[EpisodeResult]:
     """Record shards on the workers of a Ray cluster, then write the manifest of the folder.
 
-    The division into shards does not depend on the workers, so neither do the episodes.
+    The number of workers has no effect on the episodes, because the recording is always divided
+    into the same shards.
 
     Raises:
         OutputExistsError: The folder contains logs that may not be replaced.
@@ -109,7 +111,7 @@ def record_on_ray(
     from mcaprl.ray.shards import unfinished_folder
     from mcaprl.ray.workers import WorkerDiedError, run_tasks
 
-    # Paths are absolute, because workers have other working directories.
+    # Workers have other working directories, so all paths must be absolute.
     whole = replace(whole, out=whole.out.absolute(), policy=_absolute(whole.policy))
     shards = _divided(whole, _count(whole, parts))
     with options.connected(), _new_folder(whole, shards[0]):
@@ -134,7 +136,7 @@ def record_on_ray(
 
 
 def _record_on_worker(request: FileRequest, report: Callable[[int], None]) -> list[EpisodeResult]:
-    """Record a shard, or the rest of it if another worker was killed; return all its episodes."""
+    """Record a shard, or continue it if its worker was killed. Return all episodes of the shard."""
     from mcaprl.ray.shards import Shard, episodes_of
 
     shard = Shard(request.out)
@@ -164,7 +166,7 @@ def _record_on_worker(request: FileRequest, report: Callable[[int], None]) -> li
 
 
 def _count(whole: FileRequest, parts: int | None) -> int:
-    """Return the number of shards; none is empty."""
+    """Return the number of shards, which is small enough that no shard is empty."""
     if whole.episodes is not None:
         return min(parts or _MOST_SHARDS, whole.episodes)
     steps = whole.steps or 0
@@ -194,7 +196,7 @@ def _replaceable(folder: Path, *, overwrite: bool) -> list[Path]:
 
 
 def _shares(total: int, parts: int) -> list[tuple[int, int]]:
-    """Split a count into half-open ranges whose lengths differ by at most one.
+    """Split range(count) into half-open ranges whose lengths differ by at most one.
 
     >>> _shares(5, 2)
     [(0, 2), (2, 5)]

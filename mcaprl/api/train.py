@@ -56,22 +56,23 @@ def train(
         data: Dataset, file, folder or glob of logs, or several of them. `PATH:2` draws
             the transitions of PATH twice as often as others.
         out: Run folder to create.
-        algo: `dqn`, `double-dqn`, `cql`, `bc`, `bcq` or `iql`; None for `cql` or, with `resume`,
-            for the algorithm of the run.
+        algo: `dqn`, `double-dqn`, `cql`, `bc`, `bcq` or `iql`. None selects `cql`; with `resume`,
+            None selects the algorithm of the run.
         seeds: Number of networks, which are trained in parallel.
         seed: Seed of the first network; network k uses seed + k.
         threads: Number of threads of PyTorch and of the reader.
         device: `cpu` or `cuda`.
         resume: Whether training continues from the checkpoints in `out`.
-        follow: Whether episodes that another process adds to the logs meanwhile are also used.
+        follow: Whether to also train on episodes that another process adds to the logs during the
+            training.
         other_data: Whether `resume` accepts checkpoints trained on other data.
         mapping: Mapping of another robot's bag; see `open`. The mapping is copied to `out`. With a
             mapping, paths cannot have weights such as `:2`.
         trust_code: Whether the mapping may name a Python function.
         on_data: Function called with the algorithm and the dataset before the first update.
         progress: Function called with each row of metrics.
-        **settings: Settings of the algorithm. Missing settings have the defaults of the algorithm
-            or, with `resume`, the values of the run.
+        **settings: Settings of the algorithm. Missing settings have the algorithm's defaults; with
+            `resume`, they have the values of the run.
 
     Returns:
         One summary for each seed.
@@ -132,7 +133,7 @@ def train(
             seed=seed,
             weights=weights,
             resume=resume,
-            # With `follow`, the logs have grown since the checkpoints, so the data may differ.
+            # With `follow`, the data may differ, because the logs have grown since the checkpoints.
             other_data=other_data or follow,
             follow=growing,
             device=device,
@@ -175,7 +176,8 @@ def train_online(
         sim: Short name of a sim, or a Gymnasium id; None for the sim of the preset or of the
             resumed run.
         out: Run folder to create.
-        algo: `dqn`, `double-dqn`, `ppo` or `a2c`; None for the default of the preset, run or sim.
+        algo: `dqn`, `double-dqn`, `ppo` or `a2c`. None selects the default of the preset, run or
+            sim.
         preset: Name of published settings.
         seeds: Number of agents, which are trained one after the other.
         seed: Seed of the first agent; agent k uses seed + k.
@@ -189,15 +191,15 @@ def train_online(
         live: Whether viewers can connect during training, and watch one episode after the other.
         live_speed: Simulated seconds per second in the episodes that are shown.
         port: Port on 127.0.0.1 for viewers; 0 for any free port.
-        allow_origin: Origin, or several, of web pages that may connect, besides pages on this
-            machine, Foxglove and Lichtblick.
+        allow_origin: Origin of other web pages that may connect, or a list of origins. Pages on
+            this machine, Foxglove and Lichtblick may always connect.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
         sim_options: Other arguments of the environment.
         on_live: Function called with the address once viewers can connect.
         progress: Function called repeatedly during training.
         **settings: Settings of the algorithm. Missing settings have the defaults of the preset or
-            the sim or, with `resume`, the values of the run.
+            the sim; with `resume`, they have the values of the run.
 
     Returns:
         One summary for each seed.
@@ -208,7 +210,7 @@ def train_online(
             range.
         OutputExistsError: `out` or `record` exists.
         SpaceError: The algorithm does not support the observations or actions.
-        PolicyError: The policy in `sources` has a different network than the agent.
+        PolicyError: The policy in `sources` has another network than the agent.
         TrainingError: `out` cannot be written, or contains a run of another task.
         MissingExtraError: The packages of the `online` extra are not installed.
     """

@@ -41,7 +41,7 @@ _NOT_WHOLE = (
 
 
 def empty_columns(description: LogMetadata) -> Columns:
-    """Return all columns of a block without rows; they have the dtypes and shapes of a row."""
+    """Return all columns of a block without rows, to know their dtypes and shapes."""
     action = action_leaf(description.action_space)
     columns: Columns = {name: np.empty(0, dtype) for name, dtype in _SCALARS.items()}
     columns["action"] = np.empty((0, *action.shape), action.dtype)
@@ -69,7 +69,7 @@ def columns_of(data: Dataset, episodes: NDArray[np.int64], names: Sequence[str])
 
     Args:
         data: Transitions; observations that are not in `names` may be missing.
-        episodes: (E,) number of each episode in the column `episode`.
+        episodes: (E,) numbers of the episodes for the column `episode`.
         names: Names of the columns.
     """
     columns = data._transitions
@@ -97,7 +97,7 @@ def dataset_of(columns: Columns, description: LogMetadata, where: str) -> Datase
     """Return the episodes of a block, sorted by number and step.
 
     Args:
-        columns: Columns of a block; `log_time_ns` is not used, and `behavior_prob` may be missing.
+        columns: Columns of a block. `log_time_ns` is not used, and `behavior_prob` may be missing.
         description: Metadata of the environment.
         where: Name of the place for errors.
 

@@ -1,4 +1,4 @@
-"""Connection to a Ray cluster, or to a local one that only this process uses."""
+"""Connection to a Ray cluster, or to a local cluster that only this process uses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CONNECT_S = 5.0
 # File in which `ray start` writes the address of this machine's cluster.
 _CURRENT: Final = Path("/tmp/ray/ray_current_cluster")
 _MIB = 1 << 20
-# Object store of a local cluster that only passes requests and results.
+# Size of the object store of a local cluster that transfers only requests and results.
 SMALL_STORE_BYTES: Final = 100 * _MIB
 # Ray listens on every network interface unless this variable is 0 before Ray is imported.
 _LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
@@ -28,10 +28,10 @@ _TOKENS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
 def local_settings() -> dict[str, str]:
-    """Return environment variables for a local cluster, which Ray reads when it is imported.
+    """Return the environment variables for a local cluster. Ray reads them when it is imported.
 
-    The cluster listens on the loopback interface. Other users of the machine can reach that, too,
-    but only processes with the token may connect.
+    The cluster listens on the loopback interface. Other users of the machine can also reach this
+    interface, but only processes with the token may connect.
     """
     return {
         _LOOPBACK: "0",
@@ -44,14 +44,14 @@ def local_settings() -> dict[str, str]:
 
 @contextmanager
 def cluster(address: str | None = None, *, workers: int | None = None) -> Iterator[Any]:
-    """Connect to a cluster, and disconnect at the end; yields the module `ray`.
+    """Connect to a cluster, yield the module `ray`, and disconnect at the end.
 
-    A connection that exists already is used and kept. A local cluster that this function started
-    ends with the context.
+    If this process is already connected, the connection is used and kept. A local cluster that this
+    function started ends with the context.
 
     Args:
-        address: `HOST:PORT` of a cluster, `auto` for the one of this machine, or `local` for a new
-            local one. Default: the environment variable RAY_ADDRESS, or else `local`.
+        address: `HOST:PORT` of a cluster, `auto` for this machine's cluster, or `local` for a new
+            local cluster. Default: the environment variable RAY_ADDRESS, or else `local`.
         workers: Number of CPUs of a local cluster; default: number of processors.
 
     Raises:
@@ -71,7 +71,7 @@ def cluster(address: str | None = None, *, workers: int | None = None) -> Iterat
 def connect(
     address: str | None = None, *, workers: int | None = None, store_bytes: int | None = None
 ) -> bool:
-    """Connect to a cluster until the process ends, unless it is connected already.
+    """Connect this process to a cluster until the process ends. Keep an existing connection.
 
     Args:
         address: As for `cluster`.
@@ -124,13 +124,13 @@ def _join(address: str) -> None:
         address = _CURRENT.read_text().strip()
     host, _, port = address.rpartition(":")
     if host in ("127.0.0.1", "localhost"):
-        # Otherwise Ray replaces the host by the address of this machine in the network.
+        # Without this variable, Ray replaces the host by this machine's address in the network.
         os.environ.setdefault(_LOOPBACK, "0")
     import_extra("ray", "ray")
     if address != "auto" and ("/" in host or not host or not port.isdecimal()):
         raise UsageError(f"--address {address}: give HOST:PORT, auto or local")
     if address != "auto":
-        # Ray itself gives up only after minutes.
+        # Try the address first, because Ray itself gives up only after minutes.
         try:
             socket.create_connection((host, int(port)), _CONNECT_S).close()
         except (OSError, OverflowError) as error:

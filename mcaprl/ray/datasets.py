@@ -16,7 +16,7 @@ from mcaprl.recorder.format.metadata import LogMetadata
 if TYPE_CHECKING:
     import ray.data
 
-# Size of a block if Ray has no maximum.
+# Maximum size of a block if Ray sets no maximum.
 _BLOCK_BYTES = 128 << 20
 
 
@@ -33,11 +33,11 @@ def read(
     The columns are those of `Dataset.to_arrow`: `episode`, `step`, `log_time_ns`, `reward`,
     `terminated`, `truncated`, `behavior_prob`, `action`, `observation` and `next_observation`, or
     `observation_<key>` and `next_observation_<key>` for the parts of a Dict. Vectors and images
-    are tensors. Each block has whole episodes of one log, unless an episode exceeds Ray's maximum
-    size of a block. Infos are not read.
+    are tensors. Each block has whole episodes of one log. An episode above Ray's maximum block size
+    is divided. Infos are not read.
 
-    This function reads the summaries of the logs; the workers read the rest when rows are needed,
-    and only the columns that later steps need. They check all CRCs.
+    This function reads only the summaries of the logs. When rows are needed, the workers read the
+    columns that later steps use, and check all CRCs.
 
     Args:
         paths: A file, a folder of `.mcap` files, its `manifest.json`, a glob, a URL, or a sequence
@@ -48,7 +48,8 @@ def read(
         address: Address of the Ray cluster, `HOST:PORT` or `auto`; default: the cluster that this
             process is connected to, else RAY_ADDRESS, else a new local cluster.
         **options: Further arguments of `ray.data.read_datasource`, such as `concurrency`.
-            `override_num_blocks` is the least number of blocks, unless there are fewer episodes.
+            `override_num_blocks` is the minimum number of blocks; there are at most as many blocks
+            as episodes.
 
     Raises:
         LogError: A log is missing or damaged, or no log has a finished episode.
@@ -85,18 +86,18 @@ def write(
     compression: str = "zstd",
     **options: Any,
 ) -> Path | str:
-    """Write a dataset of Ray Data as logs, one for each block, and their manifest.
+    """Write a dataset of Ray Data as logs, one for each block, and write a manifest of the logs.
 
     The rows have the columns of `read`; `log_time_ns` and `behavior_prob` may be missing. All rows
-    of an episode must be in one block. The logs are numbered in the order of the blocks; their
-    times, seeds and policies are not those of the logs that were read.
+    of an episode must be in one block. The logs are numbered in the order of the blocks. They have
+    new times, and no seeds or policies of the logs that were read.
 
     Args:
         rows: Dataset to write; this function runs its steps.
-        folder: New folder that all workers see, or URL of a folder. The logs and the manifest
-            appear in a folder when all are complete.
-        like: Logs or dataset of the same environment, whose spaces and names the new logs get.
-            Needed if a step after `read` has dropped the metadata of the blocks.
+        folder: New folder that all workers see, or URL of a folder. In a local folder, the logs and
+            the manifest appear when all are complete.
+        like: Logs or dataset of the same environment. The new logs get its spaces and names. This
+            argument is needed if a step after `read` has dropped the metadata of the blocks.
         compression: Compression of chunks: `zstd`, `lz4` or `none`.
         **options: Further arguments of `Dataset.write_datasink`, such as `concurrency`.
 
@@ -128,7 +129,7 @@ def _described(like: Dataset | str | Path | Sequence[str | Path]) -> LogMetadata
 
 
 def _ours(error: BaseException | None) -> McaprlError | None:
-    """Return the error of this package that caused an error of Ray; None if there is none."""
+    """Return the error of this package that caused an error of Ray, or None."""
     seen = set()
     while error is not None and id(error) not in seen:
         if isinstance(error, McaprlError):

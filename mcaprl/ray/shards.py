@@ -1,4 +1,7 @@
-"""Log that workers continue if one of them is killed; it gets its name when it is complete."""
+"""Log that one worker records, or several in turn if workers are killed.
+
+The log gets its name when it is complete.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ class Shard:
     """
 
     def __init__(self, path: Path) -> None:
-        """Create a shard without reading anything."""
+        """Create the description of a shard; read and write no files."""
         self.path = path
         self.unfinished = path.parent / _UNFINISHED / path.name
 
@@ -37,10 +40,10 @@ class Shard:
         return self.path.exists()
 
     def resume(self) -> list[EpisodeResult]:
-        """Repair what a killed worker left, so that it can be appended to; return its episodes.
+        """Repair the log of a killed worker, so that it can be continued; return its episodes.
 
         Raises:
-            LogError: A worker is still recording it, or it cannot be written.
+            LogError: A worker is still recording the log, or the log cannot be written.
         """
         if not self.unfinished.exists():
             return []
@@ -53,8 +56,8 @@ class Shard:
         except LogError:
             # The file has no finished episode.
             kept = []
-        # A worker that was stopped, not killed, has closed the log with an interrupted episode.
-        # Such a log is recorded again from its beginning.
+        # A worker that was stopped instead of killed has closed the log with an interrupted
+        # episode. Such a log is recorded again from its beginning.
         if kept and kept[-1].reason != INTERRUPTED:
             os.replace(repaired, self.unfinished)
             return kept
@@ -70,7 +73,7 @@ class Shard:
 
 
 def unfinished_folder(folder: Path) -> Path:
-    """Return the hidden folder of a recording's unfinished logs, which is new and empty."""
+    """Create a new hidden folder for the unfinished logs of a recording, and return its path."""
     hidden = folder / _UNFINISHED
     shutil.rmtree(hidden, ignore_errors=True)
     hidden.mkdir(parents=True)

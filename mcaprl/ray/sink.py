@@ -1,4 +1,4 @@
-"""Target of Ray Data that writes rows as logs; they appear together, with their manifest."""
+"""Target of Ray Data that writes rows as logs. The logs and their manifest appear together."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class LogSink(Datasink[LogFile | None]):  # type: ignore[misc]
     def __init__(
         self, folder: str | Path, description: LogMetadata | None, compression: str
     ) -> None:
-        """Create the folder; arguments as in `ray.write`.
+        """Create the folder. The arguments are those of `ray.write`.
 
         Raises:
             OutputExistsError: The folder is not empty.
@@ -89,7 +89,7 @@ class LogSink(Datasink[LogFile | None]):  # type: ignore[misc]
             shutil.rmtree(self._hidden, ignore_errors=True)
 
     def _save(self, data: Any, path: Path) -> LogFile:
-        # A repeated task replaces what a killed one wrote.
+        # A repeated task replaces the log of the killed task.
         data.save(path, compression=self._compression, overwrite=True)
         return LogFile(path.name, len(data.episode_lengths), len(data), path.stat().st_size)
 

@@ -1,8 +1,8 @@
-"""Logs as a source of Ray Data: each task reads whole episodes of the columns that are needed.
+"""Logs as a source of Ray Data: each task reads whole episodes, and only the needed columns.
 
-If a source has fewer tasks than Ray wants, or blocks above its maximum size, Ray cuts the blocks,
-and with them episodes. Therefore each task reads one block of at most that size, and `ray.read`
-requests as many tasks as the source has.
+Ray divides blocks, and thus episodes, in two cases: a source has fewer tasks than Ray requests, or
+a block is larger than Ray's maximum. Therefore, each task reads one block of at most the maximum
+size, and `ray.read` requests exactly as many tasks as the source has.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mcaprl.recorder.dataset.open import Episodes, episode_indexes
 from mcaprl.recorder.dataset.tables import described
 from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
 
-# Smaller blocks take more time in total; they are made only if there are too few for all CPUs.
+# Smaller blocks take more time in total, so they are used only if there are more CPUs than blocks.
 _LEAST_BYTES = 16 << 20
 
 
@@ -52,7 +52,7 @@ class _Group:
 
 @dataclass(frozen=True)
 class _Wanted:
-    """Columns that every task reads, and their description.
+    """Columns that every task reads, and metadata for their blocks.
 
     Attributes:
         names: Names of the columns.
@@ -91,9 +91,9 @@ class LogSource(Datasource):  # type: ignore[misc]
             paths: Logs.
             columns: Names of the columns; default: all.
             episodes: Episodes to read, counted over all logs; default: all.
-            blocks: Least number of blocks; default: by size.
-            least: Least number of blocks, if their number is chosen by size.
-            most_bytes: Size of a block that only one with a single episode may exceed.
+            blocks: Minimum number of blocks; default: chosen by the size of the data.
+            least: Minimum number of blocks if `blocks` is None.
+            most_bytes: Maximum size of a block; only a block of a single episode may be larger.
 
         Raises:
             LogError: A log cannot be read, or no log has a finished episode.
@@ -102,7 +102,7 @@ class LogSource(Datasource):  # type: ignore[misc]
             UsageError: There is no such episode.
         """
         super().__init__()
-        # The base class does not set it.
+        # The constructor of the base class does not set this attribute.
         self._projection_map = None if columns is None else {name: name for name in columns}
         self._paths = list(paths)
         self._lengths: list[NDArray[np.int64]] = []
@@ -141,7 +141,7 @@ class LogSource(Datasource):  # type: ignore[misc]
         return "McapLogs"
 
     def supports_projection_pushdown(self) -> bool:
-        """Return True: columns that no later step needs are not read."""
+        """Return True, because only the columns that later steps need are read."""
         return True
 
     def estimate_inmemory_data_size(self) -> int:
@@ -151,7 +151,7 @@ class LogSource(Datasource):  # type: ignore[misc]
     def get_read_tasks(
         self, parallelism: int, per_task_row_limit: int | None = None, data_context: Any = None
     ) -> list[ReadTask]:
-        """Return one task for each group of episodes, whatever number Ray wants."""
+        """Return one task for each group of episodes; the number that Ray requests is ignored."""
         columns, metadata = self._columns(), described(self.description)
         schema = block_of(columns, metadata).schema
         wanted = _Wanted(
@@ -176,7 +176,7 @@ class LogSource(Datasource):  # type: ignore[misc]
         """Return the wanted columns without rows."""
         every = empty_columns(self.description)
         names = self._get_data_columns()
-        # A block needs a column to have rows.
+        # Without a column, a block would have no rows.
         return {name: every[name] for name in (every if names is None else names or ["episode"])}
 
     def _divided(self, blocks: int | None, least: int, most_bytes: int) -> Iterator[_Group]:
@@ -199,7 +199,7 @@ class LogSource(Datasource):  # type: ignore[misc]
     def _chosen_episodes(
         self,
     ) -> Iterator[tuple[Path, int, NDArray[np.int64], NDArray[np.int64]]]:
-        """Yield each log's path and first index, its chosen episodes, and their lengths."""
+        """Yield for each log: its path, its first index, the chosen episodes, and their lengths."""
         first = 0
         for path, lengths in zip(self._paths, self._lengths, strict=True):
             mine = np.arange(len(lengths))
@@ -221,5 +221,5 @@ def _read(group: _Group, wanted: _Wanted) -> Iterator[pyarrow.Table]:
 
 @lru_cache(maxsize=2)
 def _reader(path: Path, size: int, mtime_ns: int, keys: tuple[str, ...] | None) -> LogReader:
-    """Open a log, or return the reader of an earlier task if the file has not changed since."""
+    """Open a log. If the file has not changed since an earlier task, return that task's reader."""
     return LogReader(path, Selection(columns=keys))

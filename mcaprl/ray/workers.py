@@ -17,15 +17,15 @@ from mcaprl.recorder.format.metadata import installed_versions
 T = TypeVar("T")
 Result = TypeVar("Result")
 Report = Callable[[int], None]
-"""Function that a task calls with the amount of work that is done, from its beginning."""
+"""Function that a task calls with the amount of work it has done so far."""
 Task = Callable[[T, Report], Result]
 """Function of a module, called with a request and a `Report`.
 
-The task is repeated if its worker is killed, so it must have the same result then.
+If a worker is killed, its task is repeated. The task must then have the same result.
 """
 
 MOST_DEATHS = 10
-"""Number of workers that may die one after the other without progress."""
+"""Number of deaths of workers in a row, without progress between them, at which a task fails."""
 _INTERVAL_S = 0.1
 _POLLS_PER_S = 100
 
@@ -34,7 +34,7 @@ class WorkerDiedError(Exception):
     """Too many workers died while they ran one task.
 
     Attributes:
-        index: Index of its request.
+        index: Index of the task's request.
         cause: Cause of the last death.
     """
 
@@ -45,7 +45,7 @@ class WorkerDiedError(Exception):
 
 
 def check_machine(versions: dict[str, str], paths: Sequence[Path]) -> None:
-    """Check in a worker that its machine has the versions and the files of the calling process.
+    """Check that a worker's machine has the same versions and files as the calling process.
 
     Raises:
         ClusterError: A version differs, or a path does not exist here.
@@ -74,14 +74,14 @@ def _here() -> str:
 
 
 class Worker:
-    """Process of a cluster: runs one task after the other, and reports progress meanwhile."""
+    """Process of a cluster, which runs one task after the other and reports its progress."""
 
     def __init__(self) -> None:
         """Begin without a task."""
         self._progress = (-1, 0)
 
     def check(self, versions: dict[str, str], paths: Sequence[Path]) -> None:
-        """Check this machine; errors as `check_machine`."""
+        """Check this machine; raise the same errors as `check_machine`."""
         check_machine(versions, paths)
 
     def run(self, task: Task[T, Result], index: int, request: T) -> tuple[Result, int]:
@@ -94,7 +94,7 @@ class Worker:
         return task(request, report), self._progress[1]
 
     def progress(self) -> tuple[int, int]:
-        """Return the index of the current task and the amount of its work that is done."""
+        """Return the index of the current task, and the amount of work it has done."""
         return self._progress
 
 
@@ -169,7 +169,7 @@ class _Pool:
     def run(self, workers: int) -> list[Any]:
         for _ in range(workers):
             self.start()
-        # All polls together are limited to a rate that one process can handle.
+        # The rate of all polls together is limited to what one process can handle.
         interval_s = max(_INTERVAL_S, workers / _POLLS_PER_S)
         next_poll = time.monotonic() + interval_s
         while len(self.results) < len(self.requests):
@@ -198,7 +198,7 @@ class _Pool:
         try:
             found = self.ray.get(call)
         except self.ray.exceptions.RayTaskError as error:
-            # Our errors are one line; all others keep the traceback of the worker.
+            # Errors of this package are one line. All other errors keep the worker's traceback.
             raise error.cause if isinstance(error.cause, McaprlError | OSError) else error from None
         except self.ray.exceptions.RayError as error:
             self.ray.kill(worker)
@@ -217,8 +217,8 @@ class _Pool:
             self.ray.kill(worker)
 
     def replace(self, index: int | None, error: Exception) -> None:
-        """Start another worker in place of one that died; its task is the next to run."""
-        # Ray's explanation has several sentences; the first ones name the kind of death.
+        """Start another worker in place of a dead worker, whose task is the next to run."""
+        # Ray's explanation has several sentences. The first ones name the cause of the death.
         cause = str(error).strip().splitlines()[-1].partition(" Some common causes")[0]
         if index is None:
             self.failed_starts += 1
@@ -247,13 +247,13 @@ class _Pool:
         try:
             index, amount = self.ray.get(call)
         except self.ray.exceptions.RayError:
-            # The worker died; the call that runs its task reports the error.
+            # The worker died. The call that runs its task reports the error.
             return
         if index >= 0 and index not in self.results:
             self.count(index, amount)
 
     def count(self, index: int, amount: int) -> None:
-        """Report the work of a task that was not reported before; a repeated task starts again."""
+        """Report new work of a task. A repeated task reports nothing until it has passed `done`."""
         state = self.states[index]
         if amount > state.done:
             self.advance(amount - state.done)
