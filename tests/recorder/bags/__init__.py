@@ -1,1 +1,1 @@
-"""Tests of the reading of bags."""
+"""Tests that read bags."""

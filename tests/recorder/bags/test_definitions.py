@@ -1,4 +1,4 @@
-"""Definitions in bags: IDL, ROS 1 in MCAP, missing types, and encodings that are not supported."""
+"""Type definitions in bags: IDL, ROS 1 in MCAP, missing types, and unsupported encodings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ module demo_msgs { module msg {
 
 
 def write_mcap(path: Path, channels: list[tuple[str, str, str, str, str, bytes]]) -> Path:
-    """Write one message for each topic, type, schema encoding, definition, encoding and data."""
+    """Write one message for each channel.
+
+    A channel is given as topic, type, schema encoding, definition, message encoding and data.
+    """
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -124,7 +127,8 @@ std_srvs/srv/SetBool_Response[<=1] response
 @pytest.mark.parametrize("parts", ["", f"{'=' * 80}\nMSG: std_srvs/srv/SetBool_Request\n"])
 def test_service_events_are_read_without_their_request(parts: str, tmp_path: Path) -> None:
     kind = "std_srvs/srv/SetBool_Event"
-    # Event 2, 3.5 s, client 16 times 7, sequence number 9, and neither request nor response.
+    # The event has type 2, time 3.5 s, a client id of 16 bytes with the value 7, and sequence
+    # number 9. It has neither a request nor a response.
     info = struct.pack("<B3xiI16sxxxxq", 2, 3, 500_000_000, b"\7" * 16, 9)
     data = b"\0\1\0\0" + info + struct.pack("<II", 0, 0)
     other = ("/v", "geometry_msgs/msg/Vector3", "ros2msg", "", "cdr")

@@ -1,4 +1,4 @@
-"""Protobuf and JSON logs that foxglove-sdk wrote."""
+"""Protobuf and JSON logs that foxglove-sdk writes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ START_NS, STEP_NS, STEPS = 1_700_000_000 * 10**9, 50_000_000, 5
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write poses as protobuf, a state as JSON with a schema, and modes as JSON without one."""
+    """Write poses as protobuf, a state as JSON with a schema, and modes as JSON without schema."""
     need(importlib.util.find_spec("foxglove") is not None, "foxglove-sdk is not installed")
     import foxglove
     from foxglove.channels import LaserScanChannel, PoseInFrameChannel
@@ -84,7 +84,7 @@ def test_protobuf_fields(log: Path) -> None:
         np.testing.assert_allclose(found["pose.orientation.z"], np.sin(np.arange(STEPS) / 20))
         scans = bag.read("/scan", ["ranges", "start_angle", "end_angle"]).columns
         assert scans["ranges"].tolist() == [[1.0, float(step)] for step in range(STEPS)]
-        # A field that was not set has the default of protobuf.
+        # A field that the writer did not set has protobuf's default value.
         assert scans["end_angle"].tolist() == [0.0] * STEPS
 
 

@@ -1,4 +1,4 @@
-"""ROS bags of every form, written by rosbags, give the same columns."""
+"""ROS bags of every format, written by rosbags, are read as the same columns."""
 
 from __future__ import annotations
 

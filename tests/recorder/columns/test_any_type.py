@@ -1,4 +1,4 @@
-"""Random message types: columns equal the messages that mcap-ros2-support decodes."""
+"""Columns of random message types equal the messages that mcap-ros2-support decodes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TIME_TEXTS = "".join(f"{SEPARATOR}MSG: {name}\nint32 sec\nuint32 nanosec\n" for 
 
 
 def lines(kinds: tuple[str, ...]) -> st.SearchStrategy[str]:
-    """Definitions of up to four fields."""
+    """Generate message definitions with up to four fields."""
     arrays = st.sampled_from(["", "", "[3]", "[]"])
     fields = st.lists(st.tuples(st.sampled_from(kinds), arrays), min_size=1, max_size=4)
     return fields.map(
@@ -49,7 +49,7 @@ DEFINITIONS = st.tuples(
 
 
 class Maker:
-    """Random messages of a type; now and then with other lengths of strings and arrays."""
+    """Generator of random messages of a type; sometimes strings and arrays change in length."""
 
     def __init__(self, text: str, seed: int) -> None:
         self.store = get_typestore(Stores.EMPTY)
@@ -98,14 +98,14 @@ def write(path: Path, text: str, messages: list[bytes]) -> None:
 
 
 def at(message: Any, path: str) -> Any:
-    """Return a field by its path; a time in nanoseconds."""
+    """Return the value of the field with this path; times are in nanoseconds."""
     for name in path.split("."):
         message = getattr(message, name)
     return plain(message)
 
 
 def plain(value: Any) -> Any:
-    """Return messages as dicts, times as nanoseconds, and arrays as lists."""
+    """Convert messages to dicts, times to nanoseconds, and arrays to lists."""
     if isinstance(value, list | tuple | np.ndarray):
         return [plain(each) for each in value]
     if hasattr(value, "nanosec"):
@@ -131,7 +131,7 @@ def test_all_fields_equal_those_of_another_reader(text: str, seed: int, tmp_path
         try:
             column = topic.read([name])[name]
         except LogError:
-            # Arrays of numbers need equal lengths.
+            # Arrays of numbers can only be read as a column if their lengths are equal.
             assert len({len(value) for value in expected}) > 1
             continue
         assert [plain(value) for value in column.tolist()] == expected

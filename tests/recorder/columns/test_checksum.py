@@ -1,4 +1,4 @@
-"""CRCs equal zlib's with each implementation."""
+"""Each implementation of CRC-32 returns the same values as zlib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Indexes of chunks and of their messages, compared with those of the `mcap` library."""
+"""Chunk indexes and message indexes, compared with those that the `mcap` library writes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ CHUNK_INDEXES = st.builds(
 
 
 def content_of(chunk: ChunkIndex, after: bytes = b"") -> memoryview:
-    """Return the content of the record that the library writes, and more at its end."""
+    """Return the content of the record that the library writes, followed by the bytes `after`."""
     builder = RecordBuilder()
     chunk.write(builder)
     return memoryview(builder.end()[RECORD_HEADER.size :] + after)
@@ -90,7 +90,7 @@ def test_a_channel_that_is_listed_twice_is_refused() -> None:
 
 @pytest.mark.parametrize("field", ["chunk_start_offset", "chunk_length", "message_index_length"])
 def test_chunks_beyond_the_end_are_refused(log_path: Path, field: str) -> None:
-    """Also if the sum of lengths would overflow to an offset in the file."""
+    """Refuse such chunks even if the sum of lengths would overflow to an offset in the file."""
     record(log_path, MIXED_SPACE, spaces.Discrete(2), [5])
     reader = McapReader(log_path)
     data = log_path.read_bytes()[: reader.summary_start]
@@ -105,7 +105,7 @@ def test_chunks_beyond_the_end_are_refused(log_path: Path, field: str) -> None:
 
 @pytest.mark.parametrize("field", [32, 44])
 def test_invalid_lengths_are_refused(field: int) -> None:
-    """The lengths of an empty map and of the name start at bytes 32 and 44."""
+    """Change the length of the empty map, at byte 32, or the length of the name, at byte 44."""
     content = bytearray(content_of(ChunkIndex(1, 2, "zstd", 3, 4, 5, {}, 6, 7)))
     for wrong in (61, 2**31, 2**32 - 1):
         struct.pack_into("<I", content, field, wrong)

@@ -1,4 +1,4 @@
-"""Compaction at close: small chunks become few, no message is lost, whatever write fails."""
+"""Compaction at close: small chunks are merged, and no message is lost if a write fails."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LENGTHS = [1, 5, 2, 40, 3] * 12
 
 
 def messages_of(path: Path) -> dict[str, list[tuple[int, int, int, bytes]]]:
-    """Return sequence, times and bytes of all messages by topic, in file order."""
+    """Return sequence numbers, times and bytes of all messages by topic, in file order."""
     found: dict[str, list[tuple[int, int, int, bytes]]] = {}
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
@@ -77,7 +77,7 @@ def groups(*chunks: ChunkIndex) -> list[list[int]]:
 
 def test_only_small_chunks_of_one_kind_are_merged() -> None:
     small, large = 2**15, 2**16
-    # Channels 2 and 3 share a chunk, so that they are of one kind.
+    # Channels 2 and 3 share a chunk, so they are of the same kind.
     assert groups(
         chunk(0, small, 1),
         chunk(1, small, 2, 3),
@@ -114,7 +114,7 @@ def test_nothing_worth_rewriting_is_left(log_path: Path, monkeypatch: pytest.Mon
 
 
 def test_each_write_of_the_compaction_fails(log_path: Path) -> None:
-    """The log with its small chunks is complete then, and nothing is left beside it."""
+    """If a write fails, the log with small chunks is complete, and no temporary file remains."""
     write_log(log_path, 6)
     after = len(McapReader(log_path).chunks)
     failed, finished = 0, 10**9
@@ -156,13 +156,13 @@ def test_the_last_steps_fail(
     assert check_log(log_path) == []
     assert len(mcaprl.open(log_path).episodes) == 6
     monkeypatch.undo()
-    # The lock is free again.
+    # Afterwards, the log is not locked.
     file_lock.release(file_lock.reopen(log_path))
 
 
 @pytest.mark.parametrize("writes", [0, 1, 2, 4, 6])
 def test_killed_while_compacting(log_path: Path, writes: int) -> None:
-    """The log is whole, and who appends to it removes what is left of the compaction."""
+    """The log is complete, and the next writer that appends removes the temporary files."""
     code = """
         import os, signal, sys
         from pathlib import Path
@@ -204,7 +204,7 @@ def append(path: Path, episodes: int, *, first: int) -> None:
 
 
 def test_readers_keep_the_old_file(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And a second writer that waits with the old file opens the new one."""
+    """Readers keep the old file during compaction, and no second writer can lock the log."""
     opened: list[McapReader] = []
     replace = os.replace
 
@@ -232,7 +232,7 @@ def test_readers_keep_the_old_file(log_path: Path, monkeypatch: pytest.MonkeyPat
 def test_a_writer_that_opened_the_old_file_gets_the_new_one(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Between its open and its lock, the file may be replaced, and the lock of the old one free."""
+    """Replace the file after the writer has opened it and before the writer locks it."""
     write_log(log_path, 2)
     locked = try_lock
     copy = log_path.read_bytes()
@@ -265,7 +265,7 @@ def test_links_and_modes_stay(tmp_path: Path) -> None:
 
 
 def test_a_file_that_was_moved_away_is_left_alone(tmp_path: Path) -> None:
-    """Its path may be another recording's now."""
+    """Do not compact a moved file, because its path may belong to another recording."""
     env = mcaprl.RecordMcap(KnownEpisodes(), tmp_path / "a.mcap")
     for _ in range(6):
         play(env)

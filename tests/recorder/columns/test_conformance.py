@@ -1,4 +1,4 @@
-"""Every combination of MCAP's optional features is read, with and without padded records."""
+"""Files with every combination of MCAP's optional features, with and without padded records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Inputs that once failed, and the seeds of the fuzzer."""
+"""Inputs with which the fuzzer found errors in the past, and its seed inputs."""
 
 from __future__ import annotations
 

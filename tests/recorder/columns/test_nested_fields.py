@@ -1,4 +1,4 @@
-"""Nested fields, times and texts of common ROS messages as columns."""
+"""Nested fields, times and strings of common ROS messages, read as columns."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def random_value(random: np.random.Generator, description: Any, path: str) -> An
     name = kind.name
     if name == "BASE":
         if what[0] == "string":
-            # Now and then another length, so that layouts differ.
+            # Some strings have another length, so that the layouts of messages differ.
             return "frame" if random.random() < 0.9 else "another frame"
         return random_number(random, what[0])
     if name == "NAME":

@@ -1,4 +1,4 @@
-"""Logs of many short episodes: small chunks are read with the same result as merged ones."""
+"""Logs of many short episodes: small chunks and merged chunks contain the same data."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_merged_or_not(
     apart = mcaprl.open(log_path, threads=threads, images="memory")
     assert chunks * 5 < _chunks(log_path)
     assert merged.fingerprint == apart.fingerprint
-    # Compared as text, in which NaN equals NaN.
+    # The summaries are compared as text, because NaN equals NaN in text.
     assert [str(e.summary) for e in merged.episodes] == [str(e.summary) for e in apart.episodes]
     for name in ("rewards", "behavior_probs"):
         assert getattr(merged, name).tobytes() == getattr(apart, name).tobytes()
@@ -68,7 +68,7 @@ def test_an_index_may_not_lead_out_of_its_chunk(log_path: Path) -> None:
 
 
 def test_strings_of_equal_length_and_different_layout(log_path: Path) -> None:
-    """Messages of equal length whose strings differ in length are decoded one by one."""
+    """Decode messages one by one if they have equal lengths but strings of different lengths."""
     reasons, policies = ["bbbb", "bb", "bbbb"], ["aa", "aaaa", "aa"]
     infos = {"reason": ""}
     rows = [

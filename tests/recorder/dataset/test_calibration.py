@@ -1,4 +1,4 @@
-"""Calibration of logged probabilities: by hand, and for known policies."""
+"""Calibration of logged probabilities: results calculated by hand, and known policies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from mcaprl.recorder.dataset.lint import lint
 def test_by_hand() -> None:
     found = calibration(np.array([0.5, 0.5, 0.25, 1.0]), spaces.Discrete(3))
     assert found is not None
-    # (2 + 2 + 4 + 1) / 4, deviations -.25, -.25, 1.75, -1.25: variance 4.75 / 3, over 4.
+    # The mean of 1 / p is (2 + 2 + 4 + 1) / 4. The deviations are -0.25, -0.25, 1.75 and -1.25, so
+    # the variance is 4.75 / 3. The squared standard error is this variance divided by 4.
     assert (found.available, found.actions) == (3, 2.25)
     assert found.error == pytest.approx(math.sqrt(4.75 / 3 / 4))
     assert found.ranges == (
@@ -66,7 +67,7 @@ def test_probabilities_that_are_too_small_are_a_problem() -> None:
 
 @pytest.mark.parametrize("tiny", [1, 12, 400])
 def test_a_probability_too_small_to_be_drawn_is_a_problem(tiny: int) -> None:
-    """The standard error of 12 huge inverses is as large as their mean."""
+    """Report this even if 12 huge values of 1 / p make the standard error as large as the mean."""
     probs = np.full(400, 0.5)
     probs[:tiny] = 1e-38
     found = calibration(probs, spaces.Discrete(2))

@@ -18,7 +18,7 @@ from tests.support.recordings import MIXED_SPACE, record
 
 
 def small() -> mcaprl.Dataset:
-    """Three episodes: one terminated, one truncated, and one that is not finished."""
+    """Return three episodes: one terminated, one truncated, and one that is not finished."""
     return mcaprl.Dataset.from_arrays(
         observations=np.array([[0.0], [1.0], [5.0], [7.0], [8.0]], np.float32),
         next_observations=np.array([[1.0], [2.0], [6.0], [8.0], [9.0]], np.float32),

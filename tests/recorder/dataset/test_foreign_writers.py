@@ -1,4 +1,4 @@
-"""Logs of other writers: every path of the reader returns the same values."""
+"""Logs of other writers: all code paths of the reader return the same values."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ TEXTS = {
 
 
 def assert_reads(path: Path, steps: Steps = STEPS, *, lengths: list[int] = LENGTHS) -> None:
-    """Check that the file contains these transitions, and spaces that contain them."""
+    """Check that the file contains these transitions, and that its spaces contain them."""
     data = mcaprl.open(path)
     fields, actual = steps.fields, steps.actual
     following = np.roll(actual, 1)
@@ -129,7 +129,7 @@ def test_two_channels_of_one_topic(log_path: Path) -> None:
 
 
 def test_two_robots_record_at_the_same_time(log_path: Path) -> None:
-    """Two channels at the same times: one robot's episodes are read after the other's."""
+    """Read two channels with messages at the same times, one robot after the other."""
     first, second = steps_of([4, 5]), steps_of([6, 3], seed=1)
     pairs = zip(plain_messages(first), plain_messages(second), strict=True)
     write_with_mcap(log_path, [m for pair in pairs for m in pair], channels=lambda row: row % 2)
@@ -141,7 +141,7 @@ def test_two_robots_record_at_the_same_time(log_path: Path) -> None:
 
 
 def test_two_channels_of_different_types(log_path: Path) -> None:
-    """Equal fields and length in another order: each channel is read by its definition."""
+    """Read two channels whose fields have a different order; each has its own definition."""
     lines = PLAIN.splitlines(keepends=True)
     swapped = "".join([lines[1], lines[0], *lines[2:4], lines[5], lines[4], *lines[6:]])
     codecs = [Codec(PLAIN), Codec(swapped)]
@@ -179,7 +179,7 @@ def test_foxglove_writer(log_path: Path, messages: str) -> None:
 
 
 def test_images_of_another_writer(log_path: Path) -> None:
-    """More images than records, from a camera whose frame_id changes in length."""
+    """Read a log with more images than records, and with a frame_id that changes in length."""
     from mcaprl.recorder.format import messages
 
     writer = Writer(str(log_path), chunk_size=3000)
@@ -254,7 +254,7 @@ def test_no_observation(log_path: Path) -> None:
 
 
 def test_float32_rewards_are_summed_in_float64(log_path: Path) -> None:
-    """In float32, 2**24 + 1 is 2**24."""
+    """Add rewards that float32 cannot add exactly: 2**24 + 1 would be 2**24."""
     text = PLAIN.replace("float64 reward", "float32 reward")
     codec, steps = Codec(text), steps_of([3])
     steps.fields["reward"] = np.array([2**24, 1, 1, 0], np.float32)
@@ -300,7 +300,7 @@ NUMBERS = ["float64", "float32", "int64", "uint32", "int16", "uint8", "bool"]
 
 @st.composite
 def types_and_messages(draw: st.DrawFn) -> tuple[str, list[str], list[dict[str, Any]]]:
-    """A message type of numbers, arrays, lists and strings, with messages."""
+    """Generate a type of numbers, arrays, lists and strings, and messages of this type."""
     kinds = draw(st.lists(st.sampled_from([*NUMBERS, "string"]), min_size=1, max_size=8))
     shapes = [
         "" if kind == "string" else draw(st.sampled_from(["", "[3]", "[]", "[<=4]"]))
@@ -334,7 +334,7 @@ def test_columns_equal_what_rosbags_decodes(
     big_endian: bool,
     padding: int,
 ) -> None:
-    """Any type in any byte order: fast and slow path return the same bits."""
+    """The fast path and rosbags return the same bits for any type and byte order."""
     text, names, fields = drawn
     codec = Codec(text)
     encoded = [codec.encode(big_endian=big_endian, **f) + b"\0" * padding for f in fields]

@@ -1,4 +1,4 @@
-"""Each problem of a dataset is reported with its place, and only where it is."""
+"""Each problem of a dataset is reported with its position, and nothing else is reported."""
 
 from __future__ import annotations
 
@@ -131,7 +131,8 @@ def test_problems_are_listed_before_notes() -> None:
 
 def test_gaps_in_time_are_measured_in_usual_steps() -> None:
     gappy = dataset()
-    # A gap of half a second between steps of a tenth, the duration that from_arrays assumes.
+    # Make a gap of 0.5 s between two steps. All other steps take 0.1 s, the default of
+    # `from_arrays`.
     gappy.episodes[1].log_time_ns[2:] += 400_000_000
     [finding] = lint(gappy)
     assert str(finding).startswith(

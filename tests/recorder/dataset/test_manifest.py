@@ -1,4 +1,4 @@
-"""Manifests of recordings: which files are read, and what a wrong one says."""
+"""Manifests of recordings: the files that are read, and the errors for wrong manifests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.support.faults import write_log
 
 @pytest.fixture
 def manifest(tmp_path: Path) -> Path:
-    """Return the manifest of two logs, in another order than that of their names."""
+    """Return the manifest of two logs, which it does not list in the order of their names."""
     files = []
     for name, episodes in (("b.mcap", 1), ("a.mcap", 2)):
         write_log(tmp_path / name, episodes)

@@ -1,4 +1,4 @@
-"""Images on disk, in the log or in a copy beside it: the same values as in memory."""
+"""Images on disk, in the log or in a copy beside the log, equal the images in memory."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mcaprl.recorder.dataset.mapped import MappedImages
 from tests.recorder.dataset.test_selection import damage
 from tests.support.recordings import MIXED_SPACE, assert_same_bits, leaves_of, record
 
-# Each episode has its own chunks, of which single ones are damaged here.
+# Each episode has separate chunks, so that a test can damage the chunks of one episode.
 pytestmark = pytest.mark.usefixtures("small_chunks")
 
 LENGTHS = [120, 1, 33, 210]

@@ -1,4 +1,4 @@
-"""Parts of logs: only selected columns and episodes are read."""
+"""Selections of columns and episodes: nothing else of a log is read."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mcaprl.recorder.columns.reader import McapReader
 from tests.support.foreign_logs import plain_messages, steps_of, write_with_mcap
 from tests.support.recordings import MIXED_SPACE, assert_same_bits, record
 
-# Each episode has its own chunks, of which single ones are damaged here.
+# Each episode has separate chunks, so that a test can damage the chunks of one episode.
 pytestmark = pytest.mark.usefixtures("small_chunks")
 
 LENGTHS = [5, 1, 120, 30, 7]
@@ -140,7 +140,7 @@ def test_episodes_of_a_cut_log(log: Path, tmp_path: Path) -> None:
 
 
 def test_episodes_of_another_writer(tmp_path: Path) -> None:
-    """Without `/rl/episode` and in any order, episodes are found by their counters."""
+    """Find episodes by their counters if messages are unordered and `/rl/episode` is missing."""
     messages = plain_messages(steps_of([4, 9, 2, 6]))
     order = np.random.default_rng(0).permutation(len(messages)).tolist()
     write_with_mcap(tmp_path / "log.mcap", [messages[row] for row in order])
@@ -165,7 +165,7 @@ def test_damage_is_reported_with_several_threads(log: Path, tmp_path: Path) -> N
 
 @pytest.fixture(scope="module")
 def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record vectors in several large chunks: forty episodes of a thousand steps."""
+    """Record forty episodes of a thousand steps with vectors, which fill several large chunks."""
     path = tmp_path_factory.mktemp("selection") / "large.mcap"
     steps = 40_000
     frames = np.random.default_rng(0).standard_normal((steps + 1, 4), np.float32)
@@ -181,7 +181,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_indexes_of_other_chunks_are_not_read(large: Path, tmp_path: Path) -> None:
-    """Reading one episode must not touch the whole of a large file."""
+    """Read one episode without reading the indexes of all other chunks."""
     reader = McapReader(large)
     channel = reader.channel_of("/rl/step")
     assert channel is not None
@@ -208,7 +208,7 @@ def test_an_index_with_too_few_messages_is_refused(large: Path, tmp_path: Path) 
     chunk = list(reader.message_ranges(channel))[2].chunk
     assert chunk is not None
     spoilt = bytearray(large.read_bytes())
-    # The size of the entries follows opcode, length and channel id.
+    # The opcode, the record length and the channel id precede the size of the entries.
     place = chunk.message_index_offsets[channel.id] + 11
     (reported,) = struct.unpack_from("<I", spoilt, place)
     struct.pack_into("<I", spoilt, place, reported - 16)

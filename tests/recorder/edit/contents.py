@@ -12,7 +12,7 @@ Message = tuple[str, int, int, bytes]
 
 
 def messages_of(path: Path) -> Counter[Message]:
-    """Count the messages of a file by their content; all CRCs are checked."""
+    """Count the messages of a file by their content, and check all CRCs."""
     with path.open("rb") as file:
         return Counter(
             (channel.topic, message.log_time, message.publish_time, message.data)

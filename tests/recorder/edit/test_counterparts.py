@@ -1,4 +1,4 @@
-"""Other programs read edited logs, and a command that is killed leaves no log."""
+"""Other programs read edited logs, and a killed command leaves no incomplete log."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ S = 10**9
 
 @pytest.fixture(scope="module")
 def edited(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Return one log that each function made, by the name of the function."""
+    """Return one log of each editing function, by the name of the function."""
     folder = tmp_path_factory.mktemp("edited")
     space = spaces.Dict(
         {"x": spaces.Box(-1, 1, (3,), np.float64), "eye": spaces.Box(0, 255, (8, 9, 3), np.uint8)}
@@ -64,7 +64,7 @@ NAMES = ["merge", "shift", "filter", "slice", "split"]
 
 
 def by_stream(path: Path) -> Counts:
-    """Read the file from its start, as a program that does not seek does."""
+    """Read the file from start to end, without seeking."""
     with path.open("rb") as file:
         found = NonSeekingReader(file, validate_crcs=True).iter_messages()
         return Counter(channel.topic for _, channel, _ in found)
@@ -163,11 +163,12 @@ def test_commands_of_the_page(
     lines = capsys.readouterr().out.splitlines()
     both, *parts, long, start, minute = (line.split(", ")[:2] for line in lines)
     assert both == ["both.mcap: 12 episodes", "1103 steps"]
-    # A tenth of 12 episodes is rounded to 1.
+    # One tenth of 12 episodes is 1.2, which is rounded to 1 episode.
     assert [part[0].split(": ")[1] for part in parts] == ["10 episodes", "1 episode", "1 episode"]
     assert long == ["long.mcap: 2 episodes", "203 steps"]
     assert start == ["start.mcap: 11 episodes", "1000 steps"]
-    # The records at 60 to 119 s: 30 transitions of the first episode, and 28 of the second.
+    # The part has the records from 60 s to 119 s. They are 30 transitions of the first episode and
+    # 28 transitions of the second.
     assert minute == ["minute.mcap: 2 episodes", "58 steps"]
 
 
@@ -220,6 +221,6 @@ def test_killed_command_leaves_nothing_under_the_name(tmp_path: Path, command: s
             process.kill()
     assert not out.exists()
     assert (tmp_path / "a.mcap").read_bytes() == before
-    # The next command uses the name, and removes what the killed one left.
+    # The next command can write to the same path, and removes the files of the killed command.
     mcaprl.filter("length > 1", tmp_path / "a.mcap", out)
     assert sorted(one.name for one in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "out"]

@@ -1,4 +1,4 @@
-"""A joined log has all messages of its logs, and their episodes in the order of their times."""
+"""A joined log has all messages of its source logs, with the episodes in time order."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ S = 10**9
 
 
 def logged(path: Path, lengths: list[int], start_s: float = 0.0, **options: Any) -> Path:
-    """Record random values from this time on."""
+    """Record a log of random values that starts at `start_s`."""
     record(path, SPACE, ACTIONS, lengths, start_time_ns=10**18 + round(start_s * S), **options)
     return path
 
@@ -61,7 +61,7 @@ def test_logs_one_after_the_other(tmp_path: Path) -> None:
     assert summaries(tmp_path / "out.mcap") == summaries([a, b])
     assert messages_of(tmp_path / "out.mcap") == messages_of(a) + messages_of(b)
     assert check_log(tmp_path / "out.mcap") == []
-    # Ids are kept, so that all chunks are those of the logs.
+    # The channel ids do not change, so all chunks are copied unchanged.
     copies = {bytes(r.view[c.chunk_start_offset : end_of(c)]) for r, c in _chunks([a, b])}
     assert {bytes(r.view[c.chunk_start_offset : end_of(c)]) for r, c in _chunks([found.out])} == (
         copies
@@ -90,7 +90,7 @@ def test_overlapping_logs_are_refused_or_moved(tmp_path: Path) -> None:
     joined = mcaprl.open(tmp_path / "out.mcap")
     assert joined.fingerprint == mcaprl.open([a, b]).fingerprint
     assert check_log(tmp_path / "out.mcap") == []
-    # Log a has 9 records 0.05 s apart. The next time is free for the first record of log b.
+    # Log a has 9 records at intervals of 0.05 s, so log b can start at 0.45 s.
     starts = [episode.summary.start_time_ns - 10**18 for episode in joined.episodes]
     assert starts == [0, round(0.2 * S), round(0.45 * S), round(0.6 * S)]
     before = [episode.summary for episode in mcaprl.open(b).episodes]
@@ -129,7 +129,7 @@ def test_times_inside_of_messages_move(tmp_path: Path) -> None:
 
 
 def stamps_of(path: Path) -> list[tuple[str, int, int]]:
-    """Return topic, log_time and time of each time field of each message, in nanoseconds."""
+    """Return topic, log_time and value of each time field in the messages, nanoseconds."""
     found = []
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
@@ -213,7 +213,7 @@ def test_other_metadata_are_those_of_the_logs_read_together(tmp_path: Path) -> N
 
 
 def sensor_log(path: Path, ids: list[int], *, at_ns: int = 5) -> dict[str, list[bytes]]:
-    """Write a file with channels of these ids, as mcap's writer does: channels in chunks."""
+    """Write a file with channels of these ids; the `mcap` library stores channels in chunks."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -261,7 +261,7 @@ def test_sensor_file_joins_a_log(tmp_path: Path) -> None:
 
 
 def foreign_log(path: Path, text: str, start_ns: int, seed: int) -> Path:
-    """Write a log without metadata, as another program does."""
+    """Write a log without metadata, like a log of another program."""
     steps = steps_of([3, 2], start_ns=start_ns, seed=seed)
     encode = plain_messages if text == PLAIN else partial(variable_messages, text_of=str)
     with path.open("wb") as file:
@@ -318,7 +318,7 @@ def test_infos_are_joined(tmp_path: Path) -> None:
     assert mcaprl.open(tmp_path / "out.mcap").infos["info"].tolist() == [None, 0.0, None, 1.0]
     mcaprl.filter("episode == 1", tmp_path / "out.mcap", tmp_path / "part.mcap")
     assert mcaprl.open(tmp_path / "part.mcap").infos["info"].tolist() == [None, 1.0]
-    # Log a has no info, so the part that is log a has none.
+    # The filtered part contains only episodes of log a, which has no infos.
     logged(tmp_path / "a.mcap", [1], start_s=5, step_duration_s=0.05)
     mcaprl.merge([paths[0], tmp_path / "a.mcap"], tmp_path / "some.mcap")
     mcaprl.filter("episode == 1", tmp_path / "some.mcap", tmp_path / "none.mcap")

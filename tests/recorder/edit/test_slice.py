@@ -1,4 +1,4 @@
-"""A part of a log between two steps or times; episodes at its bounds become shorter."""
+"""Parts of a log between two steps or times; episodes at the bounds become shorter."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from tests.support.strategies import transitions
 SPACE = spaces.Dict(
     {"x": spaces.Box(-1, 1, (2,), np.float32), "image": spaces.Box(0, 255, (8, 9), np.uint8)}
 )
-# Records are 0.05 s apart: episode 0 begins at 0 s, 1 at 0.25 s, 2 at 0.35 s, and ends at 0.5 s.
+# Records are at intervals of 0.05 s. The episodes begin at 0 s, 0.25 s and 0.35 s, and the last one
+# ends at 0.5 s.
 LENGTHS = [4, 1, 3]
 
 
@@ -67,7 +68,7 @@ def test_part_within_two_episodes(log: Path, tmp_path: Path) -> None:
         True,
         "interrupted",
     )
-    # The last record before the part's end is only an observation.
+    # The last record of the part is a final record: it has only an observation.
     assert part.truncated.tolist() == [False, False, True, False, True]
     assert part.terminated.tolist() == [False, True, False, False, False]
 
@@ -81,7 +82,7 @@ def test_part_within_one_episode(log: Path, tmp_path: Path) -> None:
     counts: dict[str, int] = {}
     for topic, *_ in messages_of(tmp_path / "out.mcap").elements():
         counts[topic] = counts.get(topic, 0) + 1
-    # The episode has run since its start, which is the phase in which the part begins.
+    # The part keeps one phase message: the phase `running` from the start of the episode.
     assert counts.pop("/rl/phase") == 1
     assert counts == {"/rl/step": 3, "/rl/observation/image": 3, "/rl/episode": 1}
 
@@ -98,13 +99,13 @@ def test_part_of_whole_episodes_changes_no_message(log: Path, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("time", "expected"),
     [
-        # The records at 0.05, 0.10 and 0.15 s: two transitions.
+        # The records at 0.05, 0.10 and 0.15 s are two transitions.
         ((0.05, 0.2), [(0, 1, 3)]),
         ((0.04, 0.1999), [(0, 1, 3)]),
-        # The final record of the first episode alone is no transition.
+        # The final record of the first episode is left out, because it is not a transition.
         ((0.2, None), [(1, 0, 1), (2, 0, 3)]),
         ((None, 0.25), [(0, 0, 4)]),
-        # Nor is the first record of the last one.
+        # The first record of the last episode alone is not a transition, either.
         ((0.25, 0.4), [(1, 0, 1)]),
         ((None, None), [(0, 0, 4), (1, 0, 1), (2, 0, 3)]),
     ],
@@ -140,7 +141,7 @@ def test_any_part_has_the_rows_of_the_log(
 
 def test_part_of_a_file_without_steps(tmp_path: Path) -> None:
     sensor_log(tmp_path / "camera.mcap", [1, 2, 4], at_ns=10**18)
-    # The messages are 1, 2 and 4 ns after that time: 0, 1 and 3 ns after the first.
+    # The messages are 1, 2 and 4 ns after `at_ns`, and thus 0, 1 and 3 ns after the first message.
     mcaprl.slice(tmp_path / "camera.mcap", tmp_path / "out.mcap", time=(1e-9, 3e-9))
     assert [message[:2] for message in messages_of(tmp_path / "out.mcap")] == [
         ("/camera/2", 10**18 + 2)
@@ -171,7 +172,7 @@ def test_latched_messages_before_the_part(
                 writer.add_message(robot, 10**18 + time_s * 10**9, b"robot %d" % time_s, 0)
         writer.finish()
     mcaprl.slice(tmp_path / "robot.mcap", tmp_path / "out.mcap", time=(3, 5))
-    # The second of the three descriptions is the one that is valid at 3 s.
+    # Of the three descriptions, the second is valid at 3 s.
     robots = [b"robot 1"] if is_kept else []
     found = sorted(data for _, _, _, data in messages_of(tmp_path / "out.mcap"))
     assert found == sorted([b"3", b"4", *robots])

@@ -1,4 +1,4 @@
-"""Parts of a log have all messages of their episodes, and joined they are the log again."""
+"""The parts of a log have all messages of their episodes. Joined again, they equal the log."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_joined_parts_of_golden_logs(name: str, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three episodes of the lane, with its scene, which is static from the first episode on."""
+    """Record three episodes of the lane sim; its static scene is written in the first episode."""
     path = tmp_path_factory.mktemp("scenes") / "lane.mcap"
     env = mcaprl.RecordMcap(mcaprl.make_sim("lane"), path, start_time_ns=10**18)
     for seed in range(3):
@@ -141,7 +141,7 @@ def test_attachments_and_metadata_are_kept(scenes: Path, tmp_path: Path) -> None
 
 
 class _Numbers(gym.Env[Any, Any]):
-    """Observations are long vectors of noise, so that an episode fills several chunks."""
+    """Environment with long random observations, so that an episode fills several chunks."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (500,), np.float64)
     action_space = spaces.Discrete(2)
@@ -155,7 +155,7 @@ class _Numbers(gym.Env[Any, Any]):
 
 
 def chunks_of(path: Path) -> list[bytes]:
-    """Return the bytes of each chunk and its indexes."""
+    """Return the bytes of each chunk with its message indexes."""
     reader = McapReader(path)
     return [bytes(reader.view[c.chunk_start_offset : end_of(c)]) for c in reader.chunks]
 
@@ -304,8 +304,8 @@ def test_commands(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     (tmp_path / "out.mcap").unlink()
     assert run(["filter", "length > 2", str(log), str(out), "--json"]) == 0
     (one,) = json.loads(capsys.readouterr().out)["logs"]
-    # 9 records of 2 episodes, 2 summaries, and the start and end of each episode on 2 topics. So
-    # short a log has 2 chunks for each episode.
+    # There are 9 records and 2 summaries of 2 episodes, and the start and the end of each episode
+    # on 2 topics. In a log as short as this, each episode has 2 chunks.
     assert one == {
         "out": str(out),
         "episodes": 2,

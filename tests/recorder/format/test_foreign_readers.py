@@ -36,14 +36,17 @@ Messages = dict[str, list[tuple[int, Any]]]
 
 @pytest.fixture(scope="module", params=["zstd", "lz4", "none"])
 def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two topics of images, vectors of all dtypes, NaN and infinities, several chunks each."""
+    """Record two image topics, and vectors of all dtypes with NaN and infinity.
+
+    Each topic has several chunks.
+    """
     path = tmp_path_factory.mktemp("foreign") / "log.mcap"
     record(path, MIXED_SPACE, spaces.Discrete(5), [120, 1, 33], compression=request.param)
     return path
 
 
 def ours(path: Path) -> dict[str, dict[str, np.ndarray[Any, Any]]]:
-    """Read each topic with our reader: one array per field."""
+    """Read each topic with our reader, as one array per field."""
     dataset = mcaprl.open(path)
     leaves = observation_leaves(dataset.observation_space)
     topics: dict[str, dict[str, np.ndarray[Any, Any]]] = {}
@@ -106,7 +109,7 @@ def by_rosbags(path: Path) -> Messages:
 
 
 def node_lines(script: str, path: Path) -> list[Any]:
-    """Return the lines of JSON that a script of `tests/node` prints for a log."""
+    """Return the JSON lines that a script in `tests/node` prints for a log."""
     need(shutil.which("node") is not None, "Node is not installed")
     need((NODE / "node_modules").is_dir(), "packages of tests/node are not installed: npm ci")
     command = ["node", str(NODE / script), str(path)]
@@ -143,7 +146,7 @@ def test_every_reader_returns_the_recorded_values(
 
 @pytest.fixture(scope="module")
 def scene_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of the lane sim with its scene."""
+    """Record the lane sim with its scene."""
     path = tmp_path_factory.mktemp("foreign") / "lane.mcap"
     with closing(mcaprl.RecordMcap(make_sim("lane"), path)) as env:
         env.reset(seed=0)
@@ -182,7 +185,7 @@ def test_markers_and_frames_pass_through(scene_log: Path, read: Callable[[Path],
                 assert points == shapes[name].points.tolist(), name
                 assert _field(_field(marker, "header"), "frame_id") == shapes[name].frame
     for (_, tree), moment in zip(found["/tf"], moments, strict=True):
-        # The others are the poses until the next step.
+        # The other transforms are the poses until the next step.
         transform = _field(tree, "transforms")[0]
         translation = _field(_field(transform, "transform"), "translation")
         assert tuple(_field(translation, axis) for axis in "xyz") == moment.frames[0].position
@@ -210,13 +213,13 @@ def _field(message: Any, name: str) -> Any:
 
 
 def _assert_equal(values: list[Any], column: np.ndarray[Any, Any], where: str) -> None:
-    """Compare bit for bit in the dtype of our column; strings and None by ==."""
+    """Compare numbers bit for bit in the dtype of our column, and strings and None with `==`."""
     assert len(values) == len(column), f"{where}: {len(values)} messages, not {len(column)}"
     if column.dtype.kind in "OU":
         assert [_known(value) for value in values] == column.tolist(), where
         return
     dtype = stored_dtype(column.dtype)
-    # One element at a time: a list of big integers must not be converted to float.
+    # Convert one element at a time, because NumPy would convert a list of big integers to float.
     lists = [list(value) if isinstance(value, bytes) else value for value in values]
     flat = [_number(part, dtype) for value in lists for part in np.ravel(value).tolist()]
     actual = np.array(flat, dtype)
@@ -229,7 +232,7 @@ def _number(value: Any, dtype: np.dtype[Any]) -> Any:
 
 
 def _known(value: Any) -> Any:
-    """`/rl/episode` stores -1 if no seed was passed."""
+    """Convert text to an integer, and -1 to None: `/rl/episode` stores -1 if there is no seed."""
     if isinstance(value, str) and value.lstrip("-").isdigit():
         value = int(value)
     return None if value == -1 else value

@@ -1,4 +1,4 @@
-"""Logs whose metadata are huge, deep or of other types: one clear error, and no memory taken."""
+"""Logs with huge, deeply nested or wrongly typed metadata: one clear error, and little memory."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ ODD = [
 
 
 def peak_bytes(function: Callable[[], object]) -> int:
-    """The most memory that a call held at once."""
+    """Return the peak memory of a call, bytes."""
     tracemalloc.start()
     try:
         function()
@@ -153,7 +153,8 @@ def test_a_channel_that_points_at_another_schema_is_reported(log_path: Path) -> 
     steps, episodes = (reader.channel_of(topic) for topic in ("/rl/step", "/rl/episode"))
     assert steps is not None
     assert episodes is not None
-    # The id of the schema follows that of the channel; CRCs of the summary are switched off.
+    # In a Channel record, the schema id follows the channel id. The CRC of the summary is set to 0,
+    # so it is not checked.
     for channel, other in ((steps, episodes), (episodes, steps)):
         head = channel.id.to_bytes(2, "little") + channel.schema_id.to_bytes(2, "little")
         text = len(channel.topic).to_bytes(4, "little") + channel.topic.encode()

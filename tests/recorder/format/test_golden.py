@@ -1,4 +1,4 @@
-"""Golden logs of format version 1: later versions read them with the same contents."""
+"""Golden logs of format version 1, which later versions must read with the same contents."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def test_golden_file_has_the_reference_contents(name: str) -> None:
     path, stated = FOLDER / f"{name}.mcap", dict(STATED[name])
     assert hashlib.sha256(path.read_bytes()).hexdigest() == stated.pop("sha256"), "it is changed"
     assert json.loads(json.dumps(contents_of(path))) == stated
-    # The recordings take actions that their spaces do not have.
+    # The recordings contain actions that are not in their action spaces.
     assert [one for one in check_log(path) if one.next != IMPOSSIBLE_ACTION] == []
 
 
 def test_known_values() -> None:
-    """Check one file by its formula, independently of the stored hashes."""
+    """Check one file against the formula that generated it, without the stored hashes."""
     (episode,) = mcaprl.open(FOLDER / "reported.mcap").episodes
     assert_is_known(episode)
 

@@ -1,4 +1,4 @@
-"""The generated messages: definitions, bytes and names."""
+"""Generated message types: definitions, encoded bytes and names."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ FIELDS = {"float64": 8, "int64": 8, "float32": 4, "uint16": 2, "uint8": 1, "bool
     st.lists(st.tuples(st.sampled_from(list(FIELDS)), st.integers(0, 3)), min_size=1, max_size=8)
 )
 def test_fixed_length_messages_equal_those_of_rosbags(fields: list[tuple[str, int]]) -> None:
-    """Fields in any order, so with padding; each field has a distinct value."""
+    """Encode fields in any order, and thus with padding; each field has a distinct value."""
     text = "".join(
         f"{kind}{f'[{count}]' if count else ''} f{number}\n"
         for number, (kind, count) in enumerate(fields)

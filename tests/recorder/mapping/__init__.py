@@ -1,1 +1,1 @@
-"""Tests of the mapping of bags."""
+"""Tests of mappings, which convert bags to datasets."""

@@ -1,4 +1,4 @@
-"""Alignment of messages with steps, against a message-by-message reference."""
+"""Alignment of messages with steps, compared with a reference that reads one message at a time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STEPS_NS = np.array([50, 100, 150, 200, 360, 350, 600], np.int64)
 
 def test_last_message_up_to_each_step_by_hand() -> None:
     match = last(TIMES_NS, STEPS_NS, None)
-    # Of two messages with the same time, the second is the last.
+    # If two messages have the same time, the second one counts as the last.
     assert match.rows.tolist() == [NONE, 0, 0, 2, 2, 2, 3]
     np.testing.assert_allclose(
         match.age_s * 1e9, [math.nan, 0, 50, 0, 160, 150, 100], equal_nan=True
@@ -88,7 +88,7 @@ def test_alignment_equals_a_search_message_by_message(
     ]
     found = nearest(times_ns, steps_ns, limit_s).rows.tolist()
     expected = [reference(step, "nearest") for step in steps_ns.tolist()]
-    # Of messages with the same time after the step, either is nearest.
+    # If several messages have the same time, any of them can be the nearest. Compare only times.
     assert [times_ns[k] if k != NONE else None for k in found] == [
         times_ns[k] if k != NONE else None for k in expected
     ]

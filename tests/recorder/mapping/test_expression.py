@@ -1,4 +1,4 @@
-"""Expressions: values worked by hand, and syntax that is refused."""
+"""Expressions: results calculated by hand, and syntax that is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Datasets from bags in memory, with numbers worked by hand."""
+"""Datasets from bags in memory, with numbers calculated by hand."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.memory_bag import SECOND_NS, MemoryBag
 
 
 def mapping(**parts: Any) -> Mapping:
-    """Return a mapping of speed to go or stop, one step per second."""
+    """Return a mapping with the observation `speed`, a discrete action, and a rate of 1 Hz."""
     tree = {
         "clock": {"rate_hz": 1},
         "observation": {"speed": {"field": "/odom.speed"}},
@@ -28,7 +28,10 @@ def mapping(**parts: Any) -> Mapping:
 
 
 def drive(seconds: int = 6, **topics: Any) -> MemoryBag:
-    """Return a bag whose speed equals the time, with modes 0, 1, 0, ... sent after 0.1 s."""
+    """Return a bag whose speed equals the time in seconds.
+
+    The modes are 0, 1, 0, ..., each 0.1 s after a speed.
+    """
     times = list(range(seconds))
     return MemoryBag(
         {
@@ -72,7 +75,7 @@ def test_the_action_is_the_last_command_before_the_next_step() -> None:
     action = {"field": "/mode.data", "align": "nearest"}
     assert read(commands, action=action).dataset.actions.tolist() == [5, 2, 0]
     action = {"field": "/mode.data", "align": "last"}
-    # No command has come at 0 s, so the first episode begins at 1 s.
+    # There is no command up to 0 s, so the first episode begins at 1 s.
     found = read(commands, action=action).dataset
     assert found.observations.tolist() == [[1.0], [2.0]]
     assert found.actions.tolist() == [2, 2]
@@ -137,7 +140,7 @@ def test_commands_become_named_actions_and_bins_and_boxes() -> None:
     data, report = read(bag, action=named)
     assert data.actions.tolist() == [1, 0, 2]
     assert data.action_names == {0: "stop", 1: "go", 2: "turn"}
-    # The third command is 0.4 away from `turn`, more than a quarter of the range.
+    # The distance of the third command from `turn` is 0.4, more than a quarter of the range.
     assert report.far_actions == pytest.approx(1 / 3)
     assert report.action_counts == {"stop": 1, "go": 1, "turn": 1}
     binned = {"fields": fields, "edges": [[0.3, 0.8], [0.0]]}
@@ -234,7 +237,7 @@ def test_a_topic_that_dies_ends_the_episode() -> None:
         }
     )
     found = read(bag, episodes={"gap_s": 2})
-    # At 5 s the last speed is 2 s old, at 6 s older than a gap.
+    # At 5 s, the last speed is 2 s old. At 6 s, it is older than `gap_s`.
     assert found.dataset.observations.ravel().tolist() == [0, 1, 2, 3, 3]
     assert found.dataset.episodes[0].reason == "gap"
     assert found.report.fields["speed"].max_age_s == 6.0

@@ -1,4 +1,4 @@
-"""Reading by columns equals a slow reading, message by message, for random streams."""
+"""For random streams, reading by columns equals a slow reference that reads single messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Episode = tuple[list[float], list[int], list[float], bool, str]
 
 
 def slow(odom: Messages, mode: Messages) -> list[Episode]:
-    """Return observations, actions, rewards, whether terminated, and reason of each episode."""
+    """Return observations, actions, rewards, termination and end reason of each episode."""
     every = [time for time, _ in odom + mode]
     count = int((max(every) - min(every)) * RATE_HZ + 1e-6) + 1
     times = [min(every) + k / RATE_HZ for k in range(count)]
@@ -54,7 +54,7 @@ def slow(odom: Messages, mode: Messages) -> list[Episode]:
 
 
 def messages(values: int) -> Any:
-    # Quarters of a second are exact in nanoseconds and as floats.
+    # Multiples of 0.25 s are exact in nanoseconds and as floats.
     one = st.tuples(st.integers(0, 60).map(lambda k: k / 4), st.integers(0, values).map(float))
     return st.lists(one, min_size=1, max_size=25).map(
         lambda found: sorted(found, key=lambda m: m[0])

@@ -1,4 +1,4 @@
-"""Poses by /tf, worked by hand."""
+"""Poses from `/tf`, compared with poses calculated by hand."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ def test_chains_of_moving_and_static_frames() -> None:
     transforms = Transforms(bag(moving, [transform("base", "camera", 1.0, 0.0)]))
     steps_ns = STEPS_NS.astype(np.int64)
     found, age_s = transforms.planar("camera", "map", steps_ns, "last", None)
-    # Before the first message there is no pose.
+    # There is no pose before the first message.
     assert np.isnan(found[0]).all()
     np.testing.assert_allclose(
         found[1:], [[11.0, 0.0, 0.0], [11.0, 0.0, 0.0], [10.0, 5.0, math.pi / 2]], atol=1e-12
     )
     np.testing.assert_allclose(age_s[1:], [0, 1, 0])
-    # The map as seen from the camera is the inverse.
+    # The pose of the map in the camera frame is the inverse.
     back, _ = transforms.planar("map", "camera", steps_ns, "last", None)
     np.testing.assert_allclose(back[3], [-5, 10, -math.pi / 2], atol=1e-12)
     between, _ = transforms.planar("base", "map", steps_ns, "linear", None)

@@ -63,7 +63,7 @@ def cartpole_log(path: Path, episodes: int, first: int = 0, **options: Any) -> N
 
 
 def test_appending_equals_one_recording(log_path: Path) -> None:
-    """Compare byte for byte except versions and times of creation."""
+    """Compare byte for byte, except the versions and the creation times."""
     whole = log_path.with_name("whole.mcap")
     start = 10**18
     cartpole_log(whole, 6, start_time_ns=start)
@@ -137,7 +137,7 @@ def test_a_damaged_file_is_not_appended_to(log_path: Path) -> None:
 
 
 def test_killed_while_appending(log_path: Path) -> None:
-    """From the first appended byte on, the file counts as being written."""
+    """After the first appended byte, the file is read as one that is being written."""
     cartpole_log(log_path, 2)
     env = mcaprl.RecordMcap(gym.make("CartPole-v1"), log_path, append=True)
     env.reset(seed=5)
@@ -171,7 +171,7 @@ def test_rotated_files_equal_one_file(
     for path in parts:
         assert check_log(path) == []
         assert len(mcaprl.open(path).episodes) >= 1, "a file of whole episodes"
-    # Each file but the last is full, and was not before its last episode.
+    # Each file except the last one has reached the maximum size.
     assert all(path.stat().st_size >= max_file_bytes for path in parts[:-1])
 
 
@@ -210,7 +210,7 @@ def test_a_file_without_episodes_is_removed(tmp_path: Path) -> None:
 
 
 def test_a_file_without_a_finished_episode_is_skipped(tmp_path: Path) -> None:
-    """A killed recorder leaves such a file; the other files are read."""
+    """Skip a file without a finished episode, as a killed recorder leaves it; read the others."""
     cartpole_log(tmp_path / "a.mcap", 2)
     cartpole_log(tmp_path / "b.mcap", 0)
     with pytest.warns(UserWarning, match=r"b\.mcap has no finished episode: skipped"):
@@ -277,7 +277,7 @@ def test_overwriting_keeps_the_old_file_for_its_readers(log_path: Path) -> None:
 
 
 def test_readers_see_finished_episodes_during_recording(log_path: Path) -> None:
-    """At any time, what is read was recorded, and no finished episode is missing."""
+    """At any time, a reader finds all finished episodes, with the recorded values."""
     reported: list[int] = []
     space = spaces.Dict({"x": BOX, "image": spaces.Box(0, 255, (8, 8), np.uint8)})
 
@@ -312,7 +312,7 @@ def test_readers_see_finished_episodes_during_recording(log_path: Path) -> None:
 
 
 class Counting(gym.Env[Any, Any]):
-    """Record episodes of increasing length whose observations count the steps."""
+    """Environment whose observations count steps, with episodes of increasing length."""
 
     action_space = spaces.Discrete(2)
 

@@ -1,4 +1,4 @@
-"""Recorded infos: round trips, keys that come late, appending, rotation, and refused values."""
+"""Recorded infos: round trips, keys that appear late, appending, rotation, and refused values."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_a_value_of_another_type_is_left_out(log_path: Path) -> None:
 
 
 class Changing(Infos):
-    """Environment whose info is one list, which each step changes."""
+    """Environment that returns the same list as info in each step, and changes it in place."""
 
     def __init__(self) -> None:
         super().__init__({"at": [0, 0]}, {}, {})
@@ -271,7 +271,7 @@ def test_a_killed_recording_has_the_infos_of_its_episodes(tmp_path: Path) -> Non
     env.step(0)
     content = path.read_bytes()
     env.close()
-    # The last length cuts the third episode after its infos and before its steps.
+    # With the last length, the file ends after the infos of the third episode and before its steps.
     for episodes, length in ((3, sizes[2]), (2, sizes[1]), (2, sizes[2] - 100)):
         killed.write_bytes(content[:length])
         with pytest.warns(UserWarning, match=f"finished episodes read: {episodes}"):
@@ -318,7 +318,7 @@ def test_the_record_function_records_infos(log_path: Path) -> None:
     mcaprl.record("lane", log_path, policy="random", episodes=2, seed=1, infos=True)
     data = mcaprl.open(log_path)
     assert {"lateral_offset_m", "speed_m_s", "progress_m"} <= set(data.infos)
-    # Where an end is recorded, so is its reason; other steps have none.
+    # Only the last step of each episode has a reason.
     assert data.infos["reason"].compressed().tolist() == [one.reason for one in data.episodes]
     speed = data.observation_names.index("speed")
     assert np.abs(data.infos["speed_m_s"] - 30 * data.frames[:, speed]).max() < 1e-5

@@ -1,4 +1,4 @@
-"""Round trips: a log returns what was recorded, bit for bit."""
+"""Round trips: the data that is read from a log equals the recorded data, bit for bit."""
 
 from __future__ import annotations
 

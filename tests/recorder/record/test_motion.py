@@ -1,4 +1,4 @@
-"""Motion within steps on `/tf`: at any moment, interpolation finds the sim's pose."""
+"""Motion within steps on `/tf`: interpolated poses equal the poses of the sim at any moment."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_log_has_the_poses_at_20_hz_within_4_cm(sim: str, parts: int, tmp_path
     assert len(moments) == len(expected) == STEPS * parts + 1
     assert np.diff([moment.time_ns for moment in moments]).max() <= 50_000_000
     found = np.array([moment.frames[0].position for moment in moments])
-    # Positions are rounded to 1/256 m besides.
+    # The tolerance includes the rounding of positions to 1/256 m.
     np.testing.assert_allclose(found, expected, atol=0.045)
 
 

@@ -1,4 +1,4 @@
-"""What environments return although Gymnasium's interface does not foresee it."""
+"""Results of environments that do not conform to Gymnasium's interface."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mcaprl.sims.evaluation.rollout import EpsilonGreedy, rollout
 
 
 class Returning(gym.Env[Any, Any]):
-    """Episodes of two steps with given rewards and a given reason."""
+    """Environment with episodes of two steps, which returns a given reward and reason."""
 
     observation_space = spaces.Discrete(3)
     action_space = spaces.Discrete(2)

@@ -1,4 +1,4 @@
-"""One writer to a file, readers beside it, and targets that stay as they were."""
+"""A file has one writer and any number of readers, and a failed command leaves it unchanged."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def _compete(path: Path, barrier: Any, results: Any) -> None:
     try:
         with closing(mcaprl.RecordMcap(KnownEpisodes(), path, overwrite=True)) as env:
             play(env)
-            # The other recorder has had its turn before this one ends.
+            # Wait until the other recorder has tried to open the file.
             barrier.wait()
             results.put(
                 path.stat().st_ino == os.fstat(env._recording.log.mcap._file.fileno()).st_ino
@@ -252,7 +252,7 @@ def test_appending_keeps_what_readers_have_mapped(log_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore:.*is still being written")
 def test_readers_beside_a_recorder_that_appends(log_path: Path) -> None:
-    """Each opening sees whole episodes; no reader meets an error or a signal."""
+    """A reader that opens the log reads whole episodes, without an error or a signal."""
     write_log(log_path, 1)
     stop, errors, seen = threading.Event(), [], []
 
@@ -324,7 +324,7 @@ def test_reading_a_fifo_is_refused(tmp_path: Path) -> None:
 def test_chunks_with_equal_crcs_are_different_chunks(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A long log has chunks of one length and CRC by chance."""
+    """In a long log, some chunks have equal lengths and CRCs by chance."""
     write_log(log_path, 60)
     monkeypatch.setattr(valid_copy, "crc32", lambda data: 0)
     recovery = recover_log(log_path, log_path.with_name("out.mcap"))

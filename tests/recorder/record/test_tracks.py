@@ -19,13 +19,14 @@ from mcaprl.sims import make_sim
 START_NS = 1_700_000_000 * 10**9
 STEP_NS = 250_000_000
 RIGHT = 2
-# At the edge of the lane, driving away from it with 20 m/s: the first step leaves the lane.
+# The vehicle starts at the edge of the lane and drives away at 20 m/s, so that it leaves the lane
+# in the first step.
 EDGE = {"pose": (60.0, -2.0, -math.pi / 2, 20.0)}
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record an episode that is interrupted after three steps, and one that leaves the lane."""
+    """Record an episode that is interrupted after three steps, and one that ends off the lane."""
     path = tmp_path_factory.mktemp("phases") / "lane.mcap"
     with closing(mcaprl.RecordMcap(make_sim("lane"), path, start_time_ns=START_NS)) as env:
         env.reset(seed=0)

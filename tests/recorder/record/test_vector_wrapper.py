@@ -1,4 +1,4 @@
-"""RecordVecMcap: the log of a vector environment has the episodes of each sub-environment."""
+"""RecordVecMcap: the log of a vector environment contains the episodes of all sub-environments."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MODES = list(AutoresetMode)
 
 
 class Wanderer(gym.Env[Any, Any]):
-    """Environment with random observations, given episode lengths and unique rewards."""
+    """Environment with random observations, given episode lengths, and distinct rewards."""
 
     metadata: dict[str, Any] = {"render_fps": 10}  # noqa: RUF012 (as Gymnasium declares it)
 
@@ -69,7 +69,7 @@ def members(
 
 
 def act_for(env: mcaprl.RecordVecMcap, steps: int, *, seed: int = 0) -> None:
-    """Act at random with a probability that follows from the action; reset if required."""
+    """Take random actions with probabilities that depend on the action; reset if required."""
     env.reset(seed=seed)
     random = np.random.default_rng(seed)
     for _ in range(steps):
@@ -94,7 +94,7 @@ def assert_same_episode(found: Episode, expected: Episode) -> None:
 
 
 def check_against_members(folder: Path) -> None:
-    """Each episode of the vector's log is one of a sub-environment's, and none is missing."""
+    """Check that the vector log has exactly the episodes of the sub-environments."""
     data = mcaprl.open(folder / "vector.mcap")
     assert check_log(folder / "vector.mcap") == []
     waiting: list[Episode] = []
@@ -130,7 +130,7 @@ def check_against_members(folder: Path) -> None:
 def test_every_sub_environment_is_recorded(
     tmp_path: Path, space: spaces.Space[Any], mode: AutoresetMode
 ) -> None:
-    """The vector environment overwrites the returned buffers in the next step."""
+    """Record a vector environment that overwrites the returned buffers in the next step."""
     makers = members(tmp_path, space, [[3, 1, 70], [5], [1, 2]])
     envs = SyncVectorEnv(makers, copy=False, autoreset_mode=mode)
     with closing(mcaprl.RecordVecMcap(envs, tmp_path / "vector.mcap", start_time_ns=5)) as env:
@@ -206,7 +206,7 @@ def test_natively_batched_environment(log_path: Path) -> None:
             env.step(np.ones(4, np.int64))
     data = mcaprl.open(log_path)
     assert data.env_id == "CartPole-v1"
-    # Pushed to one side only, every pole falls within a dozen steps.
+    # The carts are always pushed to the same side, so every pole falls within a dozen steps.
     assert {episode.reason for episode in data.episodes[:-4]} == {"terminated"}
     assert all(8 <= episode.length <= 11 for episode in data.episodes[:-4])
 
@@ -221,7 +221,8 @@ def test_learner_topic(log_path: Path) -> None:
     times = np.concatenate([episode.log_time_ns[:-1] for episode in data.episodes])
     assert learner.log_time_ns.tolist() == times.tolist(), "one message for each transition"
     firsts = [episode.epsilon for episode in data.episodes]
-    # The first three episodes start before any step, when `epsilon` was unknown.
+    # `epsilon` is set after the first reset, so it is unknown at the start of the first three
+    # episodes.
     assert all(math.isnan(epsilon) for epsilon in firsts[:3])
     start = 0
     for episode in data.episodes[:3]:

@@ -1,4 +1,4 @@
-"""RecordMcap: what is recorded when, and what happens to interrupted episodes."""
+"""RecordMcap: the content of the log after each step, and interrupted episodes."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ class ReusesBuffer(gym.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.values["image"] += 1
         self.values["x"] += 1
-        action[:] = 99  # spoils its argument, too
+        action[:] = 99  # also overwrite the argument
         return self.values, 1.0, False, bool(self.values["x"][0] == 3), {}
 
 
@@ -257,7 +257,7 @@ def test_actions_are_stored_or_refused(log_path: Path, space: Any, action: Any, 
 
 
 def test_large_observations_make_small_chunks(log_path: Path) -> None:
-    """Chunks are limited in bytes, because readers limit the size of chunks."""
+    """Limit the bytes of a chunk, because readers refuse larger chunks."""
     image = spaces.Box(0, 255, (720, 1280, 3), np.uint8)
     rows = [(np.full(image.shape, k, np.uint8), 0.0, False, k == 9) for k in range(10)]
     env = mcaprl.RecordMcap(ScriptedEnv(image, spaces.Discrete(3), [rows]), log_path)
@@ -424,7 +424,7 @@ def test_the_working_folder_may_change_while_recording(
 
 @pytest.fixture
 def _hears_sigint() -> Iterator[None]:
-    """Restore SIGINT, which shells make background processes ignore."""
+    """Install Python's SIGINT handler, because background processes of a shell ignore SIGINT."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -432,7 +432,7 @@ def _hears_sigint() -> Iterator[None]:
 
 @pytest.mark.usefixtures("_hears_sigint")
 def test_interrupts_at_any_moment_leave_whole_episodes(log_path: Path) -> None:
-    """Interrupt a recording a hundred times, each at another time."""
+    """Interrupt a hundred recordings, each at a different time."""
     main = threading.get_ident()
     for trial in range(100):
         path = log_path.with_name(f"{trial}.mcap")
@@ -532,9 +532,9 @@ def test_killed_recorder_loses_only_the_open_episode(log_path: Path) -> None:
 
 
 def test_a_deferred_signal_keeps_no_references() -> None:
-    """A buffer that is exported when the signal arrives can be cleared before it is handled."""
+    """A buffer that is in use when a signal arrives can be resized before the signal is handled."""
     buffer = BytesIO(b"12345678")
-    # A shell that starts pytest in the background makes it ignore Ctrl-C.
+    # If a shell starts pytest in the background, pytest ignores Ctrl-C.
     usual = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def look() -> int:

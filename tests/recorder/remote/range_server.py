@@ -1,4 +1,4 @@
-"""HTTP server of a folder on 127.0.0.1 that understands ranges and counts what it sends."""
+"""HTTP server on 127.0.0.1 that serves a folder, supports range requests and counts bytes."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from threading import Thread
 
 @dataclass
 class RangeServer:
-    """A running server.
+    """A running HTTP server.
 
     Attributes:
         url: URL of the folder.
         folder: Folder that is served.
         sent: Number of bytes of each answer to a GET request.
-        knows_ranges: Whether ranges are understood.
-        cuts: Whether the connection is closed in the middle of an answer.
+        knows_ranges: Whether the server supports range requests.
+        cuts: Whether the server closes the connection in the middle of an answer.
     """
 
     url: str

@@ -1,8 +1,9 @@
-"""Record a log to an S3 server on 127.0.0.1, and read it from there; run by test_s3.py.
+"""Upload a log to an S3 server on 127.0.0.1, and read it from there; test_s3.py runs this script.
 
     python run_s3.py LOG
 
-Prints the fingerprint of the remote log, the number of its episodes, and the names in the bucket.
+The script prints the fingerprint and the number of episodes of the remote log, and the names in the
+bucket.
 """
 
 from __future__ import annotations

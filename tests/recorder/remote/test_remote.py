@@ -1,4 +1,4 @@
-"""Logs at URLs: equal to local ones, fetched in few requests, and clear errors."""
+"""Logs at URLs: the same data as local logs, few requests, and clear errors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ EPISODES, STEPS = 50, 40
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a log of images that do not compress."""
+    """Return a folder with a log of random images, which cannot be compressed."""
     found = tmp_path_factory.mktemp("served")
     random = np.random.default_rng(0)
     count = EPISODES * STEPS
@@ -60,10 +60,11 @@ def test_one_episode_needs_few_requests_and_bytes(server: RangeServer) -> None:
     url, size = f"{server.url}/images.mcap", (server.folder / "images.mcap").stat().st_size
     found = mcaprl.open(url, episodes=25)
     assert found.fingerprint == mcaprl.open(server.folder / "images.mcap", episodes=25).fingerprint
-    # The summary and the head; the chunks of /rl/episode and /rl/step; those of the images.
+    # The requests are for the summary and the start of the file, the chunks of `/rl/episode` and
+    # `/rl/step`, and the chunks of images.
     assert len(server.sent) <= 7
     assert sum(server.sent) < 0.3 * size
-    # The chunk of the images has the bytes of 50 images or more.
+    # A chunk of images contains 50 images or more.
     assert sum(server.sent) < 100 * 32 * 32 * 3 + 12 * BLOCK_BYTES
 
 
@@ -83,7 +84,7 @@ def test_fetched_parts_are_kept_on_request(
     server.sent.clear()
     assert mcaprl.open(url, episodes=[3, 4]).fingerprint == first.fingerprint
     assert server.sent == []
-    # Another version of the file has other parts.
+    # Parts of an old version of a file are not used for a new version.
     other = server.folder / "other.mcap"
     mcaprl.record("lane", other, episodes=1)
     before = mcaprl.open(f"{server.url}/other.mcap").fingerprint

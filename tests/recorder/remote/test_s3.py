@@ -1,4 +1,4 @@
-"""Logs on an S3 server, which runs with its client in a separate environment."""
+"""Logs on an S3 server. The server and its client run in a separate environment."""
 
 from __future__ import annotations
 

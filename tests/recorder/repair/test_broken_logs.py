@@ -1,4 +1,4 @@
-"""Files that are not logs or are damaged: a clear error, never a wrong value."""
+"""Files that are damaged or are not logs cause a clear error, and never return a wrong value."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_good_log_has_no_problems(log_path: Path, good: bytes) -> None:
 def test_a_flipped_bit_is_found(
     tmp_path_factory: pytest.TempPathFactory, good: bytes, data: st.DataObject
 ) -> None:
-    """`check` reports each flipped bit; reading returns the same data or raises our errors."""
+    """`check` reports each flipped bit. `open` returns the recorded data or raises our errors."""
     where = data.draw(st.integers(0, 8 * len(good) - 1))
     broken = bytearray(good)
     broken[where // 8] ^= 1 << where % 8
@@ -145,7 +145,7 @@ def test_index_outside_its_chunk(offset: int) -> None:
 @settings(max_examples=50)
 @given(st.permutations(range(12)), st.integers(0, 5))
 def test_gather_of_any_order(order: list[int], gap: int) -> None:
-    """Interleaved messages in any order: indexed and contiguous access return the same."""
+    """Gather interleaved messages in any order: indexed and contiguous access agree."""
     dtype = message_dtype("uint32 x\n")
     assert dtype is not None
     rows = message_rows(12, dtype, 1)

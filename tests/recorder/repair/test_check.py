@@ -1,4 +1,4 @@
-"""`check` reports every contradiction in a log, with its place and the next step."""
+"""`check` reports each contradiction in a log, with its position and the advised next step."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ def rewritten(
     strings: dict[str, str] | None = None,
     leave_out: str = "",
 ) -> Path:
-    """Write the same log by a faulty writer, with valid CRCs.
+    """Write a copy of a log with the given faults and with valid CRCs.
 
     Args:
-        path: of a good log.
-        change: called with each record of `/rl/step`.
-        strings: metadata that replaces the original.
-        leave_out: a topic whose second chunk is missing.
+        path: Path of a valid log.
+        change: Function that changes each record of `/rl/step`.
+        strings: Metadata that replaces the original metadata.
+        leave_out: Topic whose second chunk is left out.
     """
     reader, other = McapReader(path), path.with_name("other.mcap")
     writer = McapWriter(other, overwrite=True)
@@ -100,7 +100,7 @@ def good(log_path: Path) -> Path:
 
 
 def at(number: int, row: int, **values: Any) -> Change:
-    """Set fields of one record of `/rl/step`."""
+    """Return a function that sets fields of one record of `/rl/step`."""
 
     def change(message: np.ndarray[Any, Any]) -> None:
         if (message["episode"][0], message["step"][0]) == (number, row):
@@ -167,7 +167,8 @@ def test_a_wrong_message_count_is_reported(log_path: Path, monkeypatch: pytest.M
     counted = Summary.to_bytes
 
     def miscount(summary: Summary, start: int) -> bytes:
-        # Of /rl/episode; the reader itself reports it for /rl/step.
+        # Change the count of /rl/episode, because the reader itself reports a wrong count of
+        # /rl/step.
         summary.counts[2] += 1
         return counted(summary, start)
 
@@ -185,7 +186,7 @@ def test_metadata_with_other_spaces_is_reported(good: Path) -> None:
 
 
 def test_missing_images_are_reported(good: Path) -> None:
-    """Images are missing, or their size differs from the metadata."""
+    """Report missing images, and images whose size differs from the metadata."""
     (problem,) = check_log(rewritten(good, leave_out="/rl/observation/eye"))
     assert problem.what == "11 images for 15 records; 4 records have no image"
     other = spaces.Dict({**SPACE.spaces, "eye": spaces.Box(0, 255, (16, 4 + 4), np.uint8)})
@@ -195,7 +196,7 @@ def test_missing_images_are_reported(good: Path) -> None:
 
 
 def test_an_image_type_without_a_field_is_reported(log_path: Path, tmp_path: Path) -> None:
-    """The schema is not covered by a CRC: it is reported, and nothing is recovered from it."""
+    """Report a damaged schema that no CRC covers; recovery does not read images with it."""
     write_log(log_path, 2)
     data = without_crcs(log_path.read_bytes())
     assert data.count(b"string encoding") >= 2
@@ -227,7 +228,7 @@ def test_a_damaged_attachment_is_reported(good: Path) -> None:
 
 
 def test_each_chunk_is_read_once(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Except the chunks of `/rl/episode`, which are read again at the end."""
+    """Read each chunk once, except the chunks of `/rl/episode`, which are read again at the end."""
     read: list[int] = []
     once = chunks.chunk_records
 
@@ -250,7 +251,7 @@ def test_each_chunk_is_read_once(good: Path, monkeypatch: pytest.MonkeyPatch) ->
 def test_arrays_find_what_a_scan_finds(
     log_path: Path, monkeypatch: pytest.MonkeyPatch, compression: str
 ) -> None:
-    """Whichever byte is wrong and covered by no CRC: the problems are those of a scan by record."""
+    """Find the same problems as a scan of single records, for any wrong byte that no CRC covers."""
     record(
         log_path, SPACE, spaces.Discrete(2), [1 + k % 3 for k in range(12)], compression=compression
     )
@@ -293,7 +294,7 @@ def test_a_valid_file_of_another_kind_is_not_to_be_recovered(tmp_path: Path) -> 
     with pytest.raises(LogError, match="there is nothing to recover"):
         recover_log(other, tmp_path / "out.mcap")
     assert not (tmp_path / "out.mcap").exists()
-    # A damaged chunk is found, and its file recovered.
+    # A damaged chunk is found, and the file can be recovered.
     content = bytearray(other.read_bytes())
     content[McapReader(other).chunks[0].chunk_start_offset + 60] ^= 1
     other.write_bytes(content)

@@ -20,13 +20,13 @@ from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import recover_log
 from tests.support.faults import KnownEpisodes, assert_is_known, count, play, tell
 
-# The fork server has imported everything, so that a new recorder starts at once.
+# The fork server has imported all modules, so that a new recorder starts immediately.
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(["tests.support.faults"])
 
 
 def _record_for_ever(path: Path, finished: Connection, number: int) -> None:
-    """Print each episode whose end `step` has returned."""
+    """Record episodes, and send a byte through the pipe after each finished episode."""
     if number != signal.SIGKILL:
         signal.signal(number, signal.default_int_handler)
     env = mcaprl.RecordMcap(KnownEpisodes(), path)
@@ -39,7 +39,7 @@ def _record_for_ever(path: Path, finished: Connection, number: int) -> None:
 
 
 def _stop_one(path: Path, number: signal.Signals, delay_s: float) -> int:
-    """Send a signal to a recorder, and return the number of episodes that it had reported."""
+    """Send a signal to a recorder, and return the number of episodes that it has reported."""
     reported, telling = FORKS.Pipe(duplex=False)
     recorder = FORKS.Process(target=_record_for_ever, args=(path, telling, number))
     recorder.start()
@@ -71,7 +71,7 @@ def test_killed_recorders_lose_only_the_open_episode(tmp_path: Path) -> None:
         finished = _stop_one(path, signal.SIGKILL, randoms.random() * 0.1)
         recovery = recover_log(path, out)
         data = mcaprl.open(out)
-        # One more may have been written and not yet reported.
+        # One more episode may have been written but not reported.
         assert finished <= len(data.episodes) <= finished + 1
         for number, episode in enumerate(data.episodes):
             assert episode.summary.episode == number
@@ -80,7 +80,7 @@ def test_killed_recorders_lose_only_the_open_episode(tmp_path: Path) -> None:
         with out.open("rb") as file:
             reader = make_reader(file, validate_crcs=True)
             assert sum(1 for _ in reader.iter_messages()) == recovery.messages
-        # Starting takes half a second.
+        # AnyReader takes half a second to start, so it reads only some of the logs.
         if trial % 8 == 0:
             with AnyReader([out]) as bag:
                 assert sum(1 for _ in bag.messages()) == recovery.messages
@@ -113,7 +113,7 @@ def test_stopped_recorders_leave_whole_files(tmp_path: Path, number: signal.Sign
 
 
 def test_killed_before_its_first_episode(tmp_path: Path) -> None:
-    """There is nothing to recover, and `recover` reports it."""
+    """`recover` reports that there is nothing to recover."""
     path = tmp_path / "log.mcap"
     env = mcaprl.RecordMcap(KnownEpisodes(), path)
     env.reset()

@@ -1,4 +1,4 @@
-"""Mutated files are read correctly or refused: no crash, no hang, no wrong value."""
+"""Mutated files are read correctly or refused, without a crash, a hang or a wrong value."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FORKS.set_forkserver_preload(["tests.support.faults"])
 
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda mutation: mutation.__name__)
 def test_mutated_files(tmp_path: Path, mutation: Mutation) -> None:
-    """Run in a separate process with limited memory."""
+    """Read mutated files in a separate process with limited memory."""
     reported, telling = FORKS.Pipe(duplex=False)
     trials = count(12, 1250)
     process = FORKS.Process(target=_try_all, args=(tmp_path, mutation, trials, telling))
@@ -61,7 +61,7 @@ def _try_all(folder: Path, mutation: Mutation, trials: int, telling: Any) -> Non
         spoilt = mutation(chance.choice(originals), chance)
         path.write_bytes(spoilt)
         try:
-            # A hang is a failure.
+            # The alarm ends the process if a file takes more than 60 s.
             signal.alarm(60)
             began = time.process_time()
             seen[_outcome(path)] += 1
@@ -82,7 +82,7 @@ def _limit_memory() -> None:
 
 
 def _outcome(path: Path) -> str:
-    """Read, check and recover a file; returned values must be those that were recorded."""
+    """Read, check and recover a file, and check that all returned values were recorded."""
     out = path.with_name("out.mcap")
     problems = check_log(path)
     with warnings.catch_warnings():

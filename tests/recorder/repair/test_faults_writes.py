@@ -27,7 +27,7 @@ ERRORS = (errno.ENOSPC, errno.EIO, errno.EDQUOT)
 
 
 class FailingFile(FileIO):
-    """File that counts writes and fails from the n-th on, after writing a part of it."""
+    """File whose writes fail after `writes_left` writes; the first failing write is partial."""
 
     writes_left = 0
     error = errno.ENOSPC
@@ -53,7 +53,7 @@ class FailingFile(FileIO):
 
 @contextlib.contextmanager
 def failing(writes: int, chance: random.Random) -> Iterator[None]:
-    """Let this many writes pass; later ones fail in different ways."""
+    """Let this number of writes succeed; make later writes fail in one of several ways."""
     FailingFile.writes_left, FailingFile.error = writes, chance.choice(ERRORS)
     FailingFile.part = chance.choice([0.0, 0.5, 0.99])
     FailingFile.truncates = chance.random() < 0.5
@@ -63,7 +63,7 @@ def failing(writes: int, chance: random.Random) -> Iterator[None]:
 
 
 def record_until_it_fails(path: Path, episodes: int, **options: Any) -> int:
-    """Record, and return the number of episodes finished at the failure."""
+    """Record until a write fails, and return the number of finished episodes."""
     env = None
     try:
         env = mcaprl.RecordMcap(KnownEpisodes(), path, **options)
@@ -78,13 +78,13 @@ def record_until_it_fails(path: Path, episodes: int, **options: Any) -> int:
     finally:
         finished = env.episodes if env is not None else 0
         if env is not None:
-            # A failed write is not repeated, nor reported twice.
+            # Closing neither repeats the failed write nor reports it again.
             env.close()
     return finished
 
 
 def assert_all_there(path: Path, finished: int) -> None:
-    """All finished episodes are read, and one more if the failing write had written its chunk."""
+    """Check that all finished episodes are read, and at most one more, whose chunk was written."""
     out = path.with_name("out.mcap")
     try:
         recover_log(path, out, overwrite=True)
@@ -116,7 +116,7 @@ def test_every_write_fails_once(log_path: Path) -> None:
 
 
 class Later(KnownEpisodes):
-    """Start with the fourth episode."""
+    """Environment of known episodes that starts with the fourth episode."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -154,7 +154,7 @@ def test_vector_recording_on_a_full_disk(log_path: Path) -> None:
 
 
 def test_a_file_size_limit_is_one_error(log_path: Path) -> None:
-    """A file size limit of the system simulates a full disk."""
+    """Simulate a full disk by the system's limit for the size of a file."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     for limit in (3_000, 5_000, 20_000, 60_000):
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
@@ -167,7 +167,7 @@ def test_a_file_size_limit_is_one_error(log_path: Path) -> None:
 
 
 def test_recovering_onto_a_full_disk(log_path: Path) -> None:
-    """The damaged file is unchanged, and no partial file remains."""
+    """If the disk is full, the damaged file is unchanged, and no partial file remains."""
     write_log(log_path, 3)
     before = log_path.read_bytes()
     with failing(6, random.Random(0)), pytest.raises(LogError, match="cannot write"):

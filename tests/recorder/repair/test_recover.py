@@ -1,4 +1,4 @@
-"""Recovery: all valid records are in the new file, losses are reported, no value is wrong."""
+"""Recovery: the new file has all valid records and no wrong value, and losses are reported."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import Recovery, recover_log
 from tests.support.recordings import Truth, assert_holds, record
 
-# Losses are reported by chunk; each episode has a separate chunk here.
+# Losses are reported for each chunk, so each episode has a separate chunk here.
 pytestmark = pytest.mark.usefixtures("small_chunks")
 
 SPACE = spaces.Dict(
@@ -43,7 +43,7 @@ LENGTHS = [40, 9, 60, 25]
 
 
 class Recorded(tuple[bytes, Truth]):
-    """A log and the values that it was recorded from, with a short repr."""
+    """A log and its recorded values, with a short repr for the names of tests."""
 
     def __repr__(self) -> str:
         return "Recorded"
@@ -79,7 +79,7 @@ def recovered(path: Path, damaged: bytes, **options: Any) -> tuple[Recovery, mca
 
 
 def chunks_of(data: bytes, topic: str, path: Path) -> list[tuple[int, int]]:
-    """Return offsets and lengths of a topic's chunks."""
+    """Return the offsets and lengths of a topic's chunks."""
     path.write_bytes(data)
     reader = McapReader(path)
     channel = reader.channel_of(topic)
@@ -137,7 +137,7 @@ def test_file_without_summary_loses_nothing(log_path: Path, truth: tuple[bytes, 
 def test_a_damaged_header_loses_nothing_else(log_path: Path, truth: tuple[bytes, Truth]) -> None:
     good, recorded = truth
     spoilt = bytearray(good)
-    # The length of the profile follows the magic, the opcode and the record length.
+    # The magic bytes, the opcode and the record length precede the length of the profile.
     spoilt[8 + RECORD_HEADER_BYTES + 3] = 255
     recovery, data = recovered(log_path, bytes(spoilt))
     assert_holds(data, recorded)
@@ -145,7 +145,7 @@ def test_a_damaged_header_loses_nothing_else(log_path: Path, truth: tuple[bytes,
 
 
 def test_a_lost_channel_loses_only_its_messages(log_path: Path, truth: tuple[bytes, Truth]) -> None:
-    """Its messages are in chunks with those of a known channel."""
+    """Remove the record of a channel whose messages share chunks with another channel."""
     good, recorded = truth
     log_path.write_bytes(good)
     reader = McapReader(log_path)
@@ -192,7 +192,7 @@ def records_of(data: bytes) -> Iterator[tuple[int, int, int]]:
 def test_a_wrong_length_loses_only_its_record(
     log_path: Path, truth: tuple[bytes, Truth], opcode: Opcode, claimed: int
 ) -> None:
-    """The records after it are found despite the wrong length."""
+    """Find the records that follow a record with a wrong length."""
     good, recorded = truth
     places = [offset for offset, found, _ in records_of(good) if found == opcode]
     step_chunks = [start for start, _ in chunks_of(good, "/rl/step", log_path)]
@@ -240,7 +240,7 @@ def killed(path: Path, steps: int) -> tuple[bytes, Truth]:
     images = chunks_of(whole.read_bytes(), "/rl/observation/image", path)
     data = whole.read_bytes()
     whole.unlink()
-    # Images are written in chunks of 100, rows of /rl/step in chunks of 8192.
+    # Images are written in chunks of 100 images, and records of /rl/step in chunks of 8192.
     later = [offset for offset, _ in images if offset > 0]
     return data[: later[-1]], truth
 
@@ -311,7 +311,7 @@ def test_paths_that_are_refused(log_path: Path, good: bytes) -> None:
 
 @pytest.mark.parametrize("use_chunking", [True, False])
 def test_files_of_other_writers_keep_their_topics(log_path: Path, use_chunking: bool) -> None:
-    """Any MCAP file can be recovered, including JSON topics, profile, metadata, attachments."""
+    """Recover any MCAP file, with its JSON topics, profile, metadata and attachments."""
     writer = Writer(
         str(log_path), use_chunking=use_chunking, chunk_size=500, compression=CompressionType.LZ4
     )
@@ -366,7 +366,7 @@ def test_command_output_and_exit_codes(
 
 @pytest.mark.parametrize("other", [b"/rl/step", b"/rl/episode", b"mcaprl_msgs/msg/Episode"])
 def test_a_log_without_the_step_topic(log_path: Path, tmp_path: Path, other: bytes) -> None:
-    """Nothing is kept of a log without an episode."""
+    """Recover nothing from a log whose episodes cannot be found."""
     record(log_path, SPACE, spaces.Discrete(2), [4, 5])
     data = log_path.read_bytes()
     for name in {b"mcaprl.dataset", b"/rl/step", other}:
@@ -379,7 +379,7 @@ def test_a_log_without_the_step_topic(log_path: Path, tmp_path: Path, other: byt
 
 
 def test_scanning_for_records_does_not_copy_the_file(log_path: Path) -> None:
-    """Copying the rest of the file at each record would make the scan quadratic."""
+    """Scan without copying the rest of the file at each record, which takes quadratic time."""
     steps = 20_000
     frames = np.random.default_rng(0).standard_normal((steps + 1, 20))
     mcaprl.Dataset.from_arrays(
@@ -405,7 +405,7 @@ def test_scanning_for_records_does_not_copy_the_file(log_path: Path) -> None:
 
 
 def test_an_episode_without_any_record_is_named(log_path: Path) -> None:
-    """Its chunk is damaged, so that only `/rl/episode` and the gap in the numbers show it."""
+    """Name an episode whose chunk is damaged; only `/rl/episode` and its number still show it."""
     with closing(mcaprl.RecordMcap(gym.make("CartPole-v1"), log_path)) as recorder:
         for seed in range(30):
             recorder.reset(seed=seed)

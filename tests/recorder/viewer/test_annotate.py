@@ -1,4 +1,4 @@
-"""Annotation: values of policies, or a scene, added to a copy of a log."""
+"""Annotation: copies of logs to which outputs of policies, or a scene, are added."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FIELDS = ("q", "value", "advantage", "td_error", "entropy", "policy_action", "ag
 
 
 class Table:
-    """Policy with Q-values of an episode's four observations, or with probabilities only."""
+    """Policy with Q-values for an episode's four observations, or only with probabilities."""
 
     name = "table"
 
@@ -84,7 +84,7 @@ def plain(tmp_path: Path) -> Path:
 
 
 def test_values_by_hand(episode: Any) -> None:
-    """Gamma 0.5: 1 + 0.5*2 - 1; -1 + 0.5*4 - 2; 2 + 0 - 4, for the episode terminated."""
+    """The TD errors at gamma 0.5 are 1 + 0.5*2 - 1, -1 + 0.5*4 - 2, and at the end 2 + 0 - 4."""
     found = value_columns(Table(), episode, spaces.Discrete(2), 0.5)
     assert found["q"].tolist() == VALUES[:3].tolist()
     assert found["value"].tolist() == [3.0, 2.0, 4.0]
@@ -180,7 +180,7 @@ def test_an_error_leaves_no_partial_copy(plain: Path, tmp_path: Path) -> None:
 
 
 def test_a_scene_can_be_added_later(plain: Path, tmp_path: Path) -> None:
-    """The added messages equal those of a recording with a scene."""
+    """The added messages equal the messages of a recording with a scene."""
     out, full = tmp_path / "out.mcap", tmp_path / "full.mcap"
     assert run(["annotate", str(plain), "--scene", "--out", str(out)]) == 0
     start_ns = int(mcaprl.open(plain).episodes[0].log_time_ns[0])

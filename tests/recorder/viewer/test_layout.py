@@ -44,7 +44,7 @@ SIMS: list[tuple[str, dict[str, Any]]] = [
 
 
 def recorded(path: Path, sim: str, steps: int = 3, **options: Any) -> Path:
-    """Record two short episodes of a sim, with its depth camera if it has one."""
+    """Record two short episodes of a sim, with the depth camera if the sim has one."""
     env = make_sim(sim, **options)
     camera = hasattr(env.unwrapped, "depth_image_m")
     with closing(mcaprl.RecordMcap(env, path, camera=camera)) as recorder:
@@ -56,7 +56,7 @@ def recorded(path: Path, sim: str, steps: int = 3, **options: Any) -> Path:
 
 
 def annotated(source: Path, out: Path, names: list[str]) -> Path:
-    """Add the outputs of policies, all zero."""
+    """Add the outputs of policies, with zero for all values."""
     data = mcaprl.open(source)
     actions = len(data.action_names)
     with annotated_copy(source, out) as copy:
@@ -79,7 +79,7 @@ def annotated(source: Path, out: Path, names: list[str]) -> Path:
 def test_paths_are_in_the_log(sim: str, options: dict[str, Any], tmp_path: Path) -> None:
     path = recorded(tmp_path / "log.mcap", sim, **options)
     attached = check_layout(path)
-    # A layout that is made from the log alone has the same panels.
+    # A layout that is created from the topics of the log has the same panels.
     again = layout_of_log(McapReader(path))
     check_panels(again, Topics.of_log(path))
     assert again["configById"].keys() == attached["configById"].keys()
@@ -139,9 +139,9 @@ def test_sizes_are_shares_of_the_area() -> None:
     panels: dict[str, Any] = {"Tab!x": {"tabs": [{"layout": "Plot!c"}]}, "Plot!a": {}, "Plot!c": {}}
     tree = {"first": "Plot!a", "second": "Tab!x", "direction": "column", "splitPercentage": 25.0}
     found = dict(sizes_of(tree, panels, (960, 600)))
-    # A quarter of 600 px; the other tab has a row of tabs of 30 px.
+    # Plot a has a quarter of the height of 600 px. The row of tabs takes 30 px of the rest.
     assert found == {"Plot!a": (960, 150), "Tab!x": (960, 450), "Plot!c": (960, 420)}
-    # One row of 64 px, and 60 px for the title and the axis, of 570 px.
+    # The row takes 64 px, and the title and the axis take 60 px. The screen has 570 px.
     assert share_of_transitions(1) == 124 / 570
     assert share_of_transitions(9) == 0.45
 
@@ -171,7 +171,7 @@ def test_wrong_paths_are_found(path: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("sim", ["lane", "powerline", "racer", "highway-lane"])
 def test_the_whole_track_is_in_view_from_above(sim: str) -> None:
-    """The view from above has the size of its panel; the pilot's positions are within it."""
+    """All positions of the pilot's vehicle are within the view from above."""
     env = make_sim(sim)
     source: Any = env.unwrapped
     metadata = LogMetadata.of_env(env)
@@ -194,7 +194,7 @@ def test_the_whole_track_is_in_view_from_above(sim: str) -> None:
 
 
 def test_depth_fills_the_range_of_its_colors() -> None:
-    """The range of the colors is that of the depth, from the 1st to the 99th percentile."""
+    """The limits of the depth colors are the 1st and the 99th percentile of the depth."""
     for sim in ("lane", "powerline"):
         env = make_sim(sim)
         source: Any = env.unwrapped
@@ -219,7 +219,7 @@ def test_old_logs_without_tracks_have_a_track_as_a_plot() -> None:
     plot = old["configById"]["Plot!track"]
     assert plot["xAxisPath"]["value"] == "/tf.transforms[0].transform.translation.x"
     assert series_of(old)["y"] == "/telemetry.y_m"
-    # The world is unknown: the view from above follows the vehicle.
+    # The size of the world is unknown, so the view from above follows the vehicle.
     above = old["configById"]["3D!above"]
     assert (above["followTf"], above["followMode"]) == ("car", "follow-position")
     assert above["cameraState"]["distance"] == 100
@@ -228,7 +228,7 @@ def test_old_logs_without_tracks_have_a_track_as_a_plot() -> None:
 def test_the_vehicle_is_marked_from_above(tmp_path: Path) -> None:
     panels = check_layout(recorded(tmp_path / "log.mcap", "lane"))["configById"]
     scale = panels["3D!above"]["scene"]["transforms"]["axisScale"]
-    # Axes of 0.2 m at a scale of 1: 3 % of the 300 m of the world are 9 m.
+    # Axes are 0.2 m long at a scale of 1. They must be 3 % of the world's 300 m, which is 9 m.
     assert 0.2 * scale == pytest.approx(9.0)
     assert panels["3D!scene"]["scene"]["transforms"]["axisScale"] == 0
     assert panels["3D!above"]["topics"]["/scene"]["namespaces"] == {"speed": {"visible": False}}

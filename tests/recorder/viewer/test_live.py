@@ -1,4 +1,4 @@
-"""The live server as a viewer sees it, and the player's clock."""
+"""The live server, tested with a viewer, and the player's clock."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_layouts_are_combined_side_by_side(log: Path) -> None:
     layout = layout_of_log(McapReader(log))
     both = side_by_side([layout, layout], ["a", "b"])
     panels = both["configById"]
-    # The panels of both logs are in the screens of one panel.
+    # The panels of both logs share one panel of tabs.
     assert len(panels) == 2 * len(layout["configById"]) - 1
     assert panels["3D!b scene"]["followTf"] == "b/car"
     assert panels["3D!b scene"]["topics"].keys() == {"/b/scene", "/b/scene/static"}
@@ -172,7 +172,7 @@ def test_layouts_are_combined_side_by_side(log: Path) -> None:
 
 
 def test_a_log_of_an_hour_plays_from_anywhere(tmp_path: Path) -> None:
-    """The player keeps indexes in the mapped file and a few chunks in memory, not the log."""
+    """The player keeps a few chunks in memory, and reads all else from the mapped file."""
     steps = 60_000
     path = tmp_path / "long.mcap"
     zeros = np.zeros((steps, 4), np.float32)
@@ -205,7 +205,7 @@ def viewer_is_there() -> None:
 
 
 def _hear_signals() -> None:
-    """Child processes ignore some signals if pytest runs in the background or under nohup."""
+    """Restore default handlers, since pytest ignores signals in the background or under nohup."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
 
@@ -213,12 +213,12 @@ def _hear_signals() -> None:
 def look(
     arguments: list[str], plan: list[list[Any]], how: signal.Signals = signal.SIGINT
 ) -> tuple[Any, list[str]]:
-    """Run the server and a scripted viewer; returns what it received and what was printed.
+    """Run the server and a scripted viewer; return what they received and printed.
 
     Args:
-        arguments: of `replay`.
-        plan: what the viewer does.
-        how: the server is ended.
+        arguments: Arguments of `replay`.
+        plan: Actions of the viewer.
+        how: Signal that ends the server.
     """
     command = [sys.executable, "-m", "mcaprl.cli", "replay", *arguments, "--port", "0"]
     with subprocess.Popen(
@@ -298,7 +298,7 @@ def test_time_comes_before_the_messages_after_a_restart_and_a_jump_back(log: Pat
         for i in seeks:
             after = [pair for pair in wire[i + 1 :] if pair[0] != "state"]
             assert after[0] == ["time", starts[0]]
-            # The next messages are the current ones, one of each topic.
+            # Next comes the current message of each topic.
             sent = dict([pair for pair in after if pair[0] != "time"][: len(shown_topics)])
             assert sent == dict.fromkeys(shown_topics, starts[0])
 
@@ -308,7 +308,7 @@ def test_the_first_log_line_comes_once(log: Path) -> None:
     seen, _ = look([str(log)], [["loop", 20.0, 1]])
     wire = seen["start"] + seen["steps"][0]["wire"]
     wire = wire[: next(i for i, (kind, _) in enumerate(wire) if kind == "seeked")]
-    # Three episodes of 9 records at 0.25 s each.
+    # There are three episodes of 9 records at intervals of 0.25 s.
     starts_ns = [START_NS + 9 * STEP_NS * episode for episode in range(3)]
     expected = [time_ns for start in starts_ns for time_ns in (start, start + 8 * STEP_NS)]
     assert [int(time_ns) for kind, time_ns in wire if kind == "/rosout"] == expected
@@ -328,7 +328,7 @@ def test_a_second_viewer_gets_the_current_messages_and_the_first_one_no_line_twi
         server.tick(2.25)
         second = Watcher(server.url)
         server.tick(0.0)
-        # Messages that are not sent yet are dropped when the server is closed.
+        # Wait for the messages, because `close` drops messages that are not sent yet.
         time.sleep(0.5)
     events = Counter(m["topic"] for m in first.seen()["messages"])
     assert (events["/rosout"], events["/rl/episode"]) == (3, 1)
@@ -341,7 +341,7 @@ def test_two_logs_are_played_side_by_side(log: Path, tmp_path: Path) -> None:
     viewer_is_there()
     other = record(tmp_path / "pilot.mcap", (5,), 4)
     arguments = [str(log), str(other), "--episode", "0", "--speed", "2"]
-    # Closing the terminal ends it like Ctrl-C.
+    # Closing the terminal sends SIGHUP, which ends the server like Ctrl-C.
     seen, _ = look(arguments, [["seek", str(START_NS + STEP_NS)]], signal.SIGHUP)
     assert {"/lane/rl/step", "/pilot/rl/step", "/pilot/scene"} <= seen["topics"].keys()
     times = {message["topic"]: message["time"] for message in seen["steps"][0]["messages"]}
@@ -349,7 +349,7 @@ def test_two_logs_are_played_side_by_side(log: Path, tmp_path: Path) -> None:
 
 
 class Channels:
-    """Channels of a server that keep what is sent."""
+    """Substitute for the channels of a server. It stores all messages that are sent."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[bytes, int]] = []
@@ -411,7 +411,7 @@ def test_an_episode_in_training_is_shown_at_its_speed() -> None:
     for message in seen:
         times.setdefault(message["topic"], []).append(int(message["time"]))
     steps = times["/rl/step"]
-    # A step of 0.25 s lasts 100 ms; scenes are at most 10 a second.
+    # A step of 0.25 s takes 100 ms, and there are at most 10 scenes per second.
     assert len(steps) == len(times["/scene"]) == 4
     gaps_ns = np.diff(steps)
     assert (gaps_ns >= 100_000_000).all()
@@ -458,7 +458,7 @@ def test_the_rest_of_a_long_episode_is_not_shown(monkeypatch: pytest.MonkeyPatch
 
 
 def bytes_of(seen: list[Any], topic: str) -> bytes:
-    """Return the last message of a topic."""
+    """Return the bytes of the last message of a topic."""
     return base64.b64decode([m["bytes"] for m in seen if m["topic"] == topic][-1])
 
 

@@ -1,4 +1,4 @@
-"""Who can connect to the live server, and what a viewer can set."""
+"""Connections that the live server accepts, and parameters that a viewer can set."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def server(log_path: Path) -> Iterator[LiveServer]:
 
 
 def answer(server: LiveServer, sent: bytes) -> bytes:
-    """The first bytes that the server returns."""
+    """Send bytes to the server, and return the first bytes of its response."""
     port = int(server.url.rpartition(":")[2])
     with socket.create_connection((HOST, port), timeout=10) as connection:
         connection.sendall(sent)

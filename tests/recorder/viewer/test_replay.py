@@ -1,4 +1,4 @@
-"""Display topics: scene, frames, depth, log lines and layout, complete at any time."""
+"""Display topics: scene, frames, depth, log lines and layout are complete at any time."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def stamps(message: Any) -> list[int]:
 
 
 def test_frames_at_each_step_reach_to_the_next(log: Path) -> None:
-    """A viewer interpolates between stamps; the sim's moments are 0.05 s apart."""
+    """Each message has the poses from its step until the next step, at multiples of 0.05 s."""
     found = read(log, "/tf", "tf2_msgs/msg/TFMessage")
     times = step_times(log)
     assert [time for time, _ in found] == [time for episode in times for time in episode]
@@ -100,7 +100,7 @@ def test_frames_at_each_step_reach_to_the_next(log: Path) -> None:
 
 
 def test_poses_within_a_step_are_found_by_interpolation(log: Path, tmp_path: Path) -> None:
-    """The way that a viewer draws differs from the way of the sim by at most 0.04 m."""
+    """The path that a viewer draws differs from the path of the sim by at most 0.04 m."""
     path, env = tmp_path / "lane.mcap", gym.make("mcaprl/LaneKeeping-v0")
     way: list[tuple[int, tuple[float, ...]]] = []
     with closing(mcaprl.RecordMcap(env, path)) as recorder:
@@ -120,7 +120,7 @@ def test_poses_within_a_step_are_found_by_interpolation(log: Path, tmp_path: Pat
 
 
 def test_knots_by_hand() -> None:
-    """A stop after 0.1 s: one knot between the ends. A straight way needs none."""
+    """A stop after 0.1 s needs one pose between the ends; uniform motion needs no such pose."""
     still = (0.0, 0.0, 0.0, 1.0)
 
     def moments(places_m: list[float]) -> list[tuple[int, list[Frame]]]:
@@ -151,7 +151,7 @@ def test_unchanged_static_topics_are_written_once(log: Path) -> None:
 
 
 def test_a_frequently_changing_scene_is_subsampled(tmp_path: Path) -> None:
-    """At 25 steps a second, the scene is written every second step and at the end."""
+    """At 25 steps per second, the scene is written in every second step and at the end."""
     path, env = tmp_path / "racer.mcap", gym.make("mcaprl/Racer-v0")
     sim: Any = env.unwrapped
     sim.step_duration_s = 0.04
@@ -166,7 +166,7 @@ def test_a_frequently_changing_scene_is_subsampled(tmp_path: Path) -> None:
 
 
 def test_each_scene_message_is_complete(log: Path) -> None:
-    """A viewer that seeks clears the topic and draws only this message."""
+    """After a seek, a viewer clears the topic and draws only this message."""
     for topic in ("/scene", "/scene/static"):
         for _, array in read(log, topic, "visualization_msgs/msg/MarkerArray"):
             first, *rest = array.markers
@@ -277,7 +277,7 @@ def test_each_sim_has_its_own_camera_and_ranges(tmp_path: Path) -> None:
         layouts[sim] = mcaprl.layout(path)
         without = tmp_path / f"{sim}-without.mcap"
         mcaprl.open(path).save(without)
-        # The numbers come from the log, also if the layout is made again.
+        # The log contains the view settings, so they are available for a new layout.
         assert LogMetadata.from_strings(McapReader(without).metadata["mcaprl.dataset"]).view
     cameras = {
         sim: layout["configById"]["3D!scene"]["cameraState"] for sim, layout in layouts.items()
@@ -328,14 +328,18 @@ def test_a_scene_makes_a_log_at_most_three_times_as_large(sim: str, tmp_path: Pa
 
 
 def test_segments_are_cut_into_pieces() -> None:
-    """7 m along y in pieces of 3 m."""
+    """Cut a segment of 7 m along y into pieces of at most 3 m."""
     pieces = cut(np.array([[1.0, 0.0, 0.5], [1.0, 7.0, 0.5]]), 3.0)
     assert pieces[:, 1].tolist() == [0.0, 3.0, 3.0, 6.0, 6.0, 7.0]
     assert np.unique(pieces[:, [0, 2]], axis=0).tolist() == [[1.0, 0.5]]
 
 
 def test_depth_images_have_a_camera(log: Path) -> None:
-    """90 degrees on 84 pixels: f = 42; 144 of 256 pixels high: f = 42 256 / 144 in y."""
+    """The focal lengths follow from the field of view.
+
+    An angle of 90 degrees on 84 pixels gives 42 in x. The view has the aspect ratio 256 : 144,
+    which gives 42 * 256 / 144 in y.
+    """
     ((time, info),) = read(log, "/camera/camera_info", "sensor_msgs/msg/CameraInfo")
     assert time == step_times(log)[0][0]
     assert (info.width, info.height, info.header.frame_id) == (84, 84, "camera")
@@ -388,7 +392,7 @@ def test_without_a_scene_only_transitions_are_recorded(tmp_path: Path) -> None:
 
 
 def test_vectors_are_read_without_the_images(tmp_path: Path) -> None:
-    """Each chunk contains one kind of topic; steps are never in a chunk with images."""
+    """Each chunk contains one kind of topic, so no chunk has both step records and images."""
     path = tmp_path / "depth.mcap"
     env = gym.make("mcaprl/LaneKeeping-v0", observation="depth")
     with closing(mcaprl.RecordMcap(env, path)) as recorder:

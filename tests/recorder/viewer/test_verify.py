@@ -1,4 +1,4 @@
-"""Verification: stepping through a log again gives the same bits or the first difference."""
+"""Verification: a replay of a log returns the same bits, or the first difference is reported."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WALK_LENGTH = 9
 
 
 class Walk(gym.Env[Any, Any]):
-    """Random walk: each step depends on all random numbers since the last seed."""
+    """Random walk in which each step depends on all random numbers since the last seed."""
 
     metadata: dict[str, Any] = {"render_fps": 10}  # noqa: RUF012 (as Gymnasium declares it)
     observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
@@ -31,7 +31,7 @@ class Walk(gym.Env[Any, Any]):
     observation_names = ("place_m", "count")
 
     def __init__(self, fault: tuple[str, int] = ("", -1)) -> None:
-        """Create an environment that fails at the n-th step after its creation."""
+        """Create an environment with a fault, given by its kind and the number of the step."""
         self._fault, self._life = fault, -1
 
     def reset(
@@ -61,7 +61,7 @@ class Walk(gym.Env[Any, Any]):
 def walk(
     path: Path, seeds: list[int | None], options: dict[str, Any] | None = None, cut: int = 0
 ) -> mcaprl.Dataset:
-    """Record an episode for each seed; the last is interrupted `cut` steps before its end."""
+    """Record one episode per seed; interrupt the last one `cut` steps before its end."""
     with closing(mcaprl.RecordMcap(Walk(), path, start_time_ns=5 * 10**9)) as env:
         env.action_space.seed(0)
         for number, seed in enumerate(seeds):
@@ -141,7 +141,7 @@ def test_an_episode_without_a_seed_continues_the_random_state(log_path: Path) ->
 
 
 def test_an_unknown_start_is_not_a_difference(log_path: Path) -> None:
-    """An additional reset between two episodes is not visible in the log."""
+    """Do not compare an episode without a seed if the log lacks a reset before it."""
     with closing(mcaprl.RecordMcap(Walk(), log_path)) as env:
         for seed in (3, None):
             env.reset(seed=seed)

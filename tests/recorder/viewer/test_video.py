@@ -47,7 +47,7 @@ def box(color: Any, x_m: float, frame: str = "map", **others: Any) -> Shape:
 
 
 def share(image: Any, channel: int) -> float:
-    """Return the mask of the pixels of one pure color at any brightness."""
+    """Return the share of the pixels that have one pure color at any brightness."""
     others = [c for c in range(3) if c != channel]
     pure = (image[..., channel] > 100) & (image[..., others].max(-1) < 60)
     return float(pure.mean())
@@ -143,7 +143,7 @@ def test_a_fast_video_skips_steps() -> None:
 
 
 def test_a_slow_video_shows_moments_between_steps(tmp_path: Path) -> None:
-    """Four steps a second: five images for each step, with the car on its way."""
+    """At four steps per second, a video has five images for each step, with the car in motion."""
     assert [parts_of_step(per_s) for per_s in (2.0, 4.0, 19.0, 20.0, 50.0)] == [10, 5, 2, 1, 1]
     path, env = tmp_path / "lane.mcap", make_sim("lane")
     with closing(mcaprl.RecordMcap(env, path)) as recorder:
@@ -153,7 +153,8 @@ def test_a_slow_video_shows_moments_between_steps(tmp_path: Path) -> None:
     assert [moment.step for moment in seen] == [0, 0, 0, 0, 0, 1]
     ms = [round((moment.time_ns - seen[0].time_ns) / 1e6) for moment in seen]
     assert ms == [0, 50, 100, 150, 200, 250]
-    # 10 m/s and 4 (1 - 10 / 30) m/s^2 are at most 0.51 m in 0.05 s.
+    # At a speed of 10 m/s and an acceleration of 4 (1 - 10 / 30) m/s^2, the car moves at most 0.51
+    # m in 0.05 s.
     x_m = [moment.frames[0].position[0] for moment in seen]
     np.testing.assert_allclose(np.diff(x_m), 0.505, atol=0.01)
 

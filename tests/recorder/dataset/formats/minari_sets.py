@@ -1,4 +1,4 @@
-"""Minari datasets that Minari itself collects, and an environment with Dict observations."""
+"""Datasets that Minari's own collector writes, and an environment with Dict observations."""
 
 from __future__ import annotations
 
@@ -23,7 +23,11 @@ AUTHOR = {
 
 
 class Cameras(gym.Env[dict[str, Any], np.ndarray[Any, Any]]):
-    """Two cameras and an arm; it terminates after five steps, or is truncated after three."""
+    """Environment with two cameras and an arm.
+
+    Episodes are terminated after five steps, or truncated after the number of steps in the option
+    `limit`.
+    """
 
     observation_space = spaces.Dict(
         {
@@ -85,7 +89,7 @@ def collect(
 ) -> Any:
     """Collect episodes with Minari, and record the same episodes as a log.
 
-    The seeds are 3, 4, ... or, if not `seeded`, drawn by Minari. The actions are random.
+    The seeds are 3, 4, ...; if `seeded` is not set, Minari draws the seeds. The actions are random.
 
     Returns:
         The `MinariDataset`.
@@ -106,8 +110,8 @@ def collect(
     if log is not None:
         recorded.close()
     with warnings.catch_warnings():
-        # Minari warns of an environment that is not registered, and leaves folders to the collector
-        # of garbage.
+        # Minari warns about an environment that is not registered, and about temporary folders that
+        # are removed by garbage collection.
         warnings.simplefilter("ignore")
         made = collector.create_dataset(dataset_id, algorithm_name="random", **AUTHOR)
         del collector

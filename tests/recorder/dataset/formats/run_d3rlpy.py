@@ -1,13 +1,13 @@
-"""d3rlpy's own classes, run by the tests in an environment that has d3rlpy.
+"""Commands that use d3rlpy; the tests run them in an environment in which d3rlpy is installed.
 
 python run_d3rlpy.py COMMAND ARGUMENT... [-- COMMAND ARGUMENT...]
 
-transitions LOG OUT.npz   what `Dataset.to_d3rlpy` gives d3rlpy
-load FILE OUT.npz         what d3rlpy loads from a file
-dump LOG FILE             d3rlpy's file of a log's `to_d3rlpy`
-back LOG OUT              the log of `to_d3rlpy` and `from_d3rlpy`
-collect FILE              d3rlpy's file of steps that it was given
-train LOG                 three updates of an algorithm of d3rlpy
+transitions LOG OUT.npz   write the transitions of `Dataset.to_d3rlpy`
+load FILE OUT.npz         write the transitions that d3rlpy loads from a file
+dump LOG FILE             convert a log with `to_d3rlpy`, and write it with d3rlpy's `dump`
+back LOG OUT              convert a log with `to_d3rlpy`, and back with `from_d3rlpy`
+collect FILE              write steps that d3rlpy's replay buffer collects
+train LOG                 run three updates of one of d3rlpy's algorithms
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def main(*arguments: str) -> None:
 
 
 def save(buffer: Any, out: str) -> None:
-    """Write all transitions as d3rlpy's picker gives them, and what d3rlpy knows of the actions."""
+    """Write all transitions that d3rlpy's picker returns, and d3rlpy's action space and size."""
     picked = [
         buffer.transition_picker(episode, index)
         for episode in buffer.episodes
@@ -57,7 +57,7 @@ def save(buffer: Any, out: str) -> None:
             found[key] = np.stack(rows if part is None else [row[part] for row in rows])
     for name in ("action", "reward", "terminal"):
         found[name] = np.array([getattr(transition, name) for transition in picked])
-    # A batch has the dtypes that the algorithms need.
+    # The algorithms need batches with float32 rewards.
     assert buffer.sample_transition_batch(4).rewards.dtype == np.float32
     info = buffer.dataset_info
     found["lengths"] = np.array([episode.transition_count for episode in buffer.episodes])
@@ -79,7 +79,7 @@ def dump(log: str, file: str) -> None:
 
 
 def collect(file: str) -> None:
-    """Write steps that d3rlpy collected: three that terminate, and three until a timeout."""
+    """Write two episodes of three steps with d3rlpy's buffer: one terminated and one truncated."""
     d3rlpy = _d3rlpy()
     sample = d3rlpy.dataset.Episode(
         np.zeros((1, 2), np.float32), np.zeros((1, 1), np.int64), np.zeros((1, 1)), True

@@ -1,4 +1,4 @@
-"""d3rlpy's files and replay buffers: written and read back, and as d3rlpy itself sees them."""
+"""d3rlpy's files and replay buffers: written and read back here, and read by d3rlpy."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _SPACE = spaces.Dict(
 
 
 def _vectors() -> Dataset:
-    """Return observations 0, 1, 2, 3 and 10, 11, 12, one episode terminated and one truncated."""
+    """Return a terminated episode with observations 0 to 3 and a truncated one with 10 to 12."""
     metadata = LogMetadata(
         spaces.Box(-np.inf, np.inf, (2,), np.float32), spaces.Discrete(4), env_id="Line-v0"
     )
@@ -70,7 +70,7 @@ def _vectors() -> Dataset:
 
 
 def _images() -> Dataset:
-    """Return two transitions and a truncation, with images whose pixels all differ."""
+    """Return a truncated episode of two transitions, with images whose pixels all differ."""
 
     def rows(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
         return np.arange(3 * np.prod(shape)).reshape(3, *shape).astype(dtype)
@@ -145,7 +145,8 @@ def test_the_layout_of_the_file(tmp_path: Path) -> None:
             b"rewards",
             b"terminated",
         ]
-        # The terminated episode has a step for each transition, the truncated one has one more.
+        # The terminated episode has one step per transition. The truncated episode has one more
+        # step.
         assert file["observations_0"][:, 0].tolist() == [0, 1, 2]
         assert file["observations_1"][:, 0].tolist() == [10, 11, 12]
         assert file["actions_1"][()].tolist() == [[0], [1], [0]]
@@ -230,7 +231,7 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_buffer_of_episodes_is_copied() -> None:
-    """Truncated episodes lose their last step, which d3rlpy does not use as a transition either."""
+    """Drop the last step of truncated episodes, which d3rlpy also does not use as a transition."""
     episodes = [
         SimpleNamespace(
             observations=np.array([[first], [first + 1]], np.float32),
@@ -267,7 +268,7 @@ def test_d3rlpys_picker_gives_every_transition(tmp_path: Path) -> None:
     for name in ("direct", "loaded"):
         with np.load(tmp_path / f"{name}.npz") as found:
             assert found["observation"][:, 0].tolist() == [0, 1, 2, 10, 11]
-            # After a terminal state, d3rlpy has zeros.
+            # d3rlpy's next observation after a terminal state is zero.
             assert found["next_observation"].tolist() == [
                 [1, 0.5],
                 [2, 0.5],
@@ -280,7 +281,8 @@ def test_d3rlpys_picker_gives_every_transition(tmp_path: Path) -> None:
             assert found["terminal"].tolist() == [0, 0, 1, 0, 0]
             assert found["lengths"].tolist() == [3, 2]
             assert found["space"] == "DISCRETE"
-            # A file does not have the number of actions: d3rlpy takes the largest one.
+            # A file does not contain the number of actions, so d3rlpy infers it from the largest
+            # action.
             assert found["size"] == {"direct": 4, "loaded": 3}[name]
 
 
@@ -308,7 +310,7 @@ def test_d3rlpys_own_files_are_read(tmp_path: Path) -> None:
         assert found.rewards.tolist() == [0, 0.5, 1, 0, 0.5]
         assert found.terminated.tolist() == [False, False, True, False, False]
     assert mcaprl.open(tmp_path / "back.mcap").action_space == spaces.Discrete(4)
-    # The last of three steps before a timeout has no next observation: it is no transition.
+    # The third step before the timeout has no next observation, so it is not a transition.
     found = mcaprl.open(tmp_path / "collected.h5")
     assert found.observations[:, 0].tolist() == [0, 1, 2, 10, 11]
     assert found.next_observations[:, 0].tolist() == [1, 2, 2, 11, 12]
@@ -316,7 +318,7 @@ def test_d3rlpys_own_files_are_read(tmp_path: Path) -> None:
 
 
 def _run(*arguments: object) -> None:
-    """Run d3rlpy; skip the test where it is not installed."""
+    """Run d3rlpy; skip the test if d3rlpy is not installed."""
     python = os.environ.get("MCAPRL_D3RLPY_PYTHON", f"{sys.prefix}/rivals/bin/python")
     need(Path(python).exists(), "d3rlpy is not installed: make .venv/.rivals")
     kept = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}

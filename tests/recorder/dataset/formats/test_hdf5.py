@@ -1,4 +1,4 @@
-"""HDF5 files in D4RL's form, both ways, and in robomimic's."""
+"""HDF5 files: written and read in D4RL's form, and read in robomimic's form."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ h5py = pytest.importorskip("h5py", reason="needs the extra interop")
 
 
 def _two_episodes() -> Dataset:
-    """Return an episode of two steps that terminates, and one of a step that just stops."""
+    """Return a terminated episode of two steps, and an episode of one step without an end flag."""
     metadata = LogMetadata(
         spaces.Box(-9, 9, (2,), np.float32), spaces.Box(-1, 1, (1,), np.float32), env_id="Toy-v0"
     )
@@ -78,7 +78,7 @@ def test_the_arrays_are_those_of_d4rl(tmp_path: Path) -> None:
         assert file["terminals"][()].tolist() == [False, True, False]
         assert file["timeouts"][()].tolist() == [False, False, True]
         del file
-    # Another tool keeps these arrays alone: its reader sees a timeout.
+    # If only D4RL's arrays are left, the end of the second episode is read as a timeout.
     with h5py.File(tmp_path / "toy.hdf5", "a") as file:
         del file["mcaprl"]
     found = mcaprl.open(tmp_path / "toy.hdf5")
@@ -152,7 +152,7 @@ def test_a_file_of_d4rl_without_next_observations(tmp_path: Path) -> None:
 
 
 def _demos(path: Path, *, next_obs: bool = True) -> Path:
-    """Write three demonstrations; the one with number 10 is the last."""
+    """Write three demonstrations; the demonstration with number 10 is the last."""
     with h5py.File(path, "w") as file:
         for number, count, done in ((10, 2, 0), (0, 3, 1), (2, 1, 1)):
             rows = np.arange(count + 1, dtype=np.float64)[:, None] + 100 * number

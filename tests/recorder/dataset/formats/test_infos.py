@@ -21,7 +21,7 @@ from tests.recorder.dataset.formats.minari_sets import Cameras, collect
 h5py = pytest.importorskip("h5py", reason="needs the extra interop")
 
 _MISSING = np.array([True, False, True, True, False])
-# Rows of two episodes with two and one steps.
+# Rows of two episodes: the first has two steps, and the second has one step.
 _INFOS: dict[str, Any] = {
     "speed": np.ma.MaskedArray([0.5, np.nan, -0.0, 1, 2], np.zeros(5, bool)),
     "pose.xy": np.ma.MaskedArray(np.arange(10, dtype=np.float32).reshape(5, 2)),
@@ -101,7 +101,7 @@ def test_infos_that_minari_collects_are_those_of_the_log(
         assert set(data.infos) == set(expected)
         for name, values in expected.items():
             _same(data.infos[name], np.ma.MaskedArray(values))
-    # What is written from the log is what Minari collected.
+    # A dataset that is written from the log has the infos that Minari collected.
     log.to_minari("minari:again-v0")
     for name, values in mcaprl.open("minari:again-v0").infos.items():
         _same(values, found.infos[name])

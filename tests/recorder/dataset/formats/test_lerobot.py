@@ -1,4 +1,4 @@
-"""LeRobot datasets: written and read back, written by LeRobot, and read by LeRobot."""
+"""LeRobot datasets: written and read here, and exchanged with LeRobot in both directions."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _stacked(values: list[Any]) -> Any:
 
 
 def _cameras(step_ns: int = 100_000_000) -> Dataset:
-    """Return episodes of three and two steps: one terminates, one is truncated."""
+    """Return a terminated episode of three steps and a truncated episode of two steps."""
     metadata = LogMetadata(
         _CAMERAS, spaces.Discrete(4), env_id="Arm-v0", step_duration_ns=step_ns, seed="9"
     )
@@ -136,7 +136,7 @@ def test_all_spaces_and_values_come_back(arguments: dict[str, Any]) -> None:
 
 
 def _infos() -> dict[str, Any]:
-    """Return infos of an episode of three steps: some are missing, one comes from reset alone."""
+    """Return infos of three steps: some have missing rows, and one exists only at the reset."""
     everywhere = np.ma.MaskedArray([0, 1, 2, 3], [True, False, False, False])
     at_end = np.ma.MaskedArray([0, 0, 0, 1.5], [True, True, True, False])
     texts = np.ma.MaskedArray(["", "a", "", "longer"], [True, False, False, False])
@@ -219,7 +219,8 @@ def test_the_files_have_lerobots_names_types_and_numbers(tmp_path: Path) -> None
         [3, ["Arm-v0"], 0, 3],
         [2, ["turn"], 3, 5],
     ]
-    # The rewards 0.5, -1 and 2 of the first episode: mean 0.5, variance (0 + 2.25 + 2.25) / 3.
+    # The rewards of the first episode are 0.5, -1 and 2. Their mean is 0.5, and their variance is
+    # (0 + 2.25 + 2.25) / 3.
     assert episodes[0]["stats/next.reward/mean"] == [0.5]
     assert episodes[0]["stats/next.reward/std"] == [np.sqrt(1.5)]
     assert episodes[0]["stats/next.reward/q50"] == [0.5]
@@ -252,7 +253,7 @@ def test_statistics_of_vectors_images_and_all_episodes() -> None:
     }
     second = describe(vector, np.array([[4, 3]] * 2, np.float32))
     both = pooled([first, second])
-    # Of 0, 2, 4, 4: mean 2.5, variance (6.25 + 0.25 + 2.25 + 2.25) / 4.
+    # The values 0, 2, 4 and 4 have the mean 2.5 and the variance (6.25 + 0.25 + 2.25 + 2.25) / 4.
     assert (both["mean"][0], both["std"][0]) == (2.5, pytest.approx(np.sqrt(2.75)))
     assert (both["min"][0], both["max"][0], both["count"][0]) == (0, 4, 4)
     assert both["q50"][0] == 2.5
@@ -369,7 +370,7 @@ def _golden(kind: str) -> tuple[Dataset, list[str]]:
 
 
 def _opened(path: Path) -> tuple[Dataset, list[str]]:
-    """Open a dataset, and return what the warnings say."""
+    """Open a dataset, and return it with the texts of the warnings."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         dataset = mcaprl.open(path)
@@ -392,8 +393,8 @@ def test_a_dataset_of_lerobots_writer_with_rewards_and_images() -> None:
         "wrist": (32, 32, 3),
     }
     assert dataset.episode_lengths.tolist() == [4, 2]
-    # The observation of the terminal frame is there twice; the truncated episode has its last
-    # frame as its final observation.
+    # The observation of the terminal frame is repeated as the final observation. In the truncated
+    # episode, the last frame is the final observation.
     assert dataset.frames["front"][:, 5, 7, 1].tolist() == [0, 40, 80, 120, 120, 1, 41, 81]
     assert dataset.frames["wrist"][:, 0, 0, 0].tolist() == [0, 30, 60, 90, 90, 100, 130, 160]
     assert dataset.frames["state"][-3:].tolist() == [[1, 0], [1, 0.25], [1, 0.5]]
@@ -442,7 +443,7 @@ def test_lerobots_names_and_values_survive_a_way_through_a_log(tmp_path: Path) -
 
 
 def _edited(path: Path, edit: Any) -> None:
-    """Change the table of the data files."""
+    """Replace the table in the data file by `edit(table)`."""
     file = path / "data/chunk-000/file-000.parquet"
     parquet.write_table(edit(parquet.read_table(file)), file)
 
@@ -463,7 +464,7 @@ def test_a_done_frame_in_the_middle_ends_an_episode(written: Path) -> None:
     _edited(written, lambda t: _with(t, "next.done", pa.array([True, False, False, False, False])))
     with pytest.warns(UserWarning, match="is not stored for 2 other episodes"):
         dataset = Dataset.from_lerobot(written)
-    # The frame after the done frame is its next observation, as it was recorded.
+    # The next observation of the done frame is the observation of the following frame.
     assert dataset.episode_lengths.tolist() == [1, 1, 1]
     assert dataset.frames["state"][:, 0].tolist() == [0, 1, 1, 2, 10, 11]
     assert dataset.terminated.tolist() == [True, False, False]
@@ -542,7 +543,7 @@ def test_damage_is_named(written: Path, damage: Any, message: str) -> None:
 def test_a_changed_byte_of_the_data_is_found(written: Path) -> None:
     file = written / "data/chunk-000/file-000.parquet"
     content = bytearray(file.read_bytes())
-    # The first page has the states of the first episode.
+    # The byte is in the first page, which has the states of the first episode.
     content[content.index(np.float32(-0.25).tobytes())] ^= 1
     file.write_bytes(content)
     with pytest.raises(LogError, match="CRC"):
@@ -554,7 +555,7 @@ def test_videos_in_several_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(writer, "MAX_VIDEO_BYTES", 1)
     dataset = Dataset.concatenate([_cameras(), _cameras()])
     dataset.to_lerobot(tmp_path / "out", video=True, lossy=True)
-    # The encoder holds some images back, so that a file has more than one episode.
+    # The encoder delays some images, so a file can contain more than one episode.
     assert len(list((tmp_path / "out/videos/observation.images.front/chunk-000").iterdir())) > 1
     found = Dataset.from_lerobot(tmp_path / "out")
     difference = np.abs(found.frames["gray"].astype(int) - dataset.frames["gray"])
@@ -578,7 +579,7 @@ def _broken(table: Any) -> Any:
 
 
 def _run_lerobot(*arguments: object, home: Path) -> None:
-    """Run LeRobot; skip the test where it is not installed."""
+    """Run LeRobot; skip the test if LeRobot is not installed."""
     python = os.environ.get("MCAPRL_LEROBOT_PYTHON", f"{sys.prefix}/lerobot/bin/python")
     need(Path(python).exists(), "LeRobot is not installed: make .venv/.lerobot")
     kept = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}

@@ -1,4 +1,4 @@
-"""Minari datasets: collected by Minari and read here, written here and loaded by Minari."""
+"""Minari datasets: written by Minari and read here, and written here and read by Minari."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ h5py = pytest.importorskip("h5py", reason="needs the extra interop")
 
 _HAS_MINARI = all(importlib.util.find_spec(name) for name in ("minari", "jax", "pyarrow"))
 _FORMS = ["hdf5", "arrow", "parquet"]
-# Options of each reset.
+# Options of each reset, by environment.
 _OPTIONS: dict[str, list[dict[str, Any] | None]] = {
     "mcaprl/LaneKeeping-v0": [None, {"pose": [1.0, 0.5, 0.25]}, {"pose": [2.0, 0.0, 0.0]}],
     "CartPole-v1": [None, {"low": -0.01, "high": 0.02}, None],
@@ -62,7 +62,7 @@ def _same_tree(first: Any, second: Any) -> None:
 
 
 def _same_transitions(ours: Dataset, theirs: Any) -> None:
-    """Check that each episode of a MinariDataset is ours, bit for bit."""
+    """Check that each episode of a MinariDataset equals the episode in `ours`, bit for bit."""
     assert len(ours.episodes) == len(theirs)
     for index, episode in enumerate(theirs):
         own = ours.episodes[index]
@@ -87,7 +87,7 @@ def _summaries(data: Dataset, *names: str) -> list[tuple[Any, ...]]:
 
 
 def _vector(**fields: Any) -> Dataset:
-    """Return one episode of two steps that terminates, and one of one step without a flag."""
+    """Return a terminated episode of two steps, and an episode of one step without an end flag."""
     metadata = LogMetadata(
         spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(3, start=-1), env_id="Toy-v0"
     )
@@ -130,7 +130,7 @@ def test_a_collected_dataset_equals_the_log_of_the_same_episodes(
     assert [json.loads(text or "null") for (text,) in _summaries(found, "options")] == options
     assert (found.env_id, found.env_kwargs) == (log.env_id, log.env_kwargs)
     assert found.metadata["policy"] == "random"
-    # What the dataset says about itself is kept in a log, and on the way back.
+    # A log keeps the description of the dataset, and writes it to a new Minari dataset.
     found.save(tmp_path / "kept.mcap")
     mcaprl.open(tmp_path / "kept.mcap").to_minari("minari:drive/again-v0")
     about = json.loads((tmp_path / "sets/drive/again-v0/data/metadata.json").read_bytes())
@@ -251,7 +251,7 @@ def _has_odd_keys(space: spaces.Space[Any]) -> bool:
 
 
 def _arrays(tree: Any) -> Any:
-    """Return the arrays of a flat dict by number, without its keys."""
+    """Return the arrays of a flat dict, with numbers instead of the keys."""
     return dict(enumerate(tree.values())) if isinstance(tree, dict) else tree
 
 
@@ -283,7 +283,7 @@ def test_options_that_hdf5_cannot_hold_are_refused_or_left_out(tmp_path: Path) -
         data.to_minari(tmp_path / "odd-v0")
     (sentence,) = data.to_minari(tmp_path / "odd-v0", lossy=True)
     assert "'goal'" in sentence
-    # Minari does not see it, but it is not lost on the way back.
+    # Minari does not read the option 'goal', but this package reads it back.
     assert mcaprl.open(tmp_path / "odd-v0").episodes[0].summary.options == '{"goal": null, "x": 1}'
 
 
@@ -296,7 +296,7 @@ def test_jpeg_is_decoded_as_minari_does_and_reported(
         found = mcaprl.open("minari:jpeg-v0")
     _same_transitions(found, made)
     assert found.frames["front"].shape == (15, 32, 40, 3)
-    # Old versions of Minari always used JPEG, and did not say so.
+    # Old versions of Minari always used JPEG, but did not store this in the metadata.
     metadata = tmp_path / "sets/jpeg-v0/data/metadata.json"
     raw = json.loads(metadata.read_text())
     del raw["jpeg_encoding"]
@@ -425,7 +425,7 @@ def test_folders_are_named_with_a_version_and_replaced_on_request(tmp_path: Path
     with pytest.raises(OutputExistsError):
         data.to_minari(tmp_path / "toy-v0")
     data.to_minari(tmp_path / "toy-v0", overwrite=True)
-    # Its folder `data` is the dataset for Minari's own classes.
+    # Minari's own classes expect the path of the folder `data`.
     assert mcaprl.open(tmp_path / "toy-v0/data").fingerprint == data.fingerprint
 
 

@@ -1,4 +1,4 @@
-"""Archives of NumPy arrays: ours come back whole, and those of others are read by usual names."""
+"""NumPy archives: ours are read back unchanged, and others are read by the usual array names."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.strategies import transitions
 
 
 def _two_episodes() -> Dataset:
-    """Return episodes of two and one steps, the first with known times and probabilities."""
+    """Return an episode of two steps with action probabilities, and one step without them."""
     space = spaces.Dict(
         {"pose": spaces.Dict({"x": spaces.Box(-9, 9, (2,), np.float32)}), "a b": spaces.Discrete(5)}
     )
@@ -99,7 +99,7 @@ def test_images_are_read_from_disk_block_by_block(tmp_path: Path) -> None:
     assert "on disk" in log.storage
     log.to_npz(tmp_path / "log.npz")
     _same(mcaprl.open(tmp_path / "log.npz"), log)
-    # The same data gives the same bytes.
+    # Writing the same data again creates a file with the same bytes.
     log.to_npz(tmp_path / "again.npz")
     assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "log.npz").read_bytes()
 
@@ -121,7 +121,8 @@ def test_archives_of_others_are_read(
         arrays[truncated] = np.array([[0], [1], [0], [0]], bool)
     np.savez(tmp_path / "their.npz", **arrays)
     found = mcaprl.open(tmp_path / "their.npz")
-    # Without a flag, the first episode ends where the observations do not follow each other.
+    # The first episode ends where the next observation differs from the following observation, even
+    # if there is no flag.
     assert found.episode_lengths.tolist() == [2, 2]
     assert found.truncated.tolist() == [False, truncated is not None, False, False]
     assert found.terminated.tolist() == [False, False, False, True]
@@ -213,7 +214,7 @@ def test_damaged_archives_give_one_clear_line(tmp_path: Path) -> None:
     np.savez(path, **{**arrays, "mcaprl": np.array('{"metadata": 1}')})
     fails("the array mcaprl is damaged")
     with zipfile.ZipFile(path, "w") as archive_file:
-        # An array of an exabyte in a file of some bytes.
+        # The header declares an array of 8 PB, but the file has only a few bytes.
         header = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000000,), }"
         data = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode()
         archive_file.writestr("rewards.npy", data)

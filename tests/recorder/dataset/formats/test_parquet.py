@@ -1,4 +1,4 @@
-"""Parquet files and Arrow tables: read back, and read by pandas, polars and DuckDB."""
+"""Parquet files and Arrow tables, read back here and by pandas, polars and DuckDB."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _observations(first: int, count: int) -> dict[str, Any]:
 
 
 def _recorded() -> Dataset:
-    """Return two episodes: three steps that terminate, and two that are truncated."""
+    """Return a terminated episode of three steps and a truncated episode of two steps."""
     metadata = LogMetadata(_SPACE, spaces.Box(-1, 1, (2, 2), np.float64), env_id="Car-v0", seed="4")
     first = EpisodeArrays(
         observations=_observations(0, 4),
@@ -72,12 +72,13 @@ def _recorded() -> Dataset:
 def _vectors(
     episodes: int = 2, length: int = 3, infos: list[dict[str, Any]] | None = None
 ) -> Dataset:
-    """Return episodes of a vector and an integer: observation k of all is (k, -k).
+    """Return episodes with vector observations; observation k of the whole dataset is (k, -k).
 
     Args:
         episodes: Number of episodes.
         length: Number of transitions of an episode.
-        infos: Infos of the episodes, in place of `episodes` and `length`; None is missing.
+        infos: Infos of each episode; None marks a missing row. If given, they determine the number
+            and lengths of the episodes.
     """
     parts: list[EpisodeArrays] = []
     first = 0
@@ -248,7 +249,7 @@ def test_the_table_shares_memory_with_the_dataset() -> None:
         values = chunk.flatten() if pa.types.is_nested(chunk.type) else chunk
         shift = values.offset * values.type.bit_width // 8
         assert values.buffers()[1].address + shift == array[first:].ctypes.data, name
-    # Each episode is a chunk, because its last frame is not an observation of a transition.
+    # Each episode is a separate chunk, because its final frame is not in the column.
     assert [len(chunk) for chunk in table["observation"].chunks] == [5000, 5000]
     np.testing.assert_array_equal(
         table["next_observation"].combine_chunks().flatten().to_numpy().reshape(-1, 2),

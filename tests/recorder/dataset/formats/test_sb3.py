@@ -1,4 +1,4 @@
-"""Replay buffers of Stable-Baselines3: filled like SB3's own, and read back."""
+"""Replay buffers of Stable-Baselines3: filled as SB3 fills them, and read back."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "
 
 
 class Counter(gym.Env[Any, Any]):
-    """Observation k of an episode is filled with k; each episode ends after 4 or 6 steps."""
+    """Environment in which all elements of observation k are k; episodes have 4 or 6 steps."""
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
 
@@ -135,7 +135,7 @@ def test_training_on_it_gives_the_same_weights(tmp_path: Path) -> None:
 
 
 def test_n_step_returns_are_those_of_sb3(tmp_path: Path) -> None:
-    # The log's last episode was interrupted: no n-step return may go over its end, either.
+    # The last episode of the log was interrupted. N-step returns must not extend beyond its end.
     model, dataset = _learned(tmp_path / "log.mcap", _VECTOR, "MlpPolicy", 44, n_steps=3)
     ours = dataset.to_sb3(buffer_class=buffers.NStepReplayBuffer, n_steps=3, gamma=0.99)
     found = [_sample(buffer, 64) for buffer in (ours, model.replay_buffer)]
@@ -215,7 +215,7 @@ def test_shared_observations_are_stored_as_sb3_stores_them(tmp_path: Path) -> No
     theirs, ours = model.replay_buffer, dataset.to_sb3(optimize_memory_usage=True, **options)
     assert (ours.buffer_size, ours.pos, ours.full) == (41, 40, False)
     for name in ("observations", "actions", "rewards", "dones", "timeouts"):
-        # SB3's buffer has one row less: its last next observation is in the first row.
+        # SB3's buffer has one row less, so the last next observation is in its first row.
         np.testing.assert_array_equal(getattr(ours, name)[1:40], getattr(theirs, name)[1:])
     np.testing.assert_array_equal(ours.observations[40], theirs.observations[0])
     with pytest.raises(LogError, match="lossy=True"):
@@ -223,7 +223,7 @@ def test_shared_observations_are_stored_as_sb3_stores_them(tmp_path: Path) -> No
     for buffer, first in ((ours, 0), (theirs, 1)):
         found = Dataset.from_sb3(buffer, lossy=True)
         np.testing.assert_array_equal(found.observations, dataset.observations[first:])
-        # The final observations are lost, except for the newest one.
+        # All final observations are lost, except the newest one.
         assert [e.next_observations[-1, 0] for e in found.episodes] == [3, 5, 3, 5, 3, 5, 3, 6]
         assert all(e.terminated[-1] and not e.truncated[-1] for e in found.episodes)
 
@@ -236,7 +236,7 @@ def test_a_buffer_that_does_not_tell_truncations(tmp_path: Path) -> None:
 
 
 def test_an_end_without_a_flag_is_no_termination() -> None:
-    # The second episode was interrupted: bootstrapping from its last observation is right.
+    # The second episode was interrupted, so the learner must bootstrap from its last observation.
     columns: dict[str, Any] = {
         "observations": np.array([[0], [1], [5], [6]], np.float32),
         "next_observations": np.array([[1], [2], [6], [7]], np.float32),
@@ -251,7 +251,8 @@ def test_an_end_without_a_flag_is_no_termination() -> None:
     assert buffer.timeouts[:, 0].tolist() == [0, 0, 0, 1, 0, 0]
     found = Dataset.from_sb3(buffer)
     assert found.truncated.tolist() == [False, False, False, True]
-    # SB3 itself sets no flag where a training run stops; then the observations show it.
+    # SB3 sets no flag at the end of a training run. The observations then show the end of an
+    # episode.
     buffer.dones[1] = buffer.dones[3] = 0
     assert Dataset.from_sb3(buffer).episode_lengths.tolist() == [2, 2]
 
@@ -327,7 +328,7 @@ def test_numbers_that_float32_cannot_hold_are_refused() -> None:
     with pytest.raises(SpaceError, match=r"reward 1e\+300 is too large"):
         _steps(rewards=[1, 1e300]).to_sb3()
     assert _steps(rewards=[1, np.inf]).to_sb3().rewards[1, 0] == np.inf
-    # As SB3 does, others are rounded.
+    # Other rewards are rounded to float32, as in SB3.
     assert _steps(rewards=[1, 0.1]).to_sb3().rewards[1, 0] == np.float32(0.1)
     space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
     with pytest.raises(SpaceError, match=r"action -1e\+300 is too large"):

@@ -1,4 +1,4 @@
-"""The table of docs/formats.md: each cell is the outcome of a conversion there and back.
+"""The table of docs/formats.md. Each cell is the result of a conversion to a format and back.
 
 MCAPRL_WRITE_TABLE=1 pytest tests/recorder/dataset/formats/test_table.py     # writes the table
 """
@@ -214,7 +214,7 @@ _FACTS = (
     "infos",
     "environment and action names",
 )
-"""What is missing afterwards if it differs."""
+"""Aspects that are reported as `lost`, not as `changed`, if they differ after the conversion."""
 
 
 def _outcome(trip: _Trip, aspect: str, folder: Path) -> str:
@@ -244,7 +244,7 @@ def _table(folder: Path) -> str:
 
 def test_the_table_of_the_docs_is_what_conversions_give(tmp_path: Path) -> None:
     with warnings.catch_warnings():
-        # Conversions warn of what they leave out.
+        # Conversions warn about data that they leave out.
         warnings.simplefilter("ignore")
         table = _table(tmp_path)
     page = _PAGE.read_text()
