@@ -161,6 +161,7 @@ _LANE_IMAGES: Final[dict[str, Any]] = {
 IMAGE_SETTINGS: Final[dict[tuple[str, str], dict[str, Any]]] = {
     (SIMS["lane"], "dashboard"): _LANE_IMAGES,
     (SIMS["lane"], "depth"): {**_LANE_IMAGES, "frame_stack": 4},
+    (SIMS["lane"], "depth-commands"): {**_LANE_IMAGES, "frame_stack": 4},
     (SIMS["powerline"], "depth"): {
         **_FROM_IMAGES,
         "steps": 240_000,

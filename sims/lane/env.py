@@ -79,6 +79,13 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     float32: speed and steering as in rows 2 and 3 of the table, and the direction of the next turn,
     1 left or -1 right. A single image shows neither the speed nor the direction of the next turn.
 
+    `observation="depth-commands"`: a `Dict` with two entries. `depth` is the same image. `commands`
+    has 64 float32: two for each of the last 32 decisions, newest first. The first is -1 if the
+    decision was to brake and 1 if it was to accelerate; the second is the steering command as in
+    row 3 of the table, which braking does not change. Both are 0 before the start of the episode.
+    There is no measurement beside the image: an agent knows its own commands. The speed follows
+    from them, except the speed at the start, whose influence decreases with time.
+
     `observation="rays"`: `Box` of 20 float32.
 
     | Index | Observation | Unit | Limit |
@@ -148,7 +155,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     ## Arguments
 
     - `rules`: `"default"`, `"classic"` or `"classic-code"`.
-    - `observation`: `"state"`, `"depth"`, `"dashboard"` or `"rays"`.
+    - `observation`: `"state"`, `"depth"`, `"depth-commands"`, `"dashboard"` or `"rays"`.
     - `start`: `"anywhere"` or `"line"`; None means `"anywhere"`, or `"line"` in the classic rules.
     - `render_mode`: None, `"human"` or `"rgb_array"`.
 

@@ -19,6 +19,7 @@ from mcaprl.sims.lane.course import COURSE, NEXT_TURN
 from mcaprl.sims.lane.rays import RAY_OBSERVATION_LIMIT, RAY_OBSERVATION_NAMES, observe_all_rays
 from mcaprl.sims.lane.rules import (
     ACTION_MEANINGS,
+    BRAKE,
     DECISION_S,
     OBSERVATION_LIMIT,
     OBSERVATION_NAMES,
@@ -34,11 +35,16 @@ from mcaprl.sims.vehicle.arguments import check_name
 from mcaprl.sims.vehicle.draws import Draws
 from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
 
+OBSERVATIONS = ("state", "depth", "depth-commands", "dashboard", "rays")
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
 SPEED = Car._fields.index("speed_m_s")
 """Index of the speed in a car's row; `info` uses the values from this index onward."""
 MOTION = slice(2, 4)
 """Indices of speed and steering in the observed state."""
+STEERING_SEEN = 3
+"""Index of the last steering command in the observed state."""
+COMMANDS = 32
+"""Number of decisions whose commands are observed with `depth-commands`: 8 s by default."""
 
 
 class LaneFleet(Fleet):
@@ -60,7 +66,7 @@ class LaneFleet(Fleet):
             UnknownNameError: An argument has a value that is not in its list.
         """
         check_name("rules", rules, ("default", "classic", "classic-code"))
-        check_name("observation", observation, ("state", "depth", "dashboard", "rays"))
+        check_name("observation", observation, OBSERVATIONS)
         check_name("start", start, (None, "anywhere", "line"))
         self._classic, self._by_code = rules != "default", rules == "classic-code"
         self.has_barriers = not self._classic
@@ -78,8 +84,11 @@ class LaneFleet(Fleet):
         self._shares = np.zeros(4)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
+        # Newest command first, 0 before the start: acceleration and steering of each decision.
+        self._commands = np.zeros((count, COMMANDS, 2), dtype=np.float32)
         self.has_rays, self._has_dashboard = observation == "rays", observation == "dashboard"
-        self._has_images = observation == "depth" or self._has_dashboard
+        self._has_commands = observation == "depth-commands"
+        self._has_images = observation == "depth" or self._has_commands or self._has_dashboard
         self._seen = self._rays if self.has_rays else self._states
         self._has_fast_step = observation == "state" and not self._classic
         self._encode = encode_nearness if self._classic else encode_depth
@@ -102,6 +111,7 @@ class LaneFleet(Fleet):
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
         """Start car i; see "Starting State" of `LaneKeepingEnv`."""
         self._draws.use_generator(i, random)
+        self._commands[i] = 0.0
         if options:
             car, row = car_from(options), self._cars[i]
             store_car(car, row)
@@ -125,6 +135,7 @@ class LaneFleet(Fleet):
             seen = np.empty((len(chosen), self._rays.shape[1]), dtype=np.float32)
             observe_all_rays(self._cars[chosen], seen, self.has_barriers)
             self._rays[chosen] = seen
+        self._commands[chosen] = 0.0
         if self._depth_m:
             for i in chosen.tolist():
                 self._depth_m.pop(i, None)
@@ -132,6 +143,10 @@ class LaneFleet(Fleet):
     def advance(self) -> None:
         """Advance each car by one decision."""
         self._step()
+        if self._has_commands:
+            self._commands[:, 1:] = self._commands[:, :-1]
+            self._commands[:, 0, 0] = np.where(self.actions == BRAKE, -1.0, 1.0)
+            self._commands[:, 0, 1] = self._states[:, STEERING_SEEN]
         if self.has_rays:
             observe_all_rays(self._cars, self._rays, self.has_barriers)
         if self._depth_m:
@@ -174,7 +189,8 @@ class LaneFleet(Fleet):
         if not self._has_images:
             return self._seen[i].copy()
         depth = self._encode(self.depth_image_m(i))[:, :, np.newaxis]
-        return {"depth": depth, "motion": self._motions()[i]} if self._has_dashboard else depth
+        numbers = {key: part[i] for key, part in self._numbers().items()}
+        return {"depth": depth, **numbers} if numbers else depth
 
     def observations(self) -> Any:
         """Return the observations of all cars."""
@@ -182,7 +198,16 @@ class LaneFleet(Fleet):
             return self._seen.copy()
         images_m = np.stack([self.depth_image_m(i) for i in range(self.count)])
         depth = self._encode(images_m)[..., np.newaxis]
-        return {"depth": depth, "motion": self._motions()} if self._has_dashboard else depth
+        numbers = self._numbers()
+        return {"depth": depth, **numbers} if numbers else depth
+
+    def _numbers(self) -> dict[str, NDArray[np.float32]]:
+        """Return what is observed beside the images of all cars, by key; empty without a Dict."""
+        if self._has_dashboard:
+            return {"motion": self._motions()}
+        if self._has_commands:
+            return {"commands": self._commands.reshape(self.count, -1).copy()}
+        return {}
 
     def _motions(self) -> NDArray[np.float32]:
         """Return an (N, 3) array: speed, last steering command and direction of the next turn."""
@@ -221,6 +246,8 @@ def _space(observation: str) -> spaces.Space[Any]:
     depth = spaces.Box(0, 255, (*IMAGE_SHAPE, 1), np.uint8)
     if observation == "depth":
         return depth
+    if observation == "depth-commands":
+        return spaces.Dict({"depth": depth, "commands": spaces.Box(-1, 1, (2 * COMMANDS,))})
     if observation == "dashboard":
         ends = np.array([[0, -1, -1], [1, 1, 1]], dtype=np.float32)
         return spaces.Dict({"depth": depth, "motion": spaces.Box(*ends)})

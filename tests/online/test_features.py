@@ -186,11 +186,12 @@ def test_sb3s_network_is_used_if_it_is_asked_for(tmp_path: Path) -> None:
         assert isinstance(model.q_net.features_extractor, NatureCNN)
 
 
-def test_a_resumed_agent_has_the_same_images(tmp_path: Path) -> None:
+@pytest.mark.parametrize("observation", ["dashboard", "depth-commands"])
+def test_a_resumed_agent_has_the_same_images(tmp_path: Path, observation: str) -> None:
     """The replay buffer contains averaged images, and the checkpoint their normalization."""
     models: list[Any] = []
     for resume in (False, True):
-        task = Task.for_sim("lane", None, {"observation": "dashboard"}, **SHORT)
+        task = Task.for_sim("lane", None, {"observation": observation}, **SHORT)
         scale = Scale(0.0, 1.0)
         with closing(Agent(task, "a", tmp_path, 0, scale, resume=resume)) as begun:
             if resume:

@@ -150,7 +150,9 @@ def test_a_stacking_offline_policy_initializes_an_agent(tmp_path: Path) -> None:
         other.start_from(None, policy)
 
 
-@pytest.mark.parametrize("options", [{}, {"observation": "depth"}])
+@pytest.mark.parametrize(
+    "options", [{}, {"observation": "depth"}, {"observation": "depth-commands"}]
+)
 def test_a_run_with_frames_is_resumed(tmp_path: Path, options: dict[str, Any]) -> None:
     """Weights, the optimiser's moments and the frames come back, images' among them."""
     first = agent(tmp_path, options)

@@ -29,6 +29,7 @@ from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import read_curve
 from mcaprl.sims import make_sim
+from mcaprl.sims.lane.rules import STEERING
 from tests.support.learner_topic import read_learner
 
 SHORT: dict[str, Any] = {
@@ -48,10 +49,12 @@ def silent(_: TrainingProgress) -> None:
     """A progress callback that does nothing."""
 
 
-def trained(folder: Path, **settings: Any) -> tuple[Agent, Dataset]:
+def trained(
+    folder: Path, sim_options: dict[str, Any] | None = None, **settings: Any
+) -> tuple[Agent, Dataset]:
     """An agent that has learned a little, and its log."""
     folder.mkdir()
-    task = Task.for_sim("lane", "dqn", **{**SHORT, **settings})
+    task = Task.for_sim("lane", "dqn", sim_options, **{**SHORT, **settings})
     path = folder / "log.mcap"
     agent = Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0), record=path)
     with closing(agent):
@@ -101,6 +104,20 @@ def test_the_log_is_sb3s_replay_buffer_row_for_row(tmp_path: Path, envs: int) ->
     timeouts = [episode.truncated[-1] for episode in log.episodes]
     reported = [part["timeouts"][-1] == 1 or part["dones"][-1] == 0 for part in episodes]
     assert timeouts == reported
+
+
+def test_logged_commands_are_those_of_the_logged_actions(tmp_path: Path) -> None:
+    _, log = trained(tmp_path / "run", sim_options={"observation": "depth-commands"})
+    assert log.env_kwargs["observation"] == "depth-commands"
+    for episode in log.episodes:
+        commands = np.zeros((episode.length + 1, 32, 2), np.float32)
+        for step, action in enumerate(episode.actions.tolist()):
+            steering = commands[step, 0, 1] if action == 0 else 2 * STEERING[action]
+            commands[step + 1, 0] = -1 if action == 0 else 1, steering
+            commands[step + 1, 1:] = commands[step, :-1]
+        expected = commands.reshape(-1, 64)
+        np.testing.assert_array_equal(episode.observations["commands"], expected[:-1])
+        np.testing.assert_array_equal(episode.next_observations["commands"], expected[1:])
 
 
 def killed_log(path: Path, episodes: int) -> bytes:

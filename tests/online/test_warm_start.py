@@ -216,7 +216,7 @@ def images_of(task: Task, folder: Path, count: int = 60) -> Path:
 
 
 @pytest.mark.parametrize("frame_stack", [1, 2])
-@pytest.mark.parametrize("observation", ["depth", "dashboard"])
+@pytest.mark.parametrize("observation", ["depth", "dashboard", "depth-commands"])
 def test_a_policy_from_images_keeps_its_values(
     tmp_path: Path, observation: str, frame_stack: int
 ) -> None:

@@ -29,6 +29,7 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("lane", {}),
     ("lane", {"observation": "depth"}),
     ("lane", {"observation": "dashboard"}),
+    ("lane", {"observation": "depth-commands"}),
     ("lane", {"observation": "rays"}),
     ("lane", {"rules": "classic", "start": "anywhere"}),
     ("lane", {"rules": "classic-code", "observation": "depth"}),

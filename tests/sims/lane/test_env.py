@@ -151,6 +151,35 @@ def test_a_dashboard_has_speed_steering_and_the_next_turn(along_m: float, turn: 
     assert moved["motion"][0] == pytest.approx(sim.car.speed_m_s / 30)
 
 
+def test_the_last_commands_are_observed_beside_the_image() -> None:
+    sim = lane(observation="depth-commands")
+    seen, _ = sim.reset(options={"pose": (2.0, 1.0, 0.0, 5.0)})
+    assert seen["depth"].tobytes() == encode_depth(sim.depth_image_m()).tobytes()
+    assert seen["commands"].shape == (64,)
+    assert not seen["commands"].any(), "no decision yet"
+    # Left, brake (which keeps the steering), slightly right, straight.
+    expected = [1.0, 1.0], [-1.0, 1.0], [1.0, -0.5], [1.0, 0.0]
+    for step, action in enumerate((3, 0, 4, 1), start=1):
+        before = seen["commands"].copy()
+        seen, *_ = sim.step(action)
+        newest_first = np.ravel(expected[:step][::-1])
+        np.testing.assert_array_equal(seen["commands"][: 2 * step], newest_first)
+        assert not seen["commands"][2 * step :].any()
+    np.testing.assert_array_equal(before, [1.0, -0.5, -1.0, 1.0, 1.0, 1.0, *[0.0] * 58])
+    sim.reset(seed=0)
+    assert not sim.fleet.observation(0)["commands"].any(), "another episode"
+
+
+def test_commands_of_more_than_32_decisions_ago_are_not_observed() -> None:
+    sim = lane(observation="depth-commands")
+    sim.reset(seed=0)
+    for action in (0, 2, *[3] * 31):
+        seen, *_ = sim.step(action)
+    np.testing.assert_array_equal(seen["commands"], [1.0, 1.0] * 31 + [1.0, -1.0])
+    seen, *_ = sim.step(3)
+    np.testing.assert_array_equal(seen["commands"], [1.0, 1.0] * 32)
+
+
 def test_names_and_metadata_fit_the_sim() -> None:
     sim = lane()
     assert len(sim.action_meanings) == 6

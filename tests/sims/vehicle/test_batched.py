@@ -147,6 +147,23 @@ def test_results_are_copies() -> None:
     assert repr(given) == kept
 
 
+def test_a_reset_in_the_step_that_ends_an_episode_clears_the_commands() -> None:
+    # The second car leaves the lane; the first drives on.
+    options = {"observation": "depth-commands", "start": "line", "autoreset_mode": "SameStep"}
+    env = make_sims("lane", 2, **options)
+    env.reset(seed=0)
+    for step in range(1, 33):
+        seen, _, terminated, _, infos = env.step(np.array([1, 2]))
+        first, second = seen["commands"].reshape(2, 32, 2)
+        np.testing.assert_array_equal(first[:step], [[1.0, 0.0]] * step)
+        if terminated[1]:
+            break
+    assert terminated.tolist() == [False, True]
+    assert not second.any()
+    last = infos["final_obs"][1]["commands"].reshape(32, 2)
+    np.testing.assert_array_equal(last, [[1.0, -1.0]] * step + [[0.0, 0.0]] * (32 - step))
+
+
 def test_one_pose_for_all_or_one_for_each() -> None:
     env = make_sims("lane", 2)
     _, infos = env.reset(options={"pose": (50.0, 1.5, 0.0, 7.0)})
@@ -273,7 +290,9 @@ def test_a_step_needs_a_reset() -> None:
 
 
 def test_an_unknown_value_names_the_known_ones() -> None:
-    with pytest.raises(UnknownNameError, match="known: dashboard, depth, rays, state"):
+    with pytest.raises(
+        UnknownNameError, match="known: dashboard, depth, depth-commands, rays, state"
+    ):
         make_sims("lane", 2, observation="smell")
 
 
@@ -283,5 +302,6 @@ def test_the_cases_cover_all_that_can_be_batched() -> None:
         None,
         "dashboard",
         "depth",
+        "depth-commands",
         "rays",
     }
