@@ -80,8 +80,8 @@ def compact(
 def groups_of(chunks: Iterable[ChunkIndex]) -> list[list[ChunkIndex]]:
     """Group the source chunks, so that each group becomes one chunk of the compacted file.
 
-    Groups are in file order. A merged chunk takes the place of its last source chunk, so that it
-    comes after all top-level records that it needs.
+    Groups are in file order. A merged chunk takes the place of its last source chunk, so that all
+    top-level records that it needs come before it.
     """
     chunks = list(chunks)
     kinds = _kinds(chunks)

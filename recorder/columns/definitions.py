@@ -83,7 +83,7 @@ def definitions_of(
 ) -> Definitions:
     """Return a type and all types that are nested in it.
 
-    Definitions of the file have precedence over those of the distribution.
+    If both the file and the distribution define a type, the file's definition is used.
 
     Args:
         name: Full name of the type.

@@ -489,7 +489,7 @@ class McapReader:
             self._keep(parse_record(opcode, content))
 
     def _keep(self, record: McapRecord) -> None:
-        """Store a record, unless an earlier record has the same id or name."""
+        """Store a record if no earlier record has the same id or name."""
         match record:
             case Schema():
                 self.schemas.setdefault(record.id, record)

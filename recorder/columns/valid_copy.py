@@ -40,7 +40,7 @@ def recover_file(
     Args:
         source: Path of the damaged file.
         target: Path of the new file; an existing one is replaced.
-        damages: List to which damaged ranges and records that cannot be copied are added.
+        damages: List to which the function adds damaged ranges and records that cannot be copied.
         restore: Function that returns the metadata records to write.
 
     Raises:
@@ -174,8 +174,8 @@ class _Copy:
         self, view: memoryview, writer: McapWriter, topics: _Topics, damages: list[Damage]
     ) -> None:
         self._view, self._writer, self._topics, self._damages = view, writer, topics, damages
-        # Offsets of the chunks read so far, by the CRC and length of their records. A chunk with
-        # equal records is dropped as a repetition, unless an intact summary lists it.
+        # Offsets of the chunks read so far, by the CRC and length of their records. A second chunk
+        # with equal records is dropped as a repetition. It is kept if an intact summary lists it.
         self._seen: dict[tuple[int, int], list[int]] = {}
         self._listed = {
             record.chunk_start_offset

@@ -136,12 +136,12 @@ class McapWriter(OutputFile):
         return found[0].metadata if found else None
 
     def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
-        """Write a metadata record, unless the file has one with this name."""
+        """Write a metadata record if the file has no metadata record with this name."""
         if self.metadata(name) is None:
             self.announce(Metadata(name, metadata))
 
     def add_attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
-        """Write an attachment created at `time_ns`, unless the file has one with this name."""
+        """Write an attachment created at `time_ns` if the file has no attachment with this name."""
         if all(record.name != name for record in self._summary.attachments):
             self.announce(Attachment(time_ns, time_ns, name, media_type, data))
 

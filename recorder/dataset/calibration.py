@@ -2,10 +2,10 @@
 
 A log contains only the probability p of the action taken. If each action is drawn with its
 probability p, the expected value of 1 / p is the number of actions with p > 0. This also works for
-a range of probabilities: the sum of 1 / p over the steps whose p is in the range, divided by the
-number of all steps, estimates how many actions per state have a probability in the range. For
-example, an epsilon-greedy policy over nine actions has one action of high probability and eight of
-low probability.
+a range of probabilities: add up 1 / p over the steps whose p is in the range, and divide by the
+number of all steps. The result estimates how many actions per state have a probability in the
+range. For example, an epsilon-greedy policy over nine actions has one action of high probability
+and eight of low probability.
 """
 
 from __future__ import annotations

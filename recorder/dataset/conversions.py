@@ -246,8 +246,9 @@ class Conversions:
     ) -> Dataset:
         """Copy the transitions of a Stable-Baselines3 replay buffer.
 
-        The result contains all transitions of the first environment, then those of the second, and
-        so on. The transitions of an environment are in order from old to new.
+        The result contains all transitions of the first environment, then all transitions of the
+        second environment, and so on. The transitions of an environment are in order from old to
+        new.
 
         Args:
             buffer: `ReplayBuffer` or `DictReplayBuffer`.

@@ -26,7 +26,7 @@ _note = functools.partial(Problem, severity="note")
 
 
 def lint(dataset: Dataset) -> list[Problem]:
-    """Return the findings of all checks, problems before notes."""
+    """Return the findings of all checks: first the problems, then the notes."""
     found = [finding for check in _CHECKS for finding in check(dataset)]
     return sorted(found, key=lambda finding: finding.severity != "problem")
 

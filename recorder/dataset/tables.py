@@ -90,7 +90,7 @@ def described(description: LogMetadata) -> dict[str, str]:
 
 
 def observation_names(leaves: Sequence[Leaf]) -> list[str]:
-    """Return the name of the column of each leaf of the observation."""
+    """Return the column name of each observation leaf."""
     names: list[str] = []
     for leaf in leaves:
         name = leaf.name if leaf.name.startswith("observation") else f"observation_{leaf.name}"

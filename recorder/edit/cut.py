@@ -117,8 +117,8 @@ def _parts(
     """Divide `count` episodes into parts, and return the start and stop index of each part.
 
     Raises:
-        UsageError: Neither or both of `episodes` and `ratio` are given, one is invalid, or a part
-            would be empty.
+        UsageError: Not exactly one of `episodes` and `ratio` is given, its value is invalid, or a
+            part would be empty.
     """
     if (episodes is None) == (ratio is None):
         raise UsageError("give either the episodes of each part or the ratio of the parts")

@@ -177,7 +177,7 @@ def _overlap(spans: Times, others: Times) -> bool:
 
 
 def _overlapped(logs: Sequence[FinishedLog], log: FinishedLog) -> Path:
-    """Return the path of the first of `logs` whose episodes overlap in time with those of `log`."""
+    """Return the path of the first log in `logs` that has episodes at the times of `log`."""
     found = [one.path for one in logs if one.has_steps and _overlap(one.spans, log.spans)]
     return (found or [one.path for one in logs if one.has_steps])[0]
 

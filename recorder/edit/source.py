@@ -151,9 +151,9 @@ class FinishedLog:
     def spans_of(self, episodes: NDArray[np.int64]) -> Times:
         """Return the time ranges of the episodes' messages: (S, 2) first and last log_times.
 
-        The messages of an episode are those from its first record up to the next episode. Messages
-        before the first episode belong to the first one. The ranges of adjacent episodes are
-        merged into one.
+        An episode has all messages from its first record until the next episode. Messages before
+        the first episode belong to the first episode. The ranges of adjacent episodes are merged
+        into one range.
 
         Args:
             episodes: Increasing indexes of episodes.

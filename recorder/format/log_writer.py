@@ -269,7 +269,7 @@ class LogWriter(LogTopics):
         super().__init__(metadata, self.mcap, names_actions=not is_plain)
 
     def _check_same(self, strings: dict[str, str]) -> None:
-        """Raise LogError unless the existing log was recorded from the same environment."""
+        """Raise LogError if the existing log was recorded from another environment."""
         found = self.mcap.metadata(METADATA_NAME) or {}
         for name in SAME_WHEN_APPENDED:
             here, there = strings[name], found.get(name, "not known")

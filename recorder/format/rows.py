@@ -123,8 +123,9 @@ class TopicRows:
 class StepRows(TopicRows):
     """Rows of `/rl/step`: the T transitions of an episode, then its final record.
 
-    `number` sets the counters of consecutive rows and clears their end flags; `put` then
-    sets the other fields, `finish` makes the last rows final, and `write` adds the times.
+    First, `number` sets the counters of consecutive rows and clears their end flags. Then `put`
+    sets the other fields, `finish` turns the last rows into final records, and `write` adds the
+    times.
     """
 
     def number(self, where: Any, episode: Any, steps: Any) -> None:

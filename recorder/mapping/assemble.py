@@ -28,7 +28,7 @@ _STATE = "state"
 
 
 class _Observations(NamedTuple):
-    """Observation frames by leaf path, observation space, and names of the vector's elements."""
+    """Observation frames by leaf path, their space, and the names of the vector's elements."""
 
     frames: dict[tuple[str, ...], Array]
     space: spaces.Space[Any]
@@ -94,8 +94,8 @@ def _summary(
     if len(wrong):
         raise UsageError(
             f"{plan.place.of('reward')}: the reward is {rewards[wrong[0]]} at"
-            f" {run.times_ns[segment.first + wrong[0]]} ns, and not finite in {len(wrong)} of"
-            f" {len(rewards)} steps of its episode: set `missing` for the quantities in `reward`"
+            f" {run.times_ns[segment.first + wrong[0]]} ns; it is not finite in {len(wrong)} of"
+            f" {len(rewards)} steps of this episode: set `missing` for the quantities in `reward`"
         )
     named = (name for name, holds in run.reasons.items() if holds[segment.last])
     kind = "terminated" if segment.terminated else "truncated"

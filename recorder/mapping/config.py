@@ -190,7 +190,7 @@ class Episodes(_Part):
         default=None, description="Number of steps after which an episode is truncated."
     )
     min_steps: Annotated[int, Field(ge=1)] = Field(
-        default=2, description="Number of steps below which an episode is dropped."
+        default=2, description="Minimum number of steps; shorter episodes are dropped."
     )
 
 

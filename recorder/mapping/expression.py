@@ -37,7 +37,7 @@ FUNCTIONS: Final[dict[str, tuple[Callable[..., Any], int]]] = {
     "isnan": (np.isnan, 1),
     "clip": (np.clip, 3),
 }
-"""Functions that expressions can call, by name, with the number of arguments."""
+"""By name: a function that expressions can call, and the number of its arguments."""
 NEXT: Final = "next"
 """Name of the function that evaluates its argument at the next step."""
 _MAX_CHARACTERS, _MAX_DEPTH = 4000, 50

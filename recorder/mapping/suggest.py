@@ -11,7 +11,7 @@ from mcaprl.errors import LogError
 from mcaprl.recorder.bags.bag import Bag, TopicInfo
 
 _NS_PER_S = 1e9
-# Words in the name of a topic or type which suggest that it carries commands.
+# If the name of a topic or type contains one of these words, the topic is likely to have commands.
 _COMMAND_WORDS = ("cmd", "command", "action", "target", "setpoint", "ackermann", "control")
 _MAX_RATE_HZ, _MIN_RATE_HZ = 20.0, 1.0
 _MAX_OBSERVED = 12

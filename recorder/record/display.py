@@ -1,11 +1,11 @@
 """Topics for viewers, with the same log times as the transitions.
 
 /scene                  moving shapes, at most ten times a second, and at episode starts and ends
-/scene/static           static shapes, when they differ from those of the previous episode
+/scene/static           static shapes, if they changed since the previous episode
 /scene/tracks           tracks of the episodes so far, written at the ends of episodes
 /tf                     poses of the moving frames at and between the steps; each pose has its own
                         stamp
-/tf_static              static frames, when they differ from those of the previous episode
+/tf_static              static frames, if they changed since the previous episode
 /telemetry              numbers to plot: the environment's telemetry and the return so far
 /camera/depth           metric depth in millimeters
 /camera/camera_info     intrinsics of the depth camera, once

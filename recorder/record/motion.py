@@ -1,9 +1,9 @@
 """Motion of frames within a step, reduced to a few poses between which viewers interpolate.
 
-A message of `/tf` at the log_time of a step contains the poses of the frames from that time until
-the end of the step, each with its own stamp. A viewer interpolates between two poses, so it needs
-the pose after the current time, too. Because a message includes the pose at the end of the step,
-the viewer can draw any moment of the step.
+A message of `/tf` at the log_time of a step contains the poses of the frames until the end of the
+step, each with its own stamp. A viewer interpolates between two poses, so it needs the pose after
+the current time, too. Because a message includes the pose at the end of the step, the viewer can
+draw any moment of the step.
 """
 
 from __future__ import annotations

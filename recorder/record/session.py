@@ -221,7 +221,7 @@ class _Parts:
         return self.current
 
     def remove_replaced(self) -> None:
-        """Remove the files of the overwritten recording, except the current file.
+        """Remove the old files of an overwritten recording, except the current file.
 
         Raises:
             LogError: Another process is writing one of these files.

@@ -134,11 +134,13 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
     @property
     def episodes(self) -> int:
-        """Number of finished episodes in the log, including those from before appending."""
+        """Number of finished episodes in the log, including episodes of earlier recordings."""
         return self._recording.episodes
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
-        """Reset all environments, or those that `options["reset_mask"]` selects; begin episodes.
+        """Reset environments and begin their episodes.
+
+        The option `reset_mask` selects the environments; by default, all environments are reset.
 
         Args:
             seed: Seed of the first environment (environment k uses seed + k), or a list of seeds.

@@ -137,7 +137,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
 
     @property
     def episodes(self) -> int:
-        """Number of finished episodes in the log, including those from before appending."""
+        """Number of finished episodes in the log, including episodes of earlier recordings."""
         return self._recording.episodes
 
     def reset(

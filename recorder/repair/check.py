@@ -80,8 +80,8 @@ def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: i
         try:
             log = EpisodeCheck(reader)
         except (LogError, SpaceError) as error:
-            # Chunks of any MCAP file can be checked. The error is therefore raised only after their
-            # check.
+            # The chunks of any MCAP file can be checked, so they are checked before this error is
+            # raised.
             refusal = error
     for chunk, read in _decompressed(reader, threads):
         try:

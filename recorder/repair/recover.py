@@ -127,7 +127,7 @@ def recover_log(
 def _keep_whole_episodes(
     copied: Path, result: Path, recovery: Recovery, keep_unfinished: bool
 ) -> None:
-    """Write `result`: the whole file `copied`, or only its whole episodes if others are incomplete.
+    """Write `result`: the file `copied`, or only its whole episodes if some are incomplete.
 
     Raises:
         LogError: There is nothing to keep, or the new log has a problem.

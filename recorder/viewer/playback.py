@@ -195,7 +195,7 @@ class Player:
         self._next_ns = self.time_ns + 1
 
     def current_messages(self) -> list[Played]:
-        """Return the latest message of each topic, which a new viewer needs."""
+        """Return the latest message of each topic, to be sent to a new viewer."""
         return self._played(lambda track, shift: track.latest(self.time_ns - shift))
 
     def advance(self, elapsed_s: float) -> list[Played]:

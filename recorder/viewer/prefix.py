@@ -18,7 +18,7 @@ PREFIXED_TYPES = (_MARKERS, _FRAMES)
 
 
 def prefixes_of(paths: Sequence[Path]) -> list[str]:
-    """Return a unique prefix for each file, or an empty one for a single file.
+    """Return a unique prefix for each file; a single file gets an empty prefix.
 
     >>> prefixes_of([Path("runs/a.mcap"), Path("b/a.mcap"), Path("C-1.mcap")])
     ['a', 'a_2', 'c_1']

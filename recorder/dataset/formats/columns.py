@@ -54,7 +54,7 @@ def dataset_of(episodes: Sequence[EpisodeArrays], metadata: LogMetadata, where: 
     Otherwise, the log_times start at 0 and increase by the step duration in the metadata.
 
     Args:
-        episodes: Episodes in order; those without a transition are left out.
+        episodes: Episodes in order; episodes without a transition are left out.
         metadata: Spaces and description of the data.
         where: Name of the source, for errors.
 

@@ -298,4 +298,4 @@ def _check_arrays(episode: Mapping[str, Any], where: str) -> None:
     if any(part.dtype.kind not in "biuf" for part in (*parts, episode["terminated"])):
         raise LogError(f"{where} has arrays that are not numbers")
     if not parts[-1].size or parts[-1].shape[1] != 1 or episode["terminated"].ndim:
-        raise LogError(f"{where} has no rewards, or more than one for each step")
+        raise LogError(f"{where} has no rewards, or several rewards for each step")

@@ -91,11 +91,11 @@ def other_format(name: str | Path) -> Format | None:
 
 
 def target_format(path: str | Path, name: str | None) -> Format:
-    """Return the format to write: by its name, or else by the suffix of the path.
+    """Return the format to write, given by its name or by the suffix of the path.
 
     Raises:
         UnknownNameError: There is no format with this name.
-        UsageError: The name is not given, and no format or more than one has this suffix.
+        UsageError: The name is not given, and no format or more than one format has this suffix.
     """
     if name is not None:
         return format_named(name)

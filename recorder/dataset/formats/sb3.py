@@ -88,7 +88,7 @@ def to_buffer(
 def from_buffer(
     buffer: Any, *, channels_last: bool = True, scaled_actions: bool = True, lossy: bool = False
 ) -> Dataset:
-    """Copy the transitions of a replay buffer: one environment after the other, from old to new.
+    """Copy the transitions of a replay buffer, environment by environment and from old to new.
 
     If the buffer was full, the beginning of the first episode of each environment is missing,
     because SB3 has overwritten it.
@@ -256,7 +256,7 @@ def _check_integers(name: str, space: spaces.Space[Any]) -> None:
 def _converted(
     space: spaces.Space[Any], order_of: Callable[[spaces.Space[Any]], Order | None]
 ) -> spaces.Space[Any]:
-    """Permute the axes of each Box of a space by `order_of(box)`, unless this result is None."""
+    """Permute the axes of each Box in a space by `order_of(box)`; None keeps the axes."""
     if isinstance(space, spaces.Dict):
         return spaces.Dict([(key, _converted(part, order_of)) for key, part in space.items()])
     order = order_of(space)

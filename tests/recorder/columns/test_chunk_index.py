@@ -1,4 +1,4 @@
-"""Chunk indexes and message indexes, compared with those that the `mcap` library writes."""
+"""Chunk indexes and message indexes, compared with the output of the `mcap` library."""
 
 from __future__ import annotations
 

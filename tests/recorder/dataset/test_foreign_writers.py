@@ -129,7 +129,7 @@ def test_two_channels_of_one_topic(log_path: Path) -> None:
 
 
 def test_two_robots_record_at_the_same_time(log_path: Path) -> None:
-    """Read two channels with messages at the same times, one robot after the other."""
+    """Read the episodes of one channel after those of another channel with the same times."""
     first, second = steps_of([4, 5]), steps_of([6, 3], seed=1)
     pairs = zip(plain_messages(first), plain_messages(second), strict=True)
     write_with_mcap(log_path, [m for pair in pairs for m in pair], channels=lambda row: row % 2)

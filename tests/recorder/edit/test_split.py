@@ -56,7 +56,7 @@ def test_parts_of_two_episodes(log: Path, tmp_path: Path) -> None:
 def test_ratio_assigns_episodes_at_random(log: Path, tmp_path: Path) -> None:
     found = mcaprl.split(log, tmp_path / "parts", ratio=(3, 1), seed=5)
     chosen = [[e.summary.episode for e in mcaprl.open(part.out).episodes] for part in found]
-    # NumPy's default_rng(5) shuffles 0 to 3 to this order.
+    # NumPy's default_rng(5) shuffles the numbers 0 to 3 into this order.
     order = np.arange(4)
     np.random.default_rng(5).shuffle(order)
     assert chosen == [sorted(order[:3].tolist()), [order[3]]]

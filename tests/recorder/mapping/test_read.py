@@ -335,7 +335,7 @@ def test_wrong_units_and_fractional_modes_are_clear_errors() -> None:
 def test_a_reward_that_is_no_number_is_refused() -> None:
     bag = drive(4, **{"/late": ([2], {"x": [1.0]})})
     with pytest.raises(
-        UsageError, match=r"mapping: reward: the reward is nan at 0 ns, and not finite in 2 of 3"
+        UsageError, match=r"mapping: reward: the reward is nan at 0 ns; it is not finite in 2 of 3"
     ):
         read(bag, fields={"late": {"field": "/late.x"}}, reward="late")
     found = read(bag, fields={"late": {"field": "/late.x", "missing": 7}}, reward="late")

@@ -26,7 +26,7 @@ EDGE = {"pose": (60.0, -2.0, -math.pi / 2, 20.0)}
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record an episode that is interrupted after three steps, and one that ends off the lane."""
+    """Record an interrupted episode of three steps, and an episode that ends off the lane."""
     path = tmp_path_factory.mktemp("phases") / "lane.mcap"
     with closing(mcaprl.RecordMcap(make_sim("lane"), path, start_time_ns=START_NS)) as env:
         env.reset(seed=0)

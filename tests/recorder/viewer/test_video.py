@@ -173,7 +173,8 @@ def test_videos_of_a_scene_and_of_a_sim(
         assert run(["replay", f"{name}.mcap", "--video", f"{name}.gif"]) == 0
         for kind, plugin in (("mp4", "pyav"), ("gif", "pillow")):
             video = imageio.imread(f"{name}.{kind}", plugin=plugin)
-            # In a GIF, an image equal to the previous one extends its duration.
+            # If an image equals the previous image, a GIF stores only a longer duration of the
+            # previous image.
             count = 26 if name == "lane" else 6
             assert len(video) == count if kind == "mp4" else 2 <= len(video) <= count
             assert video.shape[1:] == (*size, 3)

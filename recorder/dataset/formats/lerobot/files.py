@@ -50,7 +50,7 @@ class Files:
             name: Feature.from_json(name, entry) for name, entry in info["features"].items()
         }
         for name in self.features:
-            # The name of a feature becomes part of the paths of its videos.
+            # The paths of a feature's videos contain the name of the feature.
             if "/" in name or "\\" in name:
                 raise LogError(f"{path}: the feature '{name}' has a slash in its name")
         self.episodes = self._episode_rows()

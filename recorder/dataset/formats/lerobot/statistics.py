@@ -42,7 +42,7 @@ def describe(feature: Feature, values: NDArray[Any]) -> Stats:
 
     Args:
         feature: Feature of the values.
-        values: Values of the feature; for images, only those that `sampled` selects.
+        values: Values of the feature; for images, only the images that `sampled` selects.
     """
     channels = values.shape[3] if values.ndim == 4 else 1
     rows = values.reshape(-1, channels if feature.is_image else feature.shape[-1])
