@@ -70,7 +70,7 @@ def filter_(expression: str, log: str, out: str, overwrite: bool, as_json: bool)
 @click.command("slice")
 @click.argument("log")
 @click.argument("out")
-@click.option("--steps", metavar="A:B", help="Transitions from A up to, not including, B.")
+@click.option("--steps", metavar="A:B", help="Transitions from A to B; B is not included.")
 @click.option("--time", metavar="A:B", help="Seconds since the first message of LOG.")
 @_overwrite_option
 @json_option

@@ -52,7 +52,7 @@ def info(
 @integer_option("--threads", "Number of threads that decompress chunks.", least=1)
 @mapping_options
 def check(files: tuple[str, ...], as_json: bool, **request: Any) -> int:
-    """Read FILE... completely and list all problems. Exits with 1 if there are any."""
+    """Read FILE... completely and list all problems. Exits with 1 if there are problems."""
     found = mcaprl.check(files, **request)
     if as_json:
         print_json(found.to_json())

@@ -36,7 +36,7 @@ class SettingsCommand(click.Command):
         return [*super().get_params(ctx), *setting_options(self._configs(), self._tuned())]
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the options of the command, then those of the algorithms that share them."""
+        """Write the options of the command, then the settings in groups for their algorithms."""
         configs = self._configs()
         settings = {option.name: option for option in setting_options(configs, self._tuned())}
         options = [param for param in super().get_params(ctx) if isinstance(param, click.Option)]

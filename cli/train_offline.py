@@ -44,15 +44,15 @@ def _configs() -> dict[str, Settings]:
 )
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--follow", is_flag=True, help="Use episodes added to DATA during training.")
-@click.option("--other-data", is_flag=True, help="With --resume: allow DATA other than the run's.")
+@click.option("--other-data", is_flag=True, help="With --resume: allow other DATA than in the run.")
 @mapping_options
 def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:
     """Train a policy on DATA: files, folders or globs of logs.
 
     A number after a name is a weight: with good.mcap:2 rest/, transitions of good.mcap are drawn
-    twice as often as others. With --follow, another process may still write DATA: training uses
-    each episode after it has ended. All seeds are trained in parallel and independently. Omitted
-    settings default to those of the algorithm; with --resume, to those of the run.
+    twice as often as others. With --follow, another process may still write DATA, and training
+    uses each episode after it has ended. All seeds are trained in parallel and independently.
+    Omitted settings have the algorithm's defaults. With --resume, they have the values of the run.
     """
     given = {name: value for name, value in request.items() if value is not None}
     with terminal_progress("updates", "loss") as progress:
@@ -85,8 +85,8 @@ def _print_data(algo: str, dataset: mcaprl.Dataset) -> None:
 def export(run: str, out: Path, overwrite: bool) -> None:
     """Write the policy of RUN, or of RUN/seed-K, as ONNX: observations in, actions out.
 
-    Inputs are the parts of the observation by their names in the log; outputs are action and
-    scores. ONNX Runtime runs the file without this package.
+    The inputs are the parts of an observation, with the same names as in the log. The outputs are
+    action and scores. ONNX Runtime runs the file without this package.
     """
     policy = mcaprl.export(run, out, overwrite=overwrite)
     echo(f"{out}: {policy.algo} policy {policy.name}, {out.stat().st_size / 1000:.0f} kB")

@@ -77,10 +77,10 @@ def _tuned() -> dict[str, dict[str, Any]]:
 def train_online(sim: str | None, out: Path, **request: Any) -> None:
     """Train a policy in SIM: lane, powerline, racer, highway-lane, or any Gymnasium id.
 
-    Omitted settings default to those of the preset, else those tuned for SIM, else those of
-    Stable-Baselines3; with --resume, to those of the run. Settings are tuned only for dqn and
-    double-dqn with default rules and without images. The best checkpoint is kept: it is selected
-    on one set of episodes and scored on another.
+    An omitted setting has the value of the preset, else the value tuned for SIM, else the default
+    of Stable-Baselines3. With --resume, it has the value of the run. Settings are tuned only for
+    dqn and double-dqn with default rules and without images. The best checkpoint is kept. It is
+    selected on one set of episodes and scored on another set.
     """
     given = {name: value for name, value in request.items() if value is not None}
     with terminal_progress("steps", "score") as progress:
