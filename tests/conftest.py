@@ -16,7 +16,7 @@ from mcaprl.ray.cluster import LOCAL, connect, local_settings
 
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# Ray reads these when it is imported: its clusters in tests listen on 127.0.0.1 only.
+# Ray reads these variables when it is imported. Its clusters in tests listen only on 127.0.0.1.
 os.environ.update(local_settings())
 
 # Disk access and JIT compilation make the first example slow, so there is no deadline.
@@ -28,7 +28,7 @@ settings.load_profile("mcaprl")
 
 @pytest.fixture(autouse=True, scope="session")
 def _one_thread() -> None:
-    """Limit torch to one thread: on a busy machine, two are many times slower."""
+    """Limit torch to one thread, because two threads are many times slower on a busy machine."""
     if importlib.util.find_spec("torch"):
         import torch
 
@@ -49,7 +49,7 @@ def log_path(tmp_path: Path) -> Path:
 
 
 def need(available: bool, reason: str) -> None:
-    """Skip the test if a counterpart is missing; in CI, fail."""
+    """Skip the test if a program to compare with is missing; fail instead if this is CI."""
     if not available and os.environ.get("CI") == "true":
         pytest.fail(f"CI must have it: {reason}")
     if not available:
@@ -61,7 +61,7 @@ def ray_cluster() -> Iterator[None]:
     """Start a Ray cluster of two workers on 127.0.0.1; this process stays connected to it."""
     ray = pytest.importorskip("ray")
     with pytest.MonkeyPatch.context() as patch:
-        # The workers import environments of the tests.
+        # The workers must be able to import environments of the tests.
         paths = [str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH", "")]
         patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
         assert connect(LOCAL, workers=2, store_bytes=200 << 20)
@@ -72,7 +72,7 @@ def ray_cluster() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def small_chunks() -> Iterator[None]:
-    """Let the writers of a module leave their small chunks, as one that is killed does."""
+    """Keep the small chunks of a module's logs, as if their writers had been killed."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mcaprl.recorder.columns.compact._MIN_CHUNKS_SAVED", 10**9)
         yield

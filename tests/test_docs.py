@@ -1,4 +1,4 @@
-"""The docs are correct: links lead somewhere, generated pages are up to date, options have help."""
+"""Tests of the docs: valid links, up-to-date generated pages, and help for all options."""
 
 from __future__ import annotations
 

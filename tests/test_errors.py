@@ -1,4 +1,4 @@
-"""Errors are one line, and the same line in another process."""
+"""Tests that errors are one line, and the same line in another process."""
 
 from __future__ import annotations
 

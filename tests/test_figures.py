@@ -1,4 +1,4 @@
-"""Figures: texts from data are drawn as they are."""
+"""Tests that figures show texts from data unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A file that is replaced has its old or its new content, and nothing is left beside it."""
+"""Tests that a replaced file has its old or its new content, and that no other file remains."""
 
 from __future__ import annotations
 

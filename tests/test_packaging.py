@@ -1,4 +1,4 @@
-"""Folders, links and the table of packages agree; importing mcaprl stays light."""
+"""Tests that folders, links and the table of packages agree, and that imports stay light."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_the_project_pins_what_it_was_tested_with() -> None:
         wanted += SETTINGS["project"]["optional-dependencies"][extra]
     for requirement in wanted:
         name = re.split(r"[<>=\[]", requirement)[0].lower()
-        # An extra may include another of our extras.
+        # An extra may include another extra of mcaprl.
         assert name in {*pinned, "mcaprl"}, f"{name} is not in constraints.txt"
 
 
@@ -141,7 +141,7 @@ def test_pre_commit_runs_the_commands_of_make_check() -> None:
 
 
 def test_the_word_check_finds_each_entry_of_its_list() -> None:
-    """A phrase that the pattern does not match as a whole would never be looked up."""
+    """The word check can only find phrases that its pattern matches as a whole."""
     pattern = re.compile(SETTINGS["tool"]["codespell"]["regex"])
     for line in (ROOT / ".ci" / "words.txt").read_text().splitlines():
         entry = line.split("->")[0]

@@ -1,4 +1,4 @@
-"""Reports as a real browser shows them."""
+"""Tests of reports in a real browser."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from mcaprl.sims.evaluation.rollout import EpisodeResult
 from tests.conftest import need
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-# Width and colors of a page and of its SVG texts, written where the document dump shows them.
+# Writes the width and the colors of a page, and of its SVG texts, into the title of the document.
 PROBE = """<script>
 addEventListener("load", () => {
   const style = getComputedStyle(document.body), text = document.querySelector("svg text");
@@ -62,7 +62,7 @@ def browse(page: Path, *flags: str, query: str = "") -> tuple[str, str]:
 
 
 def colors_at(page: Path, folder: Path, width: int, *, dark: bool) -> tuple[str, str]:
-    """Check that a page fits a width and a color scheme; return its text color and that of SVGs."""
+    """Check that a page fits a width and a color scheme; return its text and SVG colors."""
     probed = page.with_name(f"{page.stem}-{width}-{dark}.html")
     probed.write_text(page.read_text() + PROBE)
     # Chromium's windows are at least 500 pixels wide; a frame can be narrower.

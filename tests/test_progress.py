@@ -1,4 +1,4 @@
-"""Progress of long operations without a terminal."""
+"""Tests of the progress of long operations without a terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Texts from data: what is escaped before they are shown or written."""
+"""Tests of the escaping of texts from data before they are shown or written."""
 
 from __future__ import annotations
 

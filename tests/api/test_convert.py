@@ -1,4 +1,4 @@
-"""`convert`, and the commands that read bags by a mapping."""
+"""Tests of `convert`, and of the commands that read bags by a mapping."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def bag(tmp_path: Path) -> Path:
 
 def test_a_bag_is_opened_by_a_mapping(bag: Path, tmp_path: Path) -> None:
     data = mcaprl.open(bag, mapping=tmp_path / "robot.yaml")
-    # The speed is 0.5 k at step k, so step 11 is the terminal one.
+    # The speed is 0.5 k at step k, so step 11 is the terminal step.
     assert len(data) == STEPS - 1
     np.testing.assert_allclose(data.observations[:, 0], [speed(k) for k in range(STEPS - 1)])
     np.testing.assert_allclose(data.observations[:, 1], 0.1 * np.arange(STEPS - 1), rtol=1e-5)

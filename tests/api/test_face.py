@@ -1,4 +1,4 @@
-"""The public face: names, paths, and a function for each command."""
+"""Tests of the public API: names, import paths, and a function for each command."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FUNCTIONS = {
     "evaluate": ("evaluate", "estimate"),
     "replay": ("replay", "verify", "render"),
 }
-"""Functions of the commands that have more than one, or one of another name."""
+"""Functions of commands that have several functions, or a function with another name."""
 ONLY_OPTIONS = {
     "help": "click adds it",
     "json": "a function returns a dataclass, whose to_json the command prints",
@@ -42,7 +42,7 @@ ONLY_OPTIONS = {
     "record --no-scene": "scene=False",
     "train-online --from": "`from` is a keyword of Python: sources",
 }
-"""Options that are not arguments, and why."""
+"""Options that are not arguments of the function, with the reason."""
 
 
 def _functions(command: str) -> list[str]:
@@ -80,13 +80,13 @@ def test_each_option_is_an_argument() -> None:
         used |= excuse
         argument = "settings" if is_setting else name.replace("-", "_")
         assert argument in arguments or excuse, f"{command} {flag}"
-    # The context adds --help.
+    # Click adds --help through the context.
     assert used == set(ONLY_OPTIONS), "a reason without its option"
 
 
 def test_defaults_of_options_are_those_of_the_arguments() -> None:
     for command, option, is_setting in _options():
-        # An option without a default has a marker of click's here, which is none of these types.
+        # Click has a marker for a missing default. The marker has none of these types.
         if is_setting or option.is_flag or not isinstance(option.default, str | int | float):
             continue
         name = max(option.opts, key=len).lstrip("-").replace("-", "_")
@@ -129,7 +129,7 @@ def test_datasets_are_pickled_by_the_public_path() -> None:
 
 @pytest.mark.parametrize("name", PACKAGES)
 def test_names_of_a_package_are_not_those_of_its_modules(name: str) -> None:
-    """An imported module would replace a lazy name that is equal to its own."""
+    """An imported module would replace a lazy name that equals the module's name."""
     package = importlib.import_module(f"mcaprl.{name}")
     modules = {path.stem for path in Path(package.__path__[0]).iterdir()}
     for public in package.__all__:
@@ -151,7 +151,7 @@ def test_imports_are_at_most_one_level_deep(folder: str) -> None:
 
 
 def _imported(source: str) -> Iterator[str]:
-    """Yield the modules of ours that Python code imports, in strings of code as well."""
+    """Yield the modules of mcaprl that Python code imports, also in code within strings."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             yield from (one.name for one in node.names if one.name.startswith("mcaprl"))
@@ -217,7 +217,7 @@ def test_functions_print_nothing(
 def test_numbers_out_of_range_are_refused_before_anything_is_written(
     function: str, arguments: dict[str, object], message: str, tmp_path: Path
 ) -> None:
-    """Click checks the options' ranges, so that a function without checks would fail only here."""
+    """Commands check ranges with click. This test shows that the functions check them, too."""
     call, out = getattr(mcaprl, function), tmp_path / "out.mcap"
     log = GOLDEN / "discrete.mcap"
     places = {"data": log, "file": log, "files": log, "out": out}

@@ -1,4 +1,4 @@
-"""One `load_policy` for every kind of run."""
+"""Tests of `load_policy` with every kind of run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ONLINE: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An online run and an offline run of two seeds each in CartPole, and a file of plain SB3."""
+    """Make an online run, an offline run (two seeds each) and a file of plain SB3, in CartPole."""
     folder = tmp_path_factory.mktemp("runs")
     task = Task.for_sim("CartPole-v1", **ONLINE, final_episodes=2)
     log = folder / "logs"

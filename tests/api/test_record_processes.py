@@ -1,4 +1,4 @@
-"""Recording in several processes: stopped, killed, and beside another recording."""
+"""Recording in several processes that are stopped or killed, or that meet another recording."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COMMAND = [sys.executable, "-m", "mcaprl.cli", "record", "CartPole-v1", "--polic
 
 @contextmanager
 def recording(folder: Path) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
-    """Record into shards without an end; yields the command and the ids of its workers."""
+    """Record shards until stopped; yield the command's process and the ids of its workers."""
     command = [*COMMAND, "--steps", "100000000", "--envs", "2", "--out", str(folder)]
     shards = [folder / f"shard-0{number}.mcap" for number in range(2)]
     with subprocess.Popen(
@@ -36,7 +36,7 @@ def recording(folder: Path) -> Iterator[tuple[subprocess.Popen[str], list[int]]]
         stdout=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        # Shells let background processes ignore it.
+        # Shells let background processes ignore SIGINT.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         try:
@@ -51,12 +51,12 @@ def recording(folder: Path) -> Iterator[tuple[subprocess.Popen[str], list[int]]]
 
 
 def is_worker(process: int) -> bool:
-    """Return whether a process is a worker, not the tracker of resources."""
+    """Return whether a process is a worker, and not Python's resource tracker."""
     return b"spawn_main" in Path(f"/proc/{process}/cmdline").read_bytes()
 
 
 def wait_for_end(process: int) -> None:
-    """Wait until a process has ended, whoever its parent is."""
+    """Wait until a process has ended; it does not have to be a child of this process."""
     until = time.monotonic() + 20
     while Path(f"/proc/{process}").exists():
         state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]

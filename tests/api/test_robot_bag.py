@@ -17,7 +17,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "robot_bag"
 
 @pytest.fixture(scope="module")
 def native(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record drives, one of which stalls."""
+    """Record drives; in one of them, the car stalls."""
     path = tmp_path_factory.mktemp("robot") / "native.mcap"
     mcaprl.record("lane", path, epsilon=0.1, episodes=3, seed=5)
     return path
@@ -38,13 +38,14 @@ def test_the_bag_gives_the_transitions_of_the_native_log(native: Path, form: str
     recorded, read = mcaprl.open(native), mcaprl.open(bag, mapping=EXAMPLE / "robot.yaml")
     assert read.episode_lengths.tolist() == recorded.episode_lengths.tolist()
     differences = np.abs(read.frames - recorded.frames).max(axis=0)
-    # The last odometry before a step is at most 20 ms old, in which the car brakes by 0.16 m/s.
+    # The last odometry before a step is at most 20 ms old. In 20 ms, braking changes the speed by
+    # at most 0.16 m/s.
     speed = recorded.observation_names.index("speed")
     assert differences[speed] < 0.16 / 30
     assert np.delete(differences, speed).max() < 1e-6
     assert (read.actions == recorded.actions).all()
     assert read.action_meanings == recorded.action_meanings
-    # The lane detector's distance along the route is float32, at about 1,000 m.
+    # The lane detector's distance along the route, up to 1,000 m, is rounded to float32.
     assert np.abs(read.rewards - recorded.rewards).max() < 1e-4
     assert (read.terminated == recorded.terminated).all()
     assert (read.truncated == recorded.truncated).all()
@@ -70,9 +71,9 @@ def test_the_suggested_mapping_uses_frequent_topics(native: Path, tmp_path: Path
     found = mcaprl.convert(bag, None, mapping=tmp_path / "suggested.yaml")
     assert found.report is not None
     observed = found.dataset.observation_names
-    # Two joints' arrays: positions are in the messages, velocities are empty.
+    # The messages contain the positions of two joints, and an empty array of velocities.
     assert "joint_states_position" in observed
     assert "lane_data_10" in observed
     assert not any(name.startswith(("e_stop", "joint_states_velocity")) for name in observed)
-    # The clock does not follow the lane detector exactly, so some steps fall into the pauses.
+    # The clock is not aligned with the lane detector, so some steps are in the pauses.
     assert len(found.dataset) > 0.9 * len(mcaprl.open(native))

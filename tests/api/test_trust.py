@@ -1,4 +1,4 @@
-"""Environments that a log names: no import and no arguments without trust."""
+"""Tests that an untrusted log cannot import a module or pass arguments to an environment."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ gym.register("Foreign-v0", "gymnasium.envs.classic_control.cartpole:CartPoleEnv"
 
 @pytest.fixture
 def foreign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder of work with a module `foreign_envs` in the path of Python."""
+    """Prepare a working folder, and a module `foreign_envs` on Python's import path."""
     (tmp_path / "foreign_envs.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -71,7 +71,7 @@ def test_a_module_is_imported_only_with_trust(foreign: Path, step: Any) -> None:
     with pytest.raises(UsageError, match=r"foreign_envs would be imported.*--trust-env.*--sim"):
         step(log, {})
     assert not Path("imported").exists()
-    # Some commands need more of the environment than it has.
+    # Some commands fail later, because the environment lacks what they need.
     with contextlib.suppress(UsageError):
         step(log, {"trust_env": True})
     assert Path("imported").exists()

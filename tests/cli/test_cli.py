@@ -1,4 +1,4 @@
-"""The commands: what they print, what they write, and their exit codes."""
+"""Tests of the commands: printed text, written files, and exit codes."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ def test_learn_evaluate_replay(capsys: pytest.CaptureFixture[str]) -> None:
     assert run([*common, "data/a.mcap", "--epsilon", "0.1", "--steps", "400"]) == 0
     assert run([*common, "data/b.mcap", "--policy", "random", "--steps", "100"]) == 0
     small = ["--updates", "60", "--batch-size", "32", "--hidden", "16,16", "--alpha", "0.5"]
-    # Enough target syncs for the horizon of gamma, otherwise there is a warning.
+    # With fewer target syncs, training would warn about the horizon of gamma.
     small += ["--gamma", "0.5", "--target-interval", "6", "--dueling"]
     assert run(["train-offline", "data", "--out", "run", "--seeds", "2", *small]) == 0
     assert json.loads(Path("run/config.json").read_text())["env_id"] == "mcaprl/LaneKeeping-v0"

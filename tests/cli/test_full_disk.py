@@ -1,4 +1,4 @@
-"""Commands whose output does not fit on the disk: one line, and whatever was finished is kept."""
+"""Commands on a full disk print one line, and keep all finished output."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mcaprl.cli import run
 
 resource = pytest.importorskip("resource", reason="needs limits on the size of files")
 
-# Files cannot grow beyond a limit, as on a full disk; Python ignores the signal.
+# As on a full disk, files cannot grow beyond a limit. Python ignores the signal of the limit.
 SCRIPT = """
 import resource, sys
 from mcaprl.cli import main
@@ -79,7 +79,7 @@ def test_a_full_disk_is_one_line(limit: int, command: list[str], path: str) -> N
     assert ".part" not in lines[0], "the path of the user, not that of a temporary file"
     if command[0] == "record":
         found = sorted(Path().glob("x*/*.mcap")) or [Path("x.mcap")]
-        # The shard that did not meet its limit first is interrupted, and complete.
+        # One shard reaches its limit first. The other is interrupted, and its file is complete.
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*cut off")
             assert sum(len(mcaprl.open(part).episodes) for part in found) > 0

@@ -1,4 +1,4 @@
-"""Help texts: every command is listed, has examples that parse, and its settings are grouped."""
+"""Tests of help texts: each command is listed, its examples parse, and settings are grouped."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LINES = [(name, line) for name, lines in EXAMPLES.items() for line in lines]
 
 
 def help_of(*arguments: str) -> str:
-    """Return the help at 80 columns."""
+    """Return a command's help, 80 columns wide."""
     result = CliRunner().invoke(cli, [*arguments, "--help"], terminal_width=80)
     assert result.exit_code == 0
     return result.output

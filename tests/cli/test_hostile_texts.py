@@ -1,4 +1,4 @@
-"""Texts of logs and file names that try to control the terminal, a figure or the program."""
+"""Texts in logs and file names cannot control the terminal, a figure or the program."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EVIL = "\x1b[2J\x9b1m\u202e\r"
 
 
 class Worded(gym.Env[Any, Any]):
-    """Episodes of one step, with any texts."""
+    """Environment with episodes of one step and with given texts."""
 
     observation_space = spaces.Box(-1, 1, (2,), np.float32)
     action_space = spaces.Discrete(2)

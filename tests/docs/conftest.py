@@ -1,4 +1,4 @@
-"""The page about Ray runs on the cluster of the tests."""
+"""Runs the code of the page about Ray on the cluster of the tests."""
 
 from __future__ import annotations
 

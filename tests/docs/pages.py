@@ -1,21 +1,21 @@
 """Runner of the code in Markdown pages, in order, in one folder for each page.
 
-`python`, `sql` and `js` blocks are run, and `sh` blocks command by command. A block with the
-language `output` shows what the block before it prints; `...` matches any text. Comments in the
-page, which readers do not see, say more about the next block:
+`python`, `sql` and `js` blocks are run as a whole, and `sh` blocks command by command. A block with
+the language `output` shows the output of the block before it; `...` matches any text. Hidden
+comments in the page describe the next block:
 
     <!-- file: NAME -->                      content of a file
     <!-- skip: next "REASON" -->             not run
     <!-- skip: next if(quick, "REASON") -->  run only as it is written
 
-Commands that a page takes for granted are in a comment, too:
+Commands that a reader does not need to see are also in a comment:
 
     <!-- invisible-code-block: sh
     mcaprl record lane --out lane.mcap
     -->
 
-A page runs either as it is written, or, to be quick, with smaller numbers of episodes, steps and
-updates; then the output is not compared unless nothing was made smaller.
+A page runs as it is written, or quickly with smaller numbers of episodes, steps and updates. If a
+number was made smaller, the output is not compared.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from mcaprl.cli import run
 
 ROOT = Path(__file__).parent.parent.parent
 NODE_MODULES = ROOT / "tests" / "node" / "node_modules"
-# Languages of blocks that are not code.
+# Languages of blocks that are not run.
 PROSE = {"text", "{toctree}"}
 # Largest values of options in a quick run, and options that are added to a command.
 LARGEST = {"--episodes": 10, "--steps": 200, "--updates": 30, "--seeds": 2}
@@ -58,11 +58,11 @@ ADDED = {
     "evaluate --data": "--updates 10",
     "replay --video": "--speed 60",
 }
-# A recorded log is shown until Ctrl-C, unless `replay` has one of these options.
+# Without one of these options, `replay` runs until Ctrl-C.
 REPLAY_ENDS = {"--verify", "--video", "--contact-sheet", "--save"}
 SERVER_STARTS = "press Ctrl-C"
 LONGEST_SERVICE_S = 120.0
-# A server that has not served yet ends like other commands.
+# A command that ends before it serves ends like other commands.
 INTERRUPTED = "interrupted"
 
 
@@ -73,7 +73,7 @@ class Run:
         quick: Whether numbers of episodes, steps and updates are made smaller.
         changed: Whether a command was made smaller, so that its output differs from the page's.
         printed: Output of the last block; None if it was not run.
-        absent: Folders that a quick run does not have, since it does not run the examples.
+        absent: Folders that are missing in a quick run, because it does not run the examples.
     """
 
     def __init__(self, *, quick: bool) -> None:
@@ -114,7 +114,7 @@ class Run:
         )
 
     def shell(self, example: Example) -> None:
-        """Run the commands of an `sh` block: in one shell, or to be quick in this process."""
+        """Run the commands of an `sh` block in one shell; in a quick run, in this process."""
         script: list[str] = []
         for line in commands(example.parsed):
             words = shlex.split(line)
@@ -138,10 +138,10 @@ class Run:
         assert same, f"{example.path}:{example.line}: the output is\n{got}"
 
     def _other_program(self, words: list[str]) -> bool:
-        """Return whether the command is not run here; what it names must exist.
+        """Return whether a command is not run; the files that it names must exist.
 
-        Installations, the Makefile's targets and the benchmarks need other environments and up to
-        hours; examples take minutes, and run only as they are written.
+        Installations, targets of the Makefile and benchmarks need other environments and up to
+        hours. Examples take minutes, so a quick run omits them.
         """
         match words:
             case ["make", *targets]:
@@ -195,7 +195,7 @@ def _smaller(arguments: list[str]) -> list[str]:
     kinds = [f"{words[0]} {word}" for word in words if f"{words[0]} {word}" in ADDED]
     options = shlex.split(ADDED.get((kinds or words)[0], ""))
     pairs = zip(options[::2], options[1::2], strict=True)
-    # Offline and online networks of a page must be equal.
+    # The offline and online networks of a page must have the same architecture.
     added = [word for pair in pairs if pair[0] not in {*words} & {"--hidden"} for word in pair]
     return words + added
 
@@ -210,7 +210,7 @@ def _environment() -> dict[str, str]:
 
 
 def _sh(script: list[str]) -> None:
-    """Run commands in one shell, which stops at the first that fails, and empty the list."""
+    """Run commands in one shell, which stops at the first failure. Then empty the list."""
     if script:
         command = ["sh", "-e", "-c", "\n".join(script)]
         done = subprocess.run(command, env=_environment(), stdout=-1, text=True, check=False)
@@ -220,7 +220,7 @@ def _sh(script: list[str]) -> None:
 
 
 def _serve(words: list[str]) -> int:
-    """Start a server, and stop it by Ctrl-C when it says so."""
+    """Start a server, and stop it with Ctrl-C after it prints that Ctrl-C stops it."""
     command = [sys.executable, "-m", "mcaprl.cli", *words[1:], "--port", "0"]
     with subprocess.Popen(
         command, stdout=-1, stderr=-2, text=True, preexec_fn=_allow_interrupts
@@ -240,7 +240,7 @@ def _serve(words: list[str]) -> int:
 
 
 def _allow_interrupts() -> None:
-    """Undo that a shell ignores Ctrl-C for programs in the background."""
+    """Restore Ctrl-C, which shells disable for programs in the background."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -291,7 +291,7 @@ def _next_is_file(example: Example) -> None:
 
 
 def _lines(text: str) -> str:
-    """Return the text without spaces at the ends of lines and empty lines around it."""
+    """Return the text without spaces at line ends, and without empty first and last lines."""
     return "\n".join(line.rstrip() for line in text.strip().splitlines()) + "\n"
 
 
@@ -302,7 +302,7 @@ def languages(path: Path) -> list[str]:
 
 
 def link_examples(folder: Path) -> None:
-    """Make the folder look like a clone of the repository to the commands of a page."""
+    """Link files into the folder, so that a page's commands run as in a clone of the repository."""
     for name in ("examples", "benchmarks"):
         (folder / name).symlink_to(ROOT / name)
 

@@ -1,4 +1,4 @@
-"""All code and all commands of the README and the docs run."""
+"""Tests that all code and all commands in the README and the docs run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The site builds without warnings and network, and works in a browser."""
+"""Tests that the site builds without warnings or network access, and works in a browser."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.docs.pages import ROOT
 from tests.test_page import browse, colors_at
 
 PAGES = sorted(str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md"))
-# Loaded by the browser when the page is shown; other links are followed by the reader.
+# A browser loads these when it shows the page. The reader follows all other links.
 LOADED = {("script", "src"), ("img", "src"), ("link", "href"), ("iframe", "src")}
 
 

@@ -1,7 +1,7 @@
 """Writes logs of format version 1 that every later version has to read.
 
-`python -m tests.golden.make` writes only files that are missing: those that are there stay for
-ever. What is in each is stated in `contents.json`, as a hash of each column's bytes.
+`python -m tests.golden.make` writes only missing files and never replaces existing files.
+`contents.json` describes the contents of each file, with a hash of each column's bytes.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def with_scene(path: Path) -> None:
 
 
 def reported(path: Path) -> None:
-    """Run one episode of the environment whose values are all known."""
+    """Record one episode of an environment with given values."""
     with closing(mcaprl.RecordMcap(KnownEpisodes(), path, start_time_ns=START_NS)) as env:
         play(env)
 

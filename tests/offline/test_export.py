@@ -1,4 +1,4 @@
-"""Exported policies act as the originals, in ONNX Runtime."""
+"""Tests that exported policies select the same actions in ONNX Runtime as the originals."""
 
 from __future__ import annotations
 

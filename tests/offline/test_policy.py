@@ -1,4 +1,4 @@
-"""Saved policies: the round trip through files, and broken files."""
+"""Tests of saved policies: saving and loading, and broken files."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def learner_of(config: TrainingConfig, dataset: Dataset) -> Learner:
 
 
 def learner_with_outputs(learner_type: type[Learner], *outputs: list[float]) -> Learner:
-    """A learner whose networks have constant outputs."""
+    """Return a learner whose networks have constant outputs."""
     learner = learner_of(learner_type.config_type(**{**TINY, "hidden": ()}), corridor())
     for name, constants in zip(learner.policy_models, outputs, strict=True):
         *_, weight, bias = learner.network(name, 0).parameters()
@@ -113,7 +113,7 @@ def test_probabilities_of_huge_logits_are_finite(tmp_path: Path) -> None:
 
 
 def test_bcq_filters_actions_that_are_rare_in_the_log(tmp_path: Path) -> None:
-    # The second action is worth more, and a tenth as likely as the first.
+    # The second action has a higher value than the first, and a tenth of its probability.
     learner = learner_with_outputs(BCQ, [1.0, 2.0], np.log([10.0, 1.0]).tolist())
     policy = saved_and_loaded(tmp_path, learner)
     assert policy.act(inner_observations()).tolist() == [5, 5, 5]
@@ -195,7 +195,7 @@ def test_masked_actions_are_not_taken(tmp_path: Path) -> None:
 
 
 def walk_policy(folder: Path, count: int) -> Policy:
-    """A policy with a frame stack of `count` over one number."""
+    """Return a policy that observes a stack of `count` frames of one number."""
     steps = np.arange(8, dtype=np.float32)[:, None]
     dataset = Dataset.from_arrays(
         observations=steps[:-1],

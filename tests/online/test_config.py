@@ -1,4 +1,4 @@
-"""Settings of the online algorithms: help, limits, and what they mean to SB3."""
+"""Tests of the settings of online algorithms: help, limits, and the arguments of SB3."""
 
 from __future__ import annotations
 

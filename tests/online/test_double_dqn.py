@@ -1,4 +1,4 @@
-"""Double DQN: its target by hand, what it shares with SB3's DQN, and that it learns."""
+"""Tests of Double DQN: targets by hand, agreement with SB3's DQN, and learning."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mcaprl.online.zip_file import write_model
 
 
 class Table(torch.nn.Module):
-    """Q-values that are weights: a row for each of the observations 0, 1, ..."""
+    """Table of Q-values, which are its weights; row k belongs to observation k."""
 
     def __init__(self, rows: list[list[float]]) -> None:
         super().__init__()
@@ -31,7 +31,7 @@ class Table(torch.nn.Module):
 
 
 class OneBatch:
-    """A replay buffer that always gives the same transitions."""
+    """Replay buffer that always returns the same transitions."""
 
     def __init__(self, **columns: list[float]) -> None:
         self.columns = {name: torch.tensor(values)[:, None] for name, values in columns.items()}
@@ -42,7 +42,7 @@ class OneBatch:
 
 
 def model_of(kind: type[DQN], max_grad_norm: float = 10.0, gamma: float = 0.5) -> Any:
-    """A model whose online values of the next state prefer action 1, and target values action 0."""
+    """Make a model; in the next state, the online network prefers action 1, the target action 0."""
     model: Any = kind(
         "MlpPolicy",
         gym.make("CartPole-v1"),
@@ -63,7 +63,7 @@ def model_of(kind: type[DQN], max_grad_norm: float = 10.0, gamma: float = 0.5) -
 
 
 def step_of(model: Any, **columns: list[float]) -> float:
-    """How far one update moves Q(s=0, a=0), which starts at 0."""
+    """Return the change of Q(s=0, a=0) in one update; the value starts at 0."""
     batch = {
         "observations": [0.0],
         "actions": [0.0],
@@ -80,16 +80,18 @@ def step_of(model: Any, **columns: list[float]) -> float:
 @pytest.mark.parametrize(
     ("columns", "target"),
     [
-        # The online network chooses action 1 (2 > 1), the target network says 3: 1 + .5 x 3.
+        # The online network selects action 1 (2 > 1). Its value in the target network is 3, so the
+        # target is 1 + .5 x 3.
         ({}, 2.5),
         ({"dones": [1.0]}, 1.0),
-        # Three rewards, summed up by the buffer, then gamma^3.
+        # The buffer sums three rewards; the discount of the next value is gamma^3.
         ({"rewards": [1.75], "discounts": [0.125]}, 2.125),
         ({"rewards": [1.75], "discounts": [0.125], "dones": [1.0]}, 1.75),
     ],
 )
 def test_the_target_by_hand(columns: dict[str, list[float]], target: float) -> None:
-    # Huber's gradient is -1 beyond an error of 1, and -error below; SGD moves .1 of it.
+    # The gradient of the Huber loss is -1 beyond an error of 1, and -error below. SGD changes the
+    # value by .1 times the gradient.
     assert step_of(model_of(DoubleDQN), **columns) == pytest.approx(0.1 * min(target, 1.0))
     small = {**columns, "rewards": [columns.get("rewards", [1.0])[0] - target + 0.5]}
     assert step_of(model_of(DoubleDQN), **small) == pytest.approx(0.05)
@@ -108,7 +110,7 @@ def test_with_gamma_0_only_the_reward_counts() -> None:
 
 
 def test_dqn_uses_the_target_networks_maximum() -> None:
-    # 1 + .5 x max(5, 3) = 3.5 for DQN; with the reward lowered by 3, its error is .5.
+    # The target of DQN is 1 + .5 x max(5, 3) = 3.5. If the reward is 3 less, the error is .5.
     assert step_of(model_of(DQN), rewards=[-2.0]) == pytest.approx(0.05)
     assert step_of(model_of(DoubleDQN), rewards=[-2.0]) == pytest.approx(-0.05)
 
@@ -139,7 +141,7 @@ def cartpole(kind: type[DQN], **kwargs: Any) -> Any:
 
 
 def test_double_dqn_equals_dqn_if_both_networks_agree() -> None:
-    # A target network that is copied after every step is the online one.
+    # A target network that is copied after each step equals the online network.
     states = []
     for kind in (DQN, DoubleDQN):
         model = cartpole(kind)

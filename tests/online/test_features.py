@@ -1,4 +1,4 @@
-"""This package's networks within SB3's policies: inputs, normalization, files and settings."""
+"""Tests of this package's networks in SB3's policies: inputs, normalization, files, settings."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SHORT: dict[str, Any] = {
 
 
 class Camera(gym.Env[Any, int]):
-    """Environment with a depth image, and a vector if asked for."""
+    """Environment that returns a depth image and, if requested, a vector."""
 
     def __init__(self, shape: tuple[int, ...] = (84, 84, 1), vector: bool = False) -> None:
         self.action_space: Any = spaces.Discrete(3)
@@ -128,7 +128,7 @@ def test_a_file_with_too_few_weights_is_refused(tmp_path: Path) -> None:
 
 
 def test_images_have_mean_0_and_deviation_1_after_normalization() -> None:
-    """Two images whose pixels differ by 20 have a mean between them and a deviation of 10."""
+    """The pixels of the two images differ by 20, so their standard deviation is 10."""
     env = Camera()
     model = model_of(env, Architecture((8,), encoder="compact"))
     images = np.stack([np.full((84, 84, 1), value, np.uint8) for value in (100, 120)])
@@ -146,7 +146,7 @@ def test_images_have_mean_0_and_deviation_1_after_normalization() -> None:
 
 
 def test_averaged_images_have_the_same_values() -> None:
-    """Training passes images that were averaged when they were stored, and acting whole ones."""
+    """In training, images are averaged when they are stored; to act, the network averages them."""
     env = Camera(vector=True)
     model = model_of(env, Architecture((8, 8), encoder="compact"))
     blocks = np.random.default_rng(0).integers(0, 256, (5, 1, 42, 42), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""The buffer that stores frames once, against SB3's own that store them twice."""
+"""Tests of the buffer that stores frames once against SB3's buffers, which store them twice."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ACTIONS = spaces.Discrete(4)
 
 
 def drawn(space: spaces.Space[Any], envs: int, random: np.random.Generator) -> Any:
-    """An observation of each environment."""
+    """Draw an observation for each environment."""
     if isinstance(space, spaces.Dict):
         return {key: drawn(part, envs, random) for key, part in space.items()}
     values = random.integers(0, 256, (envs, *(space.shape or ())))
@@ -33,7 +33,7 @@ def drawn(space: spaces.Space[Any], envs: int, random: np.random.Generator) -> A
 
 
 def feed(buffers: list[Any], space: spaces.Space[Any], steps: int, envs: int, seed: int) -> None:
-    """The same steps, some of which end episodes, for all buffers."""
+    """Add the same steps to all buffers; some steps end episodes."""
     random = np.random.default_rng(seed)
     observation = drawn(space, envs, random)
     for _ in range(steps):
@@ -48,7 +48,7 @@ def feed(buffers: list[Any], space: spaces.Space[Any], steps: int, envs: int, se
 
 
 def _started(following: Any, fresh: Any, done: Any) -> Any:
-    """What comes next: the first observation of a new episode where one ended."""
+    """Return the next observations; an ended episode is followed by a new first observation."""
     if isinstance(following, dict):
         return {key: _started(part, fresh[key], done) for key, part in following.items()}
     return np.where(done.reshape(-1, *[1] * (following.ndim - 1)), fresh, following)
@@ -104,7 +104,7 @@ def test_dict_samples_equal_those_of_sb3s_buffer(steps: int, seed: int) -> None:
 
 
 class Stacking:
-    """Gives a buffer stacks of what it is fed, as the environments' wrapper does."""
+    """Wrapper of a buffer that stacks the added observations, like the environments' wrapper."""
 
     def __init__(self, buffer: Any, space: spaces.Space[Any], count: int) -> None:
         self.buffer, self.memory = buffer, FrameMemory(space, count)
@@ -155,14 +155,14 @@ def test_a_saved_buffer_can_be_restored(space: spaces.Space[Any], steps: int) ->
 
 
 def test_overwritten_frames_are_replaced_by_the_oldest() -> None:
-    """Four rows; frames count up, and one episode goes on."""
+    """The buffer has four rows. The frames of one long episode are numbered."""
     shown = stacked_space(IMAGE, 3)
     buffer = FrameReplayBuffer(4, shown, ACTIONS, "cpu", 1, frame_stack=3)
     frames = np.arange(7, dtype=np.uint8)[:, None, None, None, None] * np.ones((1, 1, 6, 6))
     for now, following in itertools.pairwise(frames):
         buffer.add(now, following, np.zeros(1), np.zeros(1), np.zeros(1), [{}])
     batch = buffer._get_samples(np.arange(4))
-    # Frames 2 to 5 are in rows 2, 3, 0, 1; 6 is what followed.
+    # Frames 2 to 5 are in rows 2, 3, 0, 1. Frame 6 is the last next observation.
     assert batch.observations[:, :, 0, 0].tolist() == [[2, 3, 4], [3, 4, 5], [2, 2, 2], [2, 2, 3]]
     assert batch.next_observations[:, :, 0, 0].tolist() == [
         [3, 4, 5],
@@ -191,7 +191,7 @@ def test_half_a_million_depth_images_fit_in_four_gigabytes() -> None:
 
 @pytest.mark.parametrize("frame_stack", [1, 3])
 def test_images_are_stored_at_the_networks_size(frame_stack: int) -> None:
-    """Averages of squares of 2 x 2 pixels, rounded; the odd last row and column are dropped."""
+    """Squares of 2 x 2 pixels are averaged and rounded; an odd last row or column is dropped."""
     frame = spaces.Box(0, 255, (1, 7, 7), np.uint8)
     one = spaces.Dict({"image": frame, "vector": DICT["vector"]})
     space = stacked_space(one, frame_stack)

@@ -1,4 +1,4 @@
-"""Several observations in a row as one: while training, in files of policies, and back."""
+"""Tests of frame stacking in training, in policy files and in loaded policies."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_images_are_stacked_along_their_channels(
 
 
 def test_stacks_are_reset_at_each_environments_episode() -> None:
-    """What is seen at each step is the newest frame; what is before it was seen before."""
+    """The newest frame is the current observation; earlier frames are earlier observations."""
     batch = Task.for_sim("lane").batch(3)
     with closing(StackedVecEnv(BatchedVecEnv(batch), 2)) as env:
         env.seed(0)
@@ -99,7 +99,7 @@ def test_stacks_are_reset_at_each_environments_episode() -> None:
 
 
 def test_a_stacking_policy_acts_outside_as_it_does_in_training(tmp_path: Path) -> None:
-    """`evaluate` runs single environments and remembers; training stacks in a batch."""
+    """`evaluate` stacks frames in the policy; training stacks them in the batch wrapper."""
     task = Task.for_sim("lane", **SHORT)
     (summary,) = train(task, tmp_path / "run", record=tmp_path / "log.mcap", progress=silent)
     path = summary.folder / "best_model.zip"
@@ -154,7 +154,7 @@ def test_a_stacking_offline_policy_initializes_an_agent(tmp_path: Path) -> None:
     "options", [{}, {"observation": "depth"}, {"observation": "depth-commands"}]
 )
 def test_a_run_with_frames_is_resumed(tmp_path: Path, options: dict[str, Any]) -> None:
-    """Weights, the optimiser's moments and the frames come back, images' among them."""
+    """The checkpoint restores the weights, the optimizer's moments and all frames."""
     first = agent(tmp_path, options)
     with closing(first):
         first.learn(silent)

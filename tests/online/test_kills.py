@@ -1,4 +1,4 @@
-"""Training that is killed at operations on its files, and resumed."""
+"""Tests that training can be killed at any operation on its files, and then resumed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tests.support.paths import ROOT
 
-# With a stride of 1, which takes minutes, all operations have their turn.
+# With a stride of 1, training is killed at each operation once, which takes minutes.
 SCRIPT = """
     import os, sys, warnings
     from pathlib import Path
@@ -91,5 +91,5 @@ def test_a_run_killed_at_operations_on_its_files_resumes(tmp_path: Path) -> None
     assert done.returncode == 0, done.stdout + done.stderr
     number, episodes, _ = map(int, done.stdout.split())
     assert number > 100
-    # How many depends on where the kills fall; a session ends at a checkpoint.
+    # The number of episodes depends on the operations at which training was killed.
     assert episodes > 3

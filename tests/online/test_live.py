@@ -1,4 +1,4 @@
-"""Training that is watched: what viewers get, and that it changes nothing."""
+"""Tests of training with viewers: the messages they receive, and unchanged results."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def silent(_: TrainingProgress) -> None:
 
 
 class Clock:
-    """Seconds that pass when they are reported to."""
+    """Clock that advances only by the seconds that a test passes."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
@@ -62,13 +62,14 @@ def test_frames_stay_within_their_time_budget() -> None:
             pace.begin()
             clock.now_s += 0.003
             pace.pause()
-            # The environment's own step, which is not the frame's.
+            # This time is that of the environment's step, and not part of the frame.
             clock.now_s += 0.05
             pace.begin()
             clock.now_s += 0.001
             pace.end()
         clock.now_s += 0.001
-    # A frame of 4 ms and the 196 ms that belong to it; a step of 50 ms is beside them.
+    # A frame takes 4 ms, so the next one may be shown after 200 ms. The environment's step of 50 ms
+    # is not counted.
     assert shown * 0.004 <= 0.02 * clock.now_s
     assert shown == pytest.approx(clock.now_s / 0.25, rel=0.02)
 
@@ -87,7 +88,7 @@ def test_the_frame_rate_is_limited() -> None:
 
 
 def watched(task: Task, out: Path, **options: Any) -> Any:
-    """Train, with each episode shown without delay; what the viewer got."""
+    """Train, show each episode without delay, and return the messages that the viewer received."""
     every = Pace(share=1.0, period_s=0.0)
     with closing(LiveTraining(task, port=0, speed=math.inf, pace=every)) as live:
         watcher = Watcher(live.stream.url)
@@ -96,7 +97,7 @@ def watched(task: Task, out: Path, **options: Any) -> Any:
 
 
 def decoded(seen: Any, topic: str) -> np.ndarray[Any, Any]:
-    """The messages of a topic with messages of one length, as an array."""
+    """Return the messages of a topic as an array; all of them must have the same length."""
     dtype = message_dtype(seen["topics"][topic]["schema"])
     assert dtype is not None
     found = [base64.b64decode(m["bytes"]) for m in seen["messages"] if m["topic"] == topic]
@@ -104,19 +105,20 @@ def decoded(seen: Any, topic: str) -> np.ndarray[Any, Any]:
 
 
 def test_a_viewer_receives_what_is_recorded(tmp_path: Path) -> None:
-    """With time for every frame, the first environment's transitions are those in the log."""
+    """If no frame is skipped, viewers receive the logged transitions of the first environment."""
     task = Task.for_sim("lane", **SHORT)
     seen = watched(task, tmp_path / "run", record=tmp_path / "log.mcap")
     counts = Counter(message["topic"] for message in seen["messages"])
     each_step = {"/rl/step", "/rl/learner", "/rl/values", "/rl/training"}
     shown = {"/scene", "/telemetry", "/camera/depth"}
     assert {counts[topic] for topic in each_step | shown} == {100}
-    # The frames at a step are sent with the next one, which ends their motion.
+    # The frames of a step are sent with the next step, at the end of their motion.
     assert counts["/tf"] in (99, 100)
     assert counts["/scene/static"] >= 1
     steps, learner = decoded(seen, "/rl/step"), decoded(seen, "/rl/learner")
     log, reported = mcaprl.open(tmp_path / "log.mcap"), read_learner(tmp_path / "log.mcap")
-    # Episodes are logged at their ends: find the first environment's by its observations.
+    # The log has the episodes of all environments in the order of their ends. Find those of the
+    # first environment by their observations.
     places = {row.tobytes(): i for i, row in enumerate(log.observations)}
     rows = [places[observation.tobytes()] for observation in steps["observation"]]
     for name, column in (("reward", log.rewards), ("behavior_prob", log.behavior_probs)):
@@ -141,7 +143,8 @@ def test_a_shown_episode_has_its_trail(tmp_path: Path) -> None:
     for scene in scenes:
         markers = messages.decode(scene, "visualization_msgs/msg/MarkerArray").markers
         lengths.append(next(len(marker.points) for marker in markers if marker.ns == "trail"))
-    # The first point, repeated to make a line, and one more for each step.
+    # The trail begins with the first point twice, because a line needs two points. Each step adds a
+    # point.
     assert lengths == [max(2, min(step + 1, 40)) for step in steps]
 
 
@@ -205,7 +208,7 @@ def test_other_algorithms_and_environments(
     }
     layout = json.loads((tmp_path / "run" / "foxglove-layout.json").read_text())
     check_panels(layout, Topics(schemas))
-    # The metrics that one wants first have the first place.
+    # The most important metrics come first.
     first = [path["value"] for path in layout["configById"]["Plot!training"]["paths"]]
     assert first == ["/rl/training.mean_return", "/rl/training.score"]
     loss = layout["configById"]["Plot!loss"]["lichtblickPanelTitle"]

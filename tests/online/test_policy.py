@@ -1,4 +1,4 @@
-"""Model files of SB3: what is read of them, and that nothing in them is run."""
+"""Tests of SB3's model files: the parts that are read, and that no code in them is executed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from mcaprl.runs import BEST_NAME, policy_files
 
 
 def small(**kwargs: Any) -> dict[str, Any]:
-    """Arguments of a small model; SB3 writes into `policy_kwargs`, so they are new each time."""
+    """Return new arguments of a small model; SB3 changes the dict `policy_kwargs`."""
     return {"device": "cpu", "policy_kwargs": {"net_arch": [8]}, **kwargs}
 
 
@@ -40,7 +40,7 @@ def dqn(**kwargs: Any) -> DQN:
 
 
 def ours(path: Path, model: Any, env: gym.Env[Any, Any], algo: str = "dqn") -> Path:
-    """Save a model as a run does."""
+    """Save a model in the same way as a training run."""
     spaces_ = (env.observation_space, env.action_space)
     save_policy(path, model, describe_run(algo, (8,), *spaces_, "CartPole-v1", {}))
     return path
@@ -55,7 +55,7 @@ def observations_of(space: spaces.Space[Any], count: int = 20) -> Any:
 
 
 def rewrite(path: Path, out: Path, **members: bytes | None) -> Path:
-    """A copy of a zip with other contents; None leaves a member out. `_pth` means `.pth`."""
+    """Copy a zip with other members; None omits a member. In names, `_pth` means `.pth`."""
     changed = {
         name.replace("_pth", ".pth").replace("_json", ".json"): c for name, c in members.items()
     }
@@ -129,7 +129,7 @@ def test_networks_are_built_from_the_files_shapes(tmp_path: Path) -> None:
 
 
 def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
-    """A pickle that would make a folder, wherever SB3 has pickles."""
+    """All pickles of the file are replaced by a pickle that would make a folder."""
     path = ours(tmp_path / "good.zip", dqn(), gym.make("CartPole-v1"))
     ran = tmp_path / "ran"
 
@@ -244,7 +244,7 @@ def test_sb3_loads_the_model_without_this_package(tmp_path: Path) -> None:
 
 
 def edited(path: Path, out: Path, name: str, **changes: Any) -> Path:
-    """A copy of a model file with other values in one of its JSON parts."""
+    """Copy a model file, and change values in one of its JSON members."""
     with zipfile.ZipFile(path) as archive:
         content = {**json.loads(archive.read(name)), **changes}
     return rewrite(path, out, **{name.replace(".", "_"): json.dumps(content).encode()})
@@ -273,7 +273,7 @@ def test_sizes_are_refused_before_memory_is_taken(tmp_path: Path, changes: Any) 
     try:
         with pytest.raises(PolicyError) as error:
             read_policy(edited(path, tmp_path / "large.zip", OWN_NAME, **changes))
-        # The bounds of the largest space that is accepted take less.
+        # Even the bounds of the largest accepted space need less memory.
         assert tracemalloc.get_traced_memory()[1] < 400e6
     finally:
         tracemalloc.stop()

@@ -1,4 +1,4 @@
-"""What online training records: all transitions, as SB3 stored them, and how they came about."""
+"""Tests of recorded training: SB3's transitions, action probabilities and policy versions."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def silent(_: TrainingProgress) -> None:
 def trained(
     folder: Path, sim_options: dict[str, Any] | None = None, **settings: Any
 ) -> tuple[Agent, Dataset]:
-    """An agent that has learned a little, and its log."""
+    """Train an agent for a short time; return the agent and its log."""
     folder.mkdir()
     task = Task.for_sim("lane", "dqn", sim_options, **{**SHORT, **settings})
     path = folder / "log.mcap"
@@ -63,7 +63,7 @@ def trained(
 
 
 def buffered_episodes(buffer: ReplayBuffer) -> list[dict[str, NDArray[Any]]]:
-    """SB3's rows, cut into episodes, in the order in which these ended."""
+    """Split the rows of SB3's buffer into episodes, in the order of their ends."""
     episodes = []
     for env in range(buffer.n_envs):
         columns = {
@@ -82,7 +82,7 @@ def buffered_episodes(buffer: ReplayBuffer) -> list[dict[str, NDArray[Any]]]:
         for start, end in zip(starts, [*ends, buffer.size() - 1], strict=True):
             if start <= end:
                 part = {name: values[start : end + 1] for name, values in columns.items()}
-                # What was still open when training ended comes last.
+                # Episodes that were unfinished at the end of training come last.
                 episodes.append((end if end in ends else buffer.size(), env, part))
     return [part for _, _, part in sorted(episodes, key=lambda episode: episode[:2])]
 
@@ -121,7 +121,7 @@ def test_logged_commands_are_those_of_the_logged_actions(tmp_path: Path) -> None
 
 
 def killed_log(path: Path, episodes: int) -> bytes:
-    """Create the log of a recorder that was killed; returns its bytes."""
+    """Create the log of a recorder that was killed, and return its bytes."""
     with closing(recorded(Task.for_sim("lane").batch(1), path, algo="dqn", seed=0)) as env:
         env.reset(seed=0)
         while env.episodes < episodes:
@@ -185,7 +185,7 @@ def test_probabilities_are_those_of_the_behavior_policy(tmp_path: Path) -> None:
     learner = read_learner(tmp_path / "run" / "log.mcap")
     epsilon, probs = learner.epsilon, log.behavior_probs
     warm_up = learner.policy_version == 0
-    # 160 random steps, and the four of the first decision after them.
+    # There are 160 random steps, and then four steps of the first policy decision.
     assert (epsilon == 1.0).sum() == 160
     np.testing.assert_allclose(probs[epsilon == 1.0], 1 / LANE_ACTIONS)
     low, high = epsilon / LANE_ACTIONS, 1 - epsilon + epsilon / LANE_ACTIONS

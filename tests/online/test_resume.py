@@ -1,4 +1,4 @@
-"""Stopped, killed and resumed: what comes back, and that the run goes on."""
+"""Tests of runs that are stopped or killed and then resumed: restored state and continuation."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SHORT: dict[str, Any] = {
 
 
 class Stopped(Exception):
-    """Raised to stop a training."""
+    """Exception that stops a training."""
 
 
 def silent(_: TrainingProgress) -> None:
@@ -49,7 +49,7 @@ def silent(_: TrainingProgress) -> None:
 
 
 def stop_at(step: int) -> Callable[[TrainingProgress], None]:
-    """A progress callback that stops the training."""
+    """Return a progress callback that stops the training."""
 
     def report(now: TrainingProgress) -> None:
         if now.done >= step:
@@ -65,7 +65,7 @@ def agent_in(folder: Path, resume: bool, **settings: Any) -> Agent:
 
 
 def state_of(agent: Agent) -> dict[str, Any]:
-    """All that training depends on, but for the environments."""
+    """Return all state that training depends on, except the environments."""
     model: Any = agent.model
     buffer = model.replay_buffer
     return {

@@ -1,4 +1,4 @@
-"""Online training runs: what is in the folder, what repeats, and that agents learn."""
+"""Tests of online training runs: files of the folder, reproducibility and learning."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SHORT_DQN: dict[str, Any] = {**SHORT, "learning_starts": 64, "target_update_inte
 
 
 def lane(**settings: Any) -> Task:
-    """A short task in the lane sim."""
+    """Return a short task in the lane sim."""
     return Task.for_sim("lane", **{**SHORT_DQN, **settings})
 
 

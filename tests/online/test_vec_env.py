@@ -1,4 +1,4 @@
-"""The adapter from batched environments to SB3, against SB3's own one."""
+"""Tests of the adapter from batched environments to SB3 against SB3's `DummyVecEnv`."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def batched_cartpole() -> BatchedVecEnv:
 
 
 def dummy(one: Any, seed: int) -> DummyVecEnv:
-    """SB3's, its environments seeded as ours are."""
+    """Return SB3's `DummyVecEnv`, whose environments have the same seeds as ours."""
     env = DummyVecEnv([lambda: Monitor(one()) for _ in range(COUNT)])
     env._seeds = [episode_seed(seed, i) for i in range(COUNT)]
     return env
 
 
 def short_cartpole() -> gym.Env[Any, Any]:
-    """Ends by falling and by its time limit."""
+    """Return CartPole with a short time limit, so that episodes end by falling or by the limit."""
     return gym.make("CartPole-v1", max_episode_steps=12)
 
 

@@ -1,4 +1,4 @@
-"""Beginning with logs and with trained policies, and going on from there."""
+"""Tests of training that starts from logs and trained policies."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def silent(_: TrainingProgress) -> None:
 
 
 def numbered(lengths: list[int], space: spaces.Space[Any] = VECTOR) -> Dataset:
-    """Episodes whose observations, actions and rewards count the transitions."""
+    """Return episodes in which observations, actions and rewards number the transitions."""
     count = sum(lengths)
     ends = np.cumsum(lengths) - 1
     numbers = np.arange(count, dtype=np.float32)
@@ -69,7 +69,7 @@ def numbered(lengths: list[int], space: spaces.Space[Any] = VECTOR) -> Dataset:
 
 
 class Model(DQN):
-    """A DQN for the transitions of `numbered`, without an environment."""
+    """DQN for the transitions of `numbered`, without an environment."""
 
     def __init__(self, envs: int, rows: int, **kwargs: Any) -> None:
         super().__init__(
@@ -120,7 +120,8 @@ def test_n_step_returns_end_where_the_log_was_cut() -> None:
     fill_buffer(model, numbered([6]))
     buffer: Any = model.replay_buffer
     batch = buffer._get_samples(np.array([1] * 50))
-    # Row 1 of column 0 is transition 1: 1 + .5 x 2, and no further; of column 1: 4 + .5 x 5.
+    # Row 1 of column 0 is transition 1, whose return 1 + .5 x 2 ends with the episode. Row 1 of
+    # column 1 has the return 4 + .5 x 5.
     assert set(batch.rewards[:, 0].tolist()) == {2.0, 6.5}
     assert set(batch.discounts[:, 0].tolist()) == {0.25}
     assert set(batch.dones[:, 0].tolist()) == {0.0}
@@ -134,7 +135,7 @@ def test_other_spaces_are_refused() -> None:
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small log of the lane sim."""
+    """Record a small log of the lane sim."""
     path = tmp_path_factory.mktemp("logs") / "lane.mcap"
     env = mcaprl.RecordMcap(mcaprl.sims.make_sim("lane"), path, scene=False)
     rollout(env, EpsilonGreedy(None, 1.0, env.action_space), seed=0, episodes=30)
@@ -190,7 +191,8 @@ def test_an_agent_starts_from_an_offline_policy(logs: Path, tmp_path: Path) -> N
         np.testing.assert_array_equal(values, target)
         begun.learn(silent)
         assert model.exploration_rate == pytest.approx(0.05)
-        # 26 steps of four environments come after more than 100, or 25: each is one update.
+        # The four environments exceed 100 steps after 26 steps of the batch. Each of the 25 later
+        # steps is one update.
         assert model._n_updates == 25
         acted = model.replay_buffer.actions[:25, :, 0]
         seen = model.replay_buffer.observations[:25]
@@ -220,7 +222,7 @@ def images_of(task: Task, folder: Path, count: int = 60) -> Path:
 def test_a_policy_from_images_keeps_its_values(
     tmp_path: Path, observation: str, frame_stack: int
 ) -> None:
-    """The normalization of images and vectors moves into the agent's network."""
+    """The agent's network includes the policy's normalization of images and vectors."""
     both: dict[str, Any] = {"hidden": (8, 8), "frame_stack": frame_stack, "layer_norm": True}
     settings = {**SHORT, **both, "dueling": True, "envs": 1}
     task = Task.for_sim("lane", None, {"observation": observation}, **settings)

@@ -1,4 +1,6 @@
-"""Environment whose episodes follow from their seeds, and take time; importing it registers it."""
+"""Environment with slow steps, whose episodes depend only on their seeds.
+
+Importing this module registers the environment."""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ STEP_S = 0.002
 
 
 class Seeded(gym.Env[Any, Any]):
-    """Episodes of 5 to 34 steps with random observations and rewards."""
+    """Environment with episodes of 5 to 34 steps, and random observations and rewards."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = spaces.Discrete(4)

@@ -1,4 +1,4 @@
-"""What a cluster must have, and the errors if it does not."""
+"""Tests of the requirements on a cluster, and of the errors if they are not met."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.ray.seeded import SEEDED
 
 
 def record_elsewhere(folder: Path, address: str, before: str = "") -> str:
-    """Record in another process; return the lines of its error output that are ours."""
+    """Record in another process; return the lines that mcaprl wrote to stderr."""
     arguments = ["record", SEEDED, "--policy", "random", "--episodes", "2", "--ray"]
     arguments += ["--address", address, "--out", str(folder)]
     code = f"import sys\n{before}\nfrom mcaprl.cli import main\nmain({arguments!r})"
@@ -103,7 +103,7 @@ def test_a_second_connection_is_the_first_one() -> None:
 
 @pytest.mark.usefixtures("ray_cluster")
 def test_the_cluster_listens_on_the_loopback_interface_alone() -> None:
-    """Compare the addresses of all sockets of the processes that this one started."""
+    """Check the addresses of all sockets of the processes that this process started."""
     tables = [Path(f"/proc/net/{name}") for name in ("tcp", "tcp6")]
     if not tables[0].exists():
         pytest.skip("needs /proc")
@@ -120,11 +120,11 @@ def test_the_cluster_listens_on_the_loopback_interface_alone() -> None:
 
 
 def _sockets() -> set[str]:
-    """Return the inodes of the sockets of all processes below this one."""
+    """Return the inodes of the sockets of all child processes, also indirect ones."""
     found, parents = set(), [os.getpid()]
     while parents:
         parent = parents.pop()
-        # A process or a file may end meanwhile.
+        # A process may have ended, or a file may be closed.
         with suppress(OSError):
             children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
             parents += map(int, children)
@@ -152,7 +152,7 @@ def test_without_ray_the_option_names_the_install_command(
 
 
 class _NoRay:
-    """Finder that finds no module of Ray."""
+    """Import finder that raises an error for all modules of Ray."""
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
         if name.partition(".")[0] == "ray":

@@ -1,4 +1,4 @@
-"""Logs as datasets of Ray Data, and back."""
+"""Tests of logs that are read as datasets of Ray Data and written from them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("ray_cluster")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder of two logs with a Dict of vectors and images: 5 and 3 episodes."""
+    """Record two logs of 5 and 3 episodes, with Dict observations of vectors and images."""
     path = tmp_path_factory.mktemp("logs")
     write_log(path / "a.mcap", 5)
     write_log(path / "b.mcap", 3)
@@ -124,7 +124,8 @@ def test_sizes_come_from_the_summaries(folder: Path, monkeypatch: pytest.MonkeyP
     data = mcaprl.open(folder)
     monkeypatch.setattr("mcaprl.recorder.dataset.log_reader.LogReader.read", None)
     source = LogSource([folder / "a.mcap", folder / "b.mcap"])
-    # Numbers, flags and action: 8 + 8 + 8 + 8 + 1 + 1 + 4 + 8; two observations of 12 + 64 bytes.
+    # Numbers, flags and action need 8 + 8 + 8 + 8 + 1 + 1 + 4 + 8 bytes. Each of two observations
+    # needs 12 + 64 bytes.
     assert source.estimate_inmemory_data_size() == (46 + 2 * 76) * len(data)
     tasks = source.get_read_tasks(-1)
     assert sum(task.metadata.num_rows for task in tasks) == len(data)

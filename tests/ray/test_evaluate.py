@@ -1,4 +1,4 @@
-"""Evaluation on a Ray cluster: the same numbers as locally."""
+"""Tests that evaluation on a Ray cluster has the same results as local evaluation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("ray_cluster")
 
 @pytest.fixture(scope="module")
 def lane_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a run with two seeds, trained for some updates."""
+    """Train a run with two seeds for a few updates."""
     pytest.importorskip("torch")
     pytest.importorskip("numba")
     folder = tmp_path_factory.mktemp("lane")

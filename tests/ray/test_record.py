@@ -1,4 +1,4 @@
-"""Recording on a Ray cluster: the same episodes as locally, whatever happens to the workers."""
+"""Tests that a Ray cluster records the same episodes as this process, even if workers die."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_steps_do_not_depend_on_the_workers(tmp_path: Path) -> None:
 
 
 def worker_processes() -> list[int]:
-    """Return the processes below this one that are workers of ours."""
+    """Return the worker processes of mcaprl among the descendants of this process."""
     found, parents = list[int](), [os.getpid()]
     while parents:
         try:
@@ -104,13 +104,13 @@ def worker_processes() -> list[int]:
                     found.append(child)
             parents += children
         except OSError:
-            # A process ended.
+            # The process has ended.
             continue
     return found
 
 
 class Killer(threading.Thread):
-    """Kills the oldest worker at random times after progress, up to a number of times."""
+    """Callback that kills the oldest worker at random times after progress, a few times."""
 
     def __init__(self, kills: int) -> None:
         super().__init__(daemon=True)

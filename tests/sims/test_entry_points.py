@@ -1,4 +1,4 @@
-"""Sims that installed packages add through entry points."""
+"""Tests of sims that installed packages add through entry points."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ def spec():
 
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
-    """A folder with an installed package that adds the sim `boat`."""
+    """Install a package that adds the sim `boat` into a folder, and return the folder."""
     install(tmp_path / "site", "boats", "boat = boats:spec", BOATS)
     return tmp_path / "site"
 
 
 def install(site: Path, package: str, entry_point: str, code: str) -> None:
-    """Write a package as an installer does: its module, and its metadata."""
+    """Write the module and the metadata of a package, like an installer."""
     info = site / f"{package}-1.0.dist-info"
     info.mkdir(parents=True)
     (site / f"{package}.py").write_text(code)

@@ -1,4 +1,4 @@
-"""Making of a sim by its name."""
+"""Tests of making a sim by its name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames within a step: at most 0.05 s apart, on the way of the step, and without effect on it."""
+"""Tests of the frames within a step: at most 0.05 s apart, and without effect on the step."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_moments_are_close_and_in_order(sim: str, arguments: dict[str, Any], cou
         apart_s = -np.diff([inner.step_duration_s, *left_s, 0.0])
         np.testing.assert_allclose(apart_s, inner.step_duration_s / (count + 1))
         assert apart_s.max() <= 0.05 + 1e-12
-        # No jump: 10 m/s and 0.05 s are 0.5 m.
+        # The car does not jump: it moves 0.5 m in 0.05 s at 10 m/s.
         way = [np.array(frames[0].position) for frames in (before, *between, inner.frames())]
         assert max(np.linalg.norm(b - a) for a, b in pairwise(way)) < 0.6
         before = inner.frames()
@@ -102,7 +102,7 @@ def test_a_collision_within_a_decision_stops_the_drone() -> None:
     inner.scene()
     terminated = False
     while not terminated:
-        # Down at up to 8 m/s, until the drone hits the ground or is too far from the line.
+        # The drone flies down at up to 8 m/s, until it hits the ground or is too far from the line.
         _, _, terminated, _, _ = env.step(2)
     way = [frames[0].position for _, frames in inner.motion()] + [inner.frames()[0].position]
     stays = [a == b for a, b in pairwise(way)]
@@ -110,12 +110,12 @@ def test_a_collision_within_a_decision_stops_the_drone() -> None:
 
 
 def test_an_arc_by_hand() -> None:
-    """A quarter of a circle of radius 1 to the left, from (0, 0), facing x."""
+    """The arc is a quarter of a circle of radius 1 to the left, from (0, 0) in direction x."""
     end = (1.0, 1.0, math.pi / 2)
     half = math.sqrt(0.5)
     np.testing.assert_allclose(arc((0.0, 0.0, 0.0), end, 0.5), (half, 1.0 - half, math.pi / 4))
     np.testing.assert_allclose(arc((0.0, 0.0, 0.0), end, 1.0), end)
     np.testing.assert_allclose(arc((0.0, 0.0, 0.0), end, 0.0), (0.0, 0.0, 0.0), atol=1e-15)
-    # Without a turn, the way is straight; across the limit of angles, the turn is the short one.
+    # Without a turn, the way is straight. Across +-pi, the shorter turn is used.
     np.testing.assert_allclose(arc((1.0, 2.0, 0.5), (3.0, 2.0, 0.5), 0.25), (1.5, 2.0, 0.5))
     assert abs(arc((0.0, 0.0, 3.1), (1.0, 0.0, -3.1), 0.5)[2]) == pytest.approx(math.pi)

@@ -1,4 +1,4 @@
-"""The contract that every sim fulfills."""
+"""Tests of the requirements on all sims."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def actions_of(env: gym.Env[Any, Any], chosen: list[int]) -> list[int]:
 
 
 def trace(env: gym.Env[Any, Any], seed: int, actions: list[int]) -> Trace:
-    """All results of an episode, with observations as bytes."""
+    """Return all results of an episode, with observations as bytes."""
     observation, info = env.reset(seed=seed)
     steps: Trace = [(as_bytes(observation), 0.0, False, False, info)]
     for action in actions:
@@ -185,7 +185,7 @@ def test_names_and_metadata_fit_the_sim(name: str, kwargs: dict[str, Any]) -> No
     if sim.observation_names:
         assert (len(sim.observation_names),) == sim.observation_space.shape
     if name == "racer" or kwargs.get("rules", "default") == "default":
-        # Metadata belong to the class; decisions of the classic car and drone are longer.
+        # Metadata are attributes of the class. Decisions of the classic car and drone are longer.
         assert sim.step_duration_s * sim.metadata["render_fps"] == pytest.approx(1.0)
     assert {"x_m", "y_m", "speed_m_s"} <= set(sim.telemetry())
     before = sim.telemetry()

@@ -1,4 +1,4 @@
-"""A log contains all that is needed to repeat its episodes bit for bit."""
+"""Tests that a log is sufficient to repeat its episodes bit for bit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ EPISODES = 4
 def test_a_recorded_episode_can_be_repeated(
     name: str, kwargs: dict[str, Any], log_path: Path
 ) -> None:
-    """Recorded in one sim with its scene, and repeated in another from seeds and actions."""
+    """An episode is recorded with its scene, and repeated in another sim from seed and actions."""
     sim = make_sim(name, max_episode_steps=25, **kwargs)
     sim.action_space.seed(1)
     env = mcaprl.RecordMcap(sim, log_path)

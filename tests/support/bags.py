@@ -1,4 +1,4 @@
-"""Bags of every form with the same messages, written by the libraries of others."""
+"""Bags in all formats with the same messages, written by other libraries."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Files for all combinations of MCAP's optional features, written by the specification.
+"""Files for all combinations of MCAP's optional features, written from the specification.
 
-The variants are those of MCAP's own conformance set: six contents, each with every combination of
-features that makes sense for it, 416 files in all. Records are written by hand, byte by byte, so
-that they can be padded: a reader has to ignore extra bytes at the end of any record.
+The variants are those of MCAP's own conformance tests: six contents, each with all combinations of
+features that apply to it, 416 files in total. Records are written byte by byte, so that they can be
+padded: a reader must ignore extra bytes at the end of any record.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 MAGIC = b"\x89MCAP0\r\n"
-# Longer than an entry of an index, which it must not be taken for.
+# The padding is longer than an index entry, so that a reader that mistakes it for one fails.
 PADDING = b"\x01" + b"\xff" * 37
 FEATURES = ("ch", "mx", "st", "rsh", "rch", "ax", "mdx", "chx", "sum", "pad")
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
@@ -24,7 +24,7 @@ SUMMARIZED = ("chx", "rsh", "rch", "mdx", "ax", "st")
 
 
 class Message(NamedTuple):
-    """A message of the only channel."""
+    """Message of the only channel."""
 
     sequence: int
     log_time: int
@@ -33,7 +33,7 @@ class Message(NamedTuple):
 
 
 class Content(NamedTuple):
-    """What a file contains."""
+    """Contents of a file."""
 
     name: str
     messages: tuple[Message, ...] = ()
@@ -53,7 +53,7 @@ CONTENTS = (
 
 
 def variants() -> Iterator[tuple[Content, frozenset[str]]]:
-    """Yield each content with each set of features that makes sense for it."""
+    """Yield each content with each set of features that applies to it."""
     for content in CONTENTS:
         for chosen in itertools.product((False, True), repeat=len(FEATURES)):
             features = frozenset(itertools.compress(FEATURES, chosen))
@@ -116,7 +116,7 @@ class _File:
         return bytes(self._out + MAGIC)
 
     def _put_messages(self) -> dict[str, bytes]:
-        """Write schema, channel and messages, in a chunk or not; return the chunk's index."""
+        """Write schema, channel and messages, with or without a chunk; return the chunk index."""
         content = self._content
         parts = [(SCHEMA, self._schema())] if content.has_schema else []
         parts.append((CHANNEL, self._channel()))
@@ -150,7 +150,7 @@ class _File:
         return {"chx": found + struct.pack("<QQ", len(records), len(records))}
 
     def _put_summary(self, indexes: dict[str, bytes]) -> list[tuple[int, int, int]]:
-        """Write the summary's groups; return opcode, start and length of each."""
+        """Write the groups of the summary; return the opcode, start and length of each group."""
         found = {
             "rsh": (SCHEMA, self._schema()),
             "rch": (CHANNEL, self._channel()),

@@ -1,4 +1,4 @@
-"""Shared by the fault tests: recordings whose episodes can be recomputed, and counters."""
+"""Helpers of the fault tests: recordings whose episodes can be recomputed, and counters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import mcaprl
 from mcaprl.recorder.dataset.episode import Episode
 
 LARGE = os.environ.get("MCAPRL_FAULTS") == "large"
-# File that results are appended to; see `fault_table`.
+# File to which results are appended; see `fault_table`.
 FIGURES = os.environ.get("MCAPRL_FAULT_FIGURES")
 
 
@@ -33,7 +33,10 @@ def tell(fault: str, **figures: Any) -> None:
 
 
 class KnownEpisodes(gym.Env[Any, Any]):
-    """Environment whose episode k has 5 + 7k % 40 steps; all values follow from k and the step."""
+    """Environment in which all values depend only on the episode k and the step.
+
+    Episode k has 5 + 7k % 40 steps.
+    """
 
     observation_space = spaces.Dict(
         {
@@ -84,7 +87,7 @@ def play(env: Any) -> None:
 
 
 def write_log(path: Path, episodes: int, **options: Any) -> None:
-    """Record episodes from the first one on."""
+    """Record episodes, starting with the first."""
     env = mcaprl.RecordMcap(KnownEpisodes(), path, start_time_ns=10**18, **options)
     for _ in range(episodes):
         play(env)

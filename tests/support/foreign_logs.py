@@ -1,4 +1,4 @@
-"""Logs with `/rl/step` by other writers, in various encodings and interleavings."""
+"""Logs with `/rl/step` from other writers, in various encodings, mixed with other topics."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ bool terminated
 bool truncated
 bool final
 """
-# The same fields in another order and with other types, between strings, lists and nested messages.
+# The same fields in another order and with other types, mixed with strings, lists and messages.
 VARIABLE = """\
 std_msgs/Header header
 uint32 step
@@ -72,7 +72,7 @@ class Steps:
 
 
 def steps_of(lengths: list[int], *, start_ns: int = 10**18, seed: int = 0) -> Steps:
-    """Create random values that every numeric type of PLAIN and VARIABLE represents exactly."""
+    """Create random values that all numeric types of PLAIN and VARIABLE represent exactly."""
     random = np.random.default_rng(seed)
     final = np.concatenate([np.arange(length + 1) == length for length in lengths])
     count = len(final)
@@ -149,7 +149,7 @@ def write_with_mcap(
     channels: Callable[[int], int] = lambda row: 0,
     **options: Any,
 ) -> None:
-    """Write by mcap's Writer, interleaved with a topic of messages of various lengths."""
+    """Write with mcap's Writer, mixed with a topic whose messages have various lengths."""
     writer = Writer(str(path), **{"chunk_size": 2000, **options})
     writer.start("ros2")
     schema = writer.register_schema(TYPE, "ros2msg", text.encode())
@@ -191,7 +191,7 @@ MCAP_OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def write_with_rosbags(folder: Path, messages: list[tuple[int, bytes]], text: str = PLAIN) -> Path:
-    """Write a ROS 2 bag by rosbags; returns the path of its MCAP file."""
+    """Write a ROS 2 bag with rosbags, and return the path of the bag's MCAP file."""
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(text, TYPE))
     with BagWriter(folder, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
@@ -203,7 +203,7 @@ def write_with_rosbags(folder: Path, messages: list[tuple[int, bytes]], text: st
 
 
 def write_with_foxglove(path: Path, messages: list[tuple[int, bytes]], text: str = PLAIN) -> None:
-    """Write by foxglove-sdk, interleaved with another topic."""
+    """Write with foxglove-sdk, mixed with another topic."""
     import foxglove
 
     context = foxglove.Context()

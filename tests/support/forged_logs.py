@@ -1,4 +1,4 @@
-"""Small logs whose metadata say what no recorder writes."""
+"""Small logs with metadata that no recorder would write."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
     python -m tests.support.fuzz_reader FOLDER [options of libFuzzer]
 
-It starts from small logs in FOLDER, with and without CRCs, so that the code after the CRC checks
-is reached. Failing inputs are written to `crash-...`; fix the cause, and add them to
+Fuzzing starts from small logs in FOLDER. Some have no CRCs, so that the code after the CRC checks
+is reached. Inputs that fail are written to `crash-...`. Fix the cause, and add the inputs to
 `tests/fuzz_corpus`, which `tests/recorder/columns/test_fuzz_corpus.py` reads.
 """
 

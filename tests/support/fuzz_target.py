@@ -1,4 +1,4 @@
-"""The function that is fuzzed, and the corpus that fuzzing starts from."""
+"""The function that is fuzzed, and the logs from which fuzzing starts."""
 
 from __future__ import annotations
 

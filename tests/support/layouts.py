@@ -1,4 +1,4 @@
-"""Checks of layouts: structure, sizes, and that every message path exists in the log."""
+"""Checks of layouts: structure, sizes of panels, and message paths that exist in the log."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Topics:
 
 
 class _Strict(dict[str, Any]):
-    """Fields by name; an unknown one fails with its name."""
+    """Dict of fields by name; an unknown name fails the test."""
 
     def __missing__(self, name: str) -> Any:
         raise AssertionError(f"no field {name}: {sorted(self)}")
@@ -158,7 +158,7 @@ def series_of(layout: dict[str, Any]) -> dict[str, str]:
 def sizes_of(
     node: Any, panels: dict[str, Any], area_px: tuple[float, float]
 ) -> Iterator[tuple[str, tuple[float, float]]]:
-    """Yield the width and height in pixels of each panel of a layout, also of those in tabs."""
+    """Yield the width and height of each panel of a layout in pixels, including panels in tabs."""
     width_px, height_px = area_px
     if isinstance(node, str):
         yield node, area_px

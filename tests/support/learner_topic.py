@@ -15,7 +15,7 @@ from mcaprl.recorder.format.topics import LEARNER_TOPIC
 
 @dataclass(frozen=True, eq=False)
 class LearnerColumns:
-    """Exploration and policy version at each of a log's N transitions, in order.
+    """Epsilon and policy version at each of the N transitions of a log, in order.
 
     Attributes:
         log_time_ns: (N,) log_time of the transition's observation, nanoseconds.

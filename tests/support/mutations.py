@@ -1,4 +1,4 @@
-"""Mutations of MCAP files: functions of the file's bytes and a random generator."""
+"""Mutations of MCAP files: functions that accept the bytes of a file and a random generator."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def spliced(data: bytes, chance: random.Random) -> bytes:
 
 
 def wrong_length(data: bytes, chance: random.Random) -> bytes:
-    """Change a length: the record's own, or any eight or four bytes of its content."""
+    """Change the length of a record, or any eight or four bytes of the record's content."""
     start, _, length = chance.choice(list(records_of(data)))
     spoilt, claimed = bytearray(data), chance.choice(LENGTHS)
     place = start + chance.choice([1, 1, chance.randrange(1, max(2, min(length - 8, 60)))])
@@ -64,7 +64,7 @@ def wrong_length(data: bytes, chance: random.Random) -> bytes:
 
 
 def bombed(data: bytes, chance: random.Random) -> bytes:
-    """Replace a chunk's data by a small one that decompresses to 256 MiB."""
+    """Replace the data of a chunk with small data that decompress to 256 MiB."""
     chunks = [record for record in records_of(data) if record[1] == Opcode.CHUNK]
     start, _, length = chance.choice(chunks)
     claimed = chance.choice([100, 2**20, 2**28 - 1, 2**28, 2**28 + 1, 2**40])

@@ -1,7 +1,8 @@
-"""A small task whose optimum is known: a corridor of five cells with a worthless exit at one end.
+"""A small task with a known optimum: a corridor of five cells with an exit at each end.
 
-Cell 0 is an exit that pays 0.3, cell 4 one that pays 1; both terminate. Between them action 0 goes
-left and action 1 right, and nothing is paid. Observations are one-hot, so a network is a table.
+Cell 0 is an exit with the reward 0.3, and cell 4 is an exit with the reward 1; both terminate. In
+the cells between them, action 0 goes left, action 1 goes right, and rewards are 0. Observations are
+one-hot, so a network is equivalent to a table.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ GAMMA = 0.9
 PAYS = {0: 0.3, N_CELLS - 1: 1.0}
 INNER_CELLS = range(1, N_CELLS - 1)
 ACTION_SPACE = spaces.Discrete(2, start=5)
-"""Starts at 5, so that code which ignores `start` fails."""
+"""The actions start at 5, so that code that ignores `start` fails."""
 
 
 def corridor(visits: dict[tuple[int, int], int] | None = None, repeat: int = 20) -> Dataset:
     """Create transitions of the corridor; each one is a separate episode.
 
     Args:
-        visits: how often each (cell, action) is in the data; all of them once by default.
-        repeat: how often the whole is repeated.
+        visits: Number of times that each (cell, action) is in the data; default: once.
+        repeat: Number of times that all transitions are repeated.
     """
     counts = visits or {(cell, action): 1 for cell in INNER_CELLS for action in (0, 1)}
     pairs = [pair for pair, count in counts.items() for _ in range(count)] * repeat
@@ -57,7 +58,7 @@ def optimal_values() -> NDArray[np.float64]:
 
 
 def inner_observations() -> NDArray[np.float32]:
-    """Return the observations of the inner cells, (3, 5), in which the action matters."""
+    """Return the observations of the three inner cells, (3, 5)."""
     return one_hot(np.array(INNER_CELLS))
 
 
@@ -67,7 +68,7 @@ def one_hot(cells: NDArray[np.int64]) -> NDArray[np.float32]:
 
 
 def crossing(lengths: tuple[int, ...] = (40, 30, 50), n_actions: int = 1) -> Dataset:
-    """Create episodes whose observation is the step and whose reward is 1 per step."""
+    """Create episodes in which the observation is the number of the step, and each reward is 1."""
     steps = np.concatenate([np.arange(length, dtype=np.float32) for length in lengths])[:, None]
     last = np.concatenate([np.arange(1, length + 1) == length for length in lengths])
     return Dataset.from_arrays(

@@ -24,6 +24,6 @@ def corridor(top_px: float = 100.0, bottom_px: float = 200.0) -> Track:
 def car_in(
     track: Track, x_px: float, y_px: float, heading_deg: float = 0.0, speed_px: float = 0.0
 ) -> Car:
-    """Return a car at a place, whose next gate is the first one."""
+    """Return a car at a position; its next gate is the first gate."""
     car = placed(track, x_px, y_px, math.radians(heading_deg), speed_px, x_px / 10)
     return car._replace(next_gate=0.0)

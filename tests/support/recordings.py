@@ -1,4 +1,4 @@
-"""Environments and recordings whose values are all known."""
+"""Environments and recordings with known values."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MIXED_SPACE = spaces.Dict(
 
 
 class ScriptedEnv(gym.Env[Any, Any]):
-    """Environment that plays back given observations, rewards and ends, episode by episode."""
+    """Environment that returns given observations, rewards and ends, episode by episode."""
 
     metadata: dict[str, Any] = {"render_fps": 20}  # noqa: RUF012 (as Gymnasium declares it)
 
@@ -60,7 +60,7 @@ class ScriptedEnv(gym.Env[Any, Any]):
 
 @dataclass
 class Truth:
-    """The values that were recorded, transition by transition."""
+    """Recorded values of each transition."""
 
     observations: list[Any] = field(default_factory=list)
     next_observations: list[Any] = field(default_factory=list)

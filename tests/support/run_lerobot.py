@@ -94,9 +94,9 @@ _EDGES = ["height", "width", "channels"]
 def _lerobot() -> Any:
     """Import LeRobot's module of datasets.
 
-    torchvision's wheel is built for CUDA. Beside torch for the CPU, its compiled operators are
-    missing, so they are declared; LeRobot calls none of them. This torchvision decodes no video
-    either, so that PyAV does it here.
+    torchvision's wheel is built for CUDA. With torch for the CPU, its compiled operators are
+    missing. This function declares them, but LeRobot calls none of them. This torchvision also
+    decodes no video, so PyAV decodes videos here.
     """
     library: Any = import_module("torch.library").Library("torchvision", "DEF")
     for name in ("nms", "qnms"):
@@ -107,7 +107,7 @@ def _lerobot() -> Any:
     return module
 
 
-# A library that is garbage-collected takes its operators with it.
+# If a library is garbage-collected, its operators are removed.
 _LIBRARIES: list[Any] = []
 
 

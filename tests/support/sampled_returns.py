@@ -1,4 +1,4 @@
-"""Returns of training seeds and episodes with a true mean of 0, and the coverage of intervals.
+"""Random returns of seeds and episodes with a true mean of 0, to measure interval coverage.
 
 `python -m tests.support.sampled_returns` prints the table of `docs/evaluation.md`.
 """
@@ -25,7 +25,7 @@ class Returns:
 
     Attributes:
         seeds: Number of training seeds.
-        episodes: Number of episodes of each, with the same starts for all seeds.
+        episodes: Number of episodes of each seed; all seeds have the same starts.
         skewed: Whether the effects of starts and episodes are lognormal instead of normal.
         spread: Standard deviation of the seeds' effects; that of the episodes is 1.
         skewed_seeds: Whether the effects of seeds are lognormal.
@@ -38,7 +38,7 @@ class Returns:
     skewed_seeds: bool = False
 
     def draw(self, random: np.random.Generator) -> Floats:
-        """Return returns (S, E); half of an episode's variance is that of its start."""
+        """Draw returns (S, E); half of an episode's variance is the variance of its start."""
         of_seeds = _effects(random, (self.seeds, 1), skewed=self.skewed_seeds)
         of_starts = _effects(random, (1, self.episodes), skewed=self.skewed)
         of_both = _effects(random, (self.seeds, self.episodes), skewed=self.skewed)
@@ -66,7 +66,7 @@ CASES: Final = {
 def coverage(
     returns: Returns, interval: Callable[[Floats], tuple[float, float]], trials: int
 ) -> float:
-    """Return how often the interval of the mean contains 0."""
+    """Return the fraction of trials in which the interval of the mean contains 0."""
     random = np.random.default_rng(0)
     hits = 0
     for _ in range(trials):

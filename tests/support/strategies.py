@@ -14,7 +14,7 @@ DTYPES = ("float32", "float64", "float16", "int64", "int32", "int16", "int8", "u
 
 @st.composite
 def boxes(draw: st.DrawFn) -> spaces.Box:
-    """Unbounded Boxes of any dtype, from scalars to small stacks and images."""
+    """Draw unbounded Boxes of any dtype, from scalars to small stacks and images."""
     dtype = np.dtype(draw(st.sampled_from(DTYPES)))
     shape = draw(st.sampled_from([(), (1,), (3,), (7,), (2, 2), (2, 3, 2), (8, 9, 3), (9, 8)]))
     if dtype.kind == "f":
@@ -25,7 +25,7 @@ def boxes(draw: st.DrawFn) -> spaces.Box:
 
 
 def simple_spaces() -> st.SearchStrategy[spaces.Space[Any]]:
-    """Every kind of space with a single leaf."""
+    """Draw spaces of all kinds that have a single leaf."""
     return st.one_of(
         boxes(),
         st.builds(
@@ -39,7 +39,7 @@ def simple_spaces() -> st.SearchStrategy[spaces.Space[Any]]:
 
 
 def observation_spaces() -> st.SearchStrategy[spaces.Space[Any]]:
-    """Spaces with a single leaf, and Dicts of them with any keys."""
+    """Draw spaces with a single leaf, and Dicts of such spaces with any keys."""
     keys = st.text(min_size=1, max_size=6)
     dicts = st.dictionaries(keys, simple_spaces(), min_size=1, max_size=3).map(spaces.Dict)
     return st.one_of(simple_spaces(), dicts)
@@ -47,7 +47,7 @@ def observation_spaces() -> st.SearchStrategy[spaces.Space[Any]]:
 
 @st.composite
 def values_of(draw: st.DrawFn, space: spaces.Space[Any], rows: int) -> Any:
-    """`rows` values of a space as arrays, with any bit pattern of the dtype."""
+    """Draw `rows` values of a space as arrays, with any bit pattern of the dtype."""
     if isinstance(space, spaces.Dict):
         return {key: draw(values_of(part, rows)) for key, part in space.spaces.items()}
     dtype, shape = np.dtype(space.dtype), (rows, *(space.shape or ()))
@@ -61,7 +61,7 @@ def values_of(draw: st.DrawFn, space: spaces.Space[Any], rows: int) -> Any:
 
 @st.composite
 def transitions(draw: st.DrawFn) -> dict[str, Any]:
-    """Keyword arguments of `Dataset.from_arrays`, including spaces."""
+    """Draw keyword arguments for `Dataset.from_arrays`, including spaces."""
     observation_space, action_space = draw(observation_spaces()), draw(simple_spaces())
     rows = draw(st.integers(1, 12))
     ends = numpy_strategies.arrays(np.bool_, rows)

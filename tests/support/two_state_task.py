@@ -1,7 +1,7 @@
 """An MDP with two states whose values follow from linear equations.
 
-Each step pays `PAYS[state, action]`, ends the episode with probability 0.25, and else leads to
-state 1 with probability `TO_ONE[state, action]`. Episodes start in state 0.
+The reward of a step is `PAYS[state, action]`. A step ends the episode with probability 0.25.
+Otherwise, it leads to state 1 with probability `TO_ONE[state, action]`. Episodes start in state 0.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ def true_value() -> float:
 
 
 def play(policy: NDArray[np.float64] | None, *, episodes: int, seed: int) -> EpisodeTable:
-    """Sample episodes of a policy (None: BEHAVIOR), with EVALUATED's ratios and true Q and V.
+    """Sample episodes of a policy (None: BEHAVIOR), with the ratios and true Q and V of EVALUATED.
 
-    They are cut off after 60 steps, which one in 30 million reaches.
+    Episodes are cut off after 60 steps, which one in 30 million episodes reaches.
     """
     acting = BEHAVIOR if policy is None else policy
     random = np.random.default_rng(seed)

@@ -12,7 +12,7 @@ from tests.support.paths import NODE
 
 
 class Watcher:
-    """A viewer of the Foxglove protocol that takes whatever comes."""
+    """A viewer of the Foxglove protocol that subscribes to all topics."""
 
     def __init__(self, url: str) -> None:
         need(shutil.which("node") is not None, "node is not installed")
@@ -25,5 +25,5 @@ class Watcher:
         assert self._process.stdout.readline() == "watching\n"
 
     def seen(self) -> Any:
-        """All that came, once the server has said goodbye."""
+        """Return all received messages after the server has closed the connection."""
         return json.loads(self._process.communicate(timeout=30)[0])

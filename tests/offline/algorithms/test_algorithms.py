@@ -1,4 +1,4 @@
-"""Each algorithm on tasks small enough to solve by value iteration."""
+"""Tests of each algorithm on small tasks that value iteration solves exactly."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def trained(learner: Learner) -> Learner:
 
 
 def outputs(learner: Learner, observations: NDArray[np.float32], name: str = "q") -> Tensor:
-    """Return the outputs (B, A) of the first seed; values are in units of the logged rewards."""
+    """Return the first seed's outputs (B, A); values are in units of the logged rewards."""
     network = learner.network(name, learner.seeds[0])
     with torch.no_grad():
         found = network(Observations(torch.from_numpy(observations)))
@@ -73,7 +73,7 @@ def best(learner: Learner, observations: NDArray[np.float32]) -> list[int]:
 
 
 def lone_state(*, terminated: bool, gamma: float, reward: float = 1.0, **settings: Any) -> float:
-    """Return Q, learned by DQN, of a state with `reward` that leads to itself."""
+    """Return the Q that DQN learns for a state that leads to itself with `reward`."""
     observation = np.ones((8, 1), np.float32)
     dataset = Dataset.from_arrays(
         observations=observation,
@@ -113,7 +113,8 @@ def test_values_equal_those_of_value_iteration(config: Any) -> None:
 
 
 def test_the_corridors_values_by_hand() -> None:
-    # Going right is worth 1, .9, .81 from the far exit backward; the near exit has reward .3.
+    # From the far exit backward, the values of going right are 1, .9 and .81. The near exit has the
+    # reward .3.
     np.testing.assert_allclose(optimal_values(), [[0.3, 0.81], [0.729, 0.9], [0.81, 1.0]])
 
 
@@ -133,7 +134,8 @@ def test_quantiles_stop_at_termination() -> None:
 
 
 def test_n_step_returns_propagate_a_reward_over_the_corridor() -> None:
-    # One episode from cell 1 to the far exit; with one sync, only n-step returns reach back.
+    # The data are one episode from cell 1 to the far exit. With one sync, 1-step targets do not
+    # propagate the reward to cell 1, but n-step returns do.
     walk = corridor_walk()
     config = DQNConfig(**{**SMALL_Q, "n_steps": 3, "target_interval": 600})
     values = outputs(trained(learner_of(config, walk)), inner_observations())[:, 1]
@@ -158,7 +160,8 @@ def corridor_walk() -> Dataset:
 def test_the_cached_target_equals_the_computed_one(
     learner_type: type[Learner], seeds: tuple[int, ...]
 ) -> None:
-    # If a sync interval has at least as many rows as the data, targets are cached in a table.
+    # If the batches between two syncs have at least as many rows as the data, the targets are
+    # cached in a table.
     learner = learner_of(learner_type.config_type(**SMALL_Q), corridor(), *seeds)
     for _ in range(25):
         learner.update()
@@ -245,12 +248,12 @@ def test_more_alpha_means_lower_values_of_unseen_actions() -> None:
     [
         CQLConfig(**SMALL_Q, alpha=0.01),
         BCQConfig(**SMALL_Q),
-        # Twice as often left: a weight of exp(10 * .3) is needed to outvote it.
+        # The log goes left twice as often. The weight exp(10 * .3) makes going right preferable.
         IQLConfig(**SMALL_Q, expectile=0.9, beta=20.0),
     ],
 )
 def test_the_better_action_is_found_if_the_data_has_both(config: Any) -> None:
-    # One in three visits goes right: cloning alone would go left, the reward favors right.
+    # One of three visits goes right. Cloning alone would go left, but the reward favors right.
     mostly_left = corridor({(cell, action): 2 - action for cell in (1, 2, 3) for action in (0, 1)})
     assert best(trained(learner_of(config, mostly_left)), inner_observations()) == [1, 1, 1]
     clone = trained(learner_of(BCConfig(**SMALL), mostly_left))
@@ -263,8 +266,9 @@ def test_iql_values_are_between_mean_and_maximum() -> None:
         config = IQLConfig(**{**SMALL_Q, "updates": 1500}, expectile=expectile)
         learner = trained(learner_of(config, corridor()))
         values.append(outputs(learner, inner_observations()[1:2], "v").item())
-    # Both actions are logged alike. The mean is a random walk's: v1 = (.3 + .9 v2) / 2,
-    # v2 = .9 (v1 + v3) / 2, v3 = (.9 v2 + 1) / 2, so v2 = .585 / .595 / 2 = .492; the best .9.
+    # Both actions are logged equally often, so the mean value is that of a random walk:
+    # v1 = (.3 + .9 v2) / 2, v2 = .9 (v1 + v3) / 2, v3 = (.9 v2 + 1) / 2. The solution is
+    # v2 = .585 / .595 / 2 = .492. The value of the best action is .9.
     assert values[0] == pytest.approx(0.45 * 1.3 / 2 / (1 - 0.45 * 0.9), abs=0.02)
     assert values[0] < values[1] < values[2]
     assert values[2] == pytest.approx(0.9, abs=0.05)
@@ -300,7 +304,7 @@ def test_bc_learns_how_often_each_action_was_taken() -> None:
 
 
 def masked_corridor() -> Dataset:
-    """Return the corridor with the action right masked in the middle."""
+    """Return the corridor, in which the middle cell does not allow the action right."""
     data = corridor(ONLY_LEFT | {(1, 1): 1, (3, 1): 1})
     blocked: dict[str, Any] = {
         name: {
@@ -323,7 +327,7 @@ def masked_corridor() -> Dataset:
 @pytest.mark.parametrize("config", [DQNConfig(**SMALL_Q), DoubleDQNConfig(**SMALL_Q)])
 def test_masked_actions_do_not_contribute(config: Any) -> None:
     values = outputs(trained(learner_of(config, masked_corridor())), inner_observations())
-    # From cell 1 the near exit has reward .3; going right leads to a cell that only leads back.
+    # From cell 1, the near exit has the reward .3. The cell to the right only leads back.
     assert values[0].tolist() == pytest.approx([0.3, 0.9 * 0.9 * 0.3], abs=0.02)
     assert values[1, 0].item() == pytest.approx(0.9 * 0.3, abs=0.02)
     assert values[2].tolist() == pytest.approx([0.81 * 0.3, 1.0], abs=0.02)
@@ -356,7 +360,7 @@ def test_a_restored_learner_continues_bit_for_bit(learner_type: type[Learner]) -
         whole.update()
     saved = [{name: t.clone() for name, t in whole.state(seed).items()} for seed in (0, 1)]
     trained(whole)
-    # Seed 1 continues alone.
+    # Seed 1 continues without the other seed.
     resumed = learner_of(config, corridor(), 1)
     resumed.load_state(1, saved[1], 25)
     after, expected = trained(resumed).state(1), whole.state(1)
@@ -384,7 +388,7 @@ def test_a_loss_that_is_not_finite_is_reported_and_changes_no_weights() -> None:
 
 
 def test_image_observations_are_learned_from() -> None:
-    # Action 1 is right for the brighter of two images.
+    # Action 1 is the right action for the brighter of two images.
     images: NDArray[np.uint8] = np.zeros((40, 36, 36), np.uint8)
     images[::2] = 200
     dataset = Dataset.from_arrays(
@@ -421,7 +425,7 @@ def test_updates_on_a_gpu_are_those_of_the_cpu(learner_type: type[Learner]) -> N
         trained(learner_type(config, buffer.to(torch.device(device)), (0, 1)))
         for device in ("cuda", "cpu")
     )
-    # Sums have another order, and Adam divides by small numbers, so bits differ.
+    # The results are not bit-identical: sums have another order, and Adam divides by small numbers.
     for name, model in expected.all_models().items():
         weights = found.all_models()[name].weights.detach().cpu()
         torch.testing.assert_close(weights, model.weights.detach(), rtol=2e-3, atol=2e-3)

@@ -1,4 +1,4 @@
-"""Settings: help lines, limits and the decay of the learning rate."""
+"""Tests of settings: help texts, limits and the decay of the learning rate."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_dueling_network_needs_a_hidden_layer() -> None:
 @pytest.mark.parametrize(
     ("settings", "fraction"),
     [
-        # Two syncs of one step each: 1 + .5 of a total of 2.
+        # Two syncs with one reward each give 1 + .5 of the total return of 2.
         ({"updates": 20, "target_interval": 10, "gamma": 0.5}, 0.75),
         ({"updates": 20, "target_interval": 10, "gamma": 0.5, "n_steps": 2}, 1 - 0.5**4),
         ({"updates": 20, "target_interval": 10, "gamma": 0.0}, 1.0),

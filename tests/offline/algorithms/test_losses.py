@@ -1,4 +1,4 @@
-"""The equations of offline learning, against values and gradients calculated by hand."""
+"""Tests of the equations of offline learning with values and gradients calculated by hand."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ from mcaprl.offline.algorithms.losses import (
     square_regression,
 )
 
-# Three transitions, two actions: one in mid-episode, one that terminated, one with gamma 0.
+# Three transitions with two actions each: the first is in the middle of an episode, the second
+# terminates, and the third has gamma 0.
 Q_TM1 = torch.tensor([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
 A_TM1 = torch.tensor([0, 1, 0])
 R_T = torch.tensor([0.5, -1.0, 2.0])
@@ -238,7 +239,7 @@ def test_double_q_learning_targets_never_exceed_q_learning(
 
 
 def test_noise_biases_q_learning_but_not_double_q_learning() -> None:
-    # Ten actions have value 0, and two networks estimate it with independent noise.
+    # Ten actions have the value 0. Two networks estimate these values with independent noise.
     generator = torch.Generator().manual_seed(0)
     noise, other_noise = torch.randn(2, 20_000, 10, generator=generator)
     r_t, discount_t = torch.zeros(len(noise)), torch.ones(len(noise))

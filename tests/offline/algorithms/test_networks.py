@@ -1,4 +1,4 @@
-"""Networks: inputs, outputs, and K of them at once."""
+"""Tests of networks: inputs, outputs, and K networks evaluated in parallel."""
 
 from __future__ import annotations
 

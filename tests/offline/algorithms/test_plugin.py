@@ -1,4 +1,4 @@
-"""An algorithm of another package, found by its entry point."""
+"""Tests of an algorithm in another package, which is found by its entry point."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_broken_entry_point_is_one_line_that_names_it(
     ) as error:
         all_algorithms()
     assert reason in str(error.value)
-    # Built-in algorithms do not need it.
+    # Built-in algorithms do not load the entry point.
     assert choose_algorithm("bc")[0] is ALGORITHMS["bc"]
     assert run(["train-offline", "log.mcap", "--out", "run"]) == 2
     (line,) = capsys.readouterr().err.splitlines()

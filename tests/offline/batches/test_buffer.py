@@ -1,4 +1,4 @@
-"""Buffers: columns packed into tensors, rows sampled at random."""
+"""Tests of buffers: packing of columns into tensors, and random sampling of rows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 
 
 def numbered(n_rows: int, **changes: Any) -> Dataset:
-    """Row k is (k, -k) to (k + 100, 100 - k), with action 3 + k % 2 and reward k / 2."""
+    """Make transitions; row k is (k, -k) to (k + 100, 100 - k), action 3 + k % 2, reward k / 2."""
     k = np.arange(n_rows)
     observations = np.stack([k, -k], axis=1).astype(np.float32)
     columns: dict[str, Any] = {
@@ -35,7 +35,7 @@ def numbered(n_rows: int, **changes: Any) -> Dataset:
 
 
 def walks(lengths: list[int], terminated: list[bool]) -> Dataset:
-    """Episodes that count 0, 1, 2, ... from ten times their number; step t earns 2^t."""
+    """Make episodes; observation t of episode k is 10 k + t, and the reward of step t is 2^t."""
     steps = [np.arange(length) for length in lengths]
     here = np.concatenate([10 * number + t for number, t in enumerate(steps)])
     last = np.concatenate([t == length - 1 for t, length in zip(steps, lengths, strict=True)])
@@ -81,7 +81,7 @@ def test_n_step_returns_by_hand() -> None:
         walks([3, 2], [True, False]), Packing(gamma=0.5, n_steps=2)
     )
     batch = whole(buffer)
-    # Rewards are 1, 2, 4 and 1, 2; a return has two of them, or one at the end of an episode.
+    # Rewards are 1, 2, 4 and 1, 2. A return has two rewards, or one at the end of an episode.
     assert batch.rewards.tolist() == [1 + 0.5 * 2, 2 + 0.5 * 4, 4, 1 + 0.5 * 2, 2]
     assert batch.next_observations.vector.flatten().tolist() == [2, 3, 3, 12, 12]
     # The first episode terminated; the second was truncated.
@@ -215,7 +215,7 @@ def test_a_given_encoder_keeps_its_normalization() -> None:
 
 
 def masked(actions: list[int]) -> Dataset:
-    """Return three states with only action 1 allowed, and a last one with no action allowed."""
+    """Return three states that allow only action 1, and a last state that allows no action."""
     mask = np.array([[0, 1], [0, 1], [0, 1], [0, 0]], np.int8)
     x = np.zeros((4, 1), np.float32)
     return Dataset.from_arrays(

@@ -1,4 +1,4 @@
-"""`mcaprl.torch`: items by hand, batches, workers, and streams of exact coverage."""
+"""Tests of `mcaprl.torch`: items calculated by hand, batches, workers and streams."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_an_item_is_a_transition() -> None:
 
 
 def test_returns_of_several_steps_stop_at_ends() -> None:
-    # Rewards 0 1 2 | 3 4; the first episode terminates, the second is truncated.
+    # Rewards are 0, 1, 2 and 3, 4. The first episode terminates, and the second is truncated.
     batch = TransitionDataset(numbered([3, 2], [True, False]), n_steps=2, gamma=0.5)[:]
     assert batch["reward"].tolist() == [0.5, 2.0, 2.0, 5.0, 4.0]
     assert batch["next_observation"][:, 0].tolist() == [2.0, 3.0, 3.0, 6.0, 6.0]
@@ -184,12 +184,13 @@ def test_an_epoch_has_each_item_once_and_continues(
     every = [[shard(stream, k, workers) for k in range(workers)] for stream in streams]
     seen = [action for rank in every for one in rank for batch in one for action in batch]
     assert sorted(seen) == list(range(sum(lengths)))
-    # All workers of all ranks have equally many batches, unless items or places are too few.
+    # All workers of all ranks have the same number of batches if there are enough items.
     counts = {len(one) for rank in every for one in rank}
     if sum(lengths) >= world_size * workers and batch_size > 1:
         assert len(counts) == 1
     assert all(len(batch) <= batch_size for rank in every for one in rank for batch in one)
-    # A loader takes one batch of each worker in turn. A run that continues has the same rest.
+    # A loader takes one batch from each worker in turn. A resumed epoch has the same remaining
+    # batches.
     turns = [one[k] for k in range(max(counts)) for one in every[0] if k < len(one)]
     if len(counts) == 1:
         skipped = min(skipped, len(turns))
@@ -249,7 +250,7 @@ def test_a_stream_reads_no_more_than_a_block(
     stream = TransitionStream(log_path, batch_size=32, buffer=80)
     assert sum(len(batch["action"]) for batch in stream) == 500
     assert max(sizes) <= 80
-    # A run that continues at the end of the epoch does not read what it skips.
+    # A run that resumes at the end of an epoch does not read the batches that it skips.
     sizes.clear()
     stream.load_state_dict({"seed": 0, "epoch": 0, "batches": 15})
     assert len(list(stream)) == 1

@@ -1,4 +1,4 @@
-"""Observations of any space as one vector, images and an action mask."""
+"""Tests of observations of any space, encoded as a vector, images and an action mask."""
 
 from __future__ import annotations
 
@@ -127,7 +127,8 @@ def test_images_are_centered_and_scaled_by_one_number() -> None:
     assert image.shift[0, 0, 0] == 20
     assert image.shift[1, 1, 0] == 255, "what never changes becomes 0, however bright"
     assert np.count_nonzero(image.shift) == 2
-    # One of 1,440 pixels differs from its mean, always by 10: sqrt(100 / 1440).
+    # Only one of 1,440 pixels differs from its mean, always by 10. The standard deviation is
+    # sqrt(100 / 1440).
     assert image.scale == pytest.approx(math.sqrt(100 / 1440))
     assert encoder.encode(observations).images[0].dtype == torch.uint8, "frames stay small"
 
@@ -156,7 +157,7 @@ def test_a_mask_is_not_a_network_input() -> None:
     seen = encoder.encode({"action_mask": mask, "x": np.zeros((2, 2), np.float32)})
     assert encoder.width == 2
     assert seen.mask is not None
-    # No action is allowed after the last step; all count as allowed there.
+    # After the last step, the mask allows no action, so all actions count as allowed.
     assert seen.mask.tolist() == [[True, False, True], [True, True, True]]
 
 

@@ -1,4 +1,4 @@
-"""Several logs, each with its weight."""
+"""Tests of several logs that are read with a weight for each log."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 
 @pytest.fixture(autouse=True)
 def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Logs a, b and c of 2, 3 and 1 episodes, from different environments."""
+    """Record logs a, b and c with 2, 3 and 1 episodes in different environments."""
     monkeypatch.chdir(tmp_path)
     for name, episodes in (("a", 2), ("b", 3), ("c", 1)):
         save(Path(f"logs/{name}.mcap"), episodes, width=1)

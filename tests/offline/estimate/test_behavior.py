@@ -1,4 +1,4 @@
-"""Estimated behavior probabilities: accuracy, cross-fitting, calibration, and the marks."""
+"""Tests of estimated behavior probabilities: accuracy, cross-fitting, calibration and marks."""
 
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ def test_estimates_approach_the_probabilities_of_the_policy() -> None:
     data = tabular()
     found = estimate_behavior(data, updates=300)
     true, estimated = data.behavior_probs, found.dataset.behavior_probs
-    # 0.8 and 0.1: the classifier has 1,200 steps for 4 states, so shares are known to about 0.03.
+    # The probabilities are 0.8 and 0.1. With 1,200 steps for 4 states, the classifier estimates
+    # them to about 0.03.
     assert np.abs(true - estimated).max() < 0.08
     assert np.abs(true - estimated).mean() < 0.02
     assert found.calibration_error < 0.02
@@ -74,7 +75,7 @@ def test_an_episode_is_predicted_by_networks_that_did_not_see_it() -> None:
         **arrays,
     )
     second = estimate_behavior(other, updates=40)
-    # Its own probabilities belong to the same prediction: three actions' probabilities sum to 1.
+    # The estimated probability is one of three predicted probabilities, whose sum is 1.
     third_actions = (changed[:25] + 1) % ACTIONS
     changed = data.actions.copy()
     changed[:25] = third_actions
@@ -111,7 +112,7 @@ def test_the_mark_is_kept_and_said(tmp_path: Path, capsys: pytest.CaptureFixture
     again = mcaprl.open(path)
     assert again.has_estimated_probs
     assert again.behavior_probs.tolist() == estimated.behavior_probs.tolist()
-    # A mixture with logged probabilities counts as estimated.
+    # A mixture of logged and estimated probabilities counts as estimated.
     assert mcaprl.Dataset.concatenate([data, estimated]).has_estimated_probs
     assert run(["info", str(path)]) == 0
     assert "behavior_prob  │ estimated, implies" in capsys.readouterr().out
@@ -140,7 +141,7 @@ def test_the_command_estimates_what_a_log_lacks(
 
 
 def test_values_by_estimated_probabilities_are_close_to_those_by_logged_ones() -> None:
-    # The uniform policy takes the greedy action in a third of the steps: 25 / 3 rewards.
+    # The uniform policy takes the greedy action in a third of 25 steps; its return is 25 / 3.
     data = tabular()
     estimated = estimate_behavior(data, updates=300).dataset
     values = {}

@@ -1,4 +1,4 @@
-"""Evidence for choosing among policies: values, pessimism and support of known policies."""
+"""Tests of the scores for choosing a policy: values, pessimistic values and support."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_values_of_policies_side_by_side_are_the_true_ones() -> None:
 
 
 def test_a_rare_action_ends_the_episode_at_a_low_value() -> None:
-    # In state 1, the clone takes action 1 with a hundredth of the probability of action 0.
+    # In state 1, action 1 has a hundredth of the probability of action 0 under the clone.
     clone = Table(np.array([[0.5, 0.5], [0.99, 0.0099]]))
     data = log(1_000)
     both = [Fixed([0, 0]), Fixed([1, 1])]
@@ -80,7 +80,7 @@ def test_a_rare_action_ends_the_episode_at_a_low_value() -> None:
 
 
 def test_own_values_and_bellman_error_by_hand() -> None:
-    # Both episodes have one step in state 0; Q is 3 for action 0 and 1 for action 1.
+    # Each of the two episodes has one step in state 0. Q is 3 for action 0 and 1 for action 1.
     data = Dataset.from_arrays(
         observations=np.array([[1, 0], [1, 0]], np.float32),
         actions=[0, 1],
@@ -93,7 +93,8 @@ def test_own_values_and_bellman_error_by_hand() -> None:
     collector = EvidenceCollector(data, Table(task.BEHAVIOR), fqe_config(0.5, 10, (4,)))
     (found,) = collector.collect([policy])
     assert found.own_value == 3
-    # The errors are 5 - 3 and 1 - 1: their root mean square is sqrt(2), and Q has deviation 1.
+    # The errors are 5 - 3 and 1 - 1, with a root mean square of sqrt(2). The standard deviation of
+    # Q is 1.
     assert found.bellman_error == pytest.approx(np.sqrt(2))
     assert found.agreement == 0.5
 

@@ -1,4 +1,4 @@
-"""The equations of off-policy estimation, by hand and on a task with known values."""
+"""Tests of the equations of off-policy estimation, by hand and on a task with known values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from mcaprl.offline.estimate.importance import (
 )
 from tests.support.two_state_task import EVALUATED, TRUE_Q, TRUE_V, play, true_value
 
-# Two episodes, gamma 1/2. The first has two steps, the second one and a column of padding.
+# There are two episodes, and gamma is 1/2. The first episode has two steps. The second has one step
+# and one column of padding.
 BY_HAND = EpisodeTable(
     rewards=np.array([[1.0, 4.0, 0.0], [2.0, 0.0, 0.0]]),
     ratios=np.array([[2.0, 0.5, 1.0], [3.0, 1.0, 1.0]]),
@@ -31,16 +32,17 @@ ONCE = np.ones((1, 2))
 @pytest.mark.parametrize(
     ("estimator", "value"),
     [
-        # Returns 1 + 4/2 = 3 and 2; rho_T 2 x .5 = 1 and 3.
+        # The returns are 1 + 4/2 = 3 and 2. The values of rho_T are 2 x .5 = 1 and 3.
         ("TIS", (1 * 3 + 3 * 2) / 2),
         ("WIS", (1 * 3 + 3 * 2) / 4),
-        # rho_t r_t: 2 x 1 + 1/2 x 1 x 4 = 4, and 3 x 2 = 6.
+        # The sums of gamma^t rho_t r_t are 2 x 1 + 1/2 x 1 x 4 = 4, and 3 x 2 = 6.
         ("PDIS", (4 + 6) / 2),
-        # Step 0: (2 + 6) / (2 + 3). Step 1: (4 + 0) / (1 + 3), half of it.
+        # Step 0: (2 + 6) / (2 + 3). Step 1: (4 + 0) / (1 + 3), discounted by 1/2.
         ("WPDIS", 8 / 5 + 0.5 * 4 / 4),
         # First episode: 3 + 2 (1 - 1) + 1/2 (2 x 2 + 1 (4 - 2)) = 6. Second: 3 + 3 (2 - 1) = 6.
         ("DR", (6 + 6) / 2),
-        # Step 0: V 3, and (0 + 3) / 5. Step 1: V (2 x 2 + 3 x 0) / 5, and (2 + 0) / 4; half.
+        # Step 0: V is 3, plus (0 + 3) / 5. Step 1: V is (2 x 2 + 3 x 0) / 5, plus (2 + 0) / 4.
+        # The sum of step 1 is discounted by 1/2.
         ("WDR", 3 + 3 / 5 + 0.5 * (4 / 5 + 2 / 4)),
     ],
 )
@@ -60,7 +62,7 @@ def test_a_resampling_counts_an_episode_as_often_as_it_was_drawn() -> None:
 
 
 def test_effective_sample_sizes_by_hand() -> None:
-    # rho_0 is 2 and 3, then 1 and 3: 25 / 13 and 16 / 10.
+    # The weights are 2 and 3 at step 0, and 1 and 3 at step 1: 25 / 13 and 16 / 10.
     assert effective_sample_sizes(BY_HAND) == pytest.approx([25 / 13, 1.6, 1.6])
     assert effective_sample_size("WIS", BY_HAND) == pytest.approx(1.6)
     mean = 1.75 / (13 / 25 + 0.5 / 1.6 + 0.25 / 1.6)

@@ -1,4 +1,4 @@
-"""Off-policy estimates: against true values, on-policy, and refused verdicts."""
+"""Tests of off-policy estimates: true values, on-policy estimates and refused verdicts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NO_MODEL = FQEConfig(updates=1, batch_size=2, target_interval=1, hidden=(2,), ga
 
 
 class Table:
-    """A policy of the two-state task with probabilities (states, actions)."""
+    """Policy of the two-state task, given by its probabilities (states, actions)."""
 
     def __init__(self, probabilities: NDArray[np.float64]) -> None:
         self._probabilities = probabilities
@@ -230,7 +230,7 @@ def test_weights_that_overflow_are_refused() -> None:
     )
 
     class Follows:
-        """A policy that always takes the logged action."""
+        """Policy that always takes the logged action."""
 
         def action_probabilities(self, observations: Any) -> NDArray[np.float64]:
             return np.eye(10)[np.arange(len(observations)) % 10]

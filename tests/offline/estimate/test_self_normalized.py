@@ -1,4 +1,4 @@
-"""Intervals of off-policy estimates: by hand, against SciPy, and their coverage."""
+"""Tests of the intervals of off-policy estimates: by hand, against SciPy, and their coverage."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def resamplings(episodes: int, count: int, seed: int) -> NDArray[np.float64]:
 def test_a_ratio_by_hand() -> None:
     # a is 2 and 6, b is 1 and 3: both ratios are 2, so the standard error is 0.
     same = RatioEstimate(np.array([0.5]), ((np.array([[2.0], [6.0]]), np.array([[1.0], [3.0]])),))
-    # Twice the second: 12 / 6.
+    # The second episode is drawn twice: 12 / 6.
     assert same.values(np.array([[1.0, 1.0], [0.0, 2.0]])) == pytest.approx([1.0, 1.0])
     assert same.errors(np.ones((1, 2))) == pytest.approx([0.0])
     assert same.interval(resamplings(2, 50, 0)) == pytest.approx((1.0, 1.0))
     # a is 2 and 2: 4 / 4 = 1. The changes are (2 - 1) / 4 and (2 - 3) / 4: sqrt(2 / 16).
     other = RatioEstimate(np.ones(1), ((np.array([[2.0], [2.0]]), np.array([[1.0], [3.0]])),))
     assert other.errors(np.ones((1, 2))) == pytest.approx([np.sqrt(1 / 8)])
-    # Each counted twice is like four episodes: half of the variance.
+    # Counting each episode twice is like four episodes, so the variance is half.
     assert other.errors(np.full((1, 2), 2.0)) == pytest.approx([np.sqrt(1 / 16)])
 
 
@@ -68,7 +68,7 @@ def test_an_interval_shifts_and_scales_with_its_values(
 
 
 def test_the_standard_error_is_the_spread_of_the_estimates() -> None:
-    """Agreement over 150 logs of 200 episodes, within four standard errors."""
+    """Over 150 logs of 200 episodes, both agree within four standard errors."""
     once, logs = np.ones((1, 200)), 150
     tables = [task.play(None, episodes=200, seed=seed) for seed in range(logs)]
     for name in ("WPDIS", "DR", "WDR"):
@@ -79,7 +79,10 @@ def test_the_standard_error_is_the_spread_of_the_estimates() -> None:
 
 
 def test_intervals_have_their_nominal_coverage() -> None:
-    """Coverage of 95 % within two points and two standard errors, over 200 logs of 50 episodes."""
+    """Over 200 logs of 50 episodes, 95 % intervals have this coverage within the tolerance.
+
+    The tolerance is two percentage points plus two standard errors.
+    """
     logs, episodes = 200, 50
     margin = 0.02 + 2 * np.sqrt(0.95 * 0.05 / logs)
     held = dict.fromkeys(ESTIMATORS, 0)

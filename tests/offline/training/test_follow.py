@@ -1,4 +1,4 @@
-"""Training on a log that another process is still writing."""
+"""Tests of training on a log that another process is still writing."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_each_finished_episode_is_read_once(tmp_path: Path) -> None:
     assert logs.grow()
     assert not logs.grow()
     recorder.env.close()
-    # The episode that `record` ended early has one transition.
+    # The first reset of `record` interrupted an episode after one transition.
     assert not logs.grow()
     whole = mcaprl.open(tmp_path / "log.mcap")
     assert [len(e.rewards) for e in logs.dataset.episodes] == [
@@ -66,7 +66,7 @@ def test_each_finished_episode_is_read_once(tmp_path: Path) -> None:
 
 
 def test_a_compacted_log_is_not_read_twice(tmp_path: Path) -> None:
-    """A recorder that closes replaces its log by a file of another size with the same episodes."""
+    """Closing a recorder replaces its log with a smaller file that has the same episodes."""
     path = tmp_path / "log.mcap"
     recorder = Recorder(path)
     recorder.record(6)

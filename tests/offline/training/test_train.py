@@ -1,4 +1,4 @@
-"""Training runs: the files of a run folder, also after a stop or a kill."""
+"""Tests of training runs: the files of a run folder, also after a stop or a kill."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ RESUMABLE = [
 
 
 class Stopped(Exception):
-    """Raised by a callback, as Ctrl-C would."""
+    """Exception that a callback raises to stop the training, like Ctrl-C."""
 
 
 class StopAt:
@@ -81,7 +81,7 @@ def rows(run: Path, seed: int = 0) -> list[dict[str, str]]:
 
 
 def assert_same_result(run: Path, expected: Path, seed: int = 0) -> None:
-    """Check that weights, moments, generators and curve are equal bit for bit."""
+    """Check that weights, optimizer moments, generators and metrics are equal bit for bit."""
     for name in ("policy.safetensors", "checkpoint.safetensors"):
         found, wanted = (load_file(folder / f"seed-{seed}" / name) for folder in (run, expected))
         assert found.keys() == wanted.keys()
@@ -422,7 +422,7 @@ def test_importing_the_package_loads_no_torch() -> None:
 
 
 def test_seeds_stopped_at_different_updates_resume_bit_for_bit(tmp_path: Path) -> None:
-    # As if a kill had come between the two seeds' checkpoints at update 80.
+    # Simulate a kill between the checkpoints of the two seeds at update 80.
     train(corridor(), SHORT_CQL, tmp_path / "whole", seeds=2, progress=silent)
     with pytest.raises(Stopped):
         train(corridor(), SHORT_CQL, tmp_path / "cut", seeds=2, progress=StopAt(90))

@@ -1,4 +1,4 @@
-"""Validation while training: held-out episodes, short horizons, diverging values."""
+"""Tests of validation during training: held-out episodes, short horizons, diverging values."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ def test_returns_of_short_truncated_episodes_are_unknown() -> None:
         next_observations=observations,
     )
     returns = monte_carlo_returns(data, np.array([0]), 0.5)
-    # Five steps before the truncation, missing rewards have weight 1/32; four before, 1/16.
+    # Five steps before the truncation, the first missing reward has the discount 1/32; four steps
+    # before, 1/16.
     assert np.isnan(returns).tolist() == [False, False, True, True, True, True]
 
 
@@ -69,13 +70,13 @@ def test_too_few_target_syncs_for_the_horizon_are_reported(tmp_path: Path) -> No
 
 
 def test_diverging_values_are_reported_once(tmp_path: Path) -> None:
-    # The second action is never logged, and its target is its own value.
+    # The second action is never logged, so its value can grow without limit.
     data = crossing((50,), n_actions=2)
     config = DQNConfig(**{**SHORT, "updates": 400, "learning_rate": 0.01}, gamma=0.99)
     with pytest.warns(UserWarning, match="values diverge") as caught:
         train(data, replace(config, target_interval=1), tmp_path / "run", progress=silent)
     (warning,) = caught
-    # Every reward is 1, so no return is above 1 / (1 - .99).
+    # All rewards are 1, so no return is above 1 / (1 - .99).
     assert "exceed 100;" in str(warning.message)
 
 

@@ -1,4 +1,4 @@
-"""The depth camera against independent ray casters, and its codes."""
+"""Tests of the depth camera against independent ray casters, and of the depth encoding."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def cast_on_course(eye_m: Floats, rays: Floats) -> Floats:
 
 
 def test_the_course_matches_ray_casting() -> None:
-    """Of 240,000 pixels at 60 random poses, fewer than 1 in 10,000 differ, at box edges."""
+    """At 60 random poses, fewer than 1 in 10,000 of 240,000 pixels differ, all at box edges."""
     random = np.random.default_rng(3)
     camera = DepthCamera(lane_mesh(), LENS, IMAGE_SHAPE)
     differing = 0
@@ -80,7 +80,7 @@ def test_the_course_matches_ray_casting() -> None:
 
 
 def nearest_front(triangles: Floats, ray: Floats) -> float:
-    """Return 1/z of the nearest front that a ray from the origin hits, or 0.
+    """Return 1/z of the nearest front face that a ray from the origin hits, or 0.
 
     Moeller and Trumbore, "Fast, minimum storage ray-triangle intersection", 1997.
     """
@@ -88,7 +88,7 @@ def nearest_front(triangles: Floats, ray: Floats) -> float:
     for a, b, c in triangles:
         across = np.cross(ray, c - a)
         determinant = (b - a) @ across
-        # The normal of a front points against the ray.
+        # The normal of a front face points against the ray.
         if determinant <= 0.0:
             continue
         u, turned = -a @ across / determinant, np.cross(-a, b - a)
@@ -99,7 +99,8 @@ def nearest_front(triangles: Floats, ray: Floats) -> float:
 
 
 def test_planes_tell_fronts_from_backs() -> None:
-    # In the plane z = 2, counter-clockwise seen from above: its front faces up.
+    # The triangle is in the plane z = 2. Seen from above, its corners run counter-clockwise, so its
+    # front faces up.
     flat = np.array([[[0.0, 0, 2], [1, 0, 2], [0, 1, 2]]])
     np.testing.assert_allclose(fronts(flat), [[0, 0, 1, 2]])
     np.testing.assert_allclose(fronts(flat[:, ::-1]), [[0, 0, -1, -2]])
@@ -117,7 +118,7 @@ def test_random_triangles_match_ray_casting() -> None:
 
 
 def test_a_wall_straight_ahead_has_its_distance() -> None:
-    """A wall 10 m ahead: z is 10 m in every pixel, the ray to the corner is longer."""
+    """For a wall 10 m ahead, z is 10 m in each pixel, but the rays to the corners are longer."""
     wall = box_mesh((15.0, 0.0, 0.0), (10.0, 100.0, 100.0))
     image = np.empty((144, 256))
     draw_mesh(wall, np.zeros(3), level_axes(0.0), LENS.focal_px, image)
@@ -136,7 +137,7 @@ def test_level_ground_ends_at_the_middle_row() -> None:
 
 
 def test_left_of_the_car_is_left_in_the_image() -> None:
-    """Facing north (y), a box to the west (-x) is in the left half."""
+    """If the camera faces north (y), a box to the west (-x) is in the left half of the image."""
     west = box_mesh((-5.0, 10.0, 0.0), (2.0, 2.0, 2.0))
     image = np.empty((144, 256))
     draw_mesh(west, np.zeros(3), level_axes(math.pi / 2), LENS.focal_px, image)
@@ -189,7 +190,7 @@ def test_codes_survive_decoding() -> None:
 
 
 def shrunk(inverse: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Shrink an image to a shape."""
+    """Downsample an image to a shape."""
     small = np.empty(shape, dtype=np.float32)
     rows, columns = overlaps(inverse.shape[0], shape[0]), overlaps(inverse.shape[1], shape[1])
     shrink(inverse, rows, columns, small)
@@ -197,7 +198,7 @@ def shrunk(inverse: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def test_shrinking_by_hand() -> None:
-    """1/2 and 1/4 average to 3/8; half sky counts its other half; three quarters of sky are sky."""
+    """1/2 and 1/4 average to 3/8. Half sky is the mean of the other half; 3/4 sky is sky."""
     inverse = np.array([[0.5, 0.25, 0.1, 0.0], [0.5, 0.25, 0.0, 0.1]])
     np.testing.assert_allclose(shrunk(inverse, (1, 2)), [[8 / 3, 10.0]], rtol=1e-6)
     inverse[1, 3] = 0.0
@@ -217,7 +218,7 @@ def test_each_new_pixel_is_made_of_whole_shares(old: int, new: int) -> None:
 
 
 def test_a_plane_keeps_its_depth_when_shrunk() -> None:
-    """Inverse depth is linear on the ground, so each new row has its middle's value within 1 %."""
+    """Inverse depth is linear on the ground, so each new row has the value at its middle, +-1 %."""
     image = np.empty((144, 256))
     draw_mesh(ground_mesh(1e6), np.array([0.0, 0.0, 1.4]), level_axes(0.0), LENS.focal_px, image)
     small = shrunk(image, (84, 84))

@@ -1,8 +1,8 @@
-"""Whole depth images of both worlds against Intel's ray tracer, Embree.
+"""Tests of whole depth images of both worlds against Intel's ray tracer, Embree.
 
-Embree, in single precision, only says which triangle a ray hits; how far away that one's plane is,
-is worked out here in double precision. A pixel is at an edge if the rays around it do not all hit
-the same triangle.
+Embree computes in single precision which triangle each ray hits. The distance to the triangle's
+plane is then computed in double precision. A pixel is at an edge if the rays around it do not all
+hit the same triangle.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class RayTracer:
         self._rays = np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def look(self, eye_m: Floats, axes: Floats) -> tuple[Codes, NDArray[np.bool_]]:
-        """Return the image's codes, and which of them are at an edge."""
+        """Return the codes of the image, and a mask of the pixels at edges."""
         rays = self._rays @ axes
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         flat = rays.reshape(-1, 3)
@@ -71,7 +71,7 @@ class RayTracer:
 
 
 def check(drawn: Floats, expected: Codes, at_edge: NDArray[np.bool_]) -> int:
-    """Check that an image of 1/m is exact except at edges; return the number that differ there."""
+    """Check that an image of 1/m is exact except at edges; return the number of wrong pixels."""
     with np.errstate(divide="ignore"):
         differs = encode_depth(1.0 / drawn) != expected
     assert not np.any(differs & ~at_edge)
@@ -79,7 +79,7 @@ def check(drawn: Floats, expected: Codes, at_edge: NDArray[np.bool_]) -> int:
 
 
 def test_the_streets_are_exact_except_at_edges() -> None:
-    """From 40 random places and directions in the lane."""
+    """The images are taken at 40 random places and directions in the lane."""
     random = np.random.default_rng(11)
     camera = DepthCamera(lane_mesh(), LANE_LENS, IMAGE_SHAPE)
     tracer = RayTracer(lane_mesh(), LANE_LENS)

@@ -1,4 +1,4 @@
-"""Batched episodes equal those that run one after the other."""
+"""Tests that batched episodes equal episodes that run one after the other."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mcaprl.sims.evaluation.rollout import EpsilonGreedy, batch_rollout, run_epi
 
 
 class Swaying:
-    """Policy of the first observed number, row by row, so that batching changes nothing."""
+    """Policy that uses only the first number of each row, so that batching has no effect."""
 
     name = "swaying"
 

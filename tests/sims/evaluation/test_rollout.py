@@ -1,4 +1,4 @@
-"""Rollouts and scores: seeds, probabilities, intervals."""
+"""Tests of rollouts and scores: seeds, probabilities and intervals."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_reports_are_written(env: gym.Env[Any, Any], tmp_path: Path) -> None:
 
 
 def test_policies_fit_environments_with_other_bounds() -> None:
-    """Bounds are no reason to refuse a policy; shapes and dtypes are."""
+    """A policy is refused if shapes or dtypes differ, but not if only bounds differ."""
     env = gym.make("CartPole-v1")
     unbounded = spaces.Box(-np.inf, np.inf, (4,), np.float32)
     trained = SimpleNamespace(

@@ -1,4 +1,4 @@
-"""Statistics of returns: by hand, against SciPy, and the coverage of intervals."""
+"""Tests of statistics of returns: by hand, against SciPy, and the coverage of intervals."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ returns = arrays(
 def test_means_by_hand() -> None:
     numbers = np.array([[100.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, -100.0]])
     assert median(numbers) == 3.5
-    # Two of eight are dropped at each end: 2, 3, 4, 5 remain.
+    # Two of eight returns are dropped at each end; 2, 3, 4 and 5 remain.
     assert interquartile_mean(numbers) == 3.5
     assert interquartile_mean(np.array([[1.0, 2.0, 6.0]])) == 3.0, "a quarter of three is none"
 
@@ -81,7 +81,7 @@ def test_the_interval_of_an_improvement_holds_it() -> None:
         (Returns(4, 30, skewed=True), 0.94, 0.98),
         (Returns(4, 30, spread=0), 0.94, 1.0),
         (Returns(10, 30), 0.94, 0.98),
-        # A few skewed seeds do not show their skewness.
+        # The skewness of the distribution is not visible in a few seeds.
         (Returns(4, 30, skewed_seeds=True), 0.86, 0.97),
     ],
 )
@@ -94,15 +94,16 @@ def test_intervals_of_the_mean_cover_as_often_as_documented(
 
 
 def test_interval_of_the_mean_by_hand() -> None:
-    # Means 1 and 3: standard error 1, and Student's t with one degree is 12.706.
+    # The means 1 and 3 have the standard error 1. Student's t with one degree of freedom is 12.706.
     assert mean_interval(np.array([[1.0], [3.0]])) == pytest.approx((2 - 12.7062, 2 + 12.7062))
-    # One episode of each of two seeds, or two equal ones: the starts add nothing.
+    # Each seed has one episode, or two equal episodes. The variation between starts adds nothing.
     twice = np.array([[1.0, 1.0], [3.0, 3.0]])
     assert mean_interval(twice) == pytest.approx((2 - 12.7062, 2 + 12.7062))
-    # Two episodes have only bootstrap samples whose mean is theirs: Student's t remains.
+    # All usable bootstrap samples of two episodes have the same mean, so the interval is that of
+    # Student's t.
     assert mean_interval(twice.T) == pytest.approx((2 - 12.7062, 2 + 12.7062))
     assert mean_interval(np.array([[1.0, 3.0]])) == pytest.approx((2 - 12.7062, 2 + 12.7062))
-    # Deviations from both add in squares.
+    # The squares of both deviations add up.
     both = np.array([[0.0, 2.0], [2.0, 4.0]])
     assert mean_interval(both) == pytest.approx((2 - 12.7062 * 2**0.5, 2 + 12.7062 * 2**0.5))
 

@@ -1,4 +1,4 @@
-"""The lane sim's car against highway-env's independent implementation of the same equations."""
+"""Tests of the lane sim's car against highway-env's implementation of the same equations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mcaprl.sims.lane.rules import (
 
 
 def their_car(x_m: float, y_m: float, yaw_rad: float, speed_m_s: float) -> Vehicle:
-    """Return a car as long as our wheelbase, since highway-env uses the length as the wheelbase."""
+    """Return a car whose length is our wheelbase; highway-env uses the length as the wheelbase."""
     car = Vehicle(None, np.array([x_m, y_m]), yaw_rad, speed_m_s)
     car.LENGTH = WHEELBASE_M
     return car
@@ -40,7 +40,7 @@ COMMANDS = st.lists(st.tuples(st.floats(-0.6, 0.6), st.floats(-8.0, 4.0)), min_s
 def test_each_step_of_a_trajectory_agrees(
     speed_m_s: float, yaw_rad: float, commands: list[tuple[float, float]]
 ) -> None:
-    """Equal: wheelbase 2.7 m, time step .05 s, start; steering and acceleration at each step."""
+    """Both cars have the same start, wheelbase, time step, steering and acceleration."""
     theirs = their_car(3.0, -2.0, yaw_rad, speed_m_s)
     ours = moving(3.0, -2.0, yaw_rad, speed_m_s)
     for steering_rad, acceleration_m_s2 in commands:
@@ -54,7 +54,7 @@ def test_each_step_of_a_trajectory_agrees(
 @given(st.floats(0.0, 30.0), st.lists(st.integers(0, 5), min_size=1, max_size=40))
 @settings(max_examples=50)
 def test_each_decision_of_a_drive_agrees(speed_m_s: float, actions: list[int]) -> None:
-    """Also equal: the wheel angle of `wheel_angle`, and throttle and brake as documented."""
+    """Both cars also have the same wheel angle (`wheel_angle`), throttle and brake."""
     theirs = their_car(20.0, 1.0, 0.0, speed_m_s)
     ours = located(moving(20.0, 1.0, 0.0, speed_m_s), 0.0, 20.0, 0.0)
     steering = 0.0

@@ -1,4 +1,4 @@
-"""Closed paths, by hand and against a search over many points, and the bicycle's formula."""
+"""Tests of closed paths, by hand and against a search over many points, and of the bicycle."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_a_bad_path_is_refused(corners: list[tuple[float, ...]], message: str) -
 
 
 def test_the_course_is_as_published() -> None:
-    """Legs of 130, 126, 130, 126, 130, 127, 130 and 127 m."""
+    """The legs are 130, 126, 130, 126, 130, 127, 130 and 127 m long."""
     assert np.diff(COURSE.along_m).tolist() == [130, 126, 130, 126, 130, 127, 130, 127]
     assert COURSE.length_m == 1026.0
     assert len(streets()) == 7
@@ -152,7 +152,7 @@ def test_buildings_are_beside_the_streets_and_apart() -> None:
 
 
 def test_rails_follow_the_road_but_never_cross_it() -> None:
-    """Every path point has 4 m of free road around it in the directions of the axes."""
+    """Each path point has 4 m of free road in the directions of the axes."""
     for along_m in np.arange(0.0, COURSE.length_m, 1.7):
         x, y = point_at(COURSE, along_m)
         for box in rails():
@@ -162,10 +162,11 @@ def test_rails_follow_the_road_but_never_cross_it() -> None:
 
 
 def test_pavement_has_the_streets_area() -> None:
-    """Seven streets 7 m wide with square ends, minus the overlaps at the six corners.
+    """The area is that of seven streets, 7 m wide, without the overlaps at the six corners.
 
-    Lengths: 3 x 130 + 2 x 126 + 2 x 127 = 896 m, each longer by 7 m. Two streets share 49 m^2 at
-    the four outer corners, three share it at the two inner ones (counted twice too often).
+    The streets are 3 x 130 + 2 x 126 + 2 x 127 = 896 m long, and each extends 3.5 m beyond both
+    ends. At the four outer corners, two streets overlap by 49 m^2. At the two inner corners, three
+    streets overlap, so 49 m^2 must be subtracted twice.
     """
     x_m, y_m, paved = pavement(LANE_HALF_WIDTH_M)
     area = np.outer(np.diff(x_m), np.diff(y_m))[paved].sum()

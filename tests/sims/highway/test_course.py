@@ -1,4 +1,4 @@
-"""The courses of highway-env's roads."""
+"""Tests of the courses of highway-env's roads."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def courses(road: str) -> tuple[Course, ...]:
 
 
 def a_ring() -> Course:
-    """Two half circles of radius 20 m around the origin."""
+    """Return a road of two half circles around the origin, with a radius of 20 m."""
     network = RoadNetwork()
     for start, end, phase in (("a", "b", 0.0), ("b", "a", math.pi)):
         lane = CircularLane([0, 0], 20.0, phase, phase + math.pi, clockwise=True, width=6)
@@ -46,7 +46,7 @@ def test_a_straight_road_by_hand() -> None:
 
 
 def test_a_ring_by_hand() -> None:
-    """Clockwise turns right in images with y down, and in ROS axes as well."""
+    """A clockwise course turns right, both in images with y down and in ROS axes."""
     ring = a_ring()
     assert ring.is_closed
     assert ring.length_m == pytest.approx(2 * math.pi * 20.0, rel=1e-3)
@@ -67,7 +67,7 @@ def test_a_place_is_where_its_offset_says(angle_rad: float, radius_m: float) -> 
 
 
 def test_lane_keeping_leads_from_the_straight_onto_the_wave() -> None:
-    """73.82 m, 22.71 m more, then the sine wave of 5 m from x = 135 to 500."""
+    """Straights of 73.82 m and 22.71 m are followed by a sine wave of 5 m from x = 135 to 500."""
     (road,) = courses("lane-keeping-v0")
     x_m = np.linspace(135.0, 500.0, 100_001)
     wave_m = np.hypot(np.diff(x_m), np.diff(5 * np.sin(2 * math.pi / 100 * x_m))).sum()

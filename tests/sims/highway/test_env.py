@@ -1,4 +1,4 @@
-"""The highway-lane sim: highway-env's physics and rewards with our names."""
+"""Tests of the highway-lane sim, whose physics and rewards are those of highway-env."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def made(**kwargs: Any) -> HighwayLaneEnv:
     [("lane-keeping-v0", LaneKeepingEnv, math.pi / 3), (TRACK, RacetrackEnv, math.pi / 4)],
 )
 def test_it_drives_as_highway_env_does(road: str, theirs: Any, range_rad: float) -> None:
-    """The same seed and steering result in the same bits; highway-env's y points down."""
+    """The same seed and steering give bit-identical results; only the sign of y differs."""
     ours, inner = made(road=road, start="line"), theirs()
     ours.reset(seed=4)
     inner.reset(seed=4)
@@ -67,7 +67,7 @@ def test_actions_turn_in_the_named_direction(action: int) -> None:
 
 
 def test_observation_by_hand() -> None:
-    """On the straight of the racetrack, 1 m to the left, 0.1 rad to the left, at 8 m/s."""
+    """The car is on a straight of the racetrack, 1 m and 0.1 rad to the left, at 8 m/s."""
     sim = made(road=TRACK)
     seen, info = sim.reset(seed=0, options={"pose": (50.0, 1.0, 0.1, 8.0)})
     values = dict(zip(OBSERVATION_NAMES, seen.tolist(), strict=True))
@@ -88,7 +88,7 @@ def test_another_car_is_seen_where_it_is() -> None:
     sim = made(road=TRACK)
     sim.reset(seed=0, options={"pose": ON_THE_TRACK})
     (other,) = sim.others
-    # 8 m back and 1.5 m to its right, with the same heading.
+    # The other car is 8 m back and 1.5 m to the right, with the same heading.
     cos, sin = math.cos(other.yaw_rad), math.sin(other.yaw_rad)
     x_m, y_m = other.x_m - 8 * cos + 1.5 * sin, other.y_m - 8 * sin - 1.5 * cos
     seen, _ = sim.reset(seed=0, options={"pose": (x_m, y_m, other.yaw_rad)})
@@ -105,7 +105,7 @@ def test_progress_is_what_was_driven_and_grows_over_the_laps() -> None:
         assert not terminated
         if step == 4:
             assert info["progress_m"] == pytest.approx(10.0, abs=0.2)
-    # At 10 m/s for 50 s, in part on the outer lane.
+    # The car drives 50 s at 10 m/s, partly on the outer lane.
     assert 430.0 < info["progress_m"] < 520.0
     assert info["progress_m"] > sim.courses[0].length_m
 
@@ -165,7 +165,7 @@ def test_starts_are_on_the_road_and_clear_of_others(road: str) -> None:
     for seed in range(30):
         _, info = sim.reset(seed=seed)
         assert abs(info["lateral_offset_m"]) <= 1.51
-        # Plus half a sample's turn in the tightest bend.
+        # The tolerance is increased by half the turn of a sample in the tightest bend.
         assert abs(info["heading_error_rad"]) <= 0.25
         for other in sim.others:
             assert math.hypot(other.x_m - sim.car.x_m, other.y_m - sim.car.y_m) > 20.0
@@ -207,7 +207,7 @@ def test_without_highway_env_the_error_says_what_to_install(
 
 
 def test_it_keeps_no_states_of_earlier_episodes() -> None:
-    """highway-env's list of states is cleared at each reset."""
+    """Each reset clears highway-env's list of states."""
     sim = made()
     for seed in range(3):
         sim.reset(seed=seed)

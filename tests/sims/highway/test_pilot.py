@@ -1,4 +1,4 @@
-"""The pilot of the highway-lane sim."""
+"""Tests of the pilot of the highway-lane sim."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mcaprl.sims.highway.env import STEERING_RAD
 
 
 def drive_through(seed: int, **kwargs: Any) -> tuple[str, float]:
-    """Let the pilot drive one episode: reason, mean distance from the middle of a lane."""
+    """Let the pilot drive one episode; return the reason, and the mean offset from the lane."""
     env = make_sim("highway-lane", **kwargs)
     pilot = make_pilot(env)
     seen, info = env.reset(seed=seed)
@@ -43,7 +43,7 @@ def test_in_the_middle_it_drives_straight_and_from_the_side_it_returns() -> None
     signs = []
     for left_m in (0.0, 1.5, -1.5):
         seen, _ = sim.reset(seed=0, options={"pose": (45.0, left_m, 0.0)})
-        # Nothing within 30 m ahead.
+        # There is no car within 30 m ahead.
         assert sim.others[0].x_m > 75.0
         signs.append(np.sign(STEERING_RAD[pilot.act(seen[np.newaxis])[0]]))
     assert signs == [0.0, -1.0, 1.0]

@@ -1,4 +1,4 @@
-"""The scene of the highway-lane sim, and its recording."""
+"""Tests of the scene of the highway-lane sim, and of recordings of the scene."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_the_road_is_on_the_ground_and_faces_up() -> None:
 
 
 def test_lines_are_at_the_edges_of_lanes() -> None:
-    """2.5 m from the middle of the nearest lane; solid outside and dashed between."""
+    """Lines are 2.5 m from the middle of the nearest lane: outer lines solid, others dashed."""
     sim = made(**TRACK)
     sim.reset(seed=0)
     points = shapes_of(sim)["lines"].points[:, :2]
@@ -83,7 +83,8 @@ def test_the_image_shows_the_car_on_its_road() -> None:
     rows, columns = np.nonzero(near(image, PAINT))
     assert (abs(rows.mean() - 300) < 3, abs(columns.mean() - 300) < 5) == (True, True)
     assert near(image, OTHER_PAINT).sum() > 100
-    # 80 m are 600 pixels: the left edge of the left lane is 19 pixels up, two lanes are 75 wide.
+    # 80 m are 600 pixels. The left edge of the left lane is 19 pixels up. Two lanes are 75 pixels
+    # wide.
     column = image[250:400, 330]
     rows = np.flatnonzero(near(column, ASPHALT))
     assert rows.min() == pytest.approx(50 - 19, abs=3)
@@ -119,7 +120,8 @@ def test_it_is_recorded_and_replayed_like_any_environment(tmp_path: Path) -> Non
                 store.deserialize_cdr(message.data, schema.name)
             )
     assert {marker.ns for marker in shown["/scene/static"][0].markers} >= {"road", "lines"}
-    # At least one at each episode's start and end, at most one for each observation.
+    # There is at least one message at each start and end of an episode, and at most one for each
+    # observation.
     for topic in ("/scene", "/tf"):
         assert 4 <= len(shown[topic]) <= len(data.rewards) + 2
     place = shown["/tf"][0].transforms[0]

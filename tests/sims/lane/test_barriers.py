@@ -1,4 +1,4 @@
-"""Barriers of the lane sim: they close the streets that the route does not follow."""
+"""Tests of the lane sim's barriers, which close the streets that the route does not follow."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NORTH, SOUTH = math.pi / 2, -math.pi / 2
 
 
 def car_at(along_m: float) -> Car:
-    """A car on the path."""
+    """Return a car on the path."""
     x_m, y_m = point_at(COURSE, along_m)
     leg = int(np.searchsorted(COURSE.along_m, along_m % COURSE.length_m, side="right")) - 1
     return located(moving(x_m, y_m, COURSE.yaw_rad[leg], 5.0), 0.0, along_m, 0.0)
@@ -34,7 +34,7 @@ def car_at(along_m: float) -> Car:
 def test_one_street_of_each_crossing_is_closed(
     x_m: float, along_m: float, closed_rad: float, open_rad: float
 ) -> None:
-    """A barrier is in line with the rails, 4 m from the center line at y = 1."""
+    """A barrier is in line with the rails, 4 m from the center line, which is at y = 1."""
     world = world_at(along_m)
     assert ray_length(x_m, 1.0, closed_rad, world) == pytest.approx(4.0)
     assert ray_length(x_m, 1.0, open_rad, world) == 100.0

@@ -1,4 +1,4 @@
-"""The published rules of the lane sim: numbers worked by hand, and their faults."""
+"""Tests of the published rules of the lane sim: numbers worked by hand, and known faults."""
 
 from __future__ import annotations
 
@@ -41,35 +41,35 @@ def lane(rules: str = "classic", **kwargs: Any) -> LaneKeepingEnv:
 @pytest.mark.parametrize(
     ("x_m", "y_m", "speed_m_s", "action", "hit", "reward", "text", "code"),
     [
-        # In the middle at 10 m/s: (1 - .5) + (0 - .5) = 0; at rest 10 / 290 less.
+        # In the middle at 10 m/s, the reward is (1 - .5) + (0 - .5) = 0; at rest, 10 / 290 less.
         (60.0, 1.0, 10.0, STRAIGHT, False, 0.0, DRIVING, DRIVING),
         (60.0, 1.0, 0.0, BRAKE, False, -0.034483, DRIVING, DRIVING),
-        # The same without braking: up to 5 m/s, too slow by the text.
+        # The states are the same without braking. By the text, up to 5 m/s is too slow.
         (60.0, 1.0, 0.0, STRAIGHT, False, -0.034483, SLOW, DRIVING),
         (60.0, 1.0, 5.0, LEFT, False, -0.017241, SLOW, DRIVING),
         (60.0, 1.0, 5.1, LEFT, False, -0.016897, DRIVING, DRIVING),
-        # At the maximum speed, 20 / 290 more.
+        # At the maximum speed, the reward is 20 / 290 more.
         (60.0, 1.0, 30.0, STRAIGHT, False, 0.068966, DRIVING, DRIVING),
         # 0.5 m beside it at 10 m/s: e^-1.5 - 1.
         (60.0, 1.5, 10.0, STRAIGHT, False, -0.776870, DRIVING, DRIVING),
         # 1 m beside it at 20 m/s: e^-3 - 1 + 10 / 290.
         (130.0 + 1.0, -60.0, 20.0, RIGHT, False, -0.915730, DRIVING, DRIVING),
-        # 3.4 m beside it, fast: e^-10.2 - 1 + 10 / 290 is no less than -1; at 9 m/s it is.
+        # 3.4 m beside it at 20 m/s: e^-10.2 - 1 + 10 / 290 is above -1. At 9 m/s, it is below -1.
         (60.0, 4.4, 20.0, STRAIGHT, False, -0.965480, DRIVING, DRIVING),
         (60.0, 4.4, 9.0, STRAIGHT, False, -1.003411, LOW_REWARD, LOW_REWARD),
-        # The second lane at rest ends at ln(29) / 3 = 1.1224 m: there e^-3d is 10 / 290.
+        # At rest, the reward reaches -1 at ln(29) / 3 = 1.1224 m, because e^-3d is 10 / 290 there.
         (60.0, 2.122, 0.0, BRAKE, False, -0.999955, DRIVING, DRIVING),
         (60.0, 2.123, 0.0, BRAKE, False, -1.000059, LOW_REWARD, LOW_REWARD),
-        # Beyond 3.5 m: -3 and the end, at any speed.
+        # Beyond 3.5 m, the reward is -3 and the episode ends, at any speed.
         (60.0, 4.51, 20.0, STRAIGHT, False, -3.0, OFF_LANE, OFF_LANE),
         (60.0, -60.0, 30.0, BRAKE, True, -3.0, OFF_LANE, OFF_LANE),
-        # By the code, a collision is an end, but only while driving straight ahead.
+        # By the code, a collision ends the episode, but only during the action straight.
         (60.0, 1.5, 10.0, STRAIGHT, True, -0.776870, DRIVING, COLLISION),
         (60.0, 1.5, 10.0, LEFT, True, -0.776870, DRIVING, DRIVING),
         (60.0, 1.0, 4.0, BRAKE, True, -0.020690, DRIVING, DRIVING),
-        # 200 m past the first corner, on the first leg's extension: the line is infinite.
+        # 200 m past the first corner, on the extension of the first leg: the line is infinite.
         (330.0, 1.0, 30.0, STRAIGHT, False, 0.068966, DRIVING, DRIVING),
-        # 500 m south of it all, 0.1 m beside the extension of x = 0: e^-0.3 - 1.
+        # 500 m south of the course, 0.1 m beside the extension of x = 0: e^-0.3 - 1.
         (-0.1, -500.0, 10.0, STRAIGHT, False, -0.259182, DRIVING, DRIVING),
     ],
 )
@@ -111,7 +111,7 @@ def test_the_distance_is_to_the_nearest_infinite_line(
 
 
 def test_a_decision_takes_one_second() -> None:
-    """Full throttle from 10 m/s: v(t) = 30 - 20 e^(-4 t / 30), in steps of 0.05 s."""
+    """At full throttle from 10 m/s, v(t) = 30 - 20 e^(-4 t / 30), in steps of 0.05 s."""
     car = located(moving(20.0, 1.0, 0.0, 10.0), 0.0, 20.0, 0.0)
     after, hit = classic_decide(car, STRAIGHT)
     assert not hit
@@ -140,7 +140,7 @@ def test_ends_are_named(rules: str) -> None:
 
 
 def test_the_two_published_ends_differ() -> None:
-    """Driving off from rest is too slow by the text; driving through a rail is over by the code."""
+    """Starting from rest is too slow by the text; a collision with a rail is an end by the code."""
     slow, through_a_rail = {"pose": (60.0, 1.0, 0.0, 0.0)}, {"pose": (120.0, 1.0, 0.0, 20.0)}
     reasons = {}
     for rules in ("classic", "classic-code"):
@@ -158,7 +158,7 @@ def test_the_two_published_ends_differ() -> None:
 
 
 def test_fault_a_whole_lap_scores_far_below_leaving_at_once() -> None:
-    """The reward of the pilot's lap, although it decides four times as often as the rules allow."""
+    """The pilot's lap has a low return, although the pilot decides four times per classic step."""
     sim = make_sim("lane", start="line").unwrapped
     assert isinstance(sim, LaneKeepingEnv)
     pilot = make_pilot(sim)
@@ -178,7 +178,7 @@ def test_fault_a_whole_lap_scores_far_below_leaving_at_once() -> None:
 
 
 def test_fault_speed_is_hardly_rewarded() -> None:
-    """From 10 to 30 m/s it adds 0.069 per second, the cost of an offset of 2.4 cm."""
+    """30 instead of 10 m/s adds 0.069 per second, as much as an offset of 2.4 cm costs."""
     gain = classic_reward(0.0, 30.0) - classic_reward(0.0, 10.0)
     assert gain == pytest.approx(20.0 / 290.0)
     assert classic_reward(0.0, 10.0) - classic_reward(0.024, 10.0) > gain
@@ -190,7 +190,7 @@ def test_fault_speed_is_hardly_rewarded() -> None:
 
 
 def test_fault_a_hidden_lane_at_low_speed() -> None:
-    """1.2 m beside the middle, an episode ends at 1 m/s but not at 10 m/s."""
+    """At an offset of 1.2 m, an episode ends at 1 m/s, but not at 10 m/s."""
     sim = lane()
     ends = {}
     for speed_m_s in (2.0, 20.0):
@@ -202,7 +202,7 @@ def test_fault_a_hidden_lane_at_low_speed() -> None:
 
 
 def test_fault_leaving_along_the_extension_is_rewarded() -> None:
-    """Driving straight on at the first corner, through rail and houses, has the street's reward."""
+    """Driving straight on at the first corner, through a rail and houses, has the same reward."""
     sim = lane()
     sim.reset(options={"pose": (100.0, 1.0, 0.0, 20.0)})
     for _ in range(60):
@@ -223,7 +223,7 @@ def test_fault_an_episode_at_rest_never_ends() -> None:
 
 
 def test_fault_by_the_code_walls_count_only_straight_ahead() -> None:
-    """Driving through the same rail while braking is no end."""
+    """Driving through the same rail while braking does not end the episode."""
     sim = lane("classic-code")
     reasons = []
     for action in (STRAIGHT, BRAKE):
@@ -234,7 +234,7 @@ def test_fault_by_the_code_walls_count_only_straight_ahead() -> None:
 
 
 def test_fault_in_a_second_nothing_can_be_corrected() -> None:
-    """At 15 m/s, the smallest steering angle leaves the lane from its middle."""
+    """At 15 m/s, even the smallest steering angle makes a car in the middle leave the lane."""
     sim = lane()
     for action in (RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT):
         sim.reset(options={"pose": (60.0, 1.0, 0.0, 15.0)})

@@ -1,4 +1,4 @@
-"""The Gymnasium environment of the lane sim."""
+"""Tests of the Gymnasium environment of the lane sim."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The branch-free functions of the course equal the general ones bit for bit."""
+"""Tests that the branch-free functions of the course equal the general ones bit for bit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mcaprl.sims.lane.path import (
 )
 from mcaprl.sims.lane.rules import AHEAD_M, BACK_M, LOOKAHEADS_M
 
-# A subnormal distance before the start is rounded to a distance after it.
+# Subnormal numbers are excluded: rounding moves such a distance from before the start to after it.
 along = st.one_of(
     st.floats(-20, 5000, allow_subnormal=False), st.sampled_from(COURSE.along_m.tolist())
 )

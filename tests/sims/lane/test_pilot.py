@@ -1,4 +1,4 @@
-"""The pilot of the lane sim."""
+"""Tests of the pilot of the lane sim."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mcaprl.sims.lane.rules import DRIVING, drive, end_of, located
 
 
 def drive_through(start: str, seed: int) -> tuple[float, str, float]:
-    """Let the pilot drive one episode: return, reason, progress in meters."""
+    """Let the pilot drive one episode; return its total reward, reason and progress in meters."""
     env = make_sim("lane", start=start)
     pilot = make_pilot(env)
     observation, info = env.reset(seed=seed)
@@ -40,7 +40,7 @@ def test_it_laps_the_course_from_the_start_line() -> None:
 
 
 def test_it_searches_where_pursuit_would_fail() -> None:
-    """8 m before a corner at 11.4 m/s it is too late to brake first and turn then."""
+    """At 11.4 m/s, 8 m before a corner, it is too late to brake first and then turn."""
     car = located(moving(122.4, 1.0, 0.0, 11.4), 0.0, 122.4, 0.0)
     assert pursuit_value(car) < HORIZON
     assert choose(car) != pursue(car)

@@ -1,4 +1,4 @@
-"""Contacts and ray lengths of the lane sim's car, by hand and against an outline."""
+"""Tests of collisions and ray lengths of the lane sim's car, by hand and against an outline."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def in_a_box(x_m: float, y_m: float) -> bool:
 @pytest.mark.parametrize(
     ("angle_rad", "length_m"),
     [
-        # On the first street, y = 1: the rails' inner faces are 4 m to each side.
+        # On the first street (y = 1), the inner faces of the rails are 4 m to each side.
         (math.pi / 2, 4.0),
         (-math.pi / 2, 4.0),
         (math.pi / 4, 4.0 * math.sqrt(2.0)),
@@ -67,7 +67,7 @@ def test_a_ray_from_within_something_is_0() -> None:
 
 @given(st.floats(-20.0, 150.0), st.floats(-150.0, 150.0), st.floats(-math.pi, math.pi))
 def test_a_ray_ends_where_the_first_box_begins(x_m: float, y_m: float, angle_rad: float) -> None:
-    """Sampled every 2 cm: nothing before the end, an obstacle after it."""
+    """Points every 2 cm along a ray show no obstacle before its end, and an obstacle after it."""
     length_m = ray_length(x_m, y_m, angle_rad)
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     along_m = np.arange(0.0, length_m - 1e-6, 0.02)
@@ -113,19 +113,19 @@ def test_the_path_point_distinguishes_the_streets_of_a_crossing() -> None:
     ("x_m", "y_m", "yaw_rad", "hit"),
     [
         (60.0, 1.0, 0.0, False),
-        # Its side is 0.875 m from its middle, the rail's face 4 m from the street's.
+        # The car's side is 0.875 m from its middle. The rail is 4 m from the street's middle.
         (60.0, 1.0 + 4.0 - 0.876, 0.0, False),
         (60.0, 1.0 + 4.0 - 0.874, 0.0, True),
         (60.0, 1.0 - 4.0 + 0.874, 0.0, True),
-        # Its nose is 2.2 m ahead of the middle of its wheelbase, its tail 2.1 m back.
+        # The nose is 2.2 m ahead of the middle of the wheelbase, and the tail is 2.1 m back.
         (134.0 - 2.201, 1.0, 0.0, False),
         (134.0 - 2.199, 1.0, 0.0, True),
         (134.0 - 2.101, 1.0, math.pi, False),
         (134.0 - 2.099, 1.0, math.pi, True),
-        # Across the street it needs 4.3 m; turned by 45 degrees 3.05 m to one side.
+        # Across the street, the car needs 4.3 m; turned by 45 degrees, it needs 3.05 m to one side.
         (60.0, 1.0, math.pi / 2, False),
         (60.0, 3.0, math.pi / 2, True),
-        # Off the road between the rails and the houses.
+        # The car is beside the road, between the rails and the houses.
         (60.0, 7.0, 0.0, False),
     ],
 )
@@ -135,7 +135,7 @@ def test_contacts_of_a_car_by_hand(x_m: float, y_m: float, yaw_rad: float, hit: 
 
 @given(st.floats(-12.0, 145.0), st.floats(-20.0, 20.0), st.floats(-math.pi, math.pi))
 def test_a_car_touches_what_has_a_point_in_its_body(x_m: float, y_m: float, yaw_rad: float) -> None:
-    """The body is sampled every 5 cm, finer than a rail is thick."""
+    """The body is sampled every 5 cm, which is less than the thickness of a rail."""
     forward, left = np.meshgrid(
         np.linspace(-BODY_LENGTH_M / 2, BODY_LENGTH_M / 2, 87) + 0.05,
         np.linspace(-BODY_WIDTH_M / 2, BODY_WIDTH_M / 2, 36),

@@ -1,4 +1,4 @@
-"""The equations of the lane sim, with numbers worked by hand."""
+"""Tests of the equations of the lane sim with numbers worked by hand."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STRAIGHT, RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT = 1, 2, 3, 4, 5
 
 
 def placed(x_m: float, y_m: float, yaw_rad: float, speed_m_s: float, near_m: float) -> Car:
-    """Return a car at a pose, its place on the path searched around a distance along it."""
+    """Return a car at a pose; search its place on the path near a distance along the path."""
     return located(moving(x_m, y_m, yaw_rad, speed_m_s), 0.0, near_m, 0.0)
 
 
@@ -161,7 +161,7 @@ def test_observations_stay_inside_their_limits() -> None:
     st.sampled_from([1, 12]),
 )
 def test_many_cars_drive_as_one_does(starts: list[tuple[float, int]], copies: int) -> None:
-    # The copies fill a block and more.
+    # The copies fill more than a block.
     starts = starts * copies
     cars = np.array([placed(x_m, 1.5, 0.1, 8.0, x_m) for x_m, _ in starts])
     actions = np.array([action for _, action in starts])

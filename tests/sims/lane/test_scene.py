@@ -1,4 +1,4 @@
-"""The scene of the lane sim."""
+"""Tests of the scene of the lane sim."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.sim_shapes import rotated
 
 @pytest.fixture
 def sim() -> LaneKeepingEnv:
-    """Return a car in the middle of the second leg, which is toward -y."""
+    """Return a sim with the car in the middle of the second leg, which leads toward -y."""
     made = make_sim("lane").unwrapped
     assert isinstance(made, LaneKeepingEnv)
     made.reset(options={"pose": (131.0, -60.0, -math.pi / 2, 6.0)})

@@ -1,4 +1,4 @@
-"""The top view of the lane sim, and the projection of shapes to patches."""
+"""Tests of the top view of the lane sim, and of the projection of shapes to patches."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ def test_the_car_is_in_the_middle_of_the_image() -> None:
 
 
 def test_the_car_points_where_it_is_heading() -> None:
-    """Along x it is longer from left to right, along y from top to bottom."""
+    """Along x, the car is longer from left to right; along y, it is longer from top to bottom."""
     for yaw_rad, wide in ((0.0, True), (math.pi / 2, False)):
         rows, columns = np.nonzero(near(image_at((50.0, 1.0, yaw_rad)), PAINT))
         assert (np.ptp(columns) > 1.5 * np.ptp(rows)) == wide
 
 
 def test_north_is_up_and_east_is_right() -> None:
-    """10 m before the corner at (130, 1): grass 8 m to the north, none 8 m to the east."""
+    """10 m before the corner at (130, 1), there is grass 8 m to the north, but not to the east."""
     grass = near(image_at((120.0, 1.0, 0.0)), GRASS)
     ten_meters_px = round(10 * 600 / 55)
     assert grass[300 - ten_meters_px // 2, 250]
@@ -77,7 +77,7 @@ def test_a_window_shows_each_step() -> None:
 
 
 def test_rendering_needs_a_mode() -> None:
-    """The unwrapped environment renders nothing without a mode; Gymnasium's wrapper would warn."""
+    """Without a mode, the unwrapped environment renders nothing. Gymnasium's wrapper would warn."""
     env = gym.make(ENV_ID).unwrapped
     env.reset(seed=0)
     assert env.render() is None

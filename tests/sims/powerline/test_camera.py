@@ -1,4 +1,4 @@
-"""The drone's camera against ray casting and geometry by hand."""
+"""Tests of the drone's camera against ray casting and geometry by hand."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def level_at(x: float, y: float, z: float) -> Drone:
 
 
 def cast(eye: Floats, ray: Floats) -> float:
-    """Return 1/distance of the nearest front of the world that a unit ray hits, or 0.
+    """Return 1/distance of the nearest front face of the world that a unit ray hits, or 0.
 
     Moeller and Trumbore, "Fast, minimum storage ray-triangle intersection", 1997.
     """
@@ -56,7 +56,7 @@ def cast(eye: Floats, ray: Floats) -> float:
 
 @pytest.mark.parametrize("view", ["down", "front"])
 def test_the_world_matches_ray_casting(view: str) -> None:
-    """Of 3,000 pixels at 30 random poses, tilted too, at most 3 differ in uint8, at edges."""
+    """At 30 random poses, some tilted, at most 3 of 3,000 pixels differ in uint8, all at edges."""
     random = np.random.default_rng(5)
     camera = DroneCamera(view)
     differing = 0
@@ -80,7 +80,7 @@ def test_the_world_matches_ray_casting(view: str) -> None:
 
 
 def test_the_ground_is_straight_below() -> None:
-    """Half a cell beside the line's wires, the middle of the image shows the height."""
+    """Half a grid cell beside the wires, the pixel in the middle is the height above ground."""
     x, y = 250.0, 60.0
     drone = level_at(x, y, -ground_height(x, y) - 20.0)
     image = DroneCamera("down").image_m(drone)
@@ -88,7 +88,7 @@ def test_the_ground_is_straight_below() -> None:
 
 
 def test_forward_is_up_in_the_lower_camera_and_right_is_right() -> None:
-    """6 m north of a mast, over its east side: its arm is south, in the lower half."""
+    """From 6 m north of a mast and east of it, the arm is to the south, in the lower half."""
     tower = towers()[2]
     camera = DroneCamera("down")
     north = camera.image_m(level_at(tower.x_m + 4.0, tower.y_m, tower.arm_z_m - 5.0))
@@ -100,7 +100,7 @@ def test_forward_is_up_in_the_lower_camera_and_right_is_right() -> None:
 
 
 def test_a_level_front_camera_has_its_horizon_in_the_middle() -> None:
-    """From above every hill, the upper half of the image is empty."""
+    """From a position above all hills, the upper half of the image is empty."""
     image = DroneCamera("front").image_m(level_at(100.0, -58.0, -75.0))
     assert np.all(np.isinf(image[:42]))
     assert np.isfinite(image[83]).all()
@@ -108,7 +108,7 @@ def test_a_level_front_camera_has_its_horizon_in_the_middle() -> None:
 
 @pytest.mark.parametrize("view", ["down", "front"])
 def test_conductors_are_seen_all_along_the_line(view: str) -> None:
-    """Above the middle of each span; without wires, the image shows only the ground."""
+    """Wires are visible above the middle of each span; without wires, only the ground is."""
     camera = DroneCamera(view)
     no_wires = DepthCamera(world_mesh(), LENS, IMAGE_SHAPE)
     for leg in range(4):
@@ -121,12 +121,12 @@ def test_conductors_are_seen_all_along_the_line(view: str) -> None:
 def test_the_conductor_below_has_its_distance() -> None:
     middle = WIRES_M[7, 8]
     image = DroneCamera("down").image_m(level_at(*np.add(middle, [0.0, 0.0, -7.1]).tolist()))
-    # The nearest pixel's ray ends on the wire, or half a pixel beside it.
+    # The ray of the nearest pixel ends on the wire, or at most half a pixel beside it.
     assert image.min() == pytest.approx(7.0, abs=0.05)
 
 
 def test_a_wire_takes_one_pixel_of_each_column() -> None:
-    """1 m below the axis at 10 m: row 6 + 8 x .1 = 6.8, so pixel 6, in all 16 columns."""
+    """A wire 1 m below the axis at 10 m is at row 6 + 8 x .1 = 6.8, so row 6 in all 16 columns."""
     wire = np.array([[[-99.0, 1.0, 10.0], [99.0, 1.0, 10.0]]])
     image = np.zeros((12, 16))
     draw_wires(wire, np.zeros(3), np.eye(3), 8.0, 8.0, image)
@@ -150,7 +150,7 @@ def test_a_wire_is_hidden_by_nearer_surfaces_and_clipped() -> None:
 
 
 def test_a_wire_that_passes_the_lens_is_cut_and_linear_in_1_over_z() -> None:
-    """Parallel to the axis, 1 m to the right, seen along it: u = 8 + 8/z, so 1/z = (u - 8) / 8."""
+    """For a wire parallel to the axis, 1 m to the right, u is 8 + 8/z, so 1/z is (u - 8) / 8."""
     wire = np.array([[[1.0, 0.1, -5.0], [1.0, 0.1, 1000.0]]])
     image = np.zeros((12, 16))
     draw_wires(wire, np.zeros(3), np.eye(3), 8.0, 8.0, image)

@@ -1,4 +1,4 @@
-"""The published rules of the powerline sim: numbers worked by hand, and their faults."""
+"""Tests of the published rules of the powerline sim: numbers worked by hand, and known faults."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NORTH, SOUTH, NOTHING = 0, 3, 6
 
 
 def beside(leg: int, along_m: float, distance_m: float) -> Vector:
-    """Return a place at a horizontal distance to the right of a leg or of its extension."""
+    """Return a point at a horizontal distance to the right of a leg or of the leg's extension."""
     across = np.cross([0.0, 0.0, 1.0], TANGENTS[leg])
     across /= np.linalg.norm(across)
     return Vector(*(POINTS_M[leg] + along_m * TANGENTS[leg] + distance_m * across).tolist())
@@ -47,7 +47,7 @@ def beside(leg: int, along_m: float, distance_m: float) -> Vector:
         (beside(2, 100.0, -3.0), 0.5, False, -0.450213, FLYING),
         # 6.99 m beside it: e^-6.99 - .5 + 9.5, for 10 m/s in any direction.
         (beside(3, 100.0, 6.99), 10.0, False, 9.000921, FLYING),
-        # Beyond 7 m: -10 and the end, at any speed.
+        # Beyond 7 m, the reward is -10 and the episode ends, at any speed.
         (beside(3, 100.0, 7.01), 10.0, False, -10.0, OFF_LINE),
         (beside(0, -30.0, 7.5), 1.0, False, -10.0, OFF_LINE),
         # A collision has priority.
@@ -69,7 +69,7 @@ def test_rewards_and_ends_by_hand(
 
 
 def test_the_distance_is_the_published_formula() -> None:
-    """|(p - a) x (p - b)| / |a - b|, least over the legs."""
+    """The distance is |(p - a) x (p - b)| / |a - b|, the minimum over all legs."""
     random = np.random.default_rng(0)
     for place in random.uniform([-50, -150, -90], [600, 200, 0], size=(50, 3)):
         published = min(
@@ -88,7 +88,7 @@ def classic() -> PowerlineEnv:
 
 
 def test_an_action_changes_the_measured_velocity() -> None:
-    """Commanded 1 + .25 m/s; after 5 s, ten lags, the error is e^-10 of the step."""
+    """The command is 1 + .25 m/s. After 5 s, which are ten lags, the error is e^-10 of the step."""
     flight = begin(point_on_line(150.0), Vector(1.0, 0.0, 0.0), ZERO)
     flight = flight._replace(command_m_s=Vector(4.0, 4.0, 4.0))
     after, hit = classic_decide(POINT, flight, NORTH)
@@ -107,7 +107,7 @@ def test_it_starts_with_5_seconds_at_the_published_velocity() -> None:
     drone = classic().flight.drone
     assert drone.velocity_m_s == pytest.approx((1.0, -0.67, -0.8), abs=1e-3)
     flown = np.subtract(drone.position_m, POINTS_M[0])
-    # 5 s, minus the lag of half a second.
+    # The drone flies for 5 s, minus the lag of half a second.
     np.testing.assert_allclose(flown, 4.5 * np.array([1.0, -0.67, -0.8]), atol=0.25)
 
 
@@ -125,7 +125,7 @@ def test_fault_flying_past_the_first_tower_is_rewarded_for_100_m() -> None:
 
 
 def test_fault_flying_to_and_fro_has_a_higher_return_than_following() -> None:
-    """10 m/s in either direction has a reward of 10 per decision, following at 2 m/s one of 2."""
+    """The reward per decision is 10 at 10 m/s in any direction, but 2 when following at 2 m/s."""
     place = beside(2, 100.0, 0.0)
     assert classic_reward(place, 10.0, False) == pytest.approx(10.0)
     assert classic_reward(place, 2.0, False) == pytest.approx(2.0)

@@ -1,4 +1,4 @@
-"""The power line, its conductors and the ground."""
+"""Tests of the power line, its conductors and the ground."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_no_other_point_is_nearer_than_the_nearest(position: tuple[float, float,
 
 
 def test_beyond_the_end_the_infinite_line_is_nearer() -> None:
-    """3 m beside the first leg's extension, 50 m beyond its end."""
+    """The point is 50 m beyond the end of the first leg, 3 m beside the leg's extension."""
     along = (POINTS_M[1] - POINTS_M[0]) / LEG_LENGTHS_M[0]
     beside = np.cross(along, [0, 0, 1.0])
     beside /= np.linalg.norm(beside)
@@ -67,7 +67,7 @@ def test_beyond_the_end_the_infinite_line_is_nearer() -> None:
 
 
 def test_a_level_catenary_by_its_formula() -> None:
-    """Ends at one level: lowest in the middle, a (cosh(w / 2a) - 1) = sag."""
+    """If both ends have the same height, the middle is lowest: a (cosh(w / 2a) - 1) = sag."""
     heights = catenary(100.0, 0.0, 2.0, np.array([0.0, 50.0, 100.0]))
     assert heights.tolist() == pytest.approx([0.0, -2.0, 0.0], abs=1e-9)
     parabola = catenary(100.0, 0.0, 2.0, np.array([25.0]))
@@ -119,13 +119,13 @@ def test_towers_are_on_the_ground_under_the_line() -> None:
 
 
 def test_arms_lie_across_the_line() -> None:
-    """The first tower's arm is perpendicular to the first leg; the second's bisects the corner."""
+    """The first arm is perpendicular to the first leg; the second arm bisects the corner."""
     first, second = towers()[:2]
     legs = np.diff(POINTS_M, axis=0)[:, :2]
     units = legs / np.hypot(*legs.T)[:, None]
     assert np.dot(first.right, units[0]) == pytest.approx(0.0, abs=1e-12)
     assert np.dot(second.right, units[0]) == pytest.approx(-np.dot(second.right, units[1]))
-    # Facing north-west along the first leg, right is north-east: y grows.
+    # The first leg leads to the north-west, so right is north-east, where y is larger.
     assert first.right[1] > 0
 
 
@@ -138,7 +138,7 @@ def test_no_conductor_touches_the_ground_or_a_tree() -> None:
 
 
 def test_the_mesh_of_the_ground_is_near_the_ground() -> None:
-    """Within 1.5 m in the middle of each triangle near the line; all triangles face up."""
+    """Near the line, the middle of each triangle is within 1.5 m; all triangles face up."""
     triangles = ground_triangles()
     up = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     assert np.all(up[:, 2] > 0)

@@ -1,4 +1,4 @@
-"""The Gymnasium environment of the powerline sim."""
+"""Tests of the Gymnasium environment of the powerline sim."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def last_step(sim: PowerlineEnv, action: int) -> tuple[float, str]:
 
 
 def test_starts_on_the_line_are_near_the_published_one() -> None:
-    """5 s at (1, -.5, -1), minus the lag, from the first point; not all the same."""
+    """The drone flies from the first point for 5 s minus the lag, and starts differ."""
     sim = powerline(start="line")
     places = set()
     for seed in range(20):
@@ -73,7 +73,7 @@ def test_a_pose_is_kept_and_reported_in_ros_axes() -> None:
     assert sim.flight.drone.position_m == pose[:3]
     assert (telemetry["x_m"], telemetry["y_m"], telemetry["z_m"]) == (pose[0], -pose[1], -pose[2])
     assert telemetry["speed_m_s"] == info["speed_m_s"] == 3.0
-    # East of a line toward the north is to its right; higher is positive.
+    # East of a line that leads north is to the right. A higher position is positive.
     assert telemetry["lateral_offset_m"] < -1.9
     assert telemetry["vertical_offset_m"] == pytest.approx(1.0, abs=0.15)
     assert telemetry["line_distance_m"] == pytest.approx(math.sqrt(5.0), abs=0.1)
@@ -144,7 +144,7 @@ def test_ends_have_names_and_rewards() -> None:
 
 
 def test_progress_is_rewarded_once() -> None:
-    """Flying back and forth again has no reward for the same progress."""
+    """Flying back and forth is not rewarded again for the same progress."""
     sim = powerline(plant="point")
     point = point_on_line(150.0)
     sim.reset(options={"pose": tuple(point)})
@@ -169,7 +169,7 @@ def test_the_camera_image_is_observed(camera: str) -> None:
 
 
 def test_the_classic_image_has_the_published_code() -> None:
-    """255 / max(1, d), rounded down; 0 without a surface."""
+    """The code is 255 / max(1, d), rounded down, or 0 without a surface."""
     meters = np.array([0.3, 1.0, 2.0, 6.0, 300.0, np.inf])
     assert encode_nearness(meters).tolist() == [255, 255, 127, 42, 0, 0]
     sim = powerline(rules="classic", observation="depth")
@@ -196,7 +196,7 @@ def test_wind_is_drawn_for_each_episode_and_gusts_for_each_step() -> None:
 
 
 def test_a_hover_holds_its_place_in_wind() -> None:
-    """Steady wind of 5 m/s at most: after 10 s, it hovers less than 1 m away."""
+    """In a steady wind of at most 5 m/s, the drone moves less than 1 m in 10 s."""
     sim = powerline(wind_m_s=5.0)
     start = point_on_line(300.0)
     for seed in range(5):

@@ -1,4 +1,4 @@
-"""The pilot of the powerline sim."""
+"""Tests of the pilot of the powerline sim."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mcaprl.sims.powerline.pilot import corner_speed, wanted_velocity
 
 
 def fly_through(seed: int, **kwargs: Any) -> tuple[float, str, float]:
-    """Let the pilot fly one episode: return, reason, mean distance from the line."""
+    """Let the pilot fly one episode; return its total reward, reason and mean distance."""
     env = make_sim("powerline", **kwargs)
     pilot = make_pilot(env)
     observation, info = env.reset(seed=seed)

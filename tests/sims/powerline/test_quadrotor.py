@@ -1,4 +1,4 @@
-"""The drones of the powerline sim, against closed forms and laws of motion."""
+"""Tests of the drones of the powerline sim against closed forms and laws of motion."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def speed_along(axis: int, command_m_s: float, after_s: float, wind: Vector = ZE
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("command_m_s", [-8.0, -2.0, -0.5, 0.5, 2.0, 5.0, 8.0])
 def test_it_settles_at_the_commanded_velocity(axis: int, command_m_s: float) -> None:
-    """Within 2 % from 4 s on; at 8 m/s it overshoots by less."""
+    """From 4 s on, the velocity is within 2 % of the command."""
     for after_s in (4.0, 6.0, 10.0, 20.0):
         assert speed_along(axis, command_m_s, after_s) == pytest.approx(command_m_s, rel=0.02)
 
@@ -63,7 +63,7 @@ def test_it_settles_at_the_commanded_velocity(axis: int, command_m_s: float) -> 
 def test_any_command_is_reached_in_any_wind(
     command: tuple[float, float, float], wind: tuple[float, float]
 ) -> None:
-    """The error is below 2 % of the command and the wind together, after 10 s."""
+    """After 10 s, the error is below 2 % of the sum of command and wind."""
     after = fly(QUAD, resting(), Vector(*command), Vector(*wind, 0.0), 10.0)
     error = np.array(after.velocity_m_s) - command
     assert np.linalg.norm(error) <= 0.02 * (np.linalg.norm(command) + np.linalg.norm(wind)) + 1e-9
@@ -103,7 +103,7 @@ def test_a_small_step_follows_the_closed_form(axis: int) -> None:
 
 
 def test_a_step_by_numbers() -> None:
-    """2 m/s forward: half of it after about 0.33 s, and an overshoot of at most 1 %."""
+    """A command of 2 m/s is half reached after about 0.33 s; the overshoot is at most 1 %."""
     speeds = [speed_along(0, 2.0, 0.1 * k) for k in range(60)]
     assert 0.9 < speeds[3] < 1.2
     assert max(speeds) < 2.02
@@ -130,7 +130,7 @@ def test_without_wind_a_hover_is_an_equilibrium() -> None:
 
 
 def test_falling_without_thrust_ends_at_the_speed_where_drag_holds() -> None:
-    """v(t) = g / d (1 - e^-dt), to the Euler step's first order."""
+    """The speed is v(t) = g / d (1 - e^-dt), up to the first-order error of the Euler method."""
     drone = resting()._replace(thrusts_n=NO_THRUST)
     for _ in range(1000):
         drone = move(drone, NO_THRUST, ZERO)
@@ -140,7 +140,7 @@ def test_falling_without_thrust_ends_at_the_speed_where_drag_holds() -> None:
 
 
 def test_a_free_spin_keeps_its_momentum_and_energy() -> None:
-    """Without torque, angular momentum in the world and energy are constant, to 1 % over 2 s."""
+    """Without torque, world angular momentum and energy are constant within 1 % over 2 s."""
     spin = Vector(3.0, -1.0, 2.0)
     drone = resting()._replace(thrusts_n=NO_THRUST, rates_rad_s=spin)
     before = rotate(drone.attitude, angular_momentum(drone.rates_rad_s))
@@ -163,7 +163,7 @@ def energy_j(drone: Drone) -> float:
 
 
 def test_energy_is_the_work_of_rotors_and_drag() -> None:
-    """Climbing sideways in wind, to 1 % of the work that the rotors do."""
+    """In a sideways climb in wind, both agree within 1 % of the rotors' work."""
     wind, command = Vector(3.0, -2.0, 0.0), Vector(2.0, 3.0, -2.0)
     drone = resting()
     before_j, lift_j, drag_j, turn_j = energy_j(drone), 0.0, 0.0, 0.0
@@ -190,7 +190,7 @@ def test_energy_is_the_work_of_rotors_and_drag() -> None:
     ],
 )
 def test_rotors_turn_the_body_the_right_way(rotors: Rotors, sign: tuple[int, int, int]) -> None:
-    """More on the left rolls right, more in front pitches up, the first pair yaws right."""
+    """More thrust on the left rolls right, in front pitches up, on the first pair yaws right."""
     drone = move(resting()._replace(thrusts_n=rotors), rotors, ZERO)
     assert tuple(np.sign(np.round(drone.rates_rad_s, 12)).astype(int)) == sign
 
@@ -202,7 +202,7 @@ def test_rotors_keep_their_limits(wanted: tuple[float, float, float]) -> None:
 
 
 def test_the_wanted_acceleration_by_hand() -> None:
-    """2.5 (2 - 1) + .25 x 2 + .3 = 3.3 forward; to the right, 2.5 x 4 + 1 exceeds 6; down .25."""
+    """Forward: 2.5 (2 - 1) + .25 x 2 + .3 = 3.3. Right: 2.5 x 4 + 1, limited to 6. Down: .25."""
     drone = resting()._replace(
         velocity_m_s=Vector(1.0, 0.0, 0.1), integral_m_s2=Vector(0.3, 0.0, 0.5)
     )
@@ -211,7 +211,7 @@ def test_the_wanted_acceleration_by_hand() -> None:
 
 
 def test_the_point_follows_its_closed_form() -> None:
-    """From rest at c = 2 m/s, after one lag T: v = 2 (1 - 1/e), x = 2 T / e."""
+    """From rest with c = 2 m/s, v = 2 (1 - 1/e) and x = 2 T / e after one lag T."""
     after = fly(POINT, resting(), Vector(0.0, 2.0, 0.0), Vector(9.0, 9.0, 9.0), POINT_LAG_S)
     assert after.velocity_m_s == pytest.approx((0.0, 2 * (1 - math.exp(-1)), 0.0))
     assert after.position_m == pytest.approx((0.0, 2 * POINT_LAG_S / math.e, 0.0))

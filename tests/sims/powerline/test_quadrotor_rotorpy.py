@@ -1,7 +1,8 @@
-"""Our quadrotor against rotorpy's rigid body, an independent implementation that uses SciPy.
+"""Tests of our quadrotor against rotorpy's rigid body, an independent implementation with SciPy.
 
-Equal: mass, inertia, arms, the rotors' torque per thrust, and drag, which is added to theirs as
-they have no linear one. Theirs has x forward, y left and z up: a half turn about x from ours.
+Both have the same mass, inertia, arms, and torque per thrust. rotorpy has no linear drag, so the
+test adds our drag to its forces. rotorpy's axes are x forward, y left and z up: our axes rotated by
+half a turn about x.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ def to_theirs(drone: Drone, wind: Vector) -> dict[str, Floats]:
 
 
 def moved_by_theirs(body: Any, drone: Drone, command: Vector, wind: Vector) -> Drone:
-    """Advance by 2 ms with our controllers and rotors, and rotorpy's body."""
+    """Advance a drone by 2 ms with our controllers and rotors, but with rotorpy's body."""
     ours = advance(drone, command, wind)
     state = to_theirs(drone, wind) | {"rotor_speeds": to_theirs(ours, wind)["rotor_speeds"]}
     after = body.step(state, {"cmd_motor_speeds": state["rotor_speeds"]}, TIME_STEP_S)
@@ -107,7 +108,7 @@ def moved_by_theirs(body: Any, drone: Drone, command: Vector, wind: Vector) -> D
     ids=["step", "hover in wind", "step in wind"],
 )
 def test_rotorpys_body_with_our_controllers_flies_equally(command: Vector, wind: Vector) -> None:
-    """At most 2 cm/s and 1 degree apart during the response, and at most 2 % at its end."""
+    """The two differ by at most 2 cm/s and 1 degree in the response, and by 2 % at its end."""
     body, ours = their_body(), cruising(ZERO, ZERO)
     theirs = ours
     for _ in range(30):
@@ -122,7 +123,7 @@ def test_rotorpys_body_with_our_controllers_flies_equally(command: Vector, wind:
 
 
 def test_unequal_rotors_turn_rotorpys_body_equally() -> None:
-    """A tenth of a second for each of several constant, asymmetric sets of thrusts."""
+    """Each of several asymmetric sets of thrusts acts for a tenth of a second."""
     random = np.random.default_rng(2)
     body = their_body()
     for _ in range(5):

@@ -1,4 +1,4 @@
-"""The default rules of the powerline sim, with numbers worked by hand."""
+"""Tests of the default rules of the powerline sim with numbers worked by hand."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ UP, NOTHING = 5, 6
 
 
 def decide(plant: int, flight: Flight, action: int) -> tuple[Flight, int]:
-    """Fly one drone for a decision; return it and its end."""
+    """Fly one drone for a decision; return the drone, and the outcome of the decision."""
     row, ends = np.zeros((1, FLIGHT_SIZE)), np.zeros(1, dtype=np.int64)
     store_flight(flight, row[0])
     decide_all(plant, row, np.array([action]), ends)
@@ -56,7 +56,7 @@ def decide(plant: int, flight: Flight, action: int) -> tuple[Flight, int]:
 
 
 def shifted(along_m: float, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Vector:
-    """Return a place relative to a point of the line."""
+    """Return the position at an offset from a point of the line."""
     point = point_on_line(along_m)
     return Vector(point.x + x, point.y + y, point.z + z)
 
@@ -128,7 +128,7 @@ def test_masts_arms_and_the_ground_cause_collisions() -> None:
 
 
 def moved(along_m: float, to_m: float, z: float = 0.0) -> tuple[Flight, Flight]:
-    """Return the flight before and after progress along the line."""
+    """Return two flights: before and after the drone moves along the line."""
     before = hovering(shifted(along_m))
     after = hovering(shifted(to_m, z=z))
     return before, after._replace(furthest_m=max(along_m, nearest_on_line(shifted(to_m)).along_m))
@@ -154,14 +154,14 @@ def test_rewards_by_hand(along_m: float, to_m: float, z: float, end: int, expect
 
 
 def test_distance_costs_an_exponential() -> None:
-    """The third leg is inclined: 4 m above it, the distance is 4 m times its cosine."""
+    """The third leg is inclined. 4 m above the leg, the distance is 4 m times the cosine."""
     before, after = moved(300.0, 302.5, z=-4.0)
     cosine = math.hypot(*TANGENTS[2, :2])
     assert reward_of(before.furthest_m, after, FLYING) == pytest.approx(math.exp(-cosine), abs=1e-6)
 
 
 def test_observations_by_hand() -> None:
-    """0.7 m east of a place 20 m before the second corner, at (1, 2, 0) m/s."""
+    """The drone is 20 m before the second corner, 0.7 m east of the line, at (1, 2, 0) m/s."""
     along_m = ALONG_M[2] - 20.0
     flight = begin(shifted(along_m), Vector(1.0, 2.0, 0.0), ZERO)
     flight = flight._replace(command_m_s=Vector(1.5, 2.0, -0.5), furthest_m=along_m + 5.0)
@@ -207,7 +207,7 @@ def test_no_change_keeps_the_command() -> None:
 
 
 def test_a_flight_ends_within_its_decision() -> None:
-    """At 8 m/s up from 6.5 m above, 7 m are exceeded after 0.1 s, within the decision."""
+    """From 6.5 m above the line, at 8 m/s upward, the limit of 7 m is exceeded within 0.1 s."""
     start = begin(shifted(150.0, z=-6.5), Vector(0.0, 0.0, -8.0), ZERO)
     after, end = decide(POINT, start, UP)
     assert end == OFF_LINE
@@ -215,7 +215,7 @@ def test_a_flight_ends_within_its_decision() -> None:
 
 
 def test_gusts_are_stationary_and_decorrelate() -> None:
-    """Standard deviation 1.5 m/s at all times; correlation e^-1/4 from one decision to the next."""
+    """The standard deviation is always 1.5 m/s; successive decisions correlate by e^-1/4."""
     noise = np.random.default_rng(0).standard_normal((20000, 3))
     gusts = [ZERO]
     for row in noise:

@@ -1,4 +1,4 @@
-"""The scene and the top view of the powerline sim."""
+"""Tests of the scene and the top view of the powerline sim."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NORTH, EAST = 0, 1
 
 
 def flying(**kwargs: Any) -> PowerlineEnv:
-    """A drone 150 m along the line."""
+    """Return a sim with the drone 150 m along the line."""
     sim = make_sim("powerline", **kwargs).unwrapped
     assert isinstance(sim, PowerlineEnv)
     sim.reset(options={"pose": (*point_on_line(150.0), 3.0, 0.0, 0.0)})
@@ -78,7 +78,7 @@ def test_the_scene_has_z_up() -> None:
 
 
 def test_the_drones_frame_has_its_position_and_tilt() -> None:
-    """When it accelerates east, to the right, the body's upward axis tilts to -y."""
+    """If the drone accelerates east (to the right), the upward axis of its body tilts to -y."""
     sim = flying()
     sim.step(EAST)
     level, body = sim.frames()
@@ -130,7 +130,7 @@ def near(image: NDArray[np.uint8], color: Color) -> NDArray[np.bool_]:
 
 @pytest.mark.parametrize("along_m", [5.0, 60.0, 300.0, 600.0])
 def test_the_drone_is_in_the_middle_and_in_the_strip(along_m: float) -> None:
-    """Both where the line is low and where it is high, hills never cover the drone."""
+    """Hills never cover the drone, no matter whether the line is low or high."""
     image = image_at(along_m)
     assert image.shape == (600, 600, 3)
     rows, columns = np.nonzero(near(image, PAINT))
@@ -142,7 +142,7 @@ def test_the_drone_is_in_the_middle_and_in_the_strip(along_m: float) -> None:
 
 
 def test_north_is_right_and_west_is_up() -> None:
-    """The last leg is toward north-east: from lower right to upper left is across it."""
+    """The last leg leads north-east, so the route runs from upper left to lower right."""
     route = near(image_at(500.0)[:430], ROUTE)
     rows, columns = np.nonzero(route)
     assert np.corrcoef(rows, columns)[0, 1] > 0.9

@@ -1,4 +1,4 @@
-"""The classic rules of the racer sim: rewards and ends by hand, and each of their faults."""
+"""Tests of the classic rules of the racer sim: rewards and ends by hand, and each known fault."""
 
 from __future__ import annotations
 
@@ -42,10 +42,11 @@ def lengths_of(track: Track, x_px: float, y_px: float) -> dict[str, float]:
         (275.0, 150.5, 0, 2, BACK, 0, DRIVING),
         (275.0, 150.0, 0, 3, BACK, 0, DRIVING),
         (281.0, 150.5, 0, 0, NONE, 1, DRIVING),
-        # Crossed from 295 to 305, it is behind the car. Facing it from the other side counts.
+        # From 295 to 305, the car crosses the gate without facing it nearby. Facing the gate from
+        # the other side counts.
         (295.0, 150.5, 0, 10, NONE, 0, DRIVING),
         (310.0, 150.5, 180, 0, NONE, 1, DRIVING),
-        # Near it, but facing sideways.
+        # The car is near the gate, but faces sideways.
         (290.0, 150.5, 90, 0, NONE, 0, DRIVING),
         # The gate at 600 is not the next one.
         (590.0, 150.5, 0, 0, NONE, 0, DRIVING),
@@ -96,7 +97,7 @@ def test_fault_forward_drives_backward() -> None:
 
 
 def test_fault_corner_rays_cross_the_nose_and_start_at_the_center() -> None:
-    """From (500.5, 130.5): the corners are at 515.5, and the hits are rounded down to 515."""
+    """The car is at (500.5, 130.5). The corners are at 515.5, and hits are rounded down to 515."""
     seen = lengths_of(corridor(), 500.5, 130.5)
     assert seen["left_corner_sideways"] == pytest.approx(math.hypot(14.5, 69.5))
     assert seen["right_corner_sideways"] == pytest.approx(math.hypot(14.5, 30.5))
@@ -105,7 +106,7 @@ def test_fault_corner_rays_cross_the_nose_and_start_at_the_center() -> None:
 
 
 def test_fault_hits_are_floored_to_pixels() -> None:
-    """In the middle between walls at 100.5 and 199.5, the observed distances differ."""
+    """In the middle between walls at 100.5 and 199.5, the two observed distances differ."""
     seen = lengths_of(corridor(100.5, 199.5), 500.5, 150.0)
     assert seen["left_90"] == pytest.approx(math.hypot(50.0, 0.5))
     assert seen["right_90"] == pytest.approx(math.hypot(49.0, 0.5))
@@ -135,7 +136,7 @@ def test_fault_a_joint_of_walls_costs_twice() -> None:
 
 
 def test_fault_a_gate_crossed_unseen_is_lost() -> None:
-    """From 295 to 305 in one step: the car never faces the gate at 300 from nearby."""
+    """A step from 295 to 305 crosses the gate at 300, but the car never faces it from nearby."""
     track = corridor()
     car = car_in(track, 295.0, 150.5, 0, 10)
     over = drive(track, car, NONE, True, False)

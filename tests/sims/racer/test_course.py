@@ -1,4 +1,4 @@
-"""The tracks of the racer sim."""
+"""Tests of the tracks of the racer sim."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_all_are_driven_counter_clockwise(seed: int | None) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_asphalt_covers_what_is_between_the_walls(seed: int | None) -> None:
-    """Triangles of one orientation with the whole area have neither overlaps nor gaps."""
+    """The triangles have one orientation and the whole area, so there are no overlaps or gaps."""
     track = make_track(seed)
     left, right = sides(track)
     areas = [area(triangle) for triangle in asphalt(track).reshape(-1, 3, 2)]

@@ -1,4 +1,4 @@
-"""The pilot of the racer sim."""
+"""Tests of the pilot of the racer sim."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mcaprl.sims.evaluation.pilots import make_pilot
 
 
 def drive_through(seed: int, **kwargs: Any) -> tuple[float, str]:
-    """Let the pilot drive one episode: return, reason."""
+    """Let the pilot drive one episode; return its total reward and reason."""
     env = make_sim("racer", **kwargs)
     pilot = make_pilot(env)
     observation, info = env.reset(seed=seed)

@@ -1,4 +1,4 @@
-"""The default equations of the racer sim, with numbers worked by hand."""
+"""Tests of the default equations of the racer sim with numbers worked by hand."""
 
 from __future__ import annotations
 
@@ -36,24 +36,24 @@ FORWARD_LEFT, FORWARD_RIGHT = 7, 8
     [
         (50.0, 150.0, 0, 0, NONE, 0, DRIVING),
         (50.0, 150.0, 0, 0, FORWARD, 0, DRIVING),
-        # Crossing the gate at 300: from 295 to 301, and from 290 onto it.
+        # The car crosses the gate at 300, from 295 to 301 or from 290 to the gate.
         (295.0, 150.0, 0, 4, FORWARD, 1, DRIVING),
         (290.0, 150.0, 0, 8, FORWARD, 1, DRIVING),
-        # Before it: from 289 to 299; facing it nearby does not count.
+        # From 289 to 299, the car is before the gate. Facing a near gate does not count.
         (289.0, 150.0, 0, 8, FORWARD, 0, DRIVING),
         (285.0, 150.0, 0, 0, NONE, 0, DRIVING),
-        # Crossing the gate at 600, which is not the next one.
+        # The car crosses the gate at 600, which is not the next gate.
         (595.0, 150.0, 0, 10, NONE, 0, DRIVING),
-        # The left side is 7 pixels from the middle: 101 and 99 for a wall at 100.
+        # The left side of the car is 7 pixels from its middle: 101 and 99, with a wall at 100.
         (500.0, 108.0, 0, 0, NONE, 0, DRIVING),
         (500.0, 106.0, 0, 0, NONE, -1, CRASH),
-        # The nose is 15 pixels ahead: 999 and 1001 for a wall at 1000.
+        # The nose of the car is 15 pixels ahead: 999 and 1001, with a wall at 1000.
         (984.0, 150.0, 0, 0, NONE, 0, DRIVING),
         (984.0, 150.0, 0, 0, FORWARD, -1, CRASH),
         (984.0, 150.0, 0, 0, BACK, 0, DRIVING),
-        # Into the corner: two walls, one crash.
+        # The car hits two walls in the corner, which is one crash.
         (985.0, 115.0, -45, 0, NONE, -1, CRASH),
-        # A gate and a crash in one step.
+        # The car passes a gate and crashes in one step.
         (295.0, 106.0, 0, 10, NONE, 0, CRASH),
     ],
 )
@@ -118,7 +118,7 @@ def test_speed_is_limited_both_ways() -> None:
 
 
 def test_a_drifting_course_follows_by_100_over_speed_plus_1_degrees() -> None:
-    """At 9 pixels a step by 10 degrees: after two turns of 15 it lags by 10 degrees."""
+    """At 9 pixels per step, the course turns by 10 degrees; after two turns of 15 it lags by 10."""
     track = corridor()
     car = car_in(track, 500.0, 150.0, 0, 9)
     once = drive(track, car, RIGHT, False, True)

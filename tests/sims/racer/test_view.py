@@ -1,4 +1,4 @@
-"""The scene and the top view of the racer sim."""
+"""Tests of the scene and the top view of the racer sim."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def near(image: Image, color: Color) -> NDArray[np.bool_]:
 
 
 def test_the_image_has_the_pixels_of_the_rules() -> None:
-    """Pixels of the rules are those of the image: the car at (50, 300), the infield at 300."""
+    """The rules and the image use the same pixels: the car is at (50, 300), the infield at 300."""
     image = image_after([])
     assert image.shape == (600, 1000, 3)
     assert image.dtype == np.uint8
@@ -79,7 +79,7 @@ def test_score_speed_and_step_are_written() -> None:
     for line in range(3):
         text = [each[top + 26 * line : top + 26 * (line + 1), left : left + 112] for each in ink]
         assert text[0].any()
-        # At rest and after five steps: no gate yet, but another speed and another step.
+        # After five steps, the car has passed no gate, but speed and step have changed.
         assert np.array_equal(text[0], text[1]) == (line == 0)
 
 

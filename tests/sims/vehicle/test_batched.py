@@ -1,4 +1,4 @@
-"""Batched sims against single ones, bit for bit, and against Gymnasium's batching."""
+"""Tests that batched sims equal single sims and Gymnasium's batches, bit for bit."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ choices = st.lists(
 
 
 def check_same(ours: Any, theirs: Any, where: str) -> None:
-    """Check equality bit for bit with types and shapes, also of dicts and arrays of objects."""
+    """Check that types, shapes and bits are equal, also in dicts and in arrays of objects."""
     if isinstance(theirs, dict):
         assert set(ours) == set(theirs), where
         for key in theirs:
@@ -60,7 +60,7 @@ def actions_of(envs: Envs, chosen: list[int]) -> NDArray[np.int64]:
 
 
 def one_by_one(name: str, count: int, mode: str, steps: int, kwargs: dict[str, Any]) -> Envs:
-    """Return Gymnasium's batch of our single environments."""
+    """Return a batch by Gymnasium of this package's single environments."""
 
     def make() -> gym.Env[Any, Any]:
         return make_sim(name, max_episode_steps=steps, **kwargs)
@@ -76,7 +76,7 @@ def one_by_one(name: str, count: int, mode: str, steps: int, kwargs: dict[str, A
 def test_a_batch_does_what_single_sims_do(
     name: str, kwargs: dict[str, Any], mode: str, seed: int, chosen: list[list[int]]
 ) -> None:
-    """Time limits of 6 steps and failures end many episodes; the next ones are compared too."""
+    """Time limits of 6 steps and failures end many episodes; later episodes are compared, too."""
     ours = make_sims(name, COUNT, autoreset_mode=mode, max_episode_steps=6, **kwargs)
     theirs = one_by_one(name, COUNT, mode, 6, kwargs)
     assert ours.single_observation_space == theirs.single_observation_space
@@ -95,7 +95,7 @@ def test_a_batch_does_what_single_sims_do(
 
 @every_batch
 def test_an_episode_of_a_batch_is_that_of_its_seed(name: str, kwargs: dict[str, Any]) -> None:
-    """Vehicle i equals the single sim of seed + i, whatever the other vehicles do."""
+    """Vehicle i equals the single sim of seed + i, no matter what the other vehicles do."""
     batch = make_sims(name, COUNT, **kwargs)
     batch.action_space.seed(0)
     seen, _ = batch.reset(seed=40)
@@ -197,7 +197,7 @@ def test_each_drone_has_gusts_of_its_own() -> None:
 
 
 def test_the_racers_time_limit_precedes_the_registered_one() -> None:
-    """1,000 and 10,000 steps of the first of two cars, with the pilot's actions in a single sim."""
+    """The limits are 1,000 and 10,000 steps; car 0 repeats the pilot's actions in a single sim."""
     single = make_sim("racer", start="line")
     pilot = make_pilot(single)
     observation, _ = single.reset(seed=3)

@@ -1,4 +1,4 @@
-"""Compilation on first use, and its cache."""
+"""Tests of compilation on first use, and of the cache."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_compilation_is_announced_once_and_cached(package: Path, tmp_path: Path)
 
 
 def test_without_a_writable_package_the_users_cache_is_used(package: Path, tmp_path: Path) -> None:
-    # A file in place of the folder prevents even root from writing there.
+    # With a file in place of the folder, even root cannot write there.
     (package / CACHE).touch()
     assert run(package, tmp_path) == ["compiling the sim for this machine, once"]
     assert run(package, tmp_path) == []

@@ -1,4 +1,4 @@
-"""Numbers that are drawn ahead equal those of the generators."""
+"""Tests that numbers drawn in advance equal the numbers of the generators."""
 
 from __future__ import annotations
 
