@@ -1,4 +1,4 @@
-"""Measure reading robots' bags: message fields, compressed images, and a bag with a mapping."""
+"""Measure the reading of robots' bags: message fields, compressed images, and mapped bags."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _fields(path: Path, kind: str) -> Table:
 
 
 def _ours(path: Path, topic: str, fields: Sequence[str]) -> Any:
-    # Measure the first opening of a bag, which parses the message definitions.
+    # Measure only the first opening of a bag, because it parses the message definitions.
     clear_types()
     with closing(open_bag(path)) as bag:
         return bag.read(topic, fields).columns
@@ -80,7 +80,7 @@ def _rerun(path: Path, topic: str, fields: Sequence[str]) -> list[Any]:
 
 
 def _arrow_field(batch: Any, field: str) -> NDArray[Any]:
-    """Return one field of all messages as an array, from lists that contain one struct each."""
+    """Return one field of all messages as an array; each message is a list of one struct."""
     messages = next(
         column
         for name, column in zip(batch.schema.names, batch.columns, strict=True)
@@ -155,7 +155,7 @@ def _gigabyte(path: Path) -> Table:
 def _cost(path: Path) -> tuple[float, float]:
     """Return the seconds for reading a bag, and peak memory divided by the size of the result.
 
-    Pages of the mapped file do not count: the system takes them back when it needs memory.
+    Pages of the mapped file do not count, because the system can release them at any time.
     """
     few = path.with_name("few.mcap")
     _write_images(few, 5)

@@ -92,7 +92,7 @@ def record(path: Path, act: Act, steps: int) -> None:
 
 
 class _StopAt(BaseCallback):
-    """Callback that stops training when the mean return of the last episodes is high enough."""
+    """Callback that stops training when the last episodes have a high enough mean return."""
 
     def __init__(self, mean_return: float) -> None:
         super().__init__()

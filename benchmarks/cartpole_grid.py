@@ -6,7 +6,7 @@ A training has 5000 updates with batch size 64, learning rate 1e-3, gamma .99, a
 200 updates, and layer widths 256x256. Its result is the mean return of the last three evaluations
 (after 4000, 4500 and 5000 updates) of 10 episodes each. d3rlpy is trained with one seed if it is
 installed. FOLDER/grid.json has the results of finished trainings, so an interrupted run resumes.
-The table is written to docs/results.md, with conditions on the results and whether they hold.
+The table is written to docs/results.md, followed by conditions on the results and their verdicts.
 """
 
 from __future__ import annotations
@@ -185,9 +185,9 @@ def main() -> None:
 
 
 def cells(algos: list[str]) -> list[tuple[str, str, str]]:
-    """Return library, algorithm and log of each training: mcaprl's first, then d3rlpy's.
+    """Return the library, algorithm and log of each training.
 
-    If d3rlpy is not installed, there are only mcaprl's trainings.
+    mcaprl's trainings come first. They are the only ones if d3rlpy is not installed.
     """
     wanted = sorted(algos, key=ALGOS.index)
     mine = [("mcaprl", algo, name) for algo in wanted for name in NAMES]
@@ -204,7 +204,7 @@ def summary(result: dict[str, Any]) -> str:
 def table(result: dict[str, Any]) -> str:
     """Return a Markdown table: our mean, the range of our seeds, and d3rlpy's result.
 
-    A cell without a result of ours has a dash.
+    A cell for which mcaprl has no result contains a dash.
     """
     lines = [f"| data (behavior) | {' | '.join(ALGOS)} |", "|---|" + "---|" * len(ALGOS)]
     for name in NAMES:

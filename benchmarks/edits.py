@@ -17,7 +17,7 @@ _COPY = "copy of the files"
 
 
 def tables(folder: Path) -> list[Table]:
-    """Compare each command with a copy of its files; both sync their output to disk."""
+    """Compare each command with copying its files. Both sync their output to disk."""
     log, parts, out = folder / "edited.mcap", folder / "parts", folder / "edits"
     vectors(_TRANSITIONS).save(log)
     episodes = len(mcaprl.open(log, columns=()).episodes)

@@ -1,4 +1,4 @@
-"""Measure how time and memory grow with the log, with a separate process for each size."""
+"""Measure how time and memory grow with the size of a log; each size has its own process."""
 
 from __future__ import annotations
 

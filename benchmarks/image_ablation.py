@@ -5,8 +5,8 @@
 
 Each variant differs from the sim's default settings in one respect. Every seed of every variant is
 trained and then evaluated on fresh episodes. The table has the mean score over seeds (random 0,
-pilot 1) with its range, and the CPU time of the training. Finished seeds are not repeated, so two
-processes with different `--seeds` share the work on two cores.
+pilot 1) with its range, and the CPU time of the training. Finished seeds are not repeated. Thus two
+processes with different `--seeds` can share the work on two cores.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def _mirror(observations: Any) -> None:
 
 
 def differs(variant: str, task: Task, default: Task) -> bool:
-    """Return whether to run a variant: the default, or one whose training differs from it."""
+    """Return whether to run a variant: it is the default, or its training differs from it."""
     if variant == MIRRORED:
         return task.sim == "lane"
     return variant == "default" or task.config != default.config

@@ -3,14 +3,14 @@
     python -m benchmarks.learning [--rounds 7] [--turn-s 1.0] [--only whole]
     python -m benchmarks.learning --only gradients
 
-All sides take turns in one process, on the same random transitions (19 numbers, 9 actions) and with
-layer widths 256x256. The measure is CPU time on one thread, the best of several turns. The last row
-covers all steps from a log to a policy: a log of LOG_ROWS steps on disk is read and packed, and CQL
-makes LOG_UPDATES updates with batch size 256. The alternative is mcap with mcap-ros2-support, and
-d3rlpy; it reads a tenth of the log, and its time is scaled up. The time of LOG_UPDATES updates is
-calculated from the rates in the turns. The ratios are printed and written to
-benchmarks/learning.json, and the table to docs/results.md. With --only 256, 32 or whole, the other
-rows keep the values of an earlier run.
+All libraries take turns in one process, on the same random transitions (19 numbers, 9 actions) and
+with layer widths 256x256. The measure is CPU time on one thread, the best of several turns. The
+last row covers all steps from a log to a policy: a log of LOG_ROWS steps on disk is read and
+packed, and CQL makes LOG_UPDATES updates with batch size 256. It is compared with reading by mcap
+and mcap-ros2-support, and training by d3rlpy. These read a tenth of the log, and their time is
+scaled up. The time of LOG_UPDATES updates is calculated from the rates in the turns. The ratios are
+printed and written to benchmarks/learning.json. The table is written to docs/results.md. With
+--only 256, 32 or whole, the other rows keep the values of an earlier run.
 
 --only gradients compares updates with autograd to the same updates with closed-form gradients,
 which this file implements. It prints the ratios of the speeds, and runs neither d3rlpy nor SB3.
@@ -235,7 +235,7 @@ def best_rates(sides: dict[str, tuple[Update, int]], turns: Turns) -> dict[str, 
 
 
 def whole_way(folder: Path, turns: Turns) -> float:
-    """Return the CPU time of mcap and d3rlpy relative to ours, from a log on disk to a policy."""
+    """Return the CPU time from a log to a policy with mcap and d3rlpy, relative to ours."""
     log, part = folder / "log.mcap", folder / "part.mcap"
     vectors(LOG_ROWS).save(log)
     rivals.write_mcap(rivals.messages(vectors(int(LOG_ROWS * LOG_SHARE))), part)
@@ -252,7 +252,7 @@ def whole_way(folder: Path, turns: Turns) -> float:
 
 
 def logged(columns: dict[str, Any]) -> Any:
-    """Return an object with a dataset's attributes, made of columns of equally long episodes."""
+    """Return an object with a dataset's attributes, made from columns of equally long episodes."""
     rows = len(columns["action"])
     return SimpleNamespace(
         observations=columns["observation"],

@@ -2,9 +2,9 @@
 
     make .venv/.lerobot && python -m benchmarks.lerobot_items
 
-LeRobot runs in its own Python environment, `.venv/lerobot` or that of the interpreter
-MCAPRL_LEROBOT_PYTHON, on a dataset that mcaprl writes. Its CPU time for each transition, relative
-to ours, is printed.
+LeRobot reads a dataset that mcaprl writes. It runs in its own Python environment, `.venv/lerobot`
+or that of the interpreter MCAPRL_LEROBOT_PYTHON. The program prints LeRobot's CPU time for each
+transition, relative to ours.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ def chunk_headers(path: Path, topics: tuple[str, ...]) -> list[ChunkHeader]:
 def least_work(path: Path, headers: Sequence[ChunkHeader]) -> None:
     """Map a file, decompress these chunks one after the other, and check their CRCs.
 
-    A reader has to do more: create columns in new memory, and find and validate messages.
+    A reader must also create columns in new memory, and find and validate messages.
     """
     import zstandard
 

@@ -166,7 +166,7 @@ def _reading(
 
 
 def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
-    """Measure file sizes for the same transitions; only a log also stores times and counters."""
+    """Measure file sizes for the same transitions. Only the log also stores times and counters."""
     table = Table("File size", unit="bytes, ours = 1")
     ours = log.stat().st_size
     for compression in ("lz4", "none"):
@@ -215,7 +215,7 @@ def _threads(log: Path) -> Table:
 
 
 def _checking(folder: Path, log: Path) -> Table:
-    """Measure checking a log, which reads it, and recovering it, which reads and writes it."""
+    """Measure the time to check a log, which reads it, and to recover it, which also writes."""
     out = folder / "recovered.mcap"
     return compare(
         "Checking and recovering the log of vectors",

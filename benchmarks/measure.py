@@ -1,8 +1,8 @@
 """Time the sides of a comparison in turns within one process.
 
-The machine may do other work, so the measure is CPU time, the best of several turns, and the sides
-take turns so that a slow minute affects all of them. The results are ratios, because seconds depend
-much more on the machine.
+The machine may do other work, so the measure is CPU time, and the best of several turns counts. The
+sides take turns, so that a slow minute affects all of them. The results are ratios, because seconds
+depend much more on the machine.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Side:
     Attributes:
         name: Name of the library, and of the part that is used.
         run: Function that does the task once.
-        share: Fraction of the task that `run` does; its time is scaled up. It is below 1 for sides
-            that would take minutes.
+        share: Fraction of the task that `run` does. The measured time is divided by it. The
+            fraction is below 1 for sides that would take minutes.
         floor: Name of a side whose time is subtracted, such as an environment without recorder.
     """
 

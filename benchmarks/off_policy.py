@@ -2,11 +2,13 @@
 
     python -m benchmarks.off_policy
 
-Importance sampling: the largest difference to SCOPE-RL's five estimators on the same logs. Fitted Q
-evaluation: compared with d3rlpy's DiscreteFQE on the same log, policy and settings, and with the
-policy's true returns in the sim. Coverage: the fraction of `--logs` logs whose 95 % interval
-contains the true value, on a task whose value is the solution of linear equations
-(tests/support/two_state_task.py).
+The program makes three comparisons:
+
+- Importance sampling: the largest difference from SCOPE-RL's five estimators on the same logs.
+- Fitted Q evaluation: the estimates of d3rlpy's DiscreteFQE on the same log, policy and settings,
+  and the policy's true returns in the sim.
+- Coverage: the fraction of `--logs` logs whose 95 % interval contains the true value. The task has
+  a known value, the solution of linear equations (tests/support/two_state_task.py).
 
 The first comparison needs SCOPE-RL, the second one needs d3rlpy (`make bench-learning` installs
 both). If a library is not installed, its comparison is left out with a message.
@@ -44,7 +46,7 @@ is another estimator.
 
 
 def beside_scope_rl(logs: int) -> dict[str, float]:
-    """Return the largest relative difference to SCOPE-RL's estimates, over logs of 300 episodes."""
+    """Return the largest relative difference from SCOPE-RL's estimates on logs of 300 episodes."""
     from scope_rl.ope.discrete import basic_estimators
 
     worst = dict.fromkeys(SCOPE_RL_NAMES, 0.0)
@@ -62,7 +64,7 @@ def beside_scope_rl(logs: int) -> dict[str, float]:
 
 
 def _as_scope_rl(table: EpisodeTable) -> dict[str, Any]:
-    """Return an episode table in SCOPE-RL's format, with all logged actions numbered 0."""
+    """Return an episode table in SCOPE-RL's format. All logged actions have the number 0."""
     pi = np.minimum(0.5, table.ratios / 4).ravel()
     # Action 1 has the remaining probability, and the Q that results in the table's V.
     other = (table.v.ravel() - pi * table.q.ravel()) / (1 - pi)
@@ -81,7 +83,7 @@ class Balance:
     """A CartPole policy without training: it pushes to the side to which the pole falls."""
 
     def __init__(self, look_ahead_s: float) -> None:
-        """Store the number of seconds to look ahead; without looking ahead the pole falls soon."""
+        """Store how many seconds the policy looks ahead; with 0 seconds, the pole falls soon."""
         self._look_ahead_s = look_ahead_s
 
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.int64]:
@@ -184,7 +186,7 @@ def d3rlpys(columns: dict[str, Any], policy: Balance, seed: int) -> float:
 
 
 def beside_d3rlpy(seeds: int) -> None:
-    """Print our and d3rlpy's FQE estimates, with one log and network per seed, and true values."""
+    """Print FQE estimates of mcaprl and d3rlpy, and true values; each seed has its own log."""
     print("| policy | true | ours, mean and spread | d3rlpy's | our error | d3rlpy's error |")
     for name, policy in POLICIES.items():
         found = []

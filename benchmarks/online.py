@@ -1,10 +1,10 @@
 """Measure what recording and the live view add to a training: `python -m benchmarks.online`.
 
 The same training runs in turns: alone, with a log, and with a viewer (Node, see tests/node). The
-measure is the CPU time of all threads of the training, the best of several turns. By default it is
-the complete training of the lane sim with its default settings. `--steps` shortens the training and
-increases the share of recording, because the first episodes have only about twenty steps, and an
-episode is written when it ends.
+measure is the CPU time of all threads of the training, the best of several turns. By default, the
+training is the complete training of the lane sim with its default settings. `--steps` shortens the
+training. Recording then takes a larger share of the time: the first episodes have only about twenty
+steps, and an episode is written when it ends.
 """
 
 from __future__ import annotations

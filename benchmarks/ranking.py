@@ -6,9 +6,9 @@
 Double DQN trains online and records its transitions; its checkpoints are saved. Each checkpoint is
 then evaluated twice: its greedy policy runs fresh episodes in the sim, which gives its true value,
 and each estimator computes that value from the run's log. The rankings are compared by Spearman's
-correlation and by regret@1, for each training seed; the table has their mean and range over seeds.
-Two simple rules serve as references: the later a checkpoint, the better; and the higher the mean of
-its own Q in the first states, the better.
+correlation and by regret@1, for each training seed. The table has the mean and range over seeds.
+Two simple rules serve as references. The first rule prefers later checkpoints. The second rule
+prefers checkpoints whose Q has a higher mean in the first states.
 
 FOLDER/SIM/ranking.json has all results; finished parts are not repeated.
 """
@@ -36,7 +36,7 @@ from mcaprl.sims import episode_seed, make_sims
 SEEDS: Final = 4
 CHECKPOINTS: Final = 8
 STEPS: Final = {"lane": 16_000, "racer": 8_000}
-"""Training steps, by sim: few, because the values of later checkpoints hardly differ."""
+"""Training steps, by sim. The numbers are small, because later checkpoints hardly differ."""
 EPISODES: Final = 100
 FIRST_SEED: Final = 5_000_000
 GAMMA: Final = 0.97
@@ -146,7 +146,8 @@ def show(sim: str, by_seed: list[list[dict[str, Any]]]) -> None:
 def rank_correlation(estimated: NDArray[np.floating], true: NDArray[np.floating]) -> float:
     """Return Spearman's correlation: 1 if the estimates rank the policies in their true order.
 
-    Equal values share the mean of their ranks. NaN if all estimates or all true values are equal.
+    Equal values share the mean of their ranks. The result is NaN if all estimates, or all true
+    values, are equal.
 
     >>> rank_correlation(np.array([1.0, 2.0, 3.0]), np.array([10.0, 30.0, 20.0]))
     0.5
@@ -160,7 +161,8 @@ def rank_correlation(estimated: NDArray[np.floating], true: NDArray[np.floating]
 def regret_at_1(estimated: NDArray[np.floating], true: NDArray[np.floating]) -> float:
     """Return the loss of choosing the highest estimate, as a fraction of the range of values.
 
-    (max V - V of the choice) / (max V - min V): 0 for the best policy, 1 for the worst.
+    The result is (max V - V of the choice) / (max V - min V). It is 0 for the best policy and 1 for
+    the worst.
 
     >>> regret_at_1(np.array([1.0, 5.0, 3.0]), np.array([10.0, 15.0, 20.0]))
     0.5

@@ -2,9 +2,9 @@
 
     python -m benchmarks.ray_read
 
-The tasks that Ray's workers would run are run in this process, whose CPU time is measured. Those of
-`read_mcap` return the bytes of messages, so the cheapest correct decoding follows: all messages as
-one array. Their values are compared with ours.
+This process runs the tasks that Ray's workers would run, and measures the CPU time. The tasks of
+`read_mcap` return the bytes of messages. The benchmark then decodes the bytes in the fastest
+correct way, as one array of all messages, and compares the values with ours.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def _tasks(path: Path, columns: Any) -> list[Any]:
 
 
 def _run(tasks: list[Any], path: Path) -> None:
-    # A worker keeps a log open between tasks unless the file has changed; here it is opened again.
+    # A worker keeps an unchanged log open between tasks. Here, each task opens the log again.
     os.utime(path)
     blocks = [block for task in tasks for block in task()]
     assert sum(map(len, blocks)) == TRANSITIONS

@@ -24,7 +24,7 @@ def main() -> None:
     """Print the ratio."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        # The first call starts a cluster, which later calls use.
+        # The first call starts a cluster, and later calls use the same cluster.
         _record(folder / "envs", envs=WORKERS)
         mcaprl.ray.read(folder / "envs")
         compare(

@@ -1,4 +1,4 @@
-"""Measure chunk sizes and index sizes of long logs, and the memory of our player for a seek.
+"""Measure the chunks and indexes of long logs, and the memory that our player needs for a seek.
 
     python benchmarks/replay.py
 
@@ -34,7 +34,7 @@ def main() -> None:
             path = Path(folder) / "log.mcap"
             path.unlink(missing_ok=True)
             steps = make(path)
-            # In a separate process, because creating the log takes memory, too.
+            # Measure each row in a separate process, because creating the log also takes memory.
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
                 print(f"| {name} | {steps} | {pool.submit(_row, path).result()} |", flush=True)
 

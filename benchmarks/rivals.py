@@ -1,4 +1,4 @@
-"""Do the benchmarks' tasks with other libraries, as the documentation of each library shows."""
+"""Perform the tasks of the benchmarks with other libraries, as their documentation shows."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ IMAGE_FIELDS: Fields = {"/rl/step": ("observation_state", "action", "reward"), D
 
 
 def messages(data: mcaprl.Dataset) -> list[bytes]:
-    """Return CDR messages of `/rl/step`; they are prebuilt, so that only writing is timed."""
+    """Return prebuilt CDR messages of `/rl/step`, so that only the writing is timed."""
     dtype = message_dtype(TEXT)
     assert dtype is not None
     rows = np.zeros(len(data), dtype)
@@ -52,7 +52,7 @@ def write_mcap(encoded: list[bytes], path: Path) -> None:
 
 
 def write_interleaved(encoded: list[bytes], path: Path) -> None:
-    """Write with mcap's Writer, interleaved with messages of other lengths on another topic."""
+    """Write with mcap's Writer, mixed with messages of other lengths on another topic."""
     from mcap.writer import CompressionType, Writer
 
     with path.open("wb") as file:
@@ -199,7 +199,7 @@ class MinariFolder:
         return f"bench/{what}-{data_format}-v0"
 
     def read(self, name: str, episodes: list[int] | None = None) -> list[Any]:
-        """Read observations, actions and rewards of episodes into arrays; default: all episodes."""
+        """Read observations, actions and rewards of the given, or of all, episodes into arrays."""
         import minari
 
         found = list(minari.load_dataset(name).iterate_episodes(episodes))
@@ -230,7 +230,7 @@ class _NoSpec(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def columns_of(data: mcaprl.Dataset) -> dict[str, NDArray[Any]]:
-    """Return the columns for table formats, without next observations: the next rows have them."""
+    """Return the columns for table formats; the next rows contain the next observations."""
     here = data.observations
     return {
         **(here if isinstance(here, dict) else {"observation": here}),
@@ -242,7 +242,7 @@ def columns_of(data: mcaprl.Dataset) -> dict[str, NDArray[Any]]:
 
 
 def write_h5py(data: mcaprl.Dataset, path: Path) -> None:
-    """Write with h5py, in one HDF5 file, chunked and with gzip 1: HDF5 has no built-in zstd."""
+    """Write one chunked HDF5 file with h5py and gzip 1, because HDF5 has no built-in zstd."""
     import h5py
 
     with h5py.File(path, "w") as file:

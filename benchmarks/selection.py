@@ -1,14 +1,16 @@
-"""Measure how well rules that use a log alone choose among the algorithms of offline learning.
+"""Measure how well the best offline policy can be chosen from a log alone.
 
     python -m benchmarks.selection FOLDER [--sims lane,racer] [--data weak,expert] [--seeds 4]
 
-On each log of `sim_data`, every candidate is trained with the settings of `sim_grid` and scored in
-the sim, which gives the truth. The evidence of the log is collected as well: FQE, with and without
-pessimism, the policy's own values, its Bellman error and its support in the log. FOLDER/SIM has one
-JSON file for each finished log, so an interrupted run resumes.
+The candidates are algorithms of offline learning. On each log of `sim_data`, each candidate is
+trained with the settings of `sim_grid`. Its true score is measured in the sim. Other scores are
+computed from the log: FQE with and without pessimism, the policy's own values, its Bellman error
+and its support in the log. FOLDER/SIM has one JSON file for each finished log, so an interrupted
+run resumes.
 
-The regret of a rule is the score of the best candidate minus that of the chosen one, both means
-over seeds. The table has each rule's mean regret over the finished logs, and its largest.
+A rule chooses one candidate by the scores from the log. The regret of a rule is the true score of
+the best candidate minus that of the chosen candidate; both scores are means over seeds. The table
+has the mean and the largest regret of each rule over the finished logs.
 """
 
 from __future__ import annotations
@@ -73,7 +75,7 @@ def collect(sim: str, log: Path, out: Path, seeds: int) -> list[Row]:
 
 
 def means(rows: list[Row], value: Callable[[Row], float | None]) -> dict[str, float]:
-    """Return the mean of a value over the seeds of each candidate that has the value."""
+    """Return the mean of a value over the seeds, for each candidate that has this value."""
     found: dict[str, list[float]] = {}
     for row in rows:
         if (one := value(row)) is not None:

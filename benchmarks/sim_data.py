@@ -37,9 +37,9 @@ MEDIUM_SCORE = 0.5
 WRONG = {"lane": "brake", "powerline": "no change", "racer": "none"}
 """Wrong action of the weak pilot, by sim."""
 TIMID_ABOVE_M_S = {"lane": 5.0}
-"""Minimum speed, by sim, at which the weak pilot does the wrong thing; others have no minimum."""
+"""Minimum speed at which the weak pilot does the wrong thing, for the sims that have a minimum."""
 WEAK, CLUMSY = 0.6, 0.1
-"""Two probabilities: of the wrong action and, if it is not taken, of a random action."""
+"""Probability of the wrong action, and probability of a random action in the other cases."""
 MIXED_EPSILONS = (0.1, 0.3, 0.6, 1.0)
 MakeBehavior = Callable[[gym.Env[Any, Any]], EpsilonGreedy]
 

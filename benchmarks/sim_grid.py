@@ -2,12 +2,12 @@
 
     python -m benchmarks.sim_grid FOLDER [--sims lane,racer] [--data weak] [--algos 'cql;bc']
 
-The logs are those of `sim_data`; the settings of each sim are below and the same for all its logs.
-The networks after the last update are scored: none is selected by its score in the sim. A score
-is the mean return over 30 episodes of each seed, normalized so that random is 0 and the pilot 1,
-with a 95 % bootstrap interval over seeds and episodes. FOLDER/SIM/scores.json has each finished
-cell, so an interrupted run resumes. At the end the tables are written to docs/results.md, with a
-dash for each missing cell.
+The logs are those of `sim_data`. The settings below are the same for all logs of a sim. The
+networks after the last update are scored, without selection by scores in the sim. A score is the
+mean return over 30 episodes of each seed, normalized so that random is 0 and the pilot is 1, with a
+95 % bootstrap interval over seeds and episodes. FOLDER/SIM/scores.json has each finished cell, so
+an interrupted run resumes. At the end, the tables are written to docs/results.md, with a dash for
+each missing cell.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def learn(
 
 
 def settings_of(sim: str, algo: str, special: dict[str, Any]) -> TrainingConfig:
-    """Return the settings of an algorithm for a sim; `special` differs from the shared ones."""
+    """Return the settings of an algorithm for a sim; `special` overrides the shared settings."""
     config_type = ALGORITHMS[algo].config_type
     given = {**SHARED, **SETTINGS[sim], **special}
     if issubclass(config_type, DQNConfig):
@@ -125,7 +125,7 @@ def settings_of(sim: str, algo: str, special: dict[str, Any]) -> TrainingConfig:
 
 
 def run(sim: str, policies: Sequence[Policy | None], env: Any = None) -> PolicyScore:
-    """Run the same episodes for each policy: one by one in `env`, or as a batch without `env`."""
+    """Run the same episodes for each policy: one by one in `env`, or in a batch if it is None."""
     with closing(make_sim(sim)) as own, closing(make_sims(sim, EPISODES)) as envs:
         return evaluate(
             env or own,

@@ -37,8 +37,8 @@ GOALS = {
 def ours() -> list[Side]:
     """Return a side for each of our sims.
 
-    Turns take hundredths of a second, to limit disturbances. An episode that is not finished at the
-    end of a turn continues in the next one.
+    A turn takes only hundredths of a second, so that disturbances affect few turns. An episode that
+    is not finished at the end of a turn continues in the next turn.
     """
     return [
         _single("car", make_sim("lane"), 10_000),

@@ -51,7 +51,7 @@ def start(*arguments: str, **options: Any) -> subprocess.Popen[bytes]:
 
 
 def scores_while_it_learns(learner: subprocess.Popen[bytes], run: Path) -> dict[int, float]:
-    """Return the score of each policy that a run saves while it trains, by number of updates."""
+    """Score each policy that a run saves during training; return the scores by updates."""
     found: dict[int, float] = {}
     with closing(make_sim(SIM)) as env:
         scale = measure_scale(env, episodes=EPISODES, seed=SELECTION_SEED)
