@@ -181,7 +181,7 @@ def _next_chunk(view: memoryview, start: int, stop: int) -> int:
 
 
 def intact_summary(view: memoryview) -> list[Any]:
-    """Return the schemas, channels and chunk indexes of the summary; [] if it is not intact."""
+    """Return schemas, channels and chunk indexes of the summary; [] if the summary is damaged."""
     try:
         footer = footer_of(view)
     except CorruptLogError:

@@ -1,1 +1,1 @@
-"""Conversion of any robot's bag to a dataset. A mapping assigns the topics of the bag."""
+"""Conversion of any robot's bag to a dataset, with a mapping from topics to transitions."""

@@ -56,7 +56,7 @@ def _dropped(lengths: list[int]) -> str:
 
 @dataclass(frozen=True)
 class MappingReport:
-    """Result of reading a bag by a mapping.
+    """Result of reading a bag with a mapping.
 
     Attributes:
         clock_steps: Number of steps of the clock.

@@ -211,7 +211,7 @@ def _put_info(file: Any, name: str, info: StoredInfo, dataset: Dataset) -> None:
 
 
 def _put(file: Any, name: str, column: Any, rows: NDArray[np.int64], is_image: bool) -> None:
-    """Write rows of a column block by block, because images on disk need not fit into memory."""
+    """Write rows of a column in blocks, because images on disk may be larger than the memory."""
     shape = (len(rows), *column.shape[1:])
     settings = nodes.image_settings(shape, column.dtype) if is_image else {}
     stored = file.create_dataset(name, shape, column.dtype, **settings)

@@ -268,7 +268,7 @@ def _nested(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 
 
 def _put(archive: zipfile.ZipFile, name: str, column: Any, rows: NDArray[np.int64]) -> None:
-    """Write rows of a column block by block, because images on disk need not fit into memory."""
+    """Write rows of a column in blocks, because images on disk may be larger than the memory."""
     blocks = (
         np.asarray(column[rows[start : start + _BLOCK_ROWS]])
         for start in range(0, len(rows), _BLOCK_ROWS)

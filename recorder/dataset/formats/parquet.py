@@ -110,7 +110,7 @@ def read(path: Path) -> Dataset:
     metadata = steps.metadata()
     lengths = episodes.values("length", (), _TIME)
     if not len(lengths) or (lengths < 1).any():
-        raise LogError(f"{path / EPISODES} has no episodes, or an episode without transitions")
+        raise LogError(f"{path / EPISODES} has no episodes, or has an episode without transitions")
     numbers = steps.values("episode", (), _TIME), steps.values("step", (), _TIME)
     first_steps = np.cumsum(lengths) - lengths
     expected = (

@@ -71,7 +71,7 @@ def test_indexes_missing_from_the_summary_are_found(log_path: Path, every: int) 
     assert [data.fingerprint for data in found] == [data.fingerprint for data in reported]
 
 
-def test_they_are_sorted_by_offset(log_path: Path) -> None:
+def test_chunk_indexes_are_sorted_by_offset(log_path: Path) -> None:
     record(log_path, MIXED_SPACE, spaces.Discrete(2), [5, 1, 30])
     reader = McapReader(log_path)
     data = log_path.read_bytes()[: reader.summary_start]

@@ -92,7 +92,7 @@ def test_only_small_chunks_of_one_kind_are_merged() -> None:
     assert [len(group) for group in groups(*(chunk(k, small, 1) for k in range(70)))] == [32, 32, 6]
 
 
-def test_channels_are_of_one_kind_through_others() -> None:
+def test_channels_are_of_one_kind_if_chunks_connect_them() -> None:
     chunks = [
         chunk(0, 9, 1, 2),
         chunk(1, 9, 3, 4),

@@ -122,7 +122,7 @@ def test_leaves_of_a_nested_type(log: Path) -> None:
     assert "pose" not in kinds
 
 
-def test_a_message_as_a_whole_is_no_column(log: Path) -> None:
+def test_a_whole_message_is_not_a_column(log: Path) -> None:
     with pytest.raises(UnknownNameError, match="unknown field of /odometry 'pose'"):
         Topic(McapReader(log), "/odometry").read(["pose"])
 

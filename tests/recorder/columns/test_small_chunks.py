@@ -50,7 +50,7 @@ def _chunks(path: Path) -> int:
 
 
 @pytest.mark.usefixtures("small_chunks")
-def test_an_index_may_not_lead_out_of_its_chunk(log_path: Path) -> None:
+def test_an_index_that_points_outside_its_chunk_is_refused(log_path: Path) -> None:
     record(log_path, spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(2), [2, 2, 2])
     reader = McapReader(log_path)
     channel = reader.channel_of("/rl/step")

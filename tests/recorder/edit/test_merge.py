@@ -72,7 +72,7 @@ def _chunks(paths: list[Path]) -> list[tuple[McapReader, Any]]:
     return [(reader, chunk) for reader in map(McapReader, paths) for chunk in reader.chunks]
 
 
-def test_order_is_that_of_time(tmp_path: Path) -> None:
+def test_episodes_are_in_time_order(tmp_path: Path) -> None:
     late = logged(tmp_path / "a.mcap", [3], start_s=100)
     early = logged(tmp_path / "b.mcap", [2], seed=1)
     mcaprl.merge([late, early], tmp_path / "out.mcap")
@@ -202,7 +202,7 @@ def test_metadata_that_differ_are_named(tmp_path: Path) -> None:
         mcaprl.merge([tmp_path / "a.mcap", tmp_path / "b.mcap"], tmp_path / "out.mcap")
 
 
-def test_other_metadata_are_those_of_the_logs_read_together(tmp_path: Path) -> None:
+def test_other_metadata_equal_those_of_logs_opened_together(tmp_path: Path) -> None:
     a = logged(tmp_path / "a.mcap", [2], policy="one")
     b = logged(tmp_path / "b.mcap", [2], start_s=9, policy="two")
     mcaprl.merge([a, b], tmp_path / "out.mcap")

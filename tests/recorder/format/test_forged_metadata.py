@@ -117,7 +117,9 @@ def test_many_actions_are_not_named_one_by_one() -> None:
 
 
 @pytest.mark.parametrize("layout", [DEEP, "[]", '{"configById": 1}', "no JSON"])
-def test_a_layout_that_is_none_is_refused(log_path: Path, tmp_path: Path, layout: str) -> None:
+def test_an_attachment_that_is_not_a_layout_is_refused(
+    log_path: Path, tmp_path: Path, layout: str
+) -> None:
     record(log_path, spaces.Discrete(2), spaces.Discrete(2), [3])
     out = tmp_path / "other.mcap"
     writer = McapWriter(out, source=log_path)

@@ -65,7 +65,7 @@ def test_errors_name_file_line_and_key(tmp_path: Path, old: str, new: str, expec
     assert expected in str(error.value)
 
 
-def test_files_that_are_no_mapping_are_refused(tmp_path: Path) -> None:
+def test_files_that_are_not_mappings_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="No such file"):
         load_mapping(tmp_path / "none.yaml")
     with pytest.raises(UsageError, match="a mapping has keys and values"):

@@ -229,7 +229,7 @@ def test_short_episodes_are_dropped_and_reported() -> None:
     assert found.dataset.observations.ravel().tolist() == [2.0, 3.0, 4.0]
 
 
-def test_a_topic_that_dies_ends_the_episode() -> None:
+def test_a_topic_that_stops_ends_the_episode() -> None:
     bag = MemoryBag(
         {
             "/odom": ([0, 1, 2, 3], {"speed": [0.0, 1.0, 2.0, 3.0]}),
@@ -332,7 +332,7 @@ def test_wrong_units_and_fractional_modes_are_clear_errors() -> None:
         read(far, clock={"rate_hz": 1000})
 
 
-def test_a_reward_that_is_no_number_is_refused() -> None:
+def test_a_reward_that_is_not_a_number_is_refused() -> None:
     bag = drive(4, **{"/late": ([2], {"x": [1.0]})})
     with pytest.raises(
         UsageError, match=r"mapping: reward: the reward is nan at 0 ns; it is not finite in 2 of 3"

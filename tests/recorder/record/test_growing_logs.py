@@ -89,7 +89,7 @@ def test_appending_nothing_changes_nothing(log_path: Path) -> None:
     assert log_path.read_bytes() == before
 
 
-def test_vector_of_environments_appends_to_a_single_ones_log(log_path: Path) -> None:
+def test_vector_environment_appends_to_a_log_of_one_environment(log_path: Path) -> None:
     cartpole_log(log_path, 2)
     envs = SyncVectorEnv([lambda: gym.make("CartPole-v1")] * 2)
     with closing(mcaprl.RecordVecMcap(envs, log_path, append=True)) as env:

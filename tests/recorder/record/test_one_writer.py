@@ -158,7 +158,7 @@ def _compete(path: Path, barrier: Any, results: Any) -> None:
 
 
 @pytest.mark.parametrize("exists", [False, True])
-def test_of_two_recorders_that_start_together_one_is_refused(log_path: Path, exists: bool) -> None:
+def test_one_of_two_simultaneous_recorders_is_refused(log_path: Path, exists: bool) -> None:
     context = multiprocessing.get_context("fork")
     for _ in range(6):
         log_path.unlink(missing_ok=True)
@@ -181,7 +181,7 @@ def test_of_two_recorders_that_start_together_one_is_refused(log_path: Path, exi
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_of_two_recoveries_to_one_file_one_is_refused(tmp_path: Path, overwrite: bool) -> None:
+def test_one_of_two_recoveries_to_the_same_file_is_refused(tmp_path: Path, overwrite: bool) -> None:
     source, out = tmp_path / "source.mcap", tmp_path / "out.mcap"
     write_log(source, 3)
     if overwrite:

@@ -248,7 +248,7 @@ def test_each_chunk_is_read_once(good: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("compression", ["none", "zstd"])
-def test_arrays_find_what_a_scan_finds(
+def test_array_checks_find_the_same_problems_as_a_scan(
     log_path: Path, monkeypatch: pytest.MonkeyPatch, compression: str
 ) -> None:
     """Find the same problems as a scan of single records, for any wrong byte that no CRC covers."""

@@ -166,7 +166,7 @@ def test_speeds_that_no_clock_can_have_are_ignored(server: LiveServer, speed: fl
 
 
 @pytest.mark.parametrize("episode", [math.inf, math.nan, -1, 1e300, "1", None])
-def test_episodes_that_are_no_numbers_are_ignored(server: LiveServer, episode: Any) -> None:
+def test_episodes_that_are_not_numbers_are_ignored(server: LiveServer, episode: Any) -> None:
     parameter: Any = SimpleNamespace(name="episode", get_value=lambda: episode)
     before = server._player.time_ns
     server.on_set_parameters(None, [parameter])

@@ -152,7 +152,7 @@ def _ours(plain: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def _flat(bounds: Any) -> Any:
-    """Flatten nested lists of bounds; return one number if all are equal."""
+    """Flatten nested lists of bounds; return one number if all bounds are equal."""
     while isinstance(bounds, list) and bounds and isinstance(bounds[0], list):
         bounds = [value for row in bounds for value in row]
     if isinstance(bounds, list) and bounds and bounds.count(bounds[0]) == len(bounds):

@@ -60,7 +60,7 @@ def _write(path: Path, arrays: dict[str, Any]) -> Path:
     return path
 
 
-def test_a_dataset_comes_back_whole(tmp_path: Path) -> None:
+def test_a_dataset_is_read_back_unchanged(tmp_path: Path) -> None:
     data = _two_episodes()
     assert data.to_hdf5(tmp_path / "toy.hdf5") == [
         "1 episodes that end without an end flag are written with a timeout"

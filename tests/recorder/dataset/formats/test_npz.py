@@ -60,7 +60,7 @@ def _same(found: Dataset, data: Dataset) -> None:
         assert one.log_time_ns.tolist() == other.log_time_ns.tolist()
 
 
-def test_a_dataset_comes_back_whole(tmp_path: Path) -> None:
+def test_a_dataset_is_read_back_unchanged(tmp_path: Path) -> None:
     data = _two_episodes()
     assert data.to_npz(tmp_path / "toy.npz") == []
     _same(Dataset.from_npz(tmp_path / "toy.npz"), data)

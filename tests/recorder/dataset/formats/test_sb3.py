@@ -119,7 +119,7 @@ def test_the_buffer_is_equal_to_the_one_that_sb3_filled(
             assert one is None or torch.equal(one[key], other[key])
 
 
-def test_training_on_it_gives_the_same_weights(tmp_path: Path) -> None:
+def test_training_on_the_buffer_gives_the_same_weights(tmp_path: Path) -> None:
     model, dataset = _learned(tmp_path / "log.mcap", _VECTOR, "MlpPolicy", 40)
     weights = []
     for buffer in (model.replay_buffer, dataset.to_sb3(buffer_size=40)):
@@ -190,7 +190,7 @@ def test_several_environments_follow_each_other(tmp_path: Path) -> None:
     assert (np.diff(np.concatenate([e.log_time_ns for e in found.episodes])) > 0).all()
 
 
-def test_an_overwritten_buffer_gives_what_is_left(tmp_path: Path) -> None:
+def test_an_overwritten_buffer_returns_the_remaining_transitions(tmp_path: Path) -> None:
     env = RecordMcap(Counter(_VECTOR, spaces.Discrete(3)), tmp_path / "log.mcap")
     model = sb3_package.DQN("MlpPolicy", env, buffer_size=15, learning_starts=99, seed=0)
     model.learn(40)
@@ -228,7 +228,7 @@ def test_shared_observations_are_stored_as_sb3_stores_them(tmp_path: Path) -> No
         assert all(e.terminated[-1] and not e.truncated[-1] for e in found.episodes)
 
 
-def test_a_buffer_that_does_not_tell_truncations(tmp_path: Path) -> None:
+def test_a_buffer_without_timeouts_needs_lossy(tmp_path: Path) -> None:
     buffer = _steps().to_sb3(handle_timeout_termination=False)
     with pytest.raises(LogError, match="handle_timeout_termination=False"):
         Dataset.from_sb3(buffer)
@@ -268,7 +268,7 @@ def test_environments_of_equal_observations_are_not_one_episode() -> None:
     assert found.actions.tolist() == [0, 1, 0, 1]
 
 
-def test_channels_can_stay_as_they_are(tmp_path: Path) -> None:
+def test_channels_can_keep_their_order(tmp_path: Path) -> None:
     model, dataset = _learned(tmp_path / "log.mcap", _CAMERA, "CnnPolicy", 40)
     found = Dataset.from_sb3(model.replay_buffer)
     assert found.observation_space == _CAMERA
