@@ -385,7 +385,7 @@ def test_columns_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SpaceError, match="observation is double, expected rows of shape"):
         mcaprl.open(path.parent)
     replaced("action", pa.array(np.full(6, 0.5)))
-    with pytest.raises(SpaceError, match="action is float64 and does not fit"):
+    with pytest.raises(SpaceError, match="action is float64 and cannot be converted exactly"):
         mcaprl.open(path.parent)
     replaced("action", pa.array(["left"] * 6))
     with pytest.raises(SpaceError, match="action is string, expected numbers"):
