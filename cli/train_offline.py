@@ -17,9 +17,9 @@ from mcaprl.texts import counted
 
 
 def _configs() -> dict[str, Settings]:
-    from mcaprl.offline.algorithms.registry import all_algorithms
+    from mcaprl.offline.algorithms.config import default_configs
 
-    return {name: learner.config_type() for name, learner in all_algorithms().items()}
+    return {**default_configs()}
 
 
 @click.command(cls=SettingsCommand, configs=_configs)

@@ -19,9 +19,9 @@ from mcaprl.sims import SIMS
 
 
 def _configs() -> dict[str, Settings]:
-    from mcaprl.online.algorithms import ALGORITHMS
+    from mcaprl.online.config import CONFIGS
 
-    return {name: algorithm.config_type() for name, algorithm in ALGORITHMS.items()}
+    return {name: config_type() for name, config_type in CONFIGS.items()}
 
 
 def _tuned() -> dict[str, dict[str, Any]]:

@@ -44,9 +44,14 @@ __all__ = [
 __getattr__ = lazy_attributes(
     __name__,
     {
-        "mcaprl.offline.algorithms.config": ("BootstrapConfig", "TrainingConfig"),
-        "mcaprl.offline.algorithms.cql": ("CQL", "CQLConfig"),
-        "mcaprl.offline.algorithms.dqn": ("DQNConfig", "DoubleDQN"),
+        "mcaprl.offline.algorithms.config": (
+            "BootstrapConfig",
+            "CQLConfig",
+            "DQNConfig",
+            "TrainingConfig",
+        ),
+        "mcaprl.offline.algorithms.cql": ("CQL",),
+        "mcaprl.offline.algorithms.dqn": ("DoubleDQN",),
         "mcaprl.offline.algorithms.learner": ("Learner",),
         "mcaprl.offline.algorithms.registry": ("ALGORITHMS",),
         "mcaprl.offline.batches.buffer": ("TransitionBuffer",),

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
+from mcaprl.architecture import architecture_of
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
 from mcaprl.files import parse_json, write_json
-from mcaprl.networks import ImageInput, Network, architecture_of, check_size
+from mcaprl.networks import ImageInput, Network, check_size
 from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import allowed_only, likely_actions, mean_values
 from mcaprl.offline.batches.buffer import discrete_actions

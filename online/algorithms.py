@@ -13,14 +13,13 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from mcaprl.architecture import Architecture
 from mcaprl.errors import SpaceError, UnknownNameError, UsageError
-from mcaprl.networks import Architecture
 from mcaprl.online.config import (
-    A2CConfig,
+    CONFIGS,
     DoubleDQNConfig,
     DQNConfig,
     OnlineConfig,
-    PPOConfig,
 )
 from mcaprl.online.double_dqn import DoubleDQN, WarmDQN
 from mcaprl.online.features import NetworkDQNPolicy, inputs_of, policy_arguments, pools_of
@@ -41,11 +40,14 @@ class Algorithm:
     model_type: type[BaseAlgorithm]
 
 
-ALGORITHMS: Final[dict[str, Algorithm]] = {
-    "dqn": Algorithm(DQNConfig, WarmDQN),
-    "double-dqn": Algorithm(DoubleDQNConfig, DoubleDQN),
-    "ppo": Algorithm(PPOConfig, PPO),
-    "a2c": Algorithm(A2CConfig, A2C),
+_MODELS: Final[dict[str, type[BaseAlgorithm]]] = {
+    "dqn": WarmDQN,
+    "double-dqn": DoubleDQN,
+    "ppo": PPO,
+    "a2c": A2C,
+}
+ALGORITHMS: Final = {
+    name: Algorithm(config_type, _MODELS[name]) for name, config_type in CONFIGS.items()
 }
 
 

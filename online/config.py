@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
-from mcaprl.networks import Architecture, NetworkSettings
+from mcaprl.architecture import Architecture, NetworkSettings
 
 
 @dataclass(frozen=True)
@@ -201,3 +201,12 @@ class A2CConfig(RolloutConfig):
     """Settings of A2C, with RMSProp as in the paper."""
 
     learning_rate: float = 7e-4
+
+
+CONFIGS: Final[dict[str, type[OnlineConfig]]] = {
+    "dqn": DQNConfig,
+    "double-dqn": DoubleDQNConfig,
+    "ppo": PPOConfig,
+    "a2c": A2CConfig,
+}
+"""Settings of the algorithms by name."""

@@ -18,7 +18,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import Tensor, nn
 
-from mcaprl.networks import ENCODERS, Architecture, Convolutions, ImageInput, Trunk, make_head
+from mcaprl.architecture import ENCODERS, Architecture
+from mcaprl.networks import Convolutions, ImageInput, Trunk, make_head
 from mcaprl.online.frames import parts_of, parts_of_space
 
 

@@ -22,8 +22,9 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.dqn.policies import CnnPolicy, DQNPolicy, MultiInputPolicy
 
+from mcaprl.architecture import Architecture, architecture_of
 from mcaprl.errors import PolicyError, SpaceError
-from mcaprl.networks import Architecture, architecture_of, check_size
+from mcaprl.networks import check_size
 from mcaprl.online.features import NetworkDQNPolicy, inputs_of, policy_arguments
 from mcaprl.online.frames import (
     FrameMemory,

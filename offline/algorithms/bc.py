@@ -6,19 +6,12 @@ Pomerleau, "ALVINN: An Autonomous Land Vehicle in a Neural Network", 1988.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from torch import Tensor
 
-from mcaprl.offline.algorithms.config import TrainingConfig
+from mcaprl.offline.algorithms.config import BCConfig
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.algorithms.losses import cross_entropy
 from mcaprl.offline.batches.buffer import Batch
-
-
-@dataclass(frozen=True)
-class BCConfig(TrainingConfig):
-    """Settings of behavior cloning, the same as those of `TrainingConfig`."""
 
 
 class BC(Learner):

@@ -11,12 +11,11 @@ synced at intervals instead of averaged. The departures that `dqn` lists also ap
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
-from mcaprl.offline.algorithms.dqn import DQN, DQNConfig
+from mcaprl.offline.algorithms.config import BCQConfig
+from mcaprl.offline.algorithms.dqn import DQN
 from mcaprl.offline.algorithms.losses import (
     allowed_only,
     chosen,
@@ -28,22 +27,6 @@ from mcaprl.offline.algorithms.losses import (
     temporal_difference_loss,
 )
 from mcaprl.offline.batches.buffer import Batch
-
-
-@dataclass(frozen=True)
-class BCQConfig(DQNConfig):
-    """Settings of discrete BCQ: those of DQN, plus those of the behavior clone."""
-
-    threshold: float = 0.3
-    """minimum probability relative to the most likely action; 0 is Double DQN, 1 is cloning"""
-    logits_penalty: float = 0.01
-    """weight of the mean square of the clone's logits"""
-
-    def __post_init__(self) -> None:
-        """Validate the settings."""
-        super().__post_init__()
-        self._require("threshold", 0 <= self.threshold <= 1, "within [0, 1]")
-        self._require("logits_penalty", self.logits_penalty >= 0, "at least 0")
 
 
 class BCQ(DQN):

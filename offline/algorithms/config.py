@@ -1,11 +1,16 @@
-"""Base classes of the settings of offline algorithms."""
+"""Settings of the offline algorithms. Importing this module loads no torch."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from importlib.metadata import entry_points
+from typing import Final
 
-from mcaprl.networks import NetworkSettings
-from mcaprl.offline.batches.buffer import Packing
+from mcaprl.architecture import Architecture, NetworkSettings
+from mcaprl.offline.batches.packing import Packing
+
+ENTRY_POINT_GROUP: Final = "mcaprl.algorithms"
 
 
 @dataclass(frozen=True)
@@ -90,3 +95,106 @@ class BootstrapConfig(TrainingConfig):
         """
         target_updates = max(self.updates / self.target_interval, 1)
         return float(1 - self.gamma ** (self.n_steps * target_updates))
+
+
+@dataclass(frozen=True)
+class BCConfig(TrainingConfig):
+    """Settings of behavior cloning, the same as those of `TrainingConfig`."""
+
+
+@dataclass(frozen=True)
+class DQNConfig(BootstrapConfig):
+    """Settings of DQN."""
+
+    dueling: bool = False
+    """learn the value of a state separately from the advantages of its actions"""
+    n_quantiles: int = 1
+    """number of quantiles of the return, averaged to select actions; 1 learns only the mean"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("n_quantiles", self.n_quantiles >= 1, "at least 1")
+        self._require("hidden", bool(self.hidden) or not self.dueling, "not empty if dueling")
+
+    def architecture_for(self, channels: Iterable[int]) -> Architecture:
+        """Return the architecture for images that have these numbers of channels in one frame."""
+        return replace(super().architecture_for(channels), dueling=self.dueling)
+
+
+@dataclass(frozen=True)
+class DoubleDQNConfig(DQNConfig):
+    """Settings of Double DQN, the same as those of DQN."""
+
+
+@dataclass(frozen=True)
+class BCQConfig(DQNConfig):
+    """Settings of discrete BCQ: those of DQN, plus those of the behavior clone."""
+
+    threshold: float = 0.3
+    """minimum probability relative to the most likely action; 0 is Double DQN, 1 is cloning"""
+    logits_penalty: float = 0.01
+    """weight of the mean square of the clone's logits"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("threshold", 0 <= self.threshold <= 1, "within [0, 1]")
+        self._require("logits_penalty", self.logits_penalty >= 0, "at least 0")
+
+
+@dataclass(frozen=True)
+class CQLConfig(DoubleDQNConfig):
+    """Settings of CQL: those of Double DQN, plus alpha."""
+
+    alpha: float = 1.0
+    """weight of the penalty on actions that are not in the data; 0 is Double DQN"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("alpha", self.alpha >= 0, "at least 0")
+
+
+@dataclass(frozen=True)
+class IQLConfig(BootstrapConfig):
+    """Settings of IQL."""
+
+    target_interval: int = 50
+    """updates between two syncs of the target networks"""
+    expectile: float = 0.8
+    """expectile of the action values that V estimates; 0.5 is the mean, near 1 the maximum"""
+    beta: float = 3.0
+    """inverse temperature of the advantage weights in cloning; 0 weights all actions equally"""
+    normalize_advantages: bool = False
+    """divide advantages by their root mean square in the batch; beta is then about 0.3 to 1"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("expectile", 0 < self.expectile < 1, "within (0, 1)")
+        self._require("beta", self.beta >= 0, "at least 0")
+
+
+CONFIGS: Final[dict[str, type[TrainingConfig]]] = {
+    "dqn": DQNConfig,
+    "double-dqn": DoubleDQNConfig,
+    "cql": CQLConfig,
+    "bc": BCConfig,
+    "bcq": BCQConfig,
+    "iql": IQLConfig,
+}
+"""Settings of the built-in algorithms by name."""
+
+
+def default_configs() -> dict[str, TrainingConfig]:
+    """Return the default settings of the built-in algorithms and of those of installed packages.
+
+    Raises:
+        UsageError: An entry point is broken.
+    """
+    if not entry_points(group=ENTRY_POINT_GROUP):
+        return {name: config_type() for name, config_type in CONFIGS.items()}
+    from mcaprl.offline.algorithms.registry import all_algorithms  # imports torch
+
+    return {name: learner.config_type() for name, learner in all_algorithms().items()}

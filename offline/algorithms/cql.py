@@ -11,11 +11,10 @@ Lagrange multiplier. The target is that of Double DQN.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from torch import Tensor
 
-from mcaprl.offline.algorithms.dqn import DoubleDQN, DoubleDQNConfig
+from mcaprl.offline.algorithms.config import CQLConfig
+from mcaprl.offline.algorithms.dqn import DoubleDQN
 from mcaprl.offline.algorithms.losses import (
     chosen,
     cross_entropy,
@@ -23,19 +22,6 @@ from mcaprl.offline.algorithms.losses import (
     temporal_difference_loss,
 )
 from mcaprl.offline.batches.buffer import Batch
-
-
-@dataclass(frozen=True)
-class CQLConfig(DoubleDQNConfig):
-    """Settings of CQL: those of Double DQN, plus alpha."""
-
-    alpha: float = 1.0
-    """weight of the penalty on actions that are not in the data; 0 is Double DQN"""
-
-    def __post_init__(self) -> None:
-        """Validate the settings."""
-        super().__post_init__()
-        self._require("alpha", self.alpha >= 0, "at least 0")
 
 
 class CQL(DoubleDQN):

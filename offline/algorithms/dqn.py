@@ -14,15 +14,13 @@ overestimate actions that are not in the log, so they are baselines for CQL.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from mcaprl.networks import Architecture
-from mcaprl.offline.algorithms.config import BootstrapConfig
+from mcaprl.offline.algorithms.config import DoubleDQNConfig, DQNConfig
 from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import (
     allowed_only,
@@ -33,31 +31,6 @@ from mcaprl.offline.algorithms.losses import (
     temporal_difference_loss,
 )
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
-
-
-@dataclass(frozen=True)
-class DQNConfig(BootstrapConfig):
-    """Settings of DQN."""
-
-    dueling: bool = False
-    """learn the value of a state separately from the advantages of its actions"""
-    n_quantiles: int = 1
-    """number of quantiles of the return, averaged to select actions; 1 learns only the mean"""
-
-    def __post_init__(self) -> None:
-        """Validate the settings."""
-        super().__post_init__()
-        self._require("n_quantiles", self.n_quantiles >= 1, "at least 1")
-        self._require("hidden", bool(self.hidden) or not self.dueling, "not empty if dueling")
-
-    def architecture_for(self, channels: Iterable[int]) -> Architecture:
-        """Return the architecture for images that have these numbers of channels in one frame."""
-        return replace(super().architecture_for(channels), dueling=self.dueling)
-
-
-@dataclass(frozen=True)
-class DoubleDQNConfig(DQNConfig):
-    """Settings of Double DQN, the same as those of DQN."""
 
 
 class DQN(Learner):

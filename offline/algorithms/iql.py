@@ -17,12 +17,11 @@ loss. Advantages can be divided by their root mean square, because their size di
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from mcaprl.offline.algorithms.config import BootstrapConfig
+from mcaprl.offline.algorithms.config import IQLConfig
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.algorithms.losses import (
     chosen,
@@ -37,26 +36,6 @@ MAX_WEIGHT = 100.0
 _SMALLEST_ADVANTAGE = 1e-6
 """Root mean square up to which advantages count as equal, because of rounding errors."""
 _TWINS = ("q", "q_twin")
-
-
-@dataclass(frozen=True)
-class IQLConfig(BootstrapConfig):
-    """Settings of IQL."""
-
-    target_interval: int = 50
-    """updates between two syncs of the target networks"""
-    expectile: float = 0.8
-    """expectile of the action values that V estimates; 0.5 is the mean, near 1 the maximum"""
-    beta: float = 3.0
-    """inverse temperature of the advantage weights in cloning; 0 weights all actions equally"""
-    normalize_advantages: bool = False
-    """divide advantages by their root mean square in the batch; beta is then about 0.3 to 1"""
-
-    def __post_init__(self) -> None:
-        """Validate the settings."""
-        super().__post_init__()
-        self._require("expectile", 0 < self.expectile < 1, "within (0, 1)")
-        self._require("beta", self.beta >= 0, "at least 0")
 
 
 class IQL(Learner):

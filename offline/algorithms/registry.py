@@ -11,13 +11,11 @@ from importlib.metadata import EntryPoint, entry_points
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.offline.algorithms.bc import BC
 from mcaprl.offline.algorithms.bcq import BCQ
-from mcaprl.offline.algorithms.config import TrainingConfig
+from mcaprl.offline.algorithms.config import ENTRY_POINT_GROUP, TrainingConfig
 from mcaprl.offline.algorithms.cql import CQL
 from mcaprl.offline.algorithms.dqn import DQN, DoubleDQN
 from mcaprl.offline.algorithms.iql import IQL
 from mcaprl.offline.algorithms.learner import Learner
-
-ENTRY_POINT_GROUP = "mcaprl.algorithms"
 
 ALGORITHMS: dict[str, type[Learner]] = {
     learner.name: learner for learner in (DQN, DoubleDQN, CQL, BC, BCQ, IQL)

@@ -20,7 +20,8 @@ import torch
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
-from mcaprl.offline.algorithms.bc import BC, BCConfig
+from mcaprl.offline.algorithms.bc import BC
+from mcaprl.offline.algorithms.config import BCConfig
 from mcaprl.offline.algorithms.models import outputs_of_buffer
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.recorder.dataset.calibration import EDGES

@@ -24,7 +24,8 @@ from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import chosen, expected_sarsa_target, square_regression
 from mcaprl.offline.algorithms.models import outputs_of_buffer
-from mcaprl.offline.batches.buffer import Batch, Packing, TransitionBuffer
+from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
+from mcaprl.offline.batches.packing import Packing
 
 SYNCS_PER_HORIZON = 5.0
 """Minimum number of syncs per effective horizon 1 / (1 - gamma) after which Q can converge."""

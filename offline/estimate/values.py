@@ -17,7 +17,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import PolicyError, UsageError
-from mcaprl.offline.algorithms.dqn import DQNConfig
+from mcaprl.offline.algorithms.config import DQNConfig
 from mcaprl.offline.algorithms.losses import q_learning_target
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.runs import CONFIG_NAME

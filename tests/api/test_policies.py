@@ -13,7 +13,7 @@ from stable_baselines3 import DQN
 import mcaprl
 from mcaprl.api.policies import is_policy, load_policies
 from mcaprl.errors import PolicyError
-from mcaprl.offline.algorithms.cql import CQLConfig
+from mcaprl.offline.algorithms.config import CQLConfig
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.task import Task
 from mcaprl.online.train import train as train_online

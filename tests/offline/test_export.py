@@ -10,10 +10,7 @@ import pytest
 from gymnasium import spaces
 
 from mcaprl.cli import run
-from mcaprl.offline.algorithms.bc import BCConfig
-from mcaprl.offline.algorithms.bcq import BCQConfig
-from mcaprl.offline.algorithms.config import TrainingConfig
-from mcaprl.offline.algorithms.dqn import DQNConfig
+from mcaprl.offline.algorithms.config import BCConfig, BCQConfig, DQNConfig, TrainingConfig
 from mcaprl.offline.algorithms.registry import ALGORITHMS
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.export import ExportedPolicy, export_onnx

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from mcaprl.api.policies import load_policies, load_policy
 from mcaprl.errors import PolicyError, ReportError
 from mcaprl.networks import Convolutions
-from mcaprl.offline.algorithms.bc import BC, BCConfig
+from mcaprl.offline.algorithms.bc import BC
 from mcaprl.offline.algorithms.bcq import BCQ
-from mcaprl.offline.algorithms.config import TrainingConfig
-from mcaprl.offline.algorithms.cql import CQL, CQLConfig
-from mcaprl.offline.algorithms.dqn import DQNConfig
+from mcaprl.offline.algorithms.config import BCConfig, CQLConfig, DQNConfig, TrainingConfig
+from mcaprl.offline.algorithms.cql import CQL
 from mcaprl.offline.algorithms.iql import IQL
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.algorithms.registry import ALGORITHMS

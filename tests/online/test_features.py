@@ -15,8 +15,8 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.torch_layers import NatureCNN
 
+from mcaprl.architecture import Architecture
 from mcaprl.errors import PolicyError, UsageError
-from mcaprl.networks import Architecture
 from mcaprl.online.agent import CENTERING_STEPS, Agent
 from mcaprl.online.config import DoubleDQNConfig, PPOConfig
 from mcaprl.online.evaluation import Scale

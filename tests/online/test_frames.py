@@ -15,7 +15,7 @@ from stable_baselines3 import DQN
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import PolicyError
-from mcaprl.offline.algorithms.cql import CQLConfig
+from mcaprl.offline.algorithms.config import CQLConfig
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import Scale

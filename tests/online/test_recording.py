@@ -16,7 +16,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 import mcaprl
 from mcaprl.errors import LogError, OutputExistsError, UsageError
-from mcaprl.offline.algorithms.cql import CQLConfig
+from mcaprl.offline.algorithms.config import CQLConfig
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import FirstEpisodes, Scale

@@ -18,8 +18,7 @@ import mcaprl
 from mcaprl.api.policies import load_policy
 from mcaprl.cli import run
 from mcaprl.errors import PolicyError, SpaceError, UsageError
-from mcaprl.offline.algorithms.cql import CQLConfig
-from mcaprl.offline.algorithms.dqn import DQNConfig
+from mcaprl.offline.algorithms.config import CQLConfig, DQNConfig
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import Scale

@@ -15,12 +15,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.errors import UnknownNameError, UsageError
-from mcaprl.offline.algorithms.bc import BCConfig
-from mcaprl.offline.algorithms.bcq import BCQ, BCQConfig
-from mcaprl.offline.algorithms.config import BootstrapConfig, TrainingConfig
-from mcaprl.offline.algorithms.cql import CQLConfig
-from mcaprl.offline.algorithms.dqn import DQN, DoubleDQN, DoubleDQNConfig, DQNConfig
-from mcaprl.offline.algorithms.iql import IQL, IQLConfig
+from mcaprl.offline.algorithms.bcq import BCQ
+from mcaprl.offline.algorithms.config import (
+    BCConfig,
+    BCQConfig,
+    BootstrapConfig,
+    CQLConfig,
+    DoubleDQNConfig,
+    DQNConfig,
+    IQLConfig,
+    TrainingConfig,
+)
+from mcaprl.offline.algorithms.dqn import DQN, DoubleDQN
+from mcaprl.offline.algorithms.iql import IQL
 from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import ALGORITHMS
 from mcaprl.offline.batches.buffer import TransitionBuffer

@@ -8,12 +8,14 @@ from typing import Any
 import pytest
 
 from mcaprl.errors import UnknownNameError, UsageError
-from mcaprl.offline.algorithms.bc import BCConfig
-from mcaprl.offline.algorithms.bcq import BCQConfig
-from mcaprl.offline.algorithms.config import TrainingConfig
-from mcaprl.offline.algorithms.cql import CQLConfig
-from mcaprl.offline.algorithms.dqn import DQNConfig
-from mcaprl.offline.algorithms.iql import IQLConfig
+from mcaprl.offline.algorithms.config import (
+    BCConfig,
+    BCQConfig,
+    CQLConfig,
+    DQNConfig,
+    IQLConfig,
+    TrainingConfig,
+)
 from mcaprl.offline.algorithms.registry import ALGORITHMS, choose_algorithm
 from mcaprl.settings import field_help
 

@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from mcaprl.networks import Architecture, ImageInput, Network
+from mcaprl.architecture import Architecture
+from mcaprl.networks import ImageInput, Network
 from mcaprl.offline.algorithms.models import AnyModel, Model, StackedMLP, build_model
 from mcaprl.offline.batches.observations import Observations
 

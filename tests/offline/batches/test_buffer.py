@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mcaprl.errors import McaprlError, SpaceError, TrainingError
-from mcaprl.offline.batches.buffer import Packing, TransitionBuffer
+from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline.batches.packing import Packing
 from mcaprl.recorder.dataset.dataset import Dataset
 
 

@@ -15,7 +15,8 @@ import torch
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import LogError
-from mcaprl.offline.algorithms.cql import CQL, CQLConfig
+from mcaprl.offline.algorithms.config import CQLConfig
+from mcaprl.offline.algorithms.cql import CQL
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.training.follow import CHECK_INTERVAL, GrowingLogs, with_more_data
 from mcaprl.offline.training.train import train

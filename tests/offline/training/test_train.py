@@ -20,11 +20,14 @@ from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from mcaprl.errors import OutputExistsError, SpaceError, TrainingError, UnknownNameError, UsageError
-from mcaprl.offline.algorithms.bc import BCConfig
-from mcaprl.offline.algorithms.bcq import BCQConfig
-from mcaprl.offline.algorithms.cql import CQLConfig
-from mcaprl.offline.algorithms.dqn import DoubleDQNConfig, DQNConfig
-from mcaprl.offline.algorithms.iql import IQLConfig
+from mcaprl.offline.algorithms.config import (
+    BCConfig,
+    BCQConfig,
+    CQLConfig,
+    DoubleDQNConfig,
+    DQNConfig,
+    IQLConfig,
+)
 from mcaprl.offline.policy import read_policy
 from mcaprl.offline.training.curves import draw_curves
 from mcaprl.offline.training.metrics import describe_seeds

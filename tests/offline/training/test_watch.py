@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mcaprl.offline.algorithms.dqn import DQNConfig
+from mcaprl.offline.algorithms.config import DQNConfig
 from mcaprl.offline.training.train import train
 from mcaprl.offline.training.watch import choose_held_out, divergence_warning, monte_carlo_returns
 from mcaprl.recorder.dataset.dataset import Dataset
