@@ -17,6 +17,7 @@ from typing import Any
 import click
 
 from mcaprl._version import __version__
+from mcaprl.cli.completion import completion
 from mcaprl.cli.convert import convert
 from mcaprl.cli.edit import filter_, merge, slice_, split
 from mcaprl.cli.evaluate import evaluate
@@ -56,6 +57,7 @@ _COMMANDS = (
     check,
     recover,
     layout,
+    completion,
 )
 for _command in _COMMANDS:
     cli.add_command(_command)

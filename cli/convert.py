@@ -7,14 +7,16 @@ from pathlib import Path
 import click
 
 import mcaprl
-from mcaprl.cli.options import json_option, mapping_options
+from mcaprl.cli.help import Command
+from mcaprl.cli.options import PATH, json_option, mapping_options
+from mcaprl.cli.progress import working
 from mcaprl.cli.show import echo, print_facts, print_json, print_problems
 from mcaprl.errors import UsageError
 from mcaprl.texts import counted
 
 
-@click.command()
-@click.argument("paths", nargs=-1, required=True, metavar="SRC... [DST]")
+@click.command(cls=Command)
+@click.argument("paths", nargs=-1, required=True, metavar="SRC... [DST]", type=PATH)
 @mapping_options
 @click.option("--from", "source_format", metavar="FORMAT", help="Format of SRC if not detected.")
 @click.option("--to", metavar="FORMAT", help="Format of DST if not clear from its name.")
@@ -50,17 +52,18 @@ def convert(
     if not dry_run and len(paths) < 2:
         raise UsageError("convert needs SRC and DST, or --dry-run to write nothing")
     sources, out = (paths, None) if dry_run else (paths[:-1], paths[-1])
-    found = mcaprl.convert(
-        sources,
-        out,
-        mapping=mapping,
-        source_format=source_format,
-        to=to,
-        lossy=lossy,
-        trust_code=trust_code,
-        overwrite=overwrite,
-        upload=upload,
-    )
+    with working("converting"):
+        found = mcaprl.convert(
+            sources,
+            out,
+            mapping=mapping,
+            source_format=source_format,
+            to=to,
+            lossy=lossy,
+            trust_code=trust_code,
+            overwrite=overwrite,
+            upload=upload,
+        )
     if as_json:
         print_json(found.to_json())
         return

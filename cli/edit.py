@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import click
 
 import mcaprl
-from mcaprl.cli.options import json_option
+from mcaprl.cli.help import Command
+from mcaprl.cli.options import PATH, json_option
+from mcaprl.cli.progress import working
 from mcaprl.cli.show import echo, print_json
 from mcaprl.errors import UsageError
-from mcaprl.recorder.edit.source import Edited
 from mcaprl.texts import counted
+
+if TYPE_CHECKING:
+    from mcaprl.recorder.edit.source import Edited
 
 _overwrite_option = click.option("--overwrite", is_flag=True, help="Replace existing output.")
 
 
-@click.command()
-@click.argument("logs", nargs=-1, required=True, metavar="LOG... OUT")
+@click.command(cls=Command)
+@click.argument("logs", nargs=-1, required=True, metavar="LOG... OUT", type=PATH)
 @click.option("--shift", is_flag=True, help="Delay each log that overlaps a previous one in time.")
 @_overwrite_option
 @json_option
@@ -25,12 +30,14 @@ def merge(logs: tuple[str, ...], shift: bool, overwrite: bool, as_json: bool) ->
     """Join LOG... into the new log OUT, with all topics, metadata and attachments."""
     if len(logs) < 2:
         raise UsageError("merge needs LOG... and OUT")
-    _show([mcaprl.merge(logs[:-1], logs[-1], shift=shift, overwrite=overwrite)], as_json)
+    with working("copying"):
+        found = mcaprl.merge(logs[:-1], logs[-1], shift=shift, overwrite=overwrite)
+    _show([found], as_json)
 
 
-@click.command()
-@click.argument("log")
-@click.argument("out")
+@click.command(cls=Command)
+@click.argument("log", type=PATH)
+@click.argument("out", type=PATH)
 @click.option("--episodes", type=int, help="Number of episodes of each part.")
 @click.option("--ratio", metavar="A:B[:C...]", help="Relative sizes of the parts, such as 8:1:1.")
 @click.option("--seed", type=click.IntRange(0), help="Assign episodes at random with this seed.")
@@ -47,14 +54,17 @@ def split(
 ) -> None:
     """Copy the episodes of LOG to several logs in the new folder OUT."""
     shares = None if ratio is None else [_number("ratio", part) for part in ratio.split(":")]
-    found = mcaprl.split(log, out, episodes=episodes, ratio=shares, seed=seed, overwrite=overwrite)
+    with working("copying"):
+        found = mcaprl.split(
+            log, out, episodes=episodes, ratio=shares, seed=seed, overwrite=overwrite
+        )
     _show(found, as_json)
 
 
-@click.command("filter")
+@click.command("filter", cls=Command)
 @click.argument("expression")
-@click.argument("log")
-@click.argument("out")
+@click.argument("log", type=PATH)
+@click.argument("out", type=PATH)
 @_overwrite_option
 @json_option
 def filter_(expression: str, log: str, out: str, overwrite: bool, as_json: bool) -> None:
@@ -64,12 +74,14 @@ def filter_(expression: str, log: str, out: str, overwrite: bool, as_json: bool)
     total_reward, terminated, truncated, reason, policy, epsilon, seed, options, start_s,
     duration_s.
     """
-    _show([mcaprl.filter(expression, log, out, overwrite=overwrite)], as_json)
+    with working("copying"):
+        found = mcaprl.filter(expression, log, out, overwrite=overwrite)
+    _show([found], as_json)
 
 
-@click.command("slice")
-@click.argument("log")
-@click.argument("out")
+@click.command("slice", cls=Command)
+@click.argument("log", type=PATH)
+@click.argument("out", type=PATH)
 @click.option("--steps", metavar="A:B", help="Transitions from A to B; B is not included.")
 @click.option("--time", metavar="A:B", help="Seconds since the first message of LOG.")
 @_overwrite_option
@@ -81,13 +93,12 @@ def slice_(
 
     Episodes that contain A or B are shortened. If A or B is empty, the start or end of LOG is used.
     """
-    found = mcaprl.slice(
-        log,
-        out,
-        steps=None if steps is None else _bounds("steps", steps),
-        time=None if time is None else _bounds("time", time),
-        overwrite=overwrite,
-    )
+    bounds = {
+        "steps": None if steps is None else _bounds("steps", steps),
+        "time": None if time is None else _bounds("time", time),
+    }
+    with working("copying"):
+        found = mcaprl.slice(log, out, **bounds, overwrite=overwrite)
     _show([found], as_json)
 
 

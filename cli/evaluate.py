@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import mcaprl
+from mcaprl.cli.completion import Name, policies, sims
+from mcaprl.cli.help import Command
 from mcaprl.cli.options import (
     integer_option,
     json_option,
@@ -16,11 +18,10 @@ from mcaprl.cli.options import (
     ray_options,
     sim_options,
 )
+from mcaprl.cli.progress import working
 from mcaprl.cli.show import echo, print_json, print_table
 from mcaprl.errors import UsageError
 from mcaprl.page import PAGE_NAME
-from mcaprl.progress import terminal_bar
-from mcaprl.sims.evaluation.statistics import interquartile_mean
 from mcaprl.texts import counted
 
 if TYPE_CHECKING:
@@ -30,9 +31,17 @@ if TYPE_CHECKING:
 _OF_DATA = ("gamma", "epsilon", "updates", "estimate_behavior", "threads", "mapping", "trust_code")
 
 
-@click.command()
-@click.argument("policies", nargs=-1, required=True, metavar="POLICY...")
-@click.option("--sim", help="lane, powerline, racer, highway-lane, or any Gymnasium id.")
+@click.command(cls=Command)
+@click.argument(
+    "policies",
+    nargs=-1,
+    required=True,
+    metavar="POLICY...",
+    type=Name(policies, is_path=True),
+)
+@click.option(
+    "--sim", type=Name(sims), help="lane, powerline, racer, highway-lane, or any Gymnasium id."
+)
 @click.option("--data", help="Logs to estimate returns from, instead of --sim.")
 @integer_option(
     "--episodes", "Number of episodes for each policy and training seed.", least=1, default=30
@@ -94,13 +103,15 @@ def evaluate(
         _refuse_unused(given, [name for name in others if name not in _OF_DATA], "sim")
         # Compare with None, because 0 is a valid value of these options.
         given = {name: others[name] for name in _OF_DATA if others[name] is not None}
-        estimates = mcaprl.estimate(policies, data, seed=seed, progress=terminal_bar, **given)
+        with working("reading data") as bar:
+            estimates = mcaprl.estimate(policies, data, seed=seed, progress=bar, **given)
         print_json(estimates.to_json()) if as_json else _print_estimates(estimates)
     elif sim is not None and data is None:
         _refuse_unused(given, _OF_DATA, "data")
-        found = mcaprl.evaluate(
-            policies, sim, episodes=episodes, seed=seed, progress=terminal_bar, **given
-        )
+        with working("loading the sim and the policies") as bar:
+            found = mcaprl.evaluate(
+                policies, sim, episodes=episodes, seed=seed, progress=bar, **given
+            )
         if as_json:
             print_json(found.to_json())
             return
@@ -120,6 +131,8 @@ def _refuse_unused(given: dict[str, Any], names: Sequence[str], needed: str) -> 
 
 
 def _print_scores(found: Evaluation, episodes: int) -> None:
+    from mcaprl.sims.evaluation.statistics import interquartile_mean
+
     rows = []
     if (logged := found.behavior) is not None:
         rows.append(

@@ -1,16 +1,20 @@
-"""Help texts of the program: groups of commands, groups of settings, and examples."""
+"""Help texts of the program: groups of commands, groups of options, and examples."""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Iterable
+from typing import Any, Final
 
 import click
+
+from mcaprl.cli.progress import quiet_option
 
 SECTIONS: Final[dict[str, tuple[str, ...]]] = {
     "Record and learn": ("record", "train-online", "train-offline", "evaluate", "export"),
     "Look at logs": ("info", "replay", "layout", "annotate"),
     "Check and repair logs": ("check", "recover"),
     "Convert and edit logs": ("convert", "merge", "split", "filter", "slice"),
+    "Set up the shell": ("completion",),
 }
 """Commands in the order of the program's help."""
 
@@ -57,8 +61,105 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     "split": ("mcaprl split all.mcap parts --ratio 8:1:1 --seed 0",),
     "filter": ("mcaprl filter 'return > 100' data/pilot.mcap good.mcap",),
     "slice": ("mcaprl slice data/pilot.mcap part.mcap --steps 0:1000",),
+    "completion": (
+        "mcaprl completion bash >> ~/.bashrc",
+        "mcaprl completion fish > ~/.config/fish/completions/mcaprl.fish",
+    ),
 }
 """Examples of each command, shown at the end of its help."""
+
+_BAGS: Final = {"Bags of other robots": ("mapping", "trust_code")}
+_RAY: Final = {"Ray cluster": ("ray", "workers", "address")}
+OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
+    "record": {
+        "Policy and length": ("policy", "epsilon", "episodes", "steps", "seed", "envs"),
+        "Sim": ("observation", "rules"),
+        "Log": ("out", "no_scene", "camera", "infos", "compression"),
+        "Files": ("overwrite", "append", "rotate_mb", "upload"),
+        "Ray cluster": ("ray", "workers", "address", "shards"),
+    },
+    "train-online": {
+        "Run": ("out", "algo", "preset", "seeds", "seed", "threads", "sources", "resume"),
+        "Sim": ("observation", "rules"),
+        "Log": ("record", "upload"),
+        "Live view": ("live", "live_speed", "port", "allow_origin"),
+    },
+    "train-offline": {
+        "Run": ("out", "algo", "seeds", "seed", "threads", "device", "resume"),
+        "Data": ("follow", "other_data"),
+        **_BAGS,
+    },
+    "evaluate": {
+        "Episodes in a sim": ("sim", "episodes", "seed", "observation", "rules", "behavior"),
+        "Estimates from logs": (
+            "data",
+            "gamma",
+            "epsilon",
+            "updates",
+            "estimate_behavior",
+            "threads",
+        ),
+        "Output": ("record", "report", "overwrite", "as_json"),
+        **_BAGS,
+        **_RAY,
+    },
+    "info": _BAGS,
+    "check": _BAGS,
+    "annotate": {
+        "Values": ("policy", "gamma"),
+        "Scene": ("scene", "camera", "sim", "trust_env"),
+        "Output": ("out", "overwrite"),
+        **_BAGS,
+    },
+    "replay": {
+        "Playback": ("episode", "speed", "loop", "port", "allow_origin"),
+        "Comparison with the sim": ("verifies", "sim", "trust_env"),
+        "Video and image": ("video", "contact_sheet", "overwrite"),
+    },
+    "convert": {
+        "Formats": ("source_format", "to", "lossy"),
+        "Bags of other robots": ("mapping", "trust_code", "suggest"),
+        "Output": ("dry_run", "overwrite", "upload", "as_json"),
+    },
+}
+"""Groups of options in the help of each command, by the options' names in Python; the other options
+are in the group `Options`."""
+
+
+class Command(click.Command):
+    """Command whose options are listed in groups, and which has the option `--quiet`."""
+
+    def __init__(self, *arguments: Any, **others: Any) -> None:
+        """Create the command, as `click.Command` does."""
+        super().__init__(*arguments, **others)
+        self.params.append(quiet_option())
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options in their groups."""
+        self.write_options(ctx, formatter, self.get_params(ctx))
+
+    def write_options(
+        self, ctx: click.Context, formatter: click.HelpFormatter, params: Iterable[click.Parameter]
+    ) -> None:
+        """Write options in the groups of this command."""
+        options = {param.name: param for param in params if isinstance(param, click.Option)}
+        groups = OPTION_GROUPS.get(self.name or "", {})
+        for title, names in groups.items():
+            self.write_group(ctx, formatter, title, [options.pop(n) for n in names if n in options])
+        self.write_group(ctx, formatter, "Options", options.values())
+
+    def write_group(
+        self,
+        ctx: click.Context,
+        formatter: click.HelpFormatter,
+        title: str,
+        options: Iterable[click.Option],
+    ) -> None:
+        """Write one group of options; hidden options are omitted."""
+        records = [record for option in options if (record := option.get_help_record(ctx))]
+        if records:
+            with formatter.section(title):
+                formatter.write_dl(records)
 
 
 class Program(click.Group):

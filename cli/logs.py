@@ -8,18 +8,20 @@ from typing import Any
 import click
 
 import mcaprl
-from mcaprl.cli.options import integer_option, json_option, mapping_options, trust_option
+from mcaprl.cli.completion import Name, sims
+from mcaprl.cli.help import Command
+from mcaprl.cli.options import PATH, integer_option, json_option, mapping_options, trust_option
+from mcaprl.cli.progress import hint, working
 from mcaprl.cli.show import echo, print_facts, print_json, print_problems
 from mcaprl.page import PAGE_NAME
-from mcaprl.progress import terminal_bar
 from mcaprl.texts import counted
 
 # Exit code of `recover` if data is lost.
 _WITH_LOSSES = 3
 
 
-@click.command()
-@click.argument("data", nargs=-1, required=True)
+@click.command(cls=Command)
+@click.argument("data", nargs=-1, required=True, type=PATH)
 @click.option("--report", type=click.Path(path_type=Path), help="Output folder of the HTML report.")
 @click.option("--strict", is_flag=True, help="Exit with 1 if there are problems.")
 @json_option
@@ -31,7 +33,8 @@ def info(
     data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool, **request: Any
 ) -> int:
     """Show the contents and problems of DATA: files, folders or globs of logs."""
-    found = mcaprl.info(data, report=report, **request)
+    with working("reading data"):
+        found = mcaprl.info(data, report=report, **request)
     if as_json:
         print_json(found.to_json())
     else:
@@ -46,14 +49,15 @@ def info(
     return int(strict and bool(found.problems))
 
 
-@click.command()
-@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.command(cls=Command)
+@click.argument("files", nargs=-1, required=True, metavar="FILE...", type=PATH)
 @json_option
 @integer_option("--threads", "Number of threads that decompress chunks.", least=1)
 @mapping_options
 def check(files: tuple[str, ...], as_json: bool, **request: Any) -> int:
     """Read FILE... completely and list all problems. Exits with 1 if there are problems."""
-    found = mcaprl.check(files, **request)
+    with working("reading data"):
+        found = mcaprl.check(files, **request)
     if as_json:
         print_json(found.to_json())
         return int(not found.ok)
@@ -65,8 +69,8 @@ def check(files: tuple[str, ...], as_json: bool, **request: Any) -> int:
     return int(not found.ok)
 
 
-@click.command()
-@click.argument("file")
+@click.command(cls=Command)
+@click.argument("file", type=PATH)
 @click.argument("out", type=click.Path(path_type=Path))
 @click.option(
     "--keep-unfinished",
@@ -80,7 +84,8 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
 
     Exits with 0 if nothing is lost, 3 if data is lost, 1 if nothing can be kept.
     """
-    found = mcaprl.recover(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)
+    with working("recovering the log"):
+        found = mcaprl.recover(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)
     if as_json:
         print_json(found.to_json())
     else:
@@ -91,30 +96,32 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
     return _WITH_LOSSES if found.has_losses else 0
 
 
-@click.command()
-@click.argument("source", metavar="SIM|FILE")
+@click.command(cls=Command)
+@click.argument("source", metavar="SIM|FILE", type=Name(sims, is_path=True))
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="JSON file to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def layout(source: str, out: Path, overwrite: bool) -> None:
     """Write the Foxglove layout of a log, or of the logs of a sim."""
     mcaprl.layout(source, out, overwrite=overwrite)
-    echo(f"{out}: in Foxglove, open the layout menu and import this file")
+    echo(f"{out}: written")
+    hint("in Foxglove, open the layout menu and import this file")
 
 
-@click.command()
-@click.argument("file")
+@click.command(cls=Command)
+@click.argument("file", type=PATH)
 @click.option("--policy", multiple=True, help="Path of a trained run; may be repeated.")
 @click.option("--gamma", type=click.FloatRange(0, 1), help="Discount. [default: that of the run]")
 @click.option("--scene", is_flag=True, help="Step the sim again and add its scene.")
 @click.option("--camera", is_flag=True, help="With --scene: add metric depth images.")
-@click.option("--sim", help="With --scene: sim to step instead of the logged one.")
+@click.option("--sim", type=Name(sims), help="With --scene: sim to step instead of the logged one.")
 @trust_option
 @mapping_options
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="File to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def annotate(file: Path, out: Path, **request: Any) -> None:
     """Copy FILE and add a policy's values or the scene of the sim to each step."""
-    found = mcaprl.annotate(file, out, progress=terminal_bar, **request)
+    with working("reading the log") as bar:
+        found = mcaprl.annotate(file, out, progress=bar, **request)
     for name, topic in found.topics.items():
         echo(f"{out}: {topic} has the values of {name} for {found.steps} steps")
     if found.scene is not None:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import click
 
+from mcaprl.cli.completion import Name
+
+PATH: Final = Name(tuple, is_path=True)
+"""Type of a path, a glob or a URL."""
 F = TypeVar("F", bound=Callable[..., Any])
 
 trust_option = click.option(

@@ -2,23 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import click
 
 import mcaprl
+from mcaprl.cli.completion import Name, policies, sims
+from mcaprl.cli.help import Command
 from mcaprl.cli.options import integer_option, ray_options, sim_options
+from mcaprl.cli.progress import working
 from mcaprl.cli.show import echo
-from mcaprl.progress import terminal_bar
-from mcaprl.recorder.format.writing import COMPRESSIONS
 from mcaprl.texts import counted, size
 
 
-@click.command()
-@click.argument("sim")
+def _compressions() -> Iterable[str]:
+    from mcaprl.recorder.format.writing import COMPRESSIONS
+
+    return COMPRESSIONS
+
+
+@click.command(cls=Command)
+@click.argument("sim", type=Name(sims))
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="File to write.")
-@click.option("--policy", default="pilot", show_default=True, help="pilot, random, or a path.")
+@click.option(
+    "--policy",
+    default="pilot",
+    show_default=True,
+    type=Name(policies, is_path=True),
+    help="pilot, random, or a path.",
+)
 @click.option(
     "--epsilon",
     default=0.0,
@@ -46,8 +60,8 @@ from mcaprl.texts import counted, size
     "--compression",
     default="zstd",
     show_default=True,
-    type=click.Choice(COMPRESSIONS),
-    help="Compression of chunks.",
+    type=Name(_compressions),
+    help="Compression of chunks: zstd, lz4 or none.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 @click.option("--append", is_flag=True, help="Add the episodes to an existing file.")
@@ -71,7 +85,8 @@ def record(no_scene: bool, **request: Any) -> None:
     SIM is lane, powerline, racer, highway-lane, or any Gymnasium id. Each episode is
     written when it ends.
     """
-    found = mcaprl.record(**request, scene=not no_scene, progress=terminal_bar)
+    with working("loading the sim and the policy") as bar:
+        found = mcaprl.record(**request, scene=not no_scene, progress=bar)
     echo(
         f"{found.out}: {counted(found.episodes, 'episode')}, {counted(found.steps, 'step')},"
         f" mean return {found.mean_return:.2f} (standard deviation {found.return_std:.2f}),"

@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING
 import click
 
 import mcaprl
-from mcaprl.cli.options import integer_option, origin_option, trust_option
+from mcaprl.cli.completion import Name, sims
+from mcaprl.cli.help import Command
+from mcaprl.cli.options import PATH, integer_option, origin_option, trust_option
+from mcaprl.cli.progress import hint, working
 from mcaprl.cli.show import echo, print_address, print_problems
 from mcaprl.errors import UsageError
-from mcaprl.progress import terminal_bar
-from mcaprl.recorder.dataset.open import find_logs
 from mcaprl.texts import counted
 
 if TYPE_CHECKING:
     from mcaprl.api.replay import LiveAddress
 
 
-@click.command()
-@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.command(cls=Command)
+@click.argument("files", nargs=-1, required=True, metavar="FILE...", type=PATH)
 @click.option("--episode", type=click.IntRange(0), help="Index of a single episode, from 0.")
 @click.option(
     "--speed",
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 @click.option("--video", type=click.Path(path_type=Path), help="Video to write, .mp4 or .gif.")
 @click.option("--contact-sheet", type=click.Path(path_type=Path), help="PNG image to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing video or image.")
-@click.option("--sim", help="Sim to step instead of the logged one.")
+@click.option("--sim", type=Name(sims), help="Sim to step instead of the logged one.")
 @trust_option
 def replay(
     files: tuple[str, ...],
@@ -60,6 +61,8 @@ def replay(
     """
     if verifies and (video or contact_sheet):
         raise UsageError("--verify writes no video or image: run replay once for each")
+    from mcaprl.recorder.dataset.open import find_logs
+
     if verifies:
         same = [_verify(path, episode, sim, trust_env) for path in find_logs(files)]
         return int(not all(same))
@@ -67,17 +70,18 @@ def replay(
         paths = find_logs(files)
         if len(paths) > 1:
             raise UsageError("a video shows one file: render each file separately")
-        drawn = mcaprl.render(
-            paths[0],
-            episode=episode or 0,
-            sim=sim,
-            trust_env=trust_env,
-            speed=speed,
-            video=video,
-            contact_sheet=contact_sheet,
-            overwrite=overwrite,
-            progress=terminal_bar,
-        )
+        with working("reading the log") as bar:
+            drawn = mcaprl.render(
+                paths[0],
+                episode=episode or 0,
+                sim=sim,
+                trust_env=trust_env,
+                speed=speed,
+                video=video,
+                contact_sheet=contact_sheet,
+                overwrite=overwrite,
+                progress=bar,
+            )
         if video:
             echo(f"{video}: {drawn.frames} images of episode {drawn.episode}")
         if contact_sheet:
@@ -98,14 +102,13 @@ def replay(
 
 def _print_open(address: LiveAddress) -> None:
     print_address(address)
-    echo("press Ctrl-C to stop")
+    hint("press Ctrl-C to stop")
 
 
 def _verify(path: Path, episode: int | None, sim: str | None, trust_env: bool) -> bool:
     """Compare one file with the sim, print the result, and return whether all steps match."""
-    found = mcaprl.verify(
-        path, episode=episode, sim=sim, trust_env=trust_env, progress=terminal_bar
-    )
+    with working("reading the log") as bar:
+        found = mcaprl.verify(path, episode=episode, sim=sim, trust_env=trust_env, progress=bar)
     print_problems(found.problems(str(path)))
     if found.difference is None and found.episodes:
         echo(

@@ -7,10 +7,11 @@ from typing import Any
 
 import click
 
+from mcaprl.cli.help import Command
 from mcaprl.settings import Settings, field_help, flag
 
 
-class SettingsCommand(click.Command):
+class SettingsCommand(Command):
     """Command with an option for each algorithm setting; algorithms are loaded when needed."""
 
     def __init__(
@@ -23,10 +24,10 @@ class SettingsCommand(click.Command):
         """Create the command.
 
         Args:
-            *arguments: Arguments of `click.Command`.
+            *arguments: Arguments of `Command`.
             configs: Function that loads the algorithms, and returns the default settings of each.
             tuned: Function that returns, for each sim, the settings that differ from the defaults.
-            **others: Arguments of `click.Command`.
+            **others: Arguments of `Command`.
         """
         super().__init__(*arguments, **others)
         self._configs, self._tuned = configs, tuned
@@ -39,17 +40,15 @@ class SettingsCommand(click.Command):
         """Write the options of the command, then the settings in groups for their algorithms."""
         configs = self._configs()
         settings = {option.name: option for option in setting_options(configs, self._tuned())}
-        options = [param for param in super().get_params(ctx) if isinstance(param, click.Option)]
-        own = [option for option in options if option.name not in settings]
-        sections = {"Options": own}
+        own = [param for param in super().get_params(ctx) if param.name not in settings]
+        self.write_options(ctx, formatter, own)
+        sections: dict[str, list[click.Option]] = {}
         for name, option in settings.items():
             algos = [algo for algo, config in configs.items() if hasattr(config, name)]
             whose = "all algorithms" if len(algos) == len(configs) else ", ".join(algos)
             sections.setdefault(f"Settings of {whose}", []).append(option)
         for title, params in sections.items():
-            records = [record for param in params if (record := param.get_help_record(ctx))]
-            with formatter.section(title):
-                formatter.write_dl(records)
+            self.write_group(ctx, formatter, title, params)
 
 
 def setting_options(

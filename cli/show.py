@@ -7,15 +7,14 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from mcaprl.files import json_text
 from mcaprl.problem import Problem
 from mcaprl.texts import printable
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from mcaprl.api.replay import LiveAddress
 
 _PIPE_WIDTH = 120
@@ -47,6 +46,8 @@ def print_address(address: LiveAddress) -> None:
 
 def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     """Print a table to stdout: the first column left-aligned, the others right-aligned."""
+    from rich.table import Table
+
     table = Table()
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index == 0 else "right", overflow="fold")
@@ -55,6 +56,8 @@ def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
 
 def print_facts(title: str, facts: list[tuple[str, str]]) -> None:
     """Print names and values to stdout, one pair per line."""
+    from rich.table import Table
+
     table = Table(show_header=False)
     table.add_column(style="dim")
     table.add_column(overflow="fold")
@@ -62,6 +65,9 @@ def print_facts(title: str, facts: list[tuple[str, str]]) -> None:
 
 
 def _print(table: Table, title: str, rows: Iterable[Iterable[str]]) -> None:
+    from rich.console import Console
+    from rich.text import Text
+
     table.title, table.title_style, table.title_justify = Text(printable(title)), "bold", "left"
     for row in rows:
         table.add_row(*(Text(printable(cell)) for cell in row))

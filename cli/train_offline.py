@@ -8,10 +8,12 @@ from typing import Any
 import click
 
 import mcaprl
-from mcaprl.cli.options import integer_option, mapping_options
+from mcaprl.cli.completion import Name
+from mcaprl.cli.help import Command
+from mcaprl.cli.options import PATH, integer_option, mapping_options
+from mcaprl.cli.progress import hint, training_progress, working
 from mcaprl.cli.settings import SettingsCommand
 from mcaprl.cli.show import echo
-from mcaprl.progress import terminal_progress
 from mcaprl.settings import Settings
 from mcaprl.texts import counted
 
@@ -23,10 +25,11 @@ def _configs() -> dict[str, Settings]:
 
 
 @click.command(cls=SettingsCommand, configs=_configs)
-@click.argument("data", nargs=-1, required=True, metavar="DATA...")
+@click.argument("data", nargs=-1, required=True, metavar="DATA...", type=PATH)
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Run folder to create.")
 @click.option(
     "--algo",
+    type=Name(_configs),
     help="dqn, double-dqn, cql, bc, bcq, iql, or one from another package.  [default: cql]",
 )
 @integer_option("--seeds", "Number of networks to train.", least=1)
@@ -55,7 +58,7 @@ def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:
     Omitted settings have the algorithm's defaults. With --resume, they have the values of the run.
     """
     given = {name: value for name, value in request.items() if value is not None}
-    with terminal_progress("updates", "loss") as progress:
+    with training_progress("updates", "loss") as progress:
         summaries = mcaprl.train(data, out, on_data=_print_data, progress=progress, **given)
     from mcaprl.offline.training.curves import CURVES_NAME
     from mcaprl.offline.training.metrics import describe_seeds
@@ -63,9 +66,9 @@ def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:
     for line in describe_seeds(summaries):
         echo(line)
     if (out / CURVES_NAME).exists():
-        echo(f"curves: {out / CURVES_NAME}, or tensorboard --logdir {out}")
+        hint(f"curves: {out / CURVES_NAME}, or tensorboard --logdir {out}")
     else:
-        echo(
+        hint(
             f"curves: tensorboard --logdir {out}; an image of the curves needs matplotlib:"
             " pip install 'mcaprl[report]'"
         )
@@ -78,8 +81,8 @@ def _print_data(algo: str, dataset: mcaprl.Dataset) -> None:
     )
 
 
-@click.command()
-@click.argument("run", metavar="RUN")
+@click.command(cls=Command)
+@click.argument("run", metavar="RUN", type=PATH)
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="ONNX file to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def export(run: str, out: Path, overwrite: bool) -> None:
@@ -88,5 +91,6 @@ def export(run: str, out: Path, overwrite: bool) -> None:
     The inputs are the parts of an observation, with the same names as in the log. The outputs are
     action and scores. ONNX Runtime runs the file without this package.
     """
-    policy = mcaprl.export(run, out, overwrite=overwrite)
+    with working("loading the policy"):
+        policy = mcaprl.export(run, out, overwrite=overwrite)
     echo(f"{out}: {policy.algo} policy {policy.name}, {out.stat().st_size / 1000:.0f} kB")

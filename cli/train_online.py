@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import click
 
 import mcaprl
+from mcaprl.cli.completion import Name, sims
 from mcaprl.cli.options import integer_option, origin_option, sim_options
+from mcaprl.cli.progress import hint, training_progress
 from mcaprl.cli.settings import SettingsCommand
-from mcaprl.cli.show import echo, print_address, print_table
-from mcaprl.progress import terminal_progress
-from mcaprl.runs import read_config
+from mcaprl.cli.show import print_address, print_table
 from mcaprl.settings import Settings
 from mcaprl.sims import SIMS
 
@@ -24,6 +25,12 @@ def _configs() -> dict[str, Settings]:
     return {name: config_type() for name, config_type in CONFIGS.items()}
 
 
+def _presets() -> Iterable[str]:
+    from mcaprl.online.presets import PRESETS
+
+    return PRESETS
+
+
 def _tuned() -> dict[str, dict[str, Any]]:
     from mcaprl.online.presets import SIM_SETTINGS
 
@@ -31,11 +38,15 @@ def _tuned() -> dict[str, dict[str, Any]]:
 
 
 @click.command(cls=SettingsCommand, configs=_configs, tuned=_tuned)
-@click.argument("sim", required=False)
+@click.argument("sim", required=False, type=Name(sims))
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Run folder to create.")
-@click.option("--algo", help="dqn, double-dqn, ppo or a2c.  [default: double-dqn]")
 @click.option(
-    "--preset", help="Published settings: autonomysim-car, autonomysim-drone, ddqn-racer."
+    "--algo", type=Name(_configs), help="dqn, double-dqn, ppo or a2c.  [default: double-dqn]"
+)
+@click.option(
+    "--preset",
+    type=Name(_presets),
+    help="Published settings: autonomysim-car, autonomysim-drone, ddqn-racer.",
 )
 @integer_option("--seeds", "Number of agents to train.", least=1)
 @integer_option("--seed", "Seed of the first agent; agent k uses seed + k.", least=0)
@@ -83,7 +94,7 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
     selected on one set of episodes and scored on another set.
     """
     given = {name: value for name, value in request.items() if value is not None}
-    with terminal_progress("steps", "score") as progress:
+    with training_progress("steps", "score") as progress:
         found = mcaprl.train_online(sim, out, on_live=print_address, progress=progress, **given)
     rows = [
         [
@@ -96,10 +107,12 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
         ]
         for summary in found
     ]
+    from mcaprl.runs import read_config
+
     config = read_config(out)
     print_table(
         f"{config['algo']} in {config['sim']}: the best checkpoint of each seed on new episodes",
         ["run", "steps", "best at", "mean return", "random 0, pilot 1", "ends"],
         rows,
     )
-    echo(f"curves: {out / 'curve.png'}, or tensorboard --logdir {out}")
+    hint(f"curves: {out / 'curve.png'}, or tensorboard --logdir {out}")

@@ -14,11 +14,8 @@ from typing import TYPE_CHECKING
 
 import mcaprl.sims  # noqa: F401  (registers the environments)
 from mcaprl._version import __version__
-from mcaprl.api.data import open_data as open
 from mcaprl.errors import McaprlError
 from mcaprl.lazy import lazy_attributes
-from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.sims import make_sim
 
 if TYPE_CHECKING:
@@ -26,14 +23,18 @@ if TYPE_CHECKING:
     from mcaprl.api.annotate import annotate
     from mcaprl.api.behavior import estimate_behavior
     from mcaprl.api.convert import convert, suggest_mapping
+    from mcaprl.api.data import open_data as open
     from mcaprl.api.edit import filter, merge, slice, split
     from mcaprl.api.estimate import estimate
     from mcaprl.api.evaluate import evaluate
-    from mcaprl.api.logs import check, info, layout, recover
+    from mcaprl.api.layout import layout
+    from mcaprl.api.logs import check, info, recover
     from mcaprl.api.policies import export, load_policy
     from mcaprl.api.record import record
     from mcaprl.api.replay import render, replay, verify
     from mcaprl.api.train import train, train_online
+    from mcaprl.recorder.dataset.dataset import Dataset
+    from mcaprl.recorder.dataset.episode import Episode
     from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
     from mcaprl.recorder.record.wrapper import RecordMcap
 
@@ -72,21 +73,26 @@ __all__ = [
     "verify",
 ]
 
-# These names are imported on first use, because their modules import the log writer, torch or
-# numba.
+# These names are imported on first use: their modules take long to import.
 __getattr__ = lazy_attributes(
     __name__,
-    {f"mcaprl.api.{name}": [name] for name in ("annotate", "estimate", "evaluate", "record")}
+    {
+        f"mcaprl.api.{name}": [name]
+        for name in ("annotate", "estimate", "evaluate", "layout", "record")
+    }
     | {
         "mcaprl.api.behavior": ["estimate_behavior"],
         "mcaprl.api.convert": ["convert", "suggest_mapping"],
+        "mcaprl.api.data": ["open_data as open"],
         "mcaprl.api.edit": ["filter", "merge", "slice", "split"],
-        "mcaprl.api.logs": ["check", "info", "layout", "recover"],
+        "mcaprl.api.logs": ["check", "info", "recover"],
         "mcaprl.api.policies": ["export", "load_policy"],
         "mcaprl.api.replay": ["render", "replay", "verify"],
         "mcaprl.api.train": ["train", "train_online"],
         "mcaprl.ray": ["ray"],
         "mcaprl.torch": ["torch"],
+        "mcaprl.recorder.dataset.dataset": ["Dataset"],
+        "mcaprl.recorder.dataset.episode": ["Episode"],
         "mcaprl.recorder.record.wrapper": ["RecordMcap"],
         "mcaprl.recorder.record.vector_wrapper": ["RecordVecMcap"],
     },

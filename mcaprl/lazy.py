@@ -14,16 +14,22 @@ def lazy_attributes(package: str, sources: Mapping[str, Sequence[str]]) -> Calla
     Args:
         package: Name of the package.
         sources: Dict from the full name of each module to the public names that the module defines.
-            If a name equals the last part of the module's name, such as `torch` in `mcaprl.torch`,
-            it refers to the module.
+            `a as b` makes its name `a` public as `b`. If a name equals the last part of the
+            module's name, such as `torch` in `mcaprl.torch`, it refers to the module.
     """
-    modules = {name: module for module, names in sources.items() for name in names}
+    modules: dict[str, str] = {}
+    attributes: dict[str, str] = {}
+    for module, names in sources.items():
+        for entry in names:
+            attribute, _, alias = entry.partition(" as ")
+            modules[alias or attribute], attributes[alias or attribute] = module, attribute
 
     def get(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
         module = import_module(modules[name])
-        value = module if modules[name] == f"{package}.{name}" else getattr(module, name)
+        is_module = modules[name] == f"{package}.{name}"
+        value = module if is_module else getattr(module, attributes[name])
         setattr(sys.modules[package], name, value)
         return value
 

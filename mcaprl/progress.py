@@ -6,21 +6,14 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Final
-
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeRemainingColumn,
-)
+from typing import TYPE_CHECKING, Final
 
 from mcaprl.texts import printable
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, ProgressColumn, TaskID
 
 Advance = Callable[[int], None]
 """Function called with the amount of completed work."""
@@ -42,19 +35,56 @@ def no_progress(description: str, total: int | None) -> Iterator[Advance]:
 @contextmanager
 def terminal_bar(description: str, total: int | None) -> Iterator[Advance]:
     """Show a progress bar if stderr is a terminal; otherwise, print a line at long intervals."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
+    if not _stderr_is_terminal():
         yield _ProgressLines(printable(description), total).advance
         return
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, transient=True) as bar:
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+
+    text = TextColumn("{task.description}", markup=False)
+    with _bars(
+        text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), transient=True
+    ) as bar:
         task = bar.add_task(printable(description), total=total)
         yield lambda amount: bar.advance(task, amount)
+
+
+@contextmanager
+def terminal_wait(description: str) -> Iterator[ProgressBar]:
+    """Show that a command is working: a bar without a total, and the elapsed time.
+
+    Yields:
+        Function that hides this bar and opens another one, as `terminal_bar` does.
+    """
+    if not _stderr_is_terminal():
+        yield terminal_bar
+        return
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+
+    text = TextColumn("{task.description}", markup=False)
+    bar = _bars(text, BarColumn(), TimeElapsedColumn(), transient=True)
+    with ExitStack() as shown:
+        shown.enter_context(bar).add_task(printable(description), total=None)
+
+        def opened(description: str, total: int | None) -> AbstractContextManager[Advance]:
+            shown.close()
+            return terminal_bar(description, total)
+
+        yield opened
+
+
+def _stderr_is_terminal() -> bool:
+    return sys.stderr is not None and sys.stderr.isatty()
+
+
+def _bars(*columns: ProgressColumn, transient: bool = False) -> Progress:
+    """Return progress bars on stderr."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    # While bars are shown, rich prints stdout above them, to stderr: only if both are the terminal.
+    redirects = sys.stdout is not None and sys.stdout.isatty()
+    console = Console(stderr=True)
+    return Progress(*columns, console=console, transient=transient, redirect_stdout=redirects)
 
 
 class _ProgressLines:
@@ -107,11 +137,12 @@ def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
         unit: Unit of the total, such as `updates`.
         term: Name of the term that is shown, such as `loss`.
     """
-    console = Console(stderr=True)
-    if not console.is_terminal:
+    if not _stderr_is_terminal():
         yield lambda _: None
         return
-    columns = (
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+
+    bars = _bars(
         TextColumn("seed {task.fields[seed]}"),
         BarColumn(),
         TextColumn(f"{{task.completed}}/{{task.total}} {unit}, {{task.fields[rate]:.0f}}/s"),
@@ -120,15 +151,19 @@ def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
     )
     # Bar of each seed, and the time and progress at the seed's first report.
     started: dict[int, tuple[TaskID, float, int]] = {}
-    with Progress(*columns, console=console) as bars:
+    with ExitStack() as shown, ExitStack() as waiting:
+        waiting.enter_context(terminal_wait("preparing"))
 
         def show(now: TrainingProgress) -> None:
+            if not started:
+                waiting.close()
+                shown.enter_context(bars)
             if now.seed not in started:
                 bar = bars.add_task("", total=now.total, seed=now.seed, rate=0.0, shown=math.nan)
                 started[now.seed] = bar, time.perf_counter(), now.done
             bar, began, first = started[now.seed]
             rate = (now.done - first) / max(time.perf_counter() - began, 1e-9)
-            shown = now.terms.get(term, math.nan)
-            bars.update(bar, completed=now.done, rate=rate, shown=shown)
+            value = now.terms.get(term, math.nan)
+            bars.update(bar, completed=now.done, rate=rate, shown=value)
 
         yield show

@@ -6,8 +6,9 @@ The string below a field describes the field. It is also the help of the command
 from __future__ import annotations
 
 import ast
+import functools
 import inspect
-import textwrap
+import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from typing import Any
@@ -106,9 +107,7 @@ def field_help(config_type: type) -> dict[str, str]:
 
 
 def _lines_under_fields(config_type: type) -> dict[str, str]:
-    # Python does not store the docstrings of fields, so the source is parsed.
-    tree = ast.parse(textwrap.dedent(inspect.getsource(config_type))).body[0]
-    assert isinstance(tree, ast.ClassDef)
+    tree = _classes_of(config_type.__module__)[config_type.__qualname__]
     lines = {}
     for field, below in zip(tree.body, tree.body[1:], strict=False):
         match field, below:
@@ -118,3 +117,24 @@ def _lines_under_fields(config_type: type) -> dict[str, str]:
             ):
                 lines[name] = inspect.cleandoc(text)
     return lines
+
+
+@functools.cache
+def _classes_of(module: str) -> dict[str, ast.ClassDef]:
+    """Return the parsed classes of a module by qualified name.
+
+    Python does not store the docstrings of fields, so the source is parsed.
+    """
+    found: dict[str, ast.ClassDef] = {}
+    parts: list[tuple[str, ast.AST]] = [("", ast.parse(inspect.getsource(sys.modules[module])))]
+    while parts:
+        prefix, node = parts.pop()
+        for child in ast.iter_child_nodes(node):
+            name = prefix
+            if isinstance(child, ast.ClassDef):
+                name = f"{prefix}{child.name}."
+                found[name.removesuffix(".")] = child
+            elif isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
+                name = f"{prefix}{child.name}.<locals>."
+            parts.append((name, child))
+    return found

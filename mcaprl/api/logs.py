@@ -1,18 +1,16 @@
-"""Functions on logs: contents and problems, validation, recovery, and layouts."""
+"""Functions on logs: contents and problems, validation and recovery."""
 
 from __future__ import annotations
 
-import tempfile
 import warnings
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mcaprl.api.data import MappingFile, Paths, mapped, open_data
 from mcaprl.api.ranges import check_least
-from mcaprl.errors import LogError, OutputExistsError, ReportError, UsageError, import_extra
+from mcaprl.errors import LogError, ReportError, UsageError, import_extra
 from mcaprl.files import size_of, write_json
 from mcaprl.page import PAGE_NAME
 from mcaprl.problem import Problem
@@ -20,15 +18,11 @@ from mcaprl.recorder.dataset.calibration import Calibration, calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.dataset.open import find_logs
-from mcaprl.recorder.format.reading import McapReader
-from mcaprl.recorder.record.scene import DepthSource
-from mcaprl.recorder.record.wrapper import RecordMcap
-from mcaprl.recorder.repair.check import check_log
-from mcaprl.recorder.repair.recover import Recovery, recover_log
-from mcaprl.recorder.viewer.log_layout import attached_layout
 from mcaprl.recorder.viewer.surprises import Surprise, moments_of
-from mcaprl.sims import SIMS, make_sim
 from mcaprl.texts import size
+
+if TYPE_CHECKING:
+    from mcaprl.recorder.repair.recover import Recovery
 
 _LONGEST_SPACE = 90
 
@@ -255,6 +249,8 @@ def check(
         UsageError: `data` is empty, `threads` is below 1, or the mapping does not fit the bag.
         LogError: A bag that is read by a mapping cannot be read.
     """
+    from mcaprl.recorder.repair.check import check_log
+
     check_least(1, threads=threads)
     if mapping is not None:
         found_bag, report = mapped(data, mapping, trust_code=trust_code)
@@ -299,44 +295,6 @@ def recover(
         UsageError: `file` and `out` are the same file.
         LogError: Nothing can be kept, or `out` cannot be written.
     """
+    from mcaprl.recorder.repair.recover import recover_log
+
     return recover_log(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)
-
-
-def layout(
-    source: str | Path, out: str | Path | None = None, *, overwrite: bool = False
-) -> dict[str, Any]:
-    """Return the Foxglove layout of a log, or of the logs of a sim.
-
-    Args:
-        source: Path of a log, short name of a sim, or Gymnasium id.
-        out: JSON file to write; None to write nothing.
-        overwrite: Whether an existing file is replaced.
-
-    Raises:
-        UsageError: `out` has the suffix of a log.
-        UnknownNameError: There is no such sim.
-        OutputExistsError: `out` exists.
-        LogError: The log cannot be read.
-        ReportError: `out` cannot be written.
-    """
-    path = None if out is None else Path(out)
-    if path is not None and path.suffix == ".mcap":
-        raise UsageError(f"{path}: a layout is a JSON file and must not replace a log")
-    if path is not None and path.exists() and not overwrite:
-        raise OutputExistsError(f"{path} exists: choose another path, or pass --overwrite")
-    name = str(source)
-    is_file = name not in SIMS and (Path(name).is_file() or name.endswith(".mcap"))
-    found = attached_layout(McapReader(Path(name))) if is_file else _layout_of_sim(name)
-    if path is not None:
-        write_json(path, found, ReportError)
-    return found
-
-
-def _layout_of_sim(sim: str) -> dict[str, Any]:
-    """Return the layout of a temporary recording of a sim."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "reset.mcap"
-        env = make_sim(sim)
-        with closing(RecordMcap(env, path, camera=isinstance(env.unwrapped, DepthSource))) as log:
-            log.reset(seed=0)
-        return attached_layout(McapReader(path))

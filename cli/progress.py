@@ -1,0 +1,55 @@
+"""Progress bars and hints, which `--quiet` omits."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from typing import Final
+
+import click
+
+from mcaprl.cli.show import echo
+from mcaprl.progress import (
+    ProgressBar,
+    ProgressCallback,
+    no_progress,
+    terminal_progress,
+    terminal_wait,
+)
+
+_QUIET: Final = "mcaprl.quiet"
+
+
+def quiet_option() -> click.Option:
+    """Return the option `--quiet`, which every command has."""
+    return click.Option(
+        ["-q", "--quiet"],
+        is_flag=True,
+        expose_value=False,
+        callback=lambda context, _, value: context.meta.update({_QUIET: value}),
+        help="Print results, warnings and errors only: no progress and no hints.",
+    )
+
+
+def hint(text: str) -> None:
+    """Print a line that says what the user can do next."""
+    if not _is_quiet():
+        echo(text)
+
+
+def working(text: str) -> AbstractContextManager[ProgressBar]:
+    """Show on a terminal that a command is working, until it opens a progress bar.
+
+    Args:
+        text: What the command does first, such as `reading data`.
+    """
+    return nullcontext(no_progress) if _is_quiet() else terminal_wait(text)
+
+
+def training_progress(unit: str, term: str) -> AbstractContextManager[ProgressCallback]:
+    """Show progress bars of training; see `mcaprl.progress.terminal_progress`."""
+    return nullcontext(lambda _: None) if _is_quiet() else terminal_progress(unit, term)
+
+
+def _is_quiet() -> bool:
+    context = click.get_current_context(silent=True)
+    return context is not None and context.meta.get(_QUIET, False)

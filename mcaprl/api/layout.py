@@ -1,0 +1,56 @@
+"""Foxglove layouts of logs."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from mcaprl.errors import OutputExistsError, ReportError, UsageError
+from mcaprl.files import write_json
+from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.record.scene import DepthSource
+from mcaprl.recorder.record.wrapper import RecordMcap
+from mcaprl.recorder.viewer.log_layout import attached_layout
+from mcaprl.sims import SIMS, make_sim
+
+
+def layout(
+    source: str | Path, out: str | Path | None = None, *, overwrite: bool = False
+) -> dict[str, Any]:
+    """Return the Foxglove layout of a log, or of the logs of a sim.
+
+    Args:
+        source: Path of a log, short name of a sim, or Gymnasium id.
+        out: JSON file to write; None to write nothing.
+        overwrite: Whether an existing file is replaced.
+
+    Raises:
+        UsageError: `out` has the suffix of a log.
+        UnknownNameError: There is no such sim.
+        OutputExistsError: `out` exists.
+        LogError: The log cannot be read.
+        ReportError: `out` cannot be written.
+    """
+    path = None if out is None else Path(out)
+    if path is not None and path.suffix == ".mcap":
+        raise UsageError(f"{path}: a layout is a JSON file and must not replace a log")
+    if path is not None and path.exists() and not overwrite:
+        raise OutputExistsError(f"{path} exists: choose another path, or pass --overwrite")
+    name = str(source)
+    is_file = name not in SIMS and (Path(name).is_file() or name.endswith(".mcap"))
+    found = attached_layout(McapReader(Path(name))) if is_file else _layout_of_sim(name)
+    if path is not None:
+        write_json(path, found, ReportError)
+    return found
+
+
+def _layout_of_sim(sim: str) -> dict[str, Any]:
+    """Return the layout of a temporary recording of a sim."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "reset.mcap"
+        env = make_sim(sim)
+        with closing(RecordMcap(env, path, camera=isinstance(env.unwrapped, DepthSource))) as log:
+            log.reset(seed=0)
+        return attached_layout(McapReader(path))

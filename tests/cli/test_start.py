@@ -1,0 +1,125 @@
+"""Start of the commands: few modules are imported before the first output; pipes and --quiet."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mcaprl.cli import cli
+from mcaprl.cli.help import OPTION_GROUPS
+from tests.support.paths import GOLDEN
+
+LANE_LOG = GOLDEN / "lane-1.mcap"
+ENGINES = {"torch", "numba", "stable_baselines3", "pygame", "matplotlib", "pandas", "pyarrow"}
+ENGINES |= {"ray", "scipy", "jinja2", "pydantic", "h5py", "fsspec", "foxglove", "tensorboard"}
+READING = {"mcap", "rosbags", "zstandard", "lz4", "rich"}
+RUN = "from mcaprl.cli import run\nimport sys\n"
+LOADED = "print(*sorted({name.split('.')[0] for name in sys.modules}), file=sys.stderr)\n"
+
+
+def loaded_by(*code: str) -> set[str]:
+    """Return the names of the packages that a new interpreter has imported after the code."""
+    done = subprocess.run(
+        [sys.executable, "-c", RUN + "\n".join(code) + "\n" + LOADED],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return set(done.stderr.split())
+
+
+def test_no_help_imports_an_engine_or_reads_logs() -> None:
+    loaded = loaded_by(*(f"assert run([{name!r}, '--help']) == 0" for name in cli.commands))
+    assert not loaded & (ENGINES | READING)
+    assert "gymnasium" in loaded
+
+
+def test_commands_on_logs_import_no_engine_and_no_writer() -> None:
+    code = [f"assert run(['info', {str(LANE_LOG)!r}, '--json']) == 0"]
+    code += ["assert 'mcaprl.recorder.columns.writer' not in sys.modules"]
+    loaded = loaded_by(*code)
+    assert not loaded & ENGINES
+    assert "mcap" in loaded
+
+
+def on_a_terminal(*arguments: str, stdout: int | None = None, **env: str) -> tuple[bytes, bytes]:
+    """Run a command whose stderr, and stdout unless it is given, is a terminal.
+
+    Returns:
+        Output on the terminal, and output on stdout if stdout is a pipe.
+    """
+    terminal, inner = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mcaprl", *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=inner if stdout is None else stdout,
+        stderr=inner,
+        env={**os.environ, "TERM": "xterm-256color", **env},
+    )
+    os.close(inner)
+    shown = b""
+    while True:
+        try:
+            part = os.read(terminal, 65_536)
+        except OSError:  # The other end is closed.
+            break
+        if not part:
+            break
+        shown += part
+    piped = process.communicate()[0] or b""
+    os.close(terminal)
+    assert process.returncode == 0, shown
+    return shown, piped
+
+
+def test_a_terminal_shows_progress_and_a_pipe_gets_results_only(tmp_path: Path) -> None:
+    data = tmp_path / "log.mcap"
+    shown, piped = on_a_terminal(
+        *("record", "CartPole-v1", "--policy", "random", "--episodes", "2", "--out", str(data)),
+        stdout=subprocess.PIPE,
+    )
+    assert b"loading the sim and the policy" in shown
+    assert piped.startswith(f"{data}: 2 episodes".encode())
+    assert b"\x1b" not in piped
+
+
+def test_quiet_shows_no_progress() -> None:
+    shown, _ = on_a_terminal("check", str(LANE_LOG), "--quiet")
+    assert shown.strip() == b"1 file checked, no problems"
+
+
+def test_no_color_is_honored() -> None:
+    shown, _ = on_a_terminal("info", str(LANE_LOG), NO_COLOR="1")
+    codes = {code for part in shown.split(b"\x1b[")[1:] for code in part.split(b"m")[0].split(b";")}
+    assert not codes & {str(color).encode() for color in range(30, 50)}
+
+
+def test_quiet_omits_hints(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mcaprl", "layout", str(LANE_LOG), "--overwrite", "--out"]
+    command += [str(tmp_path / "layout.json")]
+    usual = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    quiet = subprocess.run([*command, "-q"], capture_output=True, text=True, check=True).stdout
+    assert "Foxglove" in usual
+    assert quiet == f"{tmp_path / 'layout.json'}: written\n"
+
+
+def test_a_closed_pipe_ends_a_command_silently() -> None:
+    command = f"{sys.executable} -m mcaprl info {LANE_LOG} | true"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize("name", sorted(cli.commands))
+def test_options_are_grouped(name: str) -> None:
+    command = cli.commands[name]
+    own = {param.name for param in command.params if param.param_type_name == "option"}
+    groups = OPTION_GROUPS.get(name, {})
+    grouped = [option for options in groups.values() for option in options]
+    assert len(grouped) == len(set(grouped))
+    assert set(grouped) <= own
+    assert max([len(own - set(grouped)), *map(len, groups.values())]) <= 9
