@@ -50,12 +50,12 @@ def info(
 
 
 @click.command(cls=Command)
-@click.argument("files", nargs=-1, required=True, metavar="FILE...", type=PATH)
+@click.argument("files", nargs=-1, required=True, metavar="DATA...", type=PATH)
 @json_option
 @integer_option("--threads", "Number of threads that decompress chunks.", least=1)
 @mapping_options
 def check(files: tuple[str, ...], as_json: bool, **request: Any) -> int:
-    """Read FILE... completely and list all problems. Exits with 1 if there are problems."""
+    """Read DATA completely and list all problems: files, folders or globs of logs. Exits with 1 if there are problems."""
     with working("reading data"):
         found = mcaprl.check(files, **request)
     if as_json:
@@ -70,7 +70,7 @@ def check(files: tuple[str, ...], as_json: bool, **request: Any) -> int:
 
 
 @click.command(cls=Command)
-@click.argument("file", type=PATH)
+@click.argument("file", metavar="LOG", type=PATH)
 @click.argument("out", type=click.Path(path_type=Path))
 @click.option(
     "--keep-unfinished",
@@ -80,7 +80,7 @@ def check(files: tuple[str, ...], as_json: bool, **request: Any) -> int:
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 @json_option
 def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_json: bool) -> int:
-    """Write the valid part of a damaged or cut-off FILE to the new log OUT.
+    """Write the valid part of a damaged or cut-off LOG to the new log OUT.
 
     Exits with 0 if nothing is lost, 3 if data is lost, 1 if nothing can be kept.
     """
@@ -97,7 +97,7 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
 
 
 @click.command(cls=Command)
-@click.argument("source", metavar="SIM|FILE", type=Name(sims, is_path=True))
+@click.argument("source", metavar="SIM|LOG", type=Name(sims, is_path=True))
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="JSON file to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def layout(source: str, out: Path, overwrite: bool) -> None:
@@ -108,7 +108,7 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
 
 
 @click.command(cls=Command)
-@click.argument("file", type=PATH)
+@click.argument("file", metavar="LOG", type=PATH)
 @click.option("--policy", multiple=True, help="Path of a trained run; may be repeated.")
 @click.option("--gamma", type=click.FloatRange(0, 1), help="Discount. [default: that of the run]")
 @click.option("--scene", is_flag=True, help="Step the sim again and add its scene.")
@@ -119,7 +119,7 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="File to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def annotate(file: Path, out: Path, **request: Any) -> None:
-    """Copy FILE and add a policy's values or the scene of the sim to each step."""
+    """Copy LOG and add a policy's values or the scene of the sim to each step."""
     with working("reading the log") as bar:
         found = mcaprl.annotate(file, out, progress=bar, **request)
     for name, topic in found.topics.items():

@@ -17,7 +17,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 trust_option = click.option(
     "--trust-env",
     is_flag=True,
-    help="Trust FILE: import the module in the logged environment id, and use logged arguments.",
+    help="Trust LOG: import the module in the logged environment id, and use logged arguments.",
 )
 origin_option = click.option(
     "--allow-origin",

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @click.command(cls=Command)
-@click.argument("files", nargs=-1, required=True, metavar="FILE...", type=PATH)
+@click.argument("files", nargs=-1, required=True, metavar="LOG...", type=PATH)
 @click.option("--episode", type=click.IntRange(0), help="Index of a single episode, from 0.")
 @click.option(
     "--speed",
@@ -55,9 +55,9 @@ def replay(
     contact_sheet: Path | None,
     overwrite: bool,
 ) -> int:
-    """Play FILE... in Foxglove, compare it with the sim, or render an episode as a video.
+    """Play LOG... in Foxglove, compare it with the sim, or render an episode as a video.
 
-    Several files play side by side: all start at the same time, each with its own topic prefix.
+    Several logs play side by side: all start at the same time, each with its own topic prefix.
     """
     if verifies and (video or contact_sheet):
         raise UsageError("--verify writes no video or image: run replay once for each")
