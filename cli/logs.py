@@ -55,7 +55,10 @@ def info(
 @integer_option("--threads", "Number of threads that decompress chunks.", least=1)
 @mapping_options
 def check(files: tuple[str, ...], as_json: bool, **request: Any) -> int:
-    """Read DATA completely and list all problems: files, folders or globs of logs. Exits with 1 if there are problems."""
+    """Read DATA, files, folders or globs of logs, completely, and list all problems.
+
+    Exits with 1 if there are problems.
+    """
     with working("reading data"):
         found = mcaprl.check(files, **request)
     if as_json:
