@@ -68,8 +68,8 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
 }
 """Examples of each command, shown at the end of its help."""
 
-_BAGS: Final = {"Bags of other robots": ("mapping", "trust_code")}
-_RAY: Final = {"Ray cluster": ("ray", "workers", "address")}
+_BAGS: Final[dict[str, tuple[str, ...]]] = {"Bags of other robots": ("mapping", "trust_code")}
+_RAY: Final[dict[str, tuple[str, ...]]] = {"Ray cluster": ("ray", "workers", "address")}
 OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "record": {
         "Policy and length": ("policy", "epsilon", "episodes", "steps", "seed", "envs"),
