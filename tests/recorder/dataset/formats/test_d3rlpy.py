@@ -219,7 +219,7 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
         ("num_episodes", [1, 2], "num_episodes is not a whole number"),
         ("num_episodes", 0, "has no episodes"),
         ("rewards_1", np.zeros((2, 1)), "episode 1 has arrays of shapes"),
-        ("rewards_0", np.zeros((3, 2)), "more than one for each step"),
+        ("rewards_0", np.zeros((3, 2)), "several rewards for each step"),
         ("actions_0", [["a"], ["b"], ["c"]], "not numbers"),
     ):
         _write(_vectors(), path, overwrite=True)
