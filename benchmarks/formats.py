@@ -13,7 +13,7 @@ from benchmarks.measure import OURS, Side, Table, after, compare
 from benchmarks.workloads import vectors
 
 TRANSITIONS = 100_000
-# Fraction of the task that is timed for libraries that handle one transition at a time.
+# Libraries that handle one transition at a time are timed on this fraction of the task.
 SHARE = 0.05
 
 

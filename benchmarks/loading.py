@@ -15,7 +15,7 @@ import mcaprl.torch
 from benchmarks.measure import OURS, Side, Table, compare
 
 BATCH = 256
-# Fraction of the log that is timed for loaders that load one item at a time.
+# Loaders that load one item at a time are timed on this fraction of the log.
 SHARE = 0.02
 
 

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 OURS = "mcaprl"
-# Fractions of a task that are timed for libraries that handle one message at a time. A turn then
+# Libraries that handle one message at a time are timed on these fractions of a task. A turn then
 # takes tenths of a second, so that each library has many turns and a disturbance affects only one.
 SLOW_SHARE = 0.1
 SLOWEST_SHARE = 0.01

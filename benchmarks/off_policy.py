@@ -52,7 +52,7 @@ def beside_scope_rl(logs: int) -> dict[str, float]:
     worst = dict.fromkeys(SCOPE_RL_NAMES, 0.0)
     for seed in range(logs):
         table = task.play(None, episodes=300, seed=seed)
-        # Choose pi, mu and Q of two actions that result in the table's ratios, Q and V.
+        # Choose pi, mu and Q of two actions so that they result in the table's ratios, Q and V.
         given = _as_scope_rl(table)
         for name, theirs in SCOPE_RL_NAMES.items():
             estimator = getattr(basic_estimators, theirs)()

@@ -1,4 +1,4 @@
-"""Compare the time of two Ray workers that record with that of two plain processes.
+"""Compare the recording time of two Ray workers with that of two plain processes.
 
     python -m benchmarks.ray_record
 

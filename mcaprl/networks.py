@@ -166,7 +166,7 @@ class Convolutions(nn.Module):
         super().__init__()
         encoder = ENCODERS[architecture.encoder]
         self._pool = encoder.pool(image.shape)
-        # Not persistent, because the normalization of all observations is saved separately.
+        # These buffers are not persistent, because the normalization is saved separately.
         self.register_buffer("shift", self._shift_of(image), persistent=False)
         self.register_buffer("scale", torch.tensor(image.scale), persistent=False)
         layers: list[nn.Module] = []

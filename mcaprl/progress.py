@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 Advance = Callable[[int], None]
 """Function called with the amount of completed work."""
 ProgressBar = Callable[[str, int | None], AbstractContextManager[Advance]]
-"""Function that is called with a text and a total, and returns a context manager. The context
-manager shows a progress bar, and yields an `Advance`."""
+"""Function that accepts a text and a total, and returns a context manager. The context manager
+shows a progress bar, and yields an `Advance`."""
 FIRST_LINE_S: Final = 5.0
 """Time until the first line of progress if stderr is not a terminal."""
 LINE_INTERVAL_S: Final = 30.0
@@ -149,7 +149,7 @@ def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
         TextColumn(f"{term} {{task.fields[shown]:.4g}}"),
         TimeRemainingColumn(),
     )
-    # Bar of each seed, and the time and progress at the seed's first report.
+    # For each seed: its bar, and the time and the progress at its first report.
     started: dict[int, tuple[TaskID, float, int]] = {}
     with ExitStack() as shown, ExitStack() as waiting:
         waiting.enter_context(terminal_wait("preparing"))

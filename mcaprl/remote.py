@@ -296,7 +296,7 @@ def _version_of(facts: dict[str, Any]) -> str:
 
 
 def _folder_of(url: str, version: str) -> tuple[Path, bool]:
-    """Return the local folder for a remote file, and whether the folder outlives this process."""
+    """Return the local folder for a remote file, and whether it is kept for later processes."""
     name = hashlib.sha256(f"{url} {version}".encode()).hexdigest()[:24]
     kept = os.environ.get(CACHE_VARIABLE)
     if kept:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from typing import Final
 
-# Control characters except tab and line feed, marks that reorder text, and lone surrogates.
+# Matches control characters (except tab and line feed), marks that reorder text, and lone
+# surrogates.
 _UNPRINTABLE: Final = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
 )

@@ -9,5 +9,5 @@ from mcaprl.offline.batches.stream import TransitionStream
 
 __all__ = ["TransitionDataset", "TransitionStream"]
 
-# Public import paths, for reprs and pickles.
+# Reprs and pickles use the public import paths.
 TransitionDataset.__module__ = TransitionStream.__module__ = "mcaprl.torch"

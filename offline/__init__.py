@@ -40,7 +40,7 @@ __all__ = [
     "train",
 ]
 
-# Imported on first use.
+# These names are imported on first use.
 __getattr__ = lazy_attributes(
     __name__,
     {

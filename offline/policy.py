@@ -177,7 +177,7 @@ class Policy:
         return self._encode(_flatten(observations)).stacked(self.frame_stack)
 
     def _stack_onto_stored(self, now: Observations) -> Observations:
-        """Store observations; return stacks of the last k, padded with copies of the oldest."""
+        """Store observations, and return stacks of the last k; copies of the oldest pad them."""
         if self._seen and len(self._seen[-1]) != len(now):
             self.begin()
         self._seen.extend([now] * (1 if self._seen else self.frame_stack))

@@ -39,7 +39,7 @@ __all__ = [
     "save_policy",
 ]
 
-# Imported on first use.
+# These names are imported on first use.
 __getattr__ = lazy_attributes(
     __name__,
     {

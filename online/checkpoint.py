@@ -27,7 +27,7 @@ from mcaprl.online.task import Task
 from mcaprl.runs import broken_checkpoint
 from mcaprl.tensor_files import read_tensors, write_tensors
 
-# SB3 draws from NumPy's global generator; NumPy's type stubs lack `get_bit_generator`.
+# SB3 uses NumPy's global generator. NumPy's type stubs do not define `get_bit_generator`.
 _NUMPY_RANDOM: Any = np.random
 _BEST = "best"
 _COUNTERS = (
@@ -116,8 +116,8 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tens
     for number, parts in moments.items():
         for name, part in parts.items():
             if part.shape == weights[number].shape:
-                # Optimizer moments need the memory format of their weights: channels last for
-                # convolutions.
+                # Optimizer moments need the same memory format as their weights, which is
+                # channels-last for convolutions.
                 parts[name] = torch.empty_like(weights[number]).copy_(part)
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": moments, "param_groups": groups})

@@ -90,7 +90,7 @@ def policy_arguments(architecture: Architecture) -> dict[str, Any]:
 
 
 def inputs_of(space: spaces.Space[Any]) -> tuple[list[str], list[ImageInput]]:
-    """Return the keys of the vectors, and an `ImageInput` for each image; channels are first."""
+    """Return the keys of the vectors, and an `ImageInput` for each channels-first image."""
     vectors, images = [], []
     for key, part in parts_of_space(space).items():
         if is_image_space(part):
@@ -102,7 +102,7 @@ def inputs_of(space: spaces.Space[Any]) -> tuple[list[str], list[ImageInput]]:
 
 
 def pools_of(space: spaces.Space[Any], architecture: Architecture) -> dict[str, int]:
-    """Return the factor of the network's average pooling for the images of each key."""
+    """Return the network's average-pooling factor for the images of each key."""
     vectors, images = inputs_of(space)
     keys = [key for key in parts_of_space(space) if key not in vectors]
     encoder = ENCODERS[architecture.encoder]

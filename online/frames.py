@@ -1,4 +1,4 @@
-"""Frame stacking: several successive observations form one, which then shows velocities.
+"""Frame stacking: joins successive observations into one, so that it shows velocities.
 
 Frames are joined oldest first, along the channels of images and the last axis of other arrays, as
 in `offline/`. Frames before an episode's first observation are copies of that observation.

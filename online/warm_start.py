@@ -109,8 +109,8 @@ def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) ->
         values = model.q_net(inputs).cpu().numpy()
     if not np.allclose(values, expected, rtol=1e-4, atol=1e-4):
         raise PolicyError(
-            f"{policy.name} has a network of another architecture (normalized inputs, for example):"
-            " with its weights, the agent's network produces other values"
+            f"{policy.name} has a network of another architecture (for example, normalized inputs):"
+            " the agent's network produces other values with the same weights"
         )
 
 

@@ -23,8 +23,7 @@ from mcaprl.sims.spec import SimCatalog, SimSpec
 SIMS: Final = SimCatalog((lane.SPEC, racer.SPEC, powerline.SPEC, highway.SPEC))
 """Gymnasium id of each sim by short name, including sims of installed packages."""
 
-# Environments have an attribute of this name: the module to import before they are made again.
-# Recorders write the attribute's value to the log.
+# Attribute of an environment with the name of the module that registers it. Recorders log the name.
 _ENV_MODULE: Final = "env_module"
 
 

@@ -92,7 +92,7 @@ class SimCatalog(Mapping[str, str]):
         return self._spec(name).env_id
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names of the built-in sims, then over those of other packages' sims."""
+        """Iterate over the names of the built-in sims, then over the sims of other packages."""
         return iter([*self._specs, *(name for name in _installed() if name not in self._specs)])
 
     def __len__(self) -> int:

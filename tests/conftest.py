@@ -49,7 +49,7 @@ def log_path(tmp_path: Path) -> Path:
 
 
 def need(available: bool, reason: str) -> None:
-    """Skip the test if a program to compare with is missing; fail instead if this is CI."""
+    """Skip the test if something that it needs is missing. In CI, fail instead."""
     if not available and os.environ.get("CI") == "true":
         pytest.fail(f"CI must have it: {reason}")
     if not available:

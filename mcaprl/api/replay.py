@@ -1,4 +1,4 @@
-"""Replay of logs: in viewers, as images, or in the sim to compare each step."""
+"""Replay of logs: in viewers, as images, or as a comparison of each step with the sim."""
 
 from __future__ import annotations
 

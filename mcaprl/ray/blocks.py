@@ -1,4 +1,4 @@
-"""Transitions as Arrow blocks of Ray Data, and back.
+"""Conversion of transitions to Arrow blocks of Ray Data, and of blocks to transitions.
 
 A block has one row for each transition, with the columns of `Dataset.to_arrow`: `episode`, `step`,
 `log_time_ns`, `reward`, `terminated`, `truncated`, `behavior_prob`, `action`, `observation` and

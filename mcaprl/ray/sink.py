@@ -99,7 +99,7 @@ class LogSink(Datasink[LogFile | None]):  # type: ignore[misc]
         found = (table.schema.metadata or {}).get(METADATA_NAME.encode())
         if found is None:
             raise UsageError(
-                "the rows have lost the metadata of their spaces: pass like=, the logs or the"
+                "the rows have no metadata of their spaces: pass like=, the logs or the"
                 " mcaprl.Dataset of the same environment"
             )
         return LogMetadata.from_strings(parse_json(found))

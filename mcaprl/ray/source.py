@@ -29,7 +29,7 @@ from mcaprl.recorder.dataset.open import Episodes, episode_indexes
 from mcaprl.recorder.dataset.tables import described
 from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
 
-# Smaller blocks take more time in total, so they are used only if there are more CPUs than blocks.
+# Smaller blocks take more time in total. They are used only if blocks of this size are too few.
 _LEAST_BYTES = 16 << 20
 
 
@@ -199,7 +199,7 @@ class LogSource(Datasource):  # type: ignore[misc]
     def _chosen_episodes(
         self,
     ) -> Iterator[tuple[Path, int, NDArray[np.int64], NDArray[np.int64]]]:
-        """Yield for each log: its path, its first index, the chosen episodes, and their lengths."""
+        """Yield each log's path, index of the first episode, chosen episodes, and their lengths."""
         first = 0
         for path, lengths in zip(self._paths, self._lengths, strict=True):
             mine = np.arange(len(lengths))

@@ -99,8 +99,8 @@ class StackedMLP(Model):
 
     def __call__(self, observations: Observations) -> Tensor:
         """Map the observations of all seeds to outputs (R, *output_shape)."""
-        # Observations are columns (K, width, B): autograd's weight gradients, dy x^T, then have the
-        # layout of the weights and need no transposition.
+        # Store observations as columns (K, width, B). Autograd's weight gradients, dy x^T, then
+        # have the layout of the weights and need no transposition.
         seeds = len(self.networks)
         columns = observations.vector.view(seeds, -1, observations.vector.shape[1]).mT
         count = columns.shape[2]

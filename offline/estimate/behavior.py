@@ -1,4 +1,4 @@
-"""Estimation of the probabilities with which an unknown policy chose the actions of a log.
+"""Estimation of the probabilities of a log's actions under the unknown policy that chose them.
 
 A classifier of the actions (behavior cloning) is trained on a part of the episodes and predicts the
 actions of the other episodes. Thus no episode's probabilities come from a network that was trained

@@ -1,4 +1,4 @@
-"""Fitted Q evaluation: learn the value of a policy from the log of another.
+"""Fitted Q evaluation: learn the value of a policy from the log of another policy.
 
     Le, Voloshin and Yue, "Batch policy learning under constraints", https://arxiv.org/abs/1903.08738
 

@@ -135,7 +135,7 @@ def by_rows(function: Callable[[Any], NDArray[Any]], observations: Any) -> NDArr
 
 
 def gamma_of_run(path: Path) -> float:
-    """Return the discount in the settings of a run or seed folder, or the default of DQN."""
+    """Return the discount of a run or of its seed folder; DQN's default if there is none."""
     for folder in (path, path.parent):
         config = folder / CONFIG_NAME
         if config.is_file():

@@ -28,7 +28,8 @@ class Body(NamedTuple):
     y_m: float
     yaw_rad: float
     height_m: float = 0.0
-    """Height of the body, added to its shapes' heights to sort them for drawing."""
+    """Height of the body. It is added to the heights of the body's shapes, which determine the
+    order of drawing."""
 
 
 class FollowView:

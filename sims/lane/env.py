@@ -80,11 +80,11 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     1 left or -1 right. A single image shows neither the speed nor the direction of the next turn.
 
     `observation="depth-commands"`: a `Dict` with two entries. `depth` is the same image. `commands`
-    has 64 float32: two for each of the last 32 decisions, newest first. The first is -1 if the
-    decision was to brake and 1 if it was to accelerate; the second is the steering command as in
-    row 3 of the table, which braking does not change. Both are 0 before the start of the episode.
-    There is no measurement beside the image: an agent knows its own commands. The speed follows
-    from them, except the speed at the start, whose influence decreases with time.
+    has 64 float32: two numbers for each of the last 32 decisions, newest first. The first number is
+    -1 for braking and 1 for accelerating. The second number is the steering command as in row 3 of
+    the table; braking does not change it. Both are 0 before the start of the episode. The image is
+    the only measurement, because an agent knows its own commands. The commands determine the speed,
+    except for the influence of the speed at the start, which decreases with time.
 
     `observation="rays"`: `Box` of 20 float32.
 

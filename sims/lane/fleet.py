@@ -84,7 +84,7 @@ class LaneFleet(Fleet):
         self._shares = np.zeros(4)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
-        # Newest command first, 0 before the start: acceleration and steering of each decision.
+        # Acceleration and steering of the last decisions, newest first; 0 before the start.
         self._commands = np.zeros((count, COMMANDS, 2), dtype=np.float32)
         self.has_rays, self._has_dashboard = observation == "rays", observation == "dashboard"
         self._has_commands = observation == "depth-commands"
@@ -202,7 +202,7 @@ class LaneFleet(Fleet):
         return {"depth": depth, **numbers} if numbers else depth
 
     def _numbers(self) -> dict[str, NDArray[np.float32]]:
-        """Return what is observed beside the images of all cars, by key; empty without a Dict."""
+        """Return the observed arrays other than images, by key; empty if there is no Dict."""
         if self._has_dashboard:
             return {"motion": self._motions()}
         if self._has_commands:

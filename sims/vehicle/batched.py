@@ -78,7 +78,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._truncates = np.array(fleet.truncates)
         self._some_truncate = bool(self._truncates.any())
-        # None at index `GOING_ON`: a running episode has no reason for its end.
+        # The entry at index `GOING_ON` is None, because a running episode has no end.
         self._reasons = np.array([None, *fleet.reasons[GOING_ON + 1 :]], dtype=object)
         self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
         self._steps = np.zeros(num_envs, dtype=np.int64)
@@ -133,7 +133,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
                 f"episodes {np.flatnonzero(self._ended).tolist()} have ended and autoreset is"
                 " disabled: call reset(options={'reset_mask': terminated | truncated}) first"
             )
-        # `NextStep`: this step resets the environments whose episodes ended before the step.
+        # In mode `NextStep`, this step resets the environments whose episodes ended before it.
         fresh, fleet = self._ended.copy(), self.fleet
         if fleet.noise.size:
             for i in np.flatnonzero(~fresh).tolist():

@@ -93,7 +93,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         self.action_space = spaces.Discrete(len(fleet.action_meanings))
         self.observation_space = fleet.observation_space
         self._noise_size = fleet.noise.shape[1]
-        # Copies of the fleet's attributes: one attribute lookup per step instead of two.
+        # Copy attributes of the fleet, so that a step needs one attribute lookup instead of two.
         self._step_one = fleet.step_one
         self._n_actions = len(fleet.action_meanings)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)

@@ -1,4 +1,4 @@
-"""Off-policy evaluation through the public API."""
+"""Tests of off-policy evaluation through the public API."""
 
 from __future__ import annotations
 

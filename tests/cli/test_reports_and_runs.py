@@ -1,4 +1,4 @@
-"""What commands print about their reports, logs and finished runs."""
+"""Tests of the commands' output about their reports, logs and finished runs."""
 
 from __future__ import annotations
 

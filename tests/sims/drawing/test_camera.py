@@ -198,7 +198,7 @@ def shrunk(inverse: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def test_shrinking_by_hand() -> None:
-    """1/2 and 1/4 average to 3/8. Half sky is the mean of the other half; 3/4 sky is sky."""
+    """1/2 and 1/4 give 3/8. Half sky gives the mean of the rest; more than half sky gives sky."""
     inverse = np.array([[0.5, 0.25, 0.1, 0.0], [0.5, 0.25, 0.0, 0.1]])
     np.testing.assert_allclose(shrunk(inverse, (1, 2)), [[8 / 3, 10.0]], rtol=1e-6)
     inverse[1, 3] = 0.0

@@ -44,17 +44,17 @@ def lane(rules: str = "classic", **kwargs: Any) -> LaneKeepingEnv:
         # In the middle at 10 m/s, the reward is (1 - .5) + (0 - .5) = 0; at rest, 10 / 290 less.
         (60.0, 1.0, 10.0, STRAIGHT, False, 0.0, DRIVING, DRIVING),
         (60.0, 1.0, 0.0, BRAKE, False, -0.034483, DRIVING, DRIVING),
-        # The states are the same without braking. By the text, up to 5 m/s is too slow.
+        # The next action is not the brake. By the published text, 5 m/s or less is too slow.
         (60.0, 1.0, 0.0, STRAIGHT, False, -0.034483, SLOW, DRIVING),
         (60.0, 1.0, 5.0, LEFT, False, -0.017241, SLOW, DRIVING),
         (60.0, 1.0, 5.1, LEFT, False, -0.016897, DRIVING, DRIVING),
         # At the maximum speed, the reward is 20 / 290 more.
         (60.0, 1.0, 30.0, STRAIGHT, False, 0.068966, DRIVING, DRIVING),
-        # 0.5 m beside it at 10 m/s: e^-1.5 - 1.
+        # 0.5 m beside the line, at 10 m/s: e^-1.5 - 1.
         (60.0, 1.5, 10.0, STRAIGHT, False, -0.776870, DRIVING, DRIVING),
-        # 1 m beside it at 20 m/s: e^-3 - 1 + 10 / 290.
+        # 1 m beside the line, at 20 m/s: e^-3 - 1 + 10 / 290.
         (130.0 + 1.0, -60.0, 20.0, RIGHT, False, -0.915730, DRIVING, DRIVING),
-        # 3.4 m beside it at 20 m/s: e^-10.2 - 1 + 10 / 290 is above -1. At 9 m/s, it is below -1.
+        # 3.4 m beside it, at 20 m/s: e^-10.2 - 1 + 10 / 290 is above -1. At 9 m/s, it is below -1.
         (60.0, 4.4, 20.0, STRAIGHT, False, -0.965480, DRIVING, DRIVING),
         (60.0, 4.4, 9.0, STRAIGHT, False, -1.003411, LOW_REWARD, LOW_REWARD),
         # At rest, the reward reaches -1 at ln(29) / 3 = 1.1224 m, because e^-3d is 10 / 290 there.

@@ -35,17 +35,17 @@ def beside(leg: int, along_m: float, distance_m: float) -> Vector:
 @pytest.mark.parametrize(
     ("place", "speed_m_s", "hit", "reward", "end"),
     [
-        # On the line at rest: (1 - .5) + (0 - .5) = 0.
+        # On the line, at rest: (1 - .5) + (0 - .5) = 0.
         (beside(0, 30.0, 0.0), 0.0, False, 0.0, FLYING),
-        # On the line at the first speed.
+        # On the line, at the speed after the start.
         (beside(0, 30.0, 0.0), 1.445, False, 1.445, FLYING),
-        # 1 m beside it at 2 m/s: e^-1 - .5 + 1.5 = 1.36788.
+        # 1 m beside the line, at 2 m/s: e^-1 - .5 + 1.5 = 1.36788.
         (beside(1, 60.0, 1.0), 2.0, False, 1.367879, FLYING),
-        # 1 m beside it at rest: e^-1 - 1.
+        # 1 m beside the line, at rest: e^-1 - 1.
         (beside(1, 60.0, 1.0), 0.0, False, -0.632121, FLYING),
-        # 3 m beside it at half a meter per second: e^-3 - .5.
+        # 3 m beside the line, at 0.5 m/s: e^-3 - .5.
         (beside(2, 100.0, -3.0), 0.5, False, -0.450213, FLYING),
-        # 6.99 m beside it: e^-6.99 - .5 + 9.5, for 10 m/s in any direction.
+        # 6.99 m beside the line, at 10 m/s in any direction: e^-6.99 - .5 + 9.5.
         (beside(3, 100.0, 6.99), 10.0, False, 9.000921, FLYING),
         # Beyond 7 m, the reward is -10 and the episode ends, at any speed.
         (beside(3, 100.0, 7.01), 10.0, False, -10.0, OFF_LINE),
