@@ -32,6 +32,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     "train-offline": (
         "mcaprl train-offline data --algo cql --seeds 2 --out runs/cql",
         "mcaprl train-offline data/pilot.mcap:2 data/random.mcap --algo iql --out runs/iql",
+        "mcaprl train-offline data --algo auto --budget-minutes 20 --out runs/auto --report page",
         "mcaprl train-offline data --resume --out runs/cql",
     ),
     "evaluate": (
@@ -87,6 +88,7 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "train-offline": {
         "Run": ("out", "algo", "seeds", "seed", "threads", "device", "resume"),
         "Data": ("follow", "other_data"),
+        "Choice by --algo auto": ("budget_minutes", "report"),
         **_BAGS,
     },
     "evaluate": {

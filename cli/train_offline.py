@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,15 +13,20 @@ from mcaprl.cli.help import Command
 from mcaprl.cli.options import PATH, integer_option, mapping_options
 from mcaprl.cli.progress import hint, training_progress, working
 from mcaprl.cli.settings import SettingsCommand
-from mcaprl.cli.show import echo
+from mcaprl.cli.show import echo, print_table
+from mcaprl.page import PAGE_NAME
 from mcaprl.settings import Settings
 from mcaprl.texts import counted
+
+if TYPE_CHECKING:
+    from mcaprl.offline.selection.choice import Choice
 
 
 def _configs() -> dict[str, Settings]:
     from mcaprl.offline.algorithms.config import default_configs
+    from mcaprl.offline.selection.config import AUTO, AutoConfig
 
-    return {**default_configs()}
+    return {**default_configs(), AUTO: AutoConfig()}
 
 
 @click.command(cls=SettingsCommand, configs=_configs)
@@ -30,7 +35,8 @@ def _configs() -> dict[str, Settings]:
 @click.option(
     "--algo",
     type=Name(_configs),
-    help="dqn, double-dqn, cql, bc, bcq, iql, or one from another package.  [default: cql]",
+    help="dqn, double-dqn, cql, bc, bcq, iql, one from another package, or auto, which chooses by"
+    " the log.  [default: cql]",
 )
 @integer_option("--seeds", "Number of networks to train.", least=1)
 @integer_option("--seed", "Seed of the first network; network k uses seed + k.", least=0)
@@ -48,6 +54,12 @@ def _configs() -> dict[str, Settings]:
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--follow", is_flag=True, help="Use episodes added to DATA during training.")
 @click.option("--other-data", is_flag=True, help="With --resume: allow other DATA than in the run.")
+@click.option("--budget-minutes", type=float, help="Wall time after which no update is started.")
+@click.option(
+    "--report",
+    type=click.Path(path_type=Path),
+    help="Output folder of the HTML page on the choice.",
+)
 @mapping_options
 def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:
     """Train a policy on DATA: files, folders or globs of logs.
@@ -60,11 +72,15 @@ def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:
     given = {name: value for name, value in request.items() if value is not None}
     with training_progress("updates", "loss") as progress:
         summaries = mcaprl.train(data, out, on_data=_print_data, progress=progress, **given)
+    from mcaprl.offline.selection.choice import CHOICE_NAME, read_choice
     from mcaprl.offline.training.curves import CURVES_NAME
     from mcaprl.offline.training.metrics import describe_seeds
 
-    for line in describe_seeds(summaries):
-        echo(line)
+    if (out / CHOICE_NAME).exists():
+        _print_choice(read_choice(out), given.get("report"))
+    else:
+        for line in describe_seeds(summaries):
+            echo(line)
     if (out / CURVES_NAME).exists():
         hint(f"curves: {out / CURVES_NAME}, or tensorboard --logdir {out}")
     else:
@@ -79,6 +95,17 @@ def _print_data(algo: str, dataset: mcaprl.Dataset) -> None:
         f"{algo} learns from {counted(len(dataset.episodes), 'episode')},"
         f" {counted(len(dataset), 'transition')}, mean return {dataset.statistics.mean_return:.2f}"
     )
+
+
+def _print_choice(choice: Choice, report: Path | None) -> None:
+    from mcaprl.offline.selection.choice import COLUMNS
+
+    title = f"{choice.chosen}, chosen by the log"
+    print_table(title, list(COLUMNS), [list(row) for row in choice.rows])
+    for text in (choice.reason, choice.sureness, *choice.advice):
+        echo(text)
+    if report is not None:
+        echo(f"report: {report / PAGE_NAME}")
 
 
 @click.command(cls=Command)

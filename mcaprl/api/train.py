@@ -12,7 +12,7 @@ from mcaprl.api.environments import all_options
 from mcaprl.api.policies import TrainedPolicy, as_names, is_policy, load_policies
 from mcaprl.api.ranges import check_least, check_port, check_positive
 from mcaprl.api.replay import LiveAddress
-from mcaprl.errors import MissingExtraError, TrainingError, UsageError
+from mcaprl.errors import MissingExtraError, TrainingError, UsageError, import_extra
 from mcaprl.files import write_json
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -22,7 +22,7 @@ from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.live_stream import DEFAULT_SPEED
 from mcaprl.remote import check_upload, upload_all
 from mcaprl.runs import run_to_resume
-from mcaprl.settings import check_settings, settings_from_json
+from mcaprl.settings import check_settings, flag, settings_from_json
 
 if TYPE_CHECKING:
     from mcaprl.offline.training.metrics import OfflineSummary
@@ -43,6 +43,8 @@ def train(
     other_data: bool = False,
     mapping: MappingFile | None = None,
     trust_code: bool = False,
+    budget_minutes: float | None = None,
+    report: str | Path | None = None,
     on_data: Callable[[str, Dataset], None] = lambda algo, dataset: None,
     progress: ProgressCallback = lambda now: None,
     **settings: Any,
@@ -56,8 +58,9 @@ def train(
         data: Dataset, file, folder or glob of logs, or several of them. `PATH:2` draws
             the transitions of PATH twice as often as others.
         out: Run folder to create.
-        algo: `dqn`, `double-dqn`, `cql`, `bc`, `bcq` or `iql`. None selects `cql`; with `resume`,
-            None selects the algorithm of the run.
+        algo: `dqn`, `double-dqn`, `cql`, `bc`, `bcq` or `iql`, or `auto`, which chooses among
+            them by the log. None selects `cql`; with `resume`, None selects the algorithm of
+            the run.
         seeds: Number of networks, which are trained in parallel.
         seed: Seed of the first network; network k uses seed + k.
         threads: Number of threads of PyTorch and of the reader.
@@ -69,6 +72,8 @@ def train(
         mapping: Mapping of another robot's bag; see `open`. The mapping is copied to `out`. With a
             mapping, paths cannot have weights such as `:2`.
         trust_code: Whether the mapping may name a Python function.
+        budget_minutes: Wall time of `auto`, minutes; None for no bound.
+        report: Output folder of the HTML page on the choice of `auto`.
         on_data: Function called with the algorithm and the dataset before the first update.
         progress: Function called with each row of metrics.
         **settings: Settings of the algorithm. Missing settings have the algorithm's defaults; with
@@ -89,6 +94,8 @@ def train(
     """
     from mcaprl.offline.algorithms.registry import choose_algorithm
     from mcaprl.offline.batches.sources import open_weighted
+    from mcaprl.offline.selection.config import AUTO, AutoConfig
+    from mcaprl.offline.selection.race import select
     from mcaprl.offline.training.curves import draw_curves
     from mcaprl.offline.training.follow import GrowingLogs
     from mcaprl.offline.training.train import train as train_dataset
@@ -106,9 +113,10 @@ def train(
         algo = was
         settings = {**settings_from_json(earlier.get("config")), **settings}
     algo = algo or "cql"
-    _, defaults = choose_algorithm(algo)
+    defaults = AutoConfig() if algo == AUTO else choose_algorithm(algo)[1]
     check_settings(algo, defaults, settings)
     config = type(defaults)(**settings)
+    _check_choice(algo, budget_minutes, report, follow, other_data)
     with torch_threads(threads):
         growing, weights = None, None
         if mapping is not None and not isinstance(data, Dataset):
@@ -125,25 +133,52 @@ def train(
         else:
             dataset, weights = open_weighted(as_names(data), threads=threads)
         on_data(algo, dataset)
-        summaries = train_dataset(
-            dataset,
-            config,
-            out,
-            seeds=seeds,
-            seed=seed,
-            weights=weights,
-            resume=resume,
+        request: dict[str, Any] = {
+            "seeds": seeds,
+            "seed": seed,
+            "weights": weights,
+            "resume": resume,
+            "device": device,
+            "progress": progress,
+        }
+        if isinstance(config, AutoConfig):
+            choice, summaries = select(
+                dataset, config, out, budget_minutes=budget_minutes, **request
+            )
+            if report is not None:
+                choice.write_report(Path(report), f"Choice of a policy for {dataset.env_id}")
+        else:
             # With `follow`, the data may differ, because the logs have grown since the checkpoints.
-            other_data=other_data or follow,
-            follow=growing,
-            device=device,
-            progress=progress,
-        )
+            request |= {"other_data": other_data or follow, "follow": growing}
+            summaries = train_dataset(dataset, config, out, **request)
     if mapping is not None:
         write_json(out / MAPPING_NAME, mapping_tree(mapping), TrainingError)
     with suppress(MissingExtraError):
         draw_curves(out)
     return summaries
+
+
+def _check_choice(
+    algo: str,
+    budget_minutes: float | None,
+    report: str | Path | None,
+    follow: bool,
+    other_data: bool,
+) -> None:
+    """Check that arguments which only `auto` has, or has not, are not given otherwise."""
+    is_auto = algo == "auto"
+    if budget_minutes is not None:
+        check_positive(budget_minutes=budget_minutes)
+    for name, is_given, fits in (
+        ("budget_minutes", budget_minutes is not None, is_auto),
+        ("report", report is not None, is_auto),
+        ("follow", follow, not is_auto),
+        ("other_data", other_data, not is_auto),
+    ):
+        if is_given and not fits:
+            raise UsageError(f"{flag(name)} is not for --algo {algo}: omit it")
+    if report is not None:
+        import_extra("jinja2", "report")
 
 
 def train_online(

@@ -19,7 +19,7 @@ the most likely action.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
@@ -30,8 +30,14 @@ from mcaprl.errors import PolicyError, UsageError
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.items import returns_to_go
 from mcaprl.offline.estimate.fqe import FQE, FQEConfig
+from mcaprl.offline.estimate.importance import (
+    EpisodeTable,
+    effective_sample_size,
+    weighted_per_decision,
+)
 from mcaprl.offline.estimate.self_normalized import Floats
 from mcaprl.offline.estimate.values import by_rows
+from mcaprl.recorder.format.probability import is_impossible
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -60,13 +66,15 @@ class Clone(Protocol):
         """Return the probabilities (B, A) of the actions for B observations."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """Scores of one policy on one log. Values are discounted returns in units of the reward.
 
     Attributes:
         first_value: FQE's mean value of the first states of the episodes.
         mean_value: FQE's mean value of all states of the log.
+        first_values: (E,) FQE's value of the first state of each episode.
+        agrees: (N,) whether the policy's action is the logged one, in each state.
         support: Fraction of the states in which the policy's action is likely under the clone.
         agreement: Fraction of the states in which the policy's action is the logged one.
         own_value: Mean of the policy's own largest Q in the first states; None if it has no Q.
@@ -76,14 +84,17 @@ class Evidence:
 
     first_value: float
     mean_value: float
+    first_values: Floats = field(repr=False)
+    agrees: NDArray[np.bool_] = field(repr=False)
     support: float
     agreement: float
     own_value: float | None
     bellman_error: float | None
 
     def to_json(self) -> dict[str, Any]:
-        """Return the attributes as plain JSON types."""
-        return asdict(self)
+        """Return the numbers as plain JSON types, without those of single episodes and states."""
+        arrays = ("first_values", "agrees")
+        return {name: value for name, value in asdict(self).items() if name not in arrays}
 
 
 def fqe_config(gamma: float, updates: int, hidden: tuple[int, ...] = (64, 64)) -> FQEConfig:
@@ -130,7 +141,7 @@ class EvidenceCollector:
         self._fold = np.repeat(halves, lengths)
         self._first = np.cumsum(lengths) - lengths
         self._likely, self._next_likely = (
-            _likely(by_rows(clone.action_probabilities, observations))
+            likely(by_rows(clone.action_probabilities, observations))
             for observations in (dataset.observations, dataset.next_observations)
         )
         returns = returns_to_go(dataset.rewards, lengths, config.gamma)
@@ -195,11 +206,14 @@ class EvidenceCollector:
     def _evidence(self, policy: Actor, actions: NDArray[np.int64], values: Floats) -> Evidence:
         rows = np.arange(len(actions))
         own_value, bellman_error = self._own_values(policy)
+        agrees = actions == self._buffer.actions.numpy()
         return Evidence(
             first_value=float(values[self._first].mean()),
             mean_value=float(values.mean()),
+            first_values=values[self._first],
             support=float(self._likely[rows, actions].mean()),
-            agreement=float((actions == self._buffer.actions.numpy()).mean()),
+            agrees=agrees,
+            agreement=float(agrees.mean()),
             own_value=own_value,
             bellman_error=bellman_error,
         )
@@ -220,7 +234,27 @@ class EvidenceCollector:
         return float(q[self._first].max(1).mean()), float(np.sqrt((error**2).mean())) / spread
 
 
-def _likely(probabilities: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+def weighted_value(
+    dataset: Dataset, evidence: Evidence, gamma: float
+) -> tuple[float, float] | None:
+    """Return a policy's value by WPDIS, and its effective number of episodes.
+
+    None is returned if the log has no valid action probabilities.
+    """
+    behavior = dataset.behavior_probs.astype(np.float64)
+    if (np.isnan(behavior) | is_impossible(behavior)).any():
+        return None
+    lengths = dataset.episode_lengths
+    steps = np.arange(int(lengths.max()) + 1) < lengths[:, None]
+    rewards, ratios, zeros = np.zeros(steps.shape), np.ones(steps.shape), np.zeros(steps.shape)
+    rewards[steps] = dataset.rewards
+    ratios[steps] = evidence.agrees / behavior
+    table = EpisodeTable(rewards, ratios, zeros, zeros, gamma)
+    value = weighted_per_decision(table).values(np.ones((1, len(lengths))))[0]
+    return float(value), effective_sample_size("WPDIS", table)
+
+
+def likely(probabilities: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
     """Return whether each action (N, A) has at least `LIKELY` times the largest probability."""
-    likely: NDArray[np.bool_] = probabilities >= LIKELY * probabilities.max(1, keepdims=True)
-    return likely
+    above: NDArray[np.bool_] = probabilities >= LIKELY * probabilities.max(1, keepdims=True)
+    return above

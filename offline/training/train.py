@@ -97,7 +97,7 @@ def train(
     learner_type, config = choose_algorithm(algo)
     weights = np.ones(len(dataset.episodes)) if weights is None else weights
     _check_weights(weights, len(dataset.episodes))
-    data = _fingerprint(dataset, weights)
+    data = fingerprint(dataset, weights)
     parts = {"algo": learner_type.name, "config": config.to_json(), "data": data}
     identity = RunIdentity(parts, other_data)
     folder = Path(out)
@@ -271,7 +271,7 @@ def _earlier_scales(folder: Path) -> tuple[ObservationEncoder | None, float | No
     return policy.encoder, policy.reward_scale
 
 
-def _fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
+def fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
     """Return a hash of the data. The hash includes the weights if they are not all equal."""
     if len(set(weights.tolist())) < 2:
         return dataset.fingerprint

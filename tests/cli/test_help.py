@@ -54,7 +54,7 @@ def test_settings_are_listed_with_the_algorithms_that_have_them() -> None:
     sections = {part.split(":")[0]: part for part in text.split("\nSettings of ")[1:]}
     assert "--updates" in sections["all algorithms"]
     assert "--expectile" in sections["iql"]
-    assert "--gamma" in sections["dqn, double-dqn, cql, bcq, iql"]
+    assert "--gamma" in sections["dqn, double-dqn, cql, bcq, iql, auto"]
     assert "--dueling" in sections["dqn, double-dqn, cql, bcq"]
     assert "--gamma" not in sections["all algorithms"]
     online = help_of("train-online")

@@ -1,0 +1,1 @@
+"""Choice of an algorithm and its settings from the log alone."""

@@ -1,0 +1,42 @@
+"""Settings of `auto`. Importing this module loads no torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from mcaprl.offline.algorithms.config import BootstrapConfig
+
+AUTO: Final = "auto"
+"""Name of the algorithm that chooses among the others."""
+
+
+@dataclass(frozen=True)
+class AutoConfig(BootstrapConfig):
+    """Settings of `auto`: those that the candidates share, and those of the choice."""
+
+    target_interval: int = 150
+    """updates between two updates of the target network"""
+    survivors: int = 3
+    """number of candidates that are trained with all updates"""
+    short_fraction: float = 0.25
+    """fraction of the updates after which the candidates are first compared"""
+    model_updates: int = 2_000
+    """gradient updates of each model that evaluates the candidates"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require_positive("survivors", "model_updates")
+        self._require("frame_stack", self.frame_stack == 1, f"1 for {AUTO}")
+        self._require("short_fraction", 0 < self.short_fraction <= 1, "within (0, 1]")
+
+    @property
+    def short_updates(self) -> int:
+        """Number of updates after which the candidates are first compared.
+
+        If it is above `checkpoint_interval`, it is a multiple of it.
+        """
+        count = max(1, round(self.updates * self.short_fraction))
+        interval = self.checkpoint_interval
+        return count if count <= interval else round(count / interval) * interval

@@ -1,0 +1,138 @@
+"""What `auto` looks at in a log, and the candidates that it trains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from mcaprl.offline.algorithms.config import TrainingConfig
+from mcaprl.offline.algorithms.registry import choose_algorithm
+from mcaprl.offline.estimate.evidence import Clone, likely
+from mcaprl.offline.estimate.values import by_rows
+from mcaprl.offline.selection.config import AutoConfig
+from mcaprl.recorder.dataset.lint import lint
+from mcaprl.recorder.format.probability import is_impossible
+
+if TYPE_CHECKING:
+    from mcaprl.recorder.dataset.dataset import Dataset
+
+LEAST_COVERAGE: Final = 0.5
+"""Fraction of actions; more must be likely under the behavior for Double DQN to be tried."""
+_IQL_INTERVAL: Final = 50
+_OWN: Final = ("survivors", "short_fraction", "model_updates")
+
+
+@dataclass(frozen=True)
+class LogTraits:
+    """Properties of a log that determine which algorithms may work.
+
+    Attributes:
+        episodes: Number of episodes.
+        transitions: Number of transitions.
+        mean_return: Mean undiscounted return of the episodes.
+        return_spread: Standard deviation of these returns.
+        terminated: Fraction of the episodes that end in a terminal state.
+        entropy: Mean entropy of the behavior, from 0 (deterministic) to 1 (uniform).
+        coverage: Mean fraction of the actions that are likely under the behavior.
+        probabilities: Whether the log has the probabilities of its actions.
+        problems: Problems that the lint found.
+    """
+
+    episodes: int
+    transitions: int
+    mean_return: float
+    return_spread: float
+    terminated: float
+    entropy: float
+    coverage: float
+    probabilities: bool
+    problems: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the attributes as plain JSON types."""
+        return {**asdict(self), "problems": list(self.problems)}
+
+
+def traits_of(dataset: Dataset, clone: Clone) -> LogTraits:
+    """Return the properties of a log, with the behavior as a clone imitates it."""
+    chances = by_rows(clone.action_probabilities, dataset.observations).astype(np.float64)
+    logs = np.log(np.where(chances > 0, chances, 1.0))
+    most = np.log(max(chances.shape[1], 2))
+    behavior = dataset.behavior_probs
+    returns = dataset.statistics.returns
+    return LogTraits(
+        episodes=len(dataset.episodes),
+        transitions=len(dataset),
+        mean_return=float(returns.mean()),
+        return_spread=float(returns.std()),
+        terminated=float(dataset.terminated.sum() / len(dataset.episodes)),
+        entropy=float(-(chances * logs).sum(1).mean() / most),
+        coverage=float(likely(chances).mean()),
+        probabilities=not bool((np.isnan(behavior) | is_impossible(behavior)).any()),
+        problems=tuple(one.what for one in lint(dataset) if one.severity == "problem"),
+    )
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Algorithm with settings that differ from the shared ones.
+
+    Attributes:
+        name: Name in tables and of the folder of its run.
+        algo: Name of the algorithm.
+        special: Settings that differ from the shared ones.
+    """
+
+    name: str
+    algo: str
+    special: Mapping[str, Any]
+
+    def config(self, shared: AutoConfig) -> TrainingConfig:
+        """Return the settings of the algorithm: the shared ones, then its special ones."""
+        _, defaults = choose_algorithm(self.algo)
+        names = {field.name for field in fields(defaults)}
+        given = {
+            field.name: getattr(shared, field.name)
+            for field in fields(shared)
+            if field.name in names and field.name not in _OWN
+        }
+        if self.algo == "iql":
+            given["target_interval"] = min(_IQL_INTERVAL, shared.target_interval)
+        interval = min(shared.checkpoint_interval, shared.short_updates)
+        return replace(defaults, **{**given, "checkpoint_interval": interval, **self.special})
+
+
+DEFAULT: Final = Candidate("bcq", "bcq", {})
+"""Candidate that is chosen unless the log shows that another one is better."""
+PORTFOLIO: Final = (
+    DEFAULT,
+    Candidate("cql", "cql", {}),
+    Candidate("bc", "bc", {}),
+    Candidate("cql-alpha-0.1", "cql", {"alpha": 0.1}),
+    Candidate("cql-scaled", "cql", {"scale_rewards": True}),
+    Candidate("iql", "iql", {"normalize_advantages": True, "beta": 0.3}),
+    Candidate("double-dqn", "double-dqn", {}),
+)
+"""All candidates, in the order in which they are trained."""
+
+
+def candidates_for(traits: LogTraits) -> dict[str, str]:
+    """Return the reason for each candidate that is not tried on a log, by name."""
+    skipped = {}
+    if traits.coverage <= LEAST_COVERAGE:
+        skipped["double-dqn"] = (
+            f"only {traits.coverage:.0%} of the actions are likely in the log, and it overestimates"
+            " the others"
+        )
+    if traits.return_spread == 0 and traits.terminated == 0:
+        alike = "all episodes have the same return, so there is nothing to prefer"
+        skipped |= {one.name: alike for one in PORTFOLIO if one.algo not in ("bc", "bcq", "cql")}
+    return skipped
+
+
+def tried(skipped: Sequence[str] | Mapping[str, str]) -> list[Candidate]:
+    """Return the candidates of the portfolio that are not skipped."""
+    return [one for one in PORTFOLIO if one.name not in skipped]

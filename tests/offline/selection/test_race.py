@@ -1,0 +1,229 @@
+"""Runs of `auto`: choice, early end, resume, budget, interruption and report."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mcaprl
+from mcaprl.errors import OutputExistsError, TrainingError, UsageError
+from mcaprl.offline.policy import read_policy
+from mcaprl.offline.selection.choice import read_choice
+from mcaprl.offline.selection.config import AutoConfig
+from mcaprl.offline.selection.portfolio import PORTFOLIO
+from mcaprl.offline.selection.race import select
+from mcaprl.progress import TrainingProgress
+from mcaprl.recorder.dataset.dataset import Dataset
+from tests.offline.estimate.test_off_policy import log
+from tests.support import two_state_task as task
+
+TINY: dict[str, Any] = {
+    "updates": 40,
+    "batch_size": 16,
+    "hidden": (8,),
+    "log_interval": 5,
+    "gamma": 0.9,
+    "target_interval": 5,
+    "survivors": 2,
+    "model_updates": 60,
+}
+CONFIG = AutoConfig(**TINY)
+
+
+class Interrupted(Exception):
+    """Raised by a callback, as Ctrl-C would."""
+
+
+def updates(run: Path) -> dict[str, int]:
+    """Return the number of updates of each candidate."""
+    files = run.glob("candidates/*/seed-0/policy.json")
+    return {file.parts[-3]: json.loads(file.read_text())["updates"] for file in files}
+
+
+def weights(run: Path) -> dict[str, bytes]:
+    return {
+        str(file.relative_to(run)): file.read_bytes() for file in run.rglob("policy.safetensors")
+    }
+
+
+@pytest.fixture(scope="module")
+def data() -> Dataset:
+    return log(40)
+
+
+@pytest.fixture(scope="module")
+def finished(data: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("auto") / "run"
+    select(data, CONFIG, run, seeds=2)
+    return run
+
+
+def test_two_candidates_make_all_updates_and_the_others_a_quarter(finished: Path) -> None:
+    done = updates(finished)
+    assert set(done) == {candidate.name for candidate in PORTFOLIO}
+    assert sorted(done.values()) == [10] * (len(done) - 2) + [40] * 2
+    choice = read_choice(finished)
+    assert choice.complete
+    assert done[choice.chosen] == 40
+    outcomes = {name: one.outcome for name, one in choice.tried.items()}
+    assert outcomes.pop(choice.chosen) == "chosen"
+    assert sorted(outcomes.values()) == ["runner-up"] + ["stopped early"] * (len(done) - 2)
+    assert next(iter(choice.tried)) == choice.chosen
+    assert choice.chosen in choice.reason
+
+
+def test_the_run_contains_the_policy_of_the_chosen_candidate(finished: Path) -> None:
+    choice = read_choice(finished)
+    for seed in ("seed-0", "seed-1"):
+        found, wanted = (
+            (folder / seed / "policy.safetensors").read_bytes()
+            for folder in (finished, finished / "candidates" / choice.chosen)
+        )
+        assert found == wanted
+    policy = mcaprl.load_policy(finished)
+    assert policy.act(np.eye(2, dtype=np.float32)).shape == (2,)
+
+
+def test_the_traits_are_those_of_the_log(data: Dataset, finished: Path) -> None:
+    traits = read_choice(finished).traits
+    assert (traits.episodes, traits.transitions) == (40, len(data))
+    assert traits.mean_return == pytest.approx(data.statistics.mean_return)
+    assert traits.terminated == 1
+    assert traits.probabilities
+    assert traits.coverage == 1
+    # The behavior's entropy is .97 bits in state 0 and 1 in state 1.
+    assert traits.entropy == pytest.approx(0.985, abs=0.06)
+
+
+def test_actions_that_are_rare_in_the_log_exclude_double_dqn(tmp_path: Path) -> None:
+    data = log(60, acting=np.array([[1.0, 0.0], [1.0, 0.0]]))
+    choice, _ = select(data, replace(CONFIG, learning_rate=0.05), tmp_path / "run")
+    assert choice.traits.coverage == 0.5
+    assert choice.traits.entropy < 0.2
+    assert "double-dqn" not in updates(tmp_path / "run")
+    assert choice.tried["double-dqn"].outcome.startswith("not tried: only 50% of the actions")
+
+
+def test_the_same_run_again_is_bit_equal(data: Dataset, finished: Path, tmp_path: Path) -> None:
+    select(data, CONFIG, tmp_path / "run", seeds=2)
+    assert weights(tmp_path / "run") == weights(finished)
+    assert read_choice(tmp_path / "run") == read_choice(finished)
+
+
+@pytest.mark.parametrize("after", [3, 17])
+def test_an_interrupted_run_is_readable_and_resumes_to_the_same_result(
+    data: Dataset, finished: Path, tmp_path: Path, after: int
+) -> None:
+    run, reports = tmp_path / "run", 0
+
+    def interrupt(now: TrainingProgress) -> None:
+        nonlocal reports
+        reports += 1
+        if reports == 2 * after:
+            raise Interrupted
+
+    with pytest.raises(Interrupted):
+        select(data, CONFIG, run, seeds=2, progress=interrupt)
+    if after > 3:
+        assert read_policy(run / "seed-1").act(np.eye(2, dtype=np.float32)).shape == (2,)
+    select(data, CONFIG, run, seeds=2, resume=True)
+    assert weights(run) == weights(finished)
+    assert read_choice(run) == read_choice(finished)
+
+
+def test_a_finished_run_resumes_without_an_update(data: Dataset, finished: Path) -> None:
+    before = weights(finished)
+    reported: list[TrainingProgress] = []
+    choice, summaries = select(
+        data, CONFIG, finished, seeds=2, resume=True, progress=reported.append
+    )
+    assert not reported
+    assert choice == read_choice(finished)
+    assert weights(finished) == before
+    assert [summary.steps for summary in summaries] == [40, 40]
+
+
+def test_progress_is_that_of_one_training(data: Dataset, tmp_path: Path) -> None:
+    reported: list[TrainingProgress] = []
+    select(data, CONFIG, tmp_path / "run", progress=reported.append)
+    done = [now.done for now in reported]
+    assert done == sorted(done)
+    assert done[-1] == reported[-1].total == 10 * len(PORTFOLIO) + 2 * 30
+
+
+def test_a_budget_ends_the_run_with_a_policy(data: Dataset, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    config = replace(CONFIG, updates=100_000, log_interval=50, checkpoint_interval=50)
+    choice, _ = select(data, config, run, budget_minutes=0.15)
+    assert not choice.complete
+    assert "--budget-minutes" in choice.advice[0]
+    assert 0 < max(updates(run).values()) < 100_000
+    assert mcaprl.load_policy(run).act(np.eye(2, dtype=np.float32)).shape == (2,)
+
+
+def test_a_budget_without_time_for_a_checkpoint_is_one_line(data: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match="give more minutes") as caught:
+        select(data, CONFIG, tmp_path / "run", budget_minutes=1e-9)
+    assert "\n" not in str(caught.value)
+
+
+def test_other_settings_or_data_cannot_resume(data: Dataset, finished: Path) -> None:
+    with pytest.raises(TrainingError, match="has survivors 2, not 3"):
+        select(data, replace(CONFIG, survivors=3), finished, seeds=2, resume=True)
+    with pytest.raises(TrainingError, match="trained on other data"):
+        select(log(41), CONFIG, finished, seeds=2, resume=True)
+    with pytest.raises(OutputExistsError, match="choose another folder"):
+        select(data, CONFIG, finished, seeds=2)
+
+
+def test_one_episode_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="needs 2 episodes"):
+        select(log(1), CONFIG, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_auto_in_the_api_with_a_report(data: Dataset, tmp_path: Path) -> None:
+    run, report = tmp_path / "run", tmp_path / "report"
+    (summary,) = mcaprl.train(data, run, algo="auto", report=report, **TINY)
+    choice = read_choice(run)
+    assert summary.folder == run / "seed-0"
+    page = (report / "index.html").read_text()
+    for text in (choice.reason, choice.sureness, *choice.tried):
+        assert text in page
+    assert choice.tried[choice.chosen].weighted is not None
+    mcaprl.train(data, run, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"algo": "bc", "budget_minutes": 1}, "--budget-minutes is not for --algo bc"),
+        ({"algo": "cql", "report": "page"}, "--report is not for --algo cql"),
+        ({"algo": "auto", "other_data": True}, "--other-data is not for --algo auto"),
+        ({"algo": "auto", "follow": True}, "--follow is not for --algo auto"),
+        ({"algo": "auto", "budget_minutes": 0}, "--budget-minutes 0: give a number above 0"),
+        ({"algo": "auto", "frame_stack": 2}, "frame_stack must be 1 for auto, got 2"),
+        ({"algo": "auto", "survivors": 0}, "survivors must be at least 1"),
+        ({"algo": "auto", "alpha": 1.0}, "auto has no setting --alpha"),
+    ],
+)
+def test_mistakes_are_one_line(
+    data: Dataset, tmp_path: Path, given: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        mcaprl.train(data, tmp_path / "run", **given)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_of_another_algorithm_has_no_choice(tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match=r"no choice\.json"):
+        read_choice(tmp_path)
+
+
+def test_the_task_has_the_values_that_the_estimates_assume() -> None:
+    assert TINY["gamma"] == task.GAMMA
