@@ -46,6 +46,8 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     ),
     "replay": (
         "mcaprl replay replay.mcap",
+        "mcaprl replay replay.mcap --browser",
+        "mcaprl replay replay.mcap --episode 0 --save episode.html",
         "mcaprl replay replay.mcap --episode 0 --video episode.mp4",
         "mcaprl replay replay.mcap --verify",
     ),
@@ -114,9 +116,9 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         **_BAGS,
     },
     "replay": {
-        "Playback": ("episode", "speed", "loop", "port", "allow_origin"),
+        "Playback": ("browser", "episode", "speed", "loop", "port", "allow_origin"),
         "Comparison with the sim": ("verifies", "sim", "trust_env"),
-        "Video and image": ("video", "contact_sheet", "overwrite"),
+        "Page, video and image": ("save", "video", "contact_sheet", "overwrite"),
     },
     "convert": {
         "Formats": ("source_format", "to", "lossy"),

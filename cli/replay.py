@@ -1,20 +1,20 @@
-"""`mcaprl replay`: show logged episodes in Foxglove or as a video, or compare them with the sim."""
+"""`mcaprl replay`: show logged episodes in a viewer, or compare them with the sim."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 import mcaprl
 from mcaprl.cli.completion import Name, sims
 from mcaprl.cli.help import Command
-from mcaprl.cli.options import PATH, integer_option, origin_option, trust_option
+from mcaprl.cli.options import PATH, origin_option, trust_option
 from mcaprl.cli.progress import hint, working
 from mcaprl.cli.show import echo, print_address, print_problems
 from mcaprl.errors import UsageError
-from mcaprl.texts import counted
+from mcaprl.texts import counted, size
 
 if TYPE_CHECKING:
     from mcaprl.api.replay import LiveAddress
@@ -31,14 +31,20 @@ if TYPE_CHECKING:
     help="Simulated seconds per second.",
 )
 @click.option("--loop", is_flag=True, help="Restart at the end.")
-@integer_option(
-    "--port", "Port on 127.0.0.1; 0 for any free port.", least=0, most=65535, default=8765
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    help="Port on 127.0.0.1; 0 for any free port.  [default: 8765, with --browser 0]",
 )
 @origin_option
+@click.option("--browser", is_flag=True, help="Show a page in the browser instead of Foxglove.")
+@click.option(
+    "--save", type=click.Path(path_type=Path), help="Page of one episode to write, .html."
+)
 @click.option("--verify", "verifies", is_flag=True, help="Compare each step with the sim.")
 @click.option("--video", type=click.Path(path_type=Path), help="Video to write, .mp4 or .gif.")
 @click.option("--contact-sheet", type=click.Path(path_type=Path), help="PNG image to write.")
-@click.option("--overwrite", is_flag=True, help="Replace an existing video or image.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing page, video or image.")
 @click.option("--sim", type=Name(sims), help="Sim to step instead of the logged one.")
 @trust_option
 def replay(
@@ -46,8 +52,10 @@ def replay(
     episode: int | None,
     speed: float,
     loop: bool,
-    port: int,
+    port: int | None,
     allow_origin: tuple[str, ...],
+    browser: bool,
+    save: Path | None,
     verifies: bool,
     sim: str | None,
     trust_env: bool,
@@ -55,49 +63,59 @@ def replay(
     contact_sheet: Path | None,
     overwrite: bool,
 ) -> int:
-    """Play LOG... in Foxglove, compare it with the sim, or render an episode as a video.
+    """Play LOG... in Foxglove or in the browser, compare it with the sim, or render an episode.
 
-    Several logs play side by side: all start at the same time, each with its own topic prefix.
+    Several logs play side by side in Foxglove: all start at the same time, each with its own topic
+    prefix.
     """
-    if verifies and (video or contact_sheet):
-        raise UsageError("--verify writes no video or image: run replay once for each")
+    draws = video is not None or contact_sheet is not None
+    if verifies + browser + (save is not None or draws) > 1:
+        raise UsageError(
+            "--verify, --browser, and writing a page, video or image exclude each other:"
+            " run replay once for each"
+        )
     from mcaprl.recorder.dataset.open import find_logs
 
+    paths = find_logs(files)
     if verifies:
-        same = [_verify(path, episode, sim, trust_env) for path in find_logs(files)]
+        same = [_verify(path, episode, sim, trust_env) for path in paths]
         return int(not all(same))
-    if video or contact_sheet:
-        paths = find_logs(files)
-        if len(paths) > 1:
-            raise UsageError("a video shows one file: render each file separately")
-        with working("reading the log") as bar:
-            drawn = mcaprl.render(
-                paths[0],
-                episode=episode or 0,
-                sim=sim,
-                trust_env=trust_env,
-                speed=speed,
-                video=video,
-                contact_sheet=contact_sheet,
-                overwrite=overwrite,
-                progress=bar,
-            )
-        if video:
-            echo(f"{video}: {drawn.frames} images of episode {drawn.episode}")
-        if contact_sheet:
-            echo(f"{contact_sheet}: {drawn.stills} stills of episode {drawn.episode}")
+    if (browser or save or draws) and len(paths) > 1:
+        raise UsageError("a page or video shows one log: run replay once for each log")
+    chosen: dict[str, Any] = {"episode": episode or 0, "speed": speed, "overwrite": overwrite}
+    if save is not None:
+        length = mcaprl.save_page(paths[0], save, loop=loop, **chosen)
+        echo(f"{save}: episode {chosen['episode']}, {size(length)}")
+    if draws:
+        _render(paths[0], video, contact_sheet, sim=sim, trust_env=trust_env, **chosen)
+    if save is not None or draws:
         return 0
-    mcaprl.replay(
-        files,
-        episode=episode,
-        speed=speed,
-        loop=loop,
-        port=port,
-        allow_origin=allow_origin,
-        on_open=_print_open,
-    )
+    served: dict[str, Any] = {"speed": speed, "loop": loop}
+    if port is not None:
+        served["port"] = port
+    if browser:
+        mcaprl.browse(paths[0], episode=episode or 0, on_open=_print_page, **served)
+    else:
+        mcaprl.replay(
+            files, episode=episode, allow_origin=allow_origin, on_open=_print_open, **served
+        )
     echo("ended")
     return 0
+
+
+def _render(path: Path, video: Path | None, sheet: Path | None, **options: Any) -> None:
+    """Write a video, a contact sheet, or both, and print what was written."""
+    with working("reading the log") as bar:
+        drawn = mcaprl.render(path, video=video, contact_sheet=sheet, progress=bar, **options)
+    if video is not None:
+        echo(f"{video}: {drawn.frames} images of episode {drawn.episode}")
+    if sheet is not None:
+        echo(f"{sheet}: {drawn.stills} stills of episode {drawn.episode}")
+
+
+def _print_page(url: str) -> None:
+    echo(f"open {url}")
+    hint("press Ctrl-C to stop")
 
 
 def _print_open(address: LiveAddress) -> None:

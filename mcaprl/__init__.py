@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from mcaprl import ray, torch
     from mcaprl.api.annotate import annotate
     from mcaprl.api.behavior import estimate_behavior
+    from mcaprl.api.browse import browse, save_page
     from mcaprl.api.convert import convert, suggest_mapping
     from mcaprl.api.data import open_data as open
     from mcaprl.api.edit import filter, merge, slice, split
@@ -46,6 +47,7 @@ __all__ = [
     "RecordVecMcap",
     "__version__",
     "annotate",
+    "browse",
     "check",
     "convert",
     "estimate",
@@ -64,6 +66,7 @@ __all__ = [
     "recover",
     "render",
     "replay",
+    "save_page",
     "slice",
     "split",
     "suggest_mapping",
@@ -82,6 +85,7 @@ __getattr__ = lazy_attributes(
     }
     | {
         "mcaprl.api.behavior": ["estimate_behavior"],
+        "mcaprl.api.browse": ["browse", "save_page"],
         "mcaprl.api.convert": ["convert", "suggest_mapping"],
         "mcaprl.api.data": ["open_data as open"],
         "mcaprl.api.edit": ["filter", "merge", "slice", "split"],

@@ -38,7 +38,7 @@ _SPEED = "speed_m_s"
 # Suffixes of the telemetry names in the first plot. The speed is shown by a gauge instead.
 _WATCHED = ("offset_m", "steering_rad", "distance_m")
 # Values for environments without `view_settings`.
-_CAMERA_M, _TILT_DEG, _AROUND_M, _DEPTH_M, _HIGHEST_M_S = 22.0, 73.0, 100.0, (0.0, 50.0), 30.0
+CAMERA_M, TILT_DEG, _AROUND_M, DEPTH_M, _HIGHEST_M_S = 22.0, 73.0, 100.0, (0.0, 50.0), 30.0
 # Length of the vehicle's axes in the view from above, as a share of the visible height.
 _MARK = 0.03
 # End reasons of failures, from the sims and from Gymnasium. The indicator shows their names.
@@ -166,8 +166,8 @@ class _Screens:
         view = self.metadata.view
         camera = {
             "perspective": True,
-            "distance": view.get("distance_m", _CAMERA_M),
-            "phi": view.get("tilt_deg", _TILT_DEG),
+            "distance": view.get("distance_m", CAMERA_M),
+            "phi": view.get("tilt_deg", TILT_DEG),
             "targetOffset": [4, 0, 0],
         }
         followed = (self.follow_frame, "follow-pose") if self.follow_frame else _STILL
@@ -216,8 +216,8 @@ class _Screens:
         """Add the depth camera and the image observations."""
         names: list[Node] = []
         if _DEPTH in self.topics:
-            low = self.metadata.view.get("depth_min_m", _DEPTH_M[0])
-            high = self.metadata.view.get("depth_max_m", _DEPTH_M[1])
+            low = self.metadata.view.get("depth_min_m", DEPTH_M[0])
+            high = self.metadata.view.get("depth_max_m", DEPTH_M[1])
             colors = {"colorMode": "colormap", "colorMap": "turbo"}
             limits_mm = {"minValue": 1000 * low, "maxValue": 1000 * high}
             title = f"depth, {low:g} to {high:g} m; black: nothing in range"

@@ -48,17 +48,22 @@ def is_allowed(head: bytes, origins: Collection[str]) -> bool:
             return False
         headers[name] = value.strip()
     trusted = {_host_of(origin) for origin in origins if origin.startswith("http")}
-    host = _host_of(f"//{headers.get('host', '')}")
+    host = f"//{headers.get('host', '')}"
     origin = headers.get("origin")
     return (
         headers.get("upgrade", "").lower() == "websocket"
-        and (host in _LOOPBACK or host in trusted)
+        and (is_loopback(host) or _host_of(host) in trusted)
         and (
             origin is None
             or origin in origins
-            or (origin.startswith("http") and _host_of(origin) in _LOOPBACK)
+            or (origin.startswith("http") and is_loopback(origin))
         )
     )
+
+
+def is_loopback(url: str) -> bool:
+    """Return whether the host of a URL is this machine."""
+    return _host_of(url) in _LOOPBACK
 
 
 def _host_of(url: str) -> str:

@@ -92,7 +92,8 @@ def moments_of_episode(reader: McapReader, episode: Episode, parts: int = 1) -> 
     for step, time_ns in _moments(episode.log_time_ns.tolist(), parts):
         for _, channel, data in track.latest(time_ns):
             if before.get(channel.topic, (b"",))[0] != data:
-                before[channel.topic] = (data, _decoded(channel.topic, data))
+                read = frames_of if channel.topic in (TF, TF_STATIC) else shapes_of
+                before[channel.topic] = (data, read(data))
         found = {topic: values for topic, (_, values) in before.items()}
         moving_frames = _frames_at(found.get(TF, []), time_ns)
         yield SeenStep(
@@ -135,10 +136,22 @@ def _frame_at(poses: list[tuple[int, SeenFrame]], time_ns: int) -> SeenFrame:
     return replace(start, position=(x, y, z), rotation=(a, b, c, d))
 
 
-def _decoded(topic: str, data: bytes) -> list[Any]:
-    if topic in (TF, TF_STATIC):
-        tree = messages.decode(data, "tf2_msgs/msg/TFMessage")
-        return [(_stamp_ns(transform), _frame(transform)) for transform in tree.transforms]
+def frames_of(data: bytes) -> list[tuple[int, SeenFrame]]:
+    """Return the frames of a `tf2_msgs/msg/TFMessage` with their stamps in nanoseconds.
+
+    Raises:
+        CorruptLogError: The message is damaged.
+    """
+    tree = messages.decode(data, "tf2_msgs/msg/TFMessage")
+    return [(_stamp_ns(transform), _frame(transform)) for transform in tree.transforms]
+
+
+def shapes_of(data: bytes) -> list[SeenShape]:
+    """Return the shapes that a `visualization_msgs/msg/MarkerArray` adds.
+
+    Raises:
+        CorruptLogError: The message is damaged.
+    """
     array = messages.decode(data, "visualization_msgs/msg/MarkerArray")
     return [_shape(m) for m in array.markers if m.action == _ADD and m.type in _KINDS]
 

@@ -56,11 +56,12 @@ def test_resuming_with_another_algorithm_is_refused(
     assert f"{run} is a run of cql: resume it without algo" in capsys.readouterr().err
 
 
-def test_a_comparison_and_a_video_are_not_made_together(
+def test_a_comparison_excludes_all_that_shows_the_log(
     data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.run(["replay", str(data), "--verify", "--video", "x.mp4"]) != 0
-    assert "--verify writes no video or image" in capsys.readouterr().err
+    for other in (["--video", "x.mp4"], ["--save", "x.html"], ["--browser"]):
+        assert cli.run(["replay", str(data), "--verify", *other]) == 2
+        assert "run replay once for each" in capsys.readouterr().err
 
 
 def test_one_observation_without_an_axis_is_refused_with_a_hint(data: Path) -> None:

@@ -185,7 +185,7 @@ def test_videos_of_a_scene_and_of_a_sim(
         (["--video", "lane.mp4"], "lane.mp4 exists"),
         (["--video", "lane.avi"], "unknown kind of output '.avi'"),
         (["--video", "new.mp4", "--episode", "7"], "has episodes 0 to 0"),
-        (["cart.mcap", "--video", "new.mp4"], "a video shows one file"),
+        (["cart.mcap", "--video", "new.mp4"], "a page or video shows one log"),
     ):
         assert run(["replay", "lane.mcap", *arguments]) == 2
         assert why in capsys.readouterr().err

@@ -1,0 +1,297 @@
+"use strict";
+// The page: a list of episodes, the panels of one episode, and the timeline.
+
+const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8, 16];
+const MOST_LISTED = 500, MOST_BARS = 24;
+const get = (id) => document.getElementById(id);
+const state = { time: 0, step: -1, playing: false, speed: 1 };
+let log, episode, scene, plots = [], images = [], bars = [];
+
+/** Read the log's description, and show its first episode. */
+async function start() {
+  log = await unpack(embedded("log-data"));
+  document.title = log.name;
+  get("name").textContent = log.name;
+  get("about").textContent = [log.environment, ...log.policies.slice(0, 5)].filter(Boolean).join(" \u00b7 ");
+  state.speed = log.speed;
+  get("loop").checked = log.loop;
+  for (const speed of new Set([...SPEEDS, log.speed].sort((a, b) => a - b))) {
+    get("speed").append(new Option(`${speed}\u00d7`, speed, false, speed === log.speed));
+  }
+  get("number").max = log.numbers.length - 1;
+  document.querySelector("main").classList.toggle("single", log.numbers.length === 1);
+  listen();
+  await choose(Math.max(0, log.numbers.indexOf(log.first)));
+}
+
+/** Load and show the episode at an index of the log's columns. */
+async function choose(index) {
+  state.index = index;
+  const number = log.numbers[index];
+  list();
+  try {
+    let bytes = embedded("episode-data");
+    if (!bytes) {
+      const answer = await fetch(`episode/${number}`);
+      if (!answer.ok) throw new Error(await answer.text());
+      bytes = await answer.arrayBuffer();
+    }
+    const data = await unpack(bytes);
+    if (index === state.index) show(data);
+  } catch (error) {
+    report(`episode ${number} cannot be shown: ${error.message}`);
+  }
+}
+
+/** Show a problem above the panels; an empty text hides it. */
+function report(text) {
+  get("problem").textContent = text;
+  get("problem").hidden = !text;
+}
+
+/** Build the panels of an episode. */
+function show(data) {
+  report("");
+  episode = data;
+  plots.forEach((plot) => plot.destroy());
+  for (const id of ["images", "plots", "policies", "lines"]) get(id).replaceChildren();
+  get("view").hidden = !data.scene;
+  images = data.images.map((image) => new ImageView(get("images"), image));
+  plots = plotsOf(data);
+  bars = data.policies.flatMap(barsOf);
+  get("log").hidden = !data.lines.texts.length;
+  get("lines").append(...data.lines.texts.map((text, k) => lineOf(data.lines, text, k)));
+  get("time").max = duration();
+  if (data.scene) showScene(data.scene);
+  state.step = -1;
+  seek(0);
+}
+
+function showScene(data) {
+  try {
+    scene ??= new SceneView(get("scene"), log);
+    scene.resize();
+    scene.load(data);
+  } catch (error) {
+    scene = undefined;
+    get("view").hidden = true;
+    report(`the 3D view does not work in this browser: ${error.message}`);
+  }
+}
+
+function plotsOf(data) {
+  const { times, rewards } = data;
+  const sums = [0];
+  for (const reward of rewards) sums.push(sums.at(-1) + reward);
+  const plot = (series, options) => {
+    return new TimePlot(get("plots"), times, series, options, seek);
+  };
+  const rows = (values, names) => Array.from({ length: values.shape[0] }, (_, k) =>
+    ({ name: names[k] ?? String(k), values: row(values, k) }));
+  const named = data.is_discrete && log.actions.length && log.actions.length <= MOST_BARS;
+  const index = (values) => (named ? values.map((value) => value - log.first_action) : values);
+  data.sums = sums;
+  return [
+    plot([{ name: "reward", values: rewards }], { title: "Reward" }),
+    plot([{ name: "return", values: sums }], { title: "Return so far" }),
+    data.is_discrete
+      ? plot([
+        { name: "log", values: index(row(data.actions, 0)) },
+        ...data.policies.map(({ name, policy_action: chosen }) =>
+          ({ name: name || "policy", values: index(chosen), dash: [3, 3] })),
+      ], { title: "Action", names: named ? log.actions : undefined })
+      : plot(rows(data.actions, []), { title: "Action" }),
+    ...data.policies.flatMap((policy) => {
+      const hasValues = policy.q.some(Number.isFinite);
+      const errors = [{ name: "TD error", values: policy.td_error }, { name: "advantage", values: policy.advantage }];
+      return [
+        plot(rows(hasValues ? policy.q : policy.preference, log.actions), {
+          title: titled(hasValues ? "Q-values" : "Probabilities of the actions", policy), shown: 8,
+        }),
+        ...(hasValues ? [plot(errors, { title: titled("TD error and advantage", policy) })] : []),
+      ];
+    }),
+    ...data.plots.map(({ title, names, values }) =>
+      plot(rows(values, names), { title: title[0].toUpperCase() + title.slice(1) })),
+  ];
+}
+
+/** Return a title with the name of the policy, if the log has several. */
+function titled(title, { name }) {
+  return name ? `${title}: ${name}` : title;
+}
+
+/** Create the bars with a policy's value of each action at this step. */
+function barsOf(policy) {
+  const count = policy.q.shape[0];
+  if (count > MOST_BARS) return [];
+  const hasValues = policy.q.some(Number.isFinite), values = hasValues ? policy.q : policy.preference;
+  const finite = values.filter(Number.isFinite);
+  const low = hasValues ? finite.reduce((a, b) => Math.min(a, b), Infinity) : 0;
+  const high = finite.reduce((a, b) => Math.max(a, b), -Infinity);
+  const box = element("div", { className: "bars" },
+    element("h2", { textContent: titled(hasValues ? "Q-values" : "Probabilities", policy) }));
+  const cells = Array.from({ length: count }, (_, k) => {
+    const name = log.actions[k] ?? String(k);
+    const made = [
+      element("span", { className: "name", textContent: name, title: name }),
+      element("span"), element("span", { className: "number" }),
+    ];
+    made[1].append(element("div", { className: "bar" }));
+    box.append(...made);
+    return made;
+  });
+  box.append(element("p", { className: "key", textContent: "bold: taken; blue: policy's action" }));
+  get("policies").append(box);
+  return [(step) => cells.forEach(([name, bar, number], k) => {
+    const value = step < values.shape[1] ? row(values, k)[step] : NaN;
+    const share = (value - low) / (high - low || 1);
+    bar.firstChild.style.width = `${Number.isFinite(share) ? 100 * share : 0}%`;
+    number.textContent = short(value);
+    name.classList.toggle("taken", row(episode.actions, 0)[step] === k + log.first_action);
+    bar.firstChild.classList.toggle("best", policy.policy_action[step] === k + log.first_action);
+  })];
+}
+
+function lineOf({ times, levels }, text, k) {
+  const button = element("button", {
+    textContent: `${times[k].toFixed(2)} s  ${text}`,
+    className: levels[k] >= 30 ? "failed" : "",
+    onclick: () => seek(times[k]),
+  });
+  return element("li", {}, button);
+}
+
+/** List the episodes, the current one marked. */
+function list() {
+  const key = get("order").value, order = [...log.numbers.keys()];
+  if (key !== "numbers") order.sort((a, b) => log[key][a] - log[key][b]);
+  const place = order.indexOf(state.index);
+  const first = Math.max(0, Math.min(place - MOST_LISTED / 2, order.length - MOST_LISTED));
+  const listed = order.slice(first, first + MOST_LISTED);
+  state.order = order;
+  get("list").replaceChildren(...listed.map((index) => {
+    const end = element("span", {
+      className: log.failures[log.reason[index]] ? "end failed" : "end",
+      textContent: log.reasons[log.reason[index]],
+    });
+    const button = element("button", { onclick: () => choose(index) },
+      element("span", { textContent: log.numbers[index] }),
+      element("span", { textContent: `return ${short(log.returns[index])}` }),
+      element("span", { textContent: `${log.lengths[index]} steps` }), end);
+    if (index === state.index) button.setAttribute("aria-current", "true");
+    return element("li", {}, button);
+  }));
+  get("list").querySelector("[aria-current]").scrollIntoView({ block: "nearest" });
+  get("more").hidden = listed.length === order.length;
+  get("more").textContent = `${listed.length} of ${order.length} episodes`;
+  get("number").value = log.numbers[state.index];
+}
+
+function duration() {
+  return episode.times[episode.times.length - 1];
+}
+
+/** Show a time in seconds from the start of the episode. */
+function seek(time) {
+  if (!episode) return;
+  state.time = Math.min(Math.max(time, 0), duration());
+  const step = Math.max(0, indexAt(episode.times, state.time + 1e-9));
+  get("time").value = state.time;
+  const clock = `${state.time.toFixed(2)} of ${duration().toFixed(2)} s, step ${step} of ${episode.rewards.length}`;
+  get("clock").value = clock;
+  get("time").setAttribute("aria-valuetext", clock);
+  if (episode.scene) scene?.draw(state.time);
+  plots.forEach((plot) => plot.draw(state.time, step));
+  if (step === state.step) return;
+  state.step = step;
+  images.forEach((image) => image.draw(step));
+  bars.forEach((draw) => draw(step));
+  facts(step);
+}
+
+/** Write the action and the reward of a step, and the return so far. */
+function facts(step) {
+  const actions = [...Array(episode.actions.shape[0]).keys()].map((k) => row(episode.actions, k)[step]);
+  const action = step === episode.rewards.length ? "\u2013"
+    : (episode.is_discrete && log.actions[actions[0] - log.first_action]) || actions.slice(0, 8).map(short).join(", ");
+  const rows = { action, reward: short(episode.rewards[step]), "return so far": short(episode.sums[step]) };
+  if (step === episode.rewards.length) rows.end = log.reasons[log.reason[state.index]];
+  get("facts").replaceChildren(...Object.entries(rows).flatMap(([name, value]) =>
+    [element("dt", { textContent: name }), element("dd", { textContent: value })]));
+}
+
+function play(playing) {
+  state.playing = playing;
+  get("play").textContent = playing ? "Pause" : "Play";
+  if (!playing) return;
+  if (state.time >= duration()) seek(0);
+  let last = performance.now();
+  const tick = (now) => {
+    if (!state.playing) return;
+    seek(state.time + ((now - last) / 1000) * state.speed);
+    last = now;
+    if (state.time >= duration()) {
+      if (!get("loop").checked) return play(false);
+      seek(0);
+    }
+    requestAnimationFrame(tick);
+  };
+  requestAnimationFrame(tick);
+}
+
+/** Move by a number of steps. */
+function stepBy(count) {
+  play(false);
+  seek(episode.times[Math.min(Math.max(state.step + count, 0), episode.times.length - 1)]);
+}
+
+/** Show the episode that is `count` places further in the list. */
+function turn(count) {
+  const index = state.order[state.order.indexOf(state.index) + count];
+  if (index !== undefined) choose(index);
+}
+
+function follow(following) {
+  get("follow").setAttribute("aria-pressed", following);
+  scene?.follow(following);
+}
+
+const KEYS = {
+  " ": () => play(!state.playing),
+  ArrowLeft: (event) => stepBy(event.shiftKey ? -10 : -1),
+  ArrowRight: (event) => stepBy(event.shiftKey ? 10 : 1),
+  Home: () => seek(0),
+  End: () => seek(duration()),
+  PageUp: () => turn(-1),
+  PageDown: () => turn(1),
+  f: () => follow(get("follow").getAttribute("aria-pressed") !== "true"),
+};
+
+function listen() {
+  get("play").onclick = () => play(!state.playing);
+  get("back").onclick = () => stepBy(-1);
+  get("forth").onclick = () => stepBy(1);
+  get("speed").onchange = ({ target }) => { state.speed = Number(target.value); };
+  get("time").oninput = ({ target }) => seek(Number(target.value));
+  get("follow").onclick = () => KEYS.f();
+  get("order").onchange = list;
+  get("number").onchange = ({ target }) => {
+    const index = log.numbers.indexOf(Number(target.value));
+    if (index >= 0) choose(index);
+  };
+  document.addEventListener("keydown", (event) => {
+    const { target, key } = event;
+    const isText = target.matches("select, input[type=number]");
+    const isPressed = key === " " && target.matches("button, input[type=checkbox]");
+    if (!episode || isText || isPressed || event.ctrlKey || event.metaKey || event.altKey || !KEYS[key]) return;
+    event.preventDefault();
+    KEYS[key](event);
+  });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+    plots.forEach((plot) => plot.build());
+    scene?.setColors();
+  });
+}
+
+start().catch((error) => report(`the page cannot be shown: ${error.message}`));

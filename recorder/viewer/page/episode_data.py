@@ -1,0 +1,284 @@
+"""Data of a log and of its episodes, as the page shows them."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterator, Sequence
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.dataset.open import open_logs
+from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.reading import McapReader, Topic
+from mcaprl.recorder.format.spaces import observation_leaves
+from mcaprl.recorder.format.topics import LOG_TOPIC
+from mcaprl.recorder.record.display import (
+    DEPTH,
+    SCENE,
+    SCENE_STATIC,
+    TELEMETRY,
+    TF,
+    TF_STATIC,
+)
+from mcaprl.recorder.record.layout import (
+    CAMERA_M,
+    DEPTH_M,
+    RETURN_SO_FAR,
+    TILT_DEG,
+    VALUES_TOPIC,
+    is_values_topic,
+)
+from mcaprl.recorder.viewer.page.packed import pack
+from mcaprl.recorder.viewer.page.scene_data import scene_data
+from mcaprl.recorder.viewer.playback import Track
+
+_SCENE_TYPES = {
+    SCENE: "visualization_msgs/msg/MarkerArray",
+    SCENE_STATIC: "visualization_msgs/msg/MarkerArray",
+    TF: "tf2_msgs/msg/TFMessage",
+    TF_STATIC: "tf2_msgs/msg/TFMessage",
+}
+_VALUES_FIELDS = ("q", "preference", "policy_action", "value", "advantage", "td_error")
+# Uncompressed size of the images of one topic above which some steps have no image.
+_MOST_IMAGE_BYTES = 2**26
+_MOST_CHANNELS = 4
+
+
+class LogPage:
+    """Data of one log, read episode by episode.
+
+    Attributes:
+        name: Name of the file.
+        dataset: Dataset of the log, without observations.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read the summaries of the episodes.
+
+        Raises:
+            LogError: The log cannot be read.
+        """
+        self.name = path.name
+        self.dataset = open_logs(path, columns=[])
+        self._path, self._reader = path, McapReader(path)
+        self._metadata = LogMetadata.from_strings(self.dataset.metadata)
+        typed = [
+            topic for topic, name in _SCENE_TYPES.items() if _type_of(self._reader, topic) == name
+        ]
+        self._scene = Track(self._reader, topics=typed) if SCENE in typed else None
+        self._reading = threading.Lock()
+
+    def index(self, only: int | None = None, **settings: Any) -> bytes:
+        """Return the packed description of the log and its episodes.
+
+        Args:
+            only: Index of the only episode to list; None for all.
+            **settings: Values to add, such as the episode to show first.
+        """
+        view = self._metadata.view
+        episodes = self.dataset.episodes[slice(None) if only is None else slice(only, only + 1)]
+        reasons = sorted({episode.reason for episode in episodes})
+        number_of = {reason: number for number, reason in enumerate(reasons)}
+        actions = self.dataset.action_names
+        return pack(
+            {
+                "name": self.name,
+                "environment": self.dataset.env_id,
+                "policies": sorted({e.policy for e in episodes if e.policy}),
+                "actions": [actions[key] for key in sorted(actions)],
+                "first_action": min(actions, default=0),
+                "distance_m": _finite(view.get("distance_m"), CAMERA_M),
+                "tilt_deg": _finite(view.get("tilt_deg"), TILT_DEG),
+                "reasons": reasons,
+                "failures": [self._metadata.is_failure(reason) for reason in reasons],
+                "numbers": _column([e.index for e in episodes], np.int32),
+                "reason": _column([number_of[e.reason] for e in episodes], np.int32),
+                "returns": _column([e.total_reward for e in episodes], np.float64),
+                "lengths": _column([e.length for e in episodes], np.int32),
+                **settings,
+            }
+        )
+
+    def episode(self, number: int) -> bytes:
+        """Return the packed data of an episode.
+
+        Raises:
+            LogError: A chunk or message is damaged.
+        """
+        with self._reading:
+            dataset = open_logs(self._path, episodes=number)
+            episode = dataset.episodes[0]
+            start_ns, end_ns = int(episode.log_time_ns[0]), int(episode.log_time_ns[-1])
+            scene = self._scene and scene_data(self._scene, start_ns, end_ns)
+            return pack(
+                {
+                    "times": _seconds(episode.log_time_ns, start_ns),
+                    "rewards": episode.rewards.astype(np.float32),
+                    "actions": _rows(episode.actions).T.astype(np.float32),
+                    "is_discrete": isinstance(dataset.action_space, spaces.Discrete),
+                    "plots": list(self._plots(dataset, episode)),
+                    "policies": list(self._policies(episode)),
+                    "images": [*_observed_images(dataset), *self._depth_images(episode)],
+                    "lines": self._lines(start_ns, end_ns),
+                    "scene": scene,
+                }
+            )
+
+    def _plots(self, dataset: Dataset, episode: Episode) -> Iterator[dict[str, Any]]:
+        """Yield groups of series: title, names, and values (series, T or T + 1)."""
+        leaves = observation_leaves(dataset.observation_space)
+        for leaf in leaves:
+            if leaf.encoding is None:
+                values = _rows(_at(dataset.frames, leaf.path))
+                names = list(dataset.observation_names) if len(leaves) == 1 else []
+                yield _plot("/".join(("observation", *leaf.path)), names, values)
+        telemetry = self._at_steps(TELEMETRY, episode.log_time_ns)
+        telemetry.pop(RETURN_SO_FAR, None)
+        if telemetry:
+            yield _plot("telemetry", list(telemetry), np.column_stack(list(telemetry.values())))
+        infos = {
+            name: np.ma.filled(info.astype(np.float64), np.nan)
+            for name, info in episode.infos.items()
+            if info.ndim == 1 and info.dtype.kind in "biuf"
+        }
+        if infos:
+            yield _plot("info", list(infos), np.column_stack(list(infos.values())))
+        if not np.isnan(episode.behavior_probs).all():
+            yield _plot("probability of the action", ["behavior_prob"], episode.behavior_probs)
+
+    def _policies(self, episode: Episode) -> Iterator[dict[str, Any]]:
+        """Yield the values of each policy that annotated the log."""
+        topics = {channel.topic for channel in self._reader.channels.values()}
+        for topic in sorted(filter(is_values_topic, topics)):
+            columns = self._at_steps(topic, episode.log_time_ns[:-1])
+            if set(_VALUES_FIELDS) <= set(columns):
+                name = topic.removeprefix(VALUES_TOPIC).lstrip("/")
+                values = {field: columns[field].T for field in _VALUES_FIELDS}
+                yield {"name": name, **values}
+
+    def _depth_images(self, episode: Episode) -> Iterator[dict[str, Any]]:
+        """Yield the depth images as numbers from 1 (near) to 255 (far); 0 is unknown."""
+        if _type_of(self._reader, DEPTH) != "sensor_msgs/msg/Image":
+            return
+        topic = Topic(self._reader, DEPTH)
+        found, steps = _rows_at(topic, episode.log_time_ns)
+        if not len(found):
+            return
+        first = topic.read(("height", "width", "encoding"), found[:1])
+        if first["encoding"][0] not in ("16UC1", b"16UC1"):
+            return
+        height, width = int(first["height"][0]), int(first["width"][0])
+        every = _thinning(len(found) * height * width)
+        data = topic.read(("data",), found[::every])["data"]
+        depth_m = data.view("<u2").reshape(-1, height, width) / np.float32(1000)
+        view = self._metadata.view
+        low, high = (
+            _finite(view.get(name), default)
+            for name, default in zip(("depth_min_m", "depth_max_m"), DEPTH_M, strict=True)
+        )
+        share = np.clip((depth_m - low) / max(high - low, 1e-6), 0, 1)
+        coded = np.where(depth_m > 0, 1 + np.rint(share * 254), 0).astype(np.uint8)
+        title = f"depth, {low:g} to {high:g} m"
+        yield {
+            "title": title,
+            "is_depth": True,
+            "steps": steps[::every],
+            "pixels": coded[..., None],
+        }
+
+    def _lines(self, start_ns: int, end_ns: int) -> dict[str, Any]:
+        """Return the log lines of an episode."""
+        topic = Topic(self._reader, LOG_TOPIC)
+        rows = np.flatnonzero((topic.times >= start_ns) & (topic.times <= end_ns))
+        if not len(rows) or not {"msg", "level"} <= set(topic.fields):
+            return {"times": np.empty(0), "levels": np.empty(0, np.int32), "texts": []}
+        columns = topic.read(("msg", "level"), rows)
+        return {
+            "times": _seconds(topic.times[rows], start_ns),
+            "levels": columns["level"].astype(np.int32),
+            "texts": [str(text) for text in columns["msg"]],
+        }
+
+    def _at_steps(self, topic_name: str, times_ns: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        """Return the numeric fields of a topic at these log_times; NaN where there is no message.
+
+        Returns:
+            (len(times_ns),) or (len(times_ns), N) float32 by field.
+        """
+        topic = Topic(self._reader, topic_name)
+        found, steps = _rows_at(topic, times_ns)
+        names = [name for name, dtype in topic.fields.items() if dtype.base.kind in "biuf"]
+        columns = {}
+        for name, values in topic.read(names, found).items() if len(found) else ():
+            if name in names:
+                columns[name] = np.full((len(times_ns), *values.shape[1:]), np.nan, np.float32)
+                columns[name][steps] = values
+        return columns
+
+
+def _observed_images(dataset: Dataset) -> Iterator[dict[str, Any]]:
+    """Yield the image observations of a dataset of one episode."""
+    for leaf in observation_leaves(dataset.observation_space):
+        images = _at(dataset.frames, leaf.path)
+        if leaf.encoding is None or math.prod(leaf.shape[2:]) > _MOST_CHANNELS:
+            continue
+        every = _thinning(math.prod(images.shape))
+        steps = np.arange(0, len(images), every, dtype=np.int32)
+        pixels = np.asarray(images[steps]).reshape(len(steps), *leaf.shape[:2], -1)
+        title = "/".join(("observation", *leaf.path))
+        yield {"title": title, "is_depth": False, "steps": steps, "pixels": pixels}
+
+
+def _plot(title: str, names: Sequence[str], values: NDArray[Any]) -> dict[str, Any]:
+    columns = _rows(values)
+    known = len(names) == columns.shape[1]
+    return {
+        "title": title,
+        "names": list(names) if known else [str(number) for number in range(columns.shape[1])],
+        "values": np.ascontiguousarray(columns.T, np.float32),
+    }
+
+
+def _rows_at(topic: Topic, times_ns: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[np.int32]]:
+    """Return the rows of a topic at increasing log_times, and their indexes in `times_ns`."""
+    rows = np.flatnonzero(np.isin(topic.times, times_ns))
+    return rows, np.searchsorted(times_ns, topic.times[rows]).astype(np.int32)
+
+
+def _type_of(reader: McapReader, topic: str) -> str:
+    """Return the type of a topic's messages; empty if there is none, or if there are several."""
+    names = {reader.schema_of(channel).name for channel in reader.channels_of(topic)}
+    return names.pop() if len(names) == 1 else ""
+
+
+def _at(nested: Any, path: Sequence[str]) -> Any:
+    return reduce(lambda part, key: part[key], path, nested)
+
+
+def _rows(values: NDArray[Any]) -> NDArray[Any]:
+    return values.reshape(len(values), -1)
+
+
+def _column(values: Sequence[float], dtype: type[Any]) -> NDArray[Any]:
+    return np.array(values, dtype)
+
+
+def _seconds(times_ns: NDArray[np.int64], start_ns: int) -> NDArray[np.float64]:
+    return (times_ns - start_ns) / 1e9
+
+
+def _finite(value: float | None, default: float) -> float:
+    return float(value) if value is not None and math.isfinite(value) else default
+
+
+def _thinning(size: int) -> int:
+    """Return k, so that every k-th image is shown."""
+    return max(1, math.ceil(size / _MOST_IMAGE_BYTES))

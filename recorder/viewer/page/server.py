@@ -1,0 +1,122 @@
+"""An HTTP server on 127.0.0.1 for the page of one log.
+
+It answers two kinds of requests: `/` is the page, and `/episode/K` the packed data of an episode.
+No request names a file. A web page of another site cannot read the answers: browsers send its
+origin, or the host name that it resolves to this machine, and both are checked.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import threading
+from functools import lru_cache
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+from mcaprl.errors import McaprlError, UsageError
+from mcaprl.recorder.viewer.origin_filter import is_loopback
+from mcaprl.recorder.viewer.page.episode_data import LogPage
+from mcaprl.recorder.viewer.page.html import page_html
+
+_EPISODE = re.compile(r"/episode/(\d{1,9})")
+_EPISODES_KEPT = 4
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+class PageServer:
+    """Server of the page of a log.
+
+    Attributes:
+        url: Address of the page.
+    """
+
+    def __init__(self, page: LogPage, *, port: int, **settings: Any) -> None:
+        """Start to listen.
+
+        Args:
+            page: Data of the log.
+            port: Port on 127.0.0.1; 0 for any free port.
+            **settings: Values for the page; see `LogPage.index`.
+
+        Raises:
+            UsageError: The port is in use.
+        """
+        self._html = page_html(page.index(**settings)).encode()
+        self._count = len(page.dataset.episodes)
+        self._episode = lru_cache(_EPISODES_KEPT)(page.episode)
+        handler = type("_Handler", (_Handler,), {"respond": self._respond})
+        try:
+            self._server = _Server(("127.0.0.1", port), handler)
+        except OSError as error:
+            raise UsageError(f"port {port}: {error.strerror or error}; choose another") from error
+        self.url = f"http://127.0.0.1:{self._server.server_port}/"
+
+    def run(self, stop: threading.Event) -> None:
+        """Answer requests until `stop` is set."""
+        serving = threading.Thread(target=self._server.serve_forever, daemon=True)
+        serving.start()
+        try:
+            stop.wait()
+        finally:
+            self._server.shutdown()
+            serving.join()
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._server.server_close()
+
+    def _respond(self, path: str) -> tuple[int, str, bytes]:
+        """Return status, type and body of the answer to a request."""
+        found = _EPISODE.fullmatch(path)
+        if path == "/":
+            return 200, "text/html; charset=utf-8", self._html
+        if found is None or int(found[1]) >= self._count:
+            return 404, "text/plain; charset=utf-8", b"there is no such page"
+        try:
+            return 200, "application/octet-stream", self._episode(int(found[1]))
+        except McaprlError as error:
+            return 500, "text/plain; charset=utf-8", str(error).encode(errors="backslashreplace")
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, *_: Any) -> None:
+        """Ignore connections that a browser closed early; print other errors."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(*_)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    respond: Any
+
+    def do_GET(self) -> None:
+        """Answer a request of the page, or of a program on this machine."""
+        if self._is_allowed():
+            status, kind, body = self.respond(self.path)
+        else:
+            status, kind, body = 403, "text/plain; charset=utf-8", b"this page may not connect"
+        self.send_response(status)
+        for name, value in {"Content-Type": kind, **_HEADERS}.items():
+            self.send_header(name, value)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def _is_allowed(self) -> bool:
+        hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))
+        return (
+            len(hosts) == 1
+            and is_loopback(f"//{hosts[0]}")
+            and all(origin == f"http://{hosts[0]}" for origin in origins)
+        )
+
+    def log_message(self, *_: Any) -> None:
+        """Print nothing for a request."""

@@ -1,0 +1,632 @@
+"""The page of `mcaprl replay --browser` and `--save`: data, server, and what a browser shows."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from http.client import HTTPConnection
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.record.display import SCENE
+from mcaprl.recorder.viewer.annotate import annotated_copy
+from mcaprl.recorder.viewer.page.episode_data import LogPage
+from mcaprl.recorder.viewer.page.packed import pack
+from mcaprl.recorder.viewer.scene_reader import moments_of_episode
+from mcaprl.sims import make_sim
+from mcaprl.sims.drawing.scene import Frame, Shape, yaw_rotation
+from tests.support.browser import Browser, browsing
+
+ROOT = Path(__file__).parents[3]
+VENDOR = ROOT / "recorder/viewer/page/vendor"
+EVIL = "<img src=x onerror=window.hit=1></script><script>window.hit=1</script>"
+STEPS = 5
+
+
+class Driver(gym.Env[Any, Any]):
+    """A red box that drives 10 m ahead in each step, and turns by a right angle."""
+
+    observation_space = spaces.Dict(
+        {
+            "image": spaces.Box(0, 255, (8, 12, 3), np.uint8),
+            "place": spaces.Box(-100, 100, (2,), np.float32),
+        }
+    )
+    action_space = spaces.Discrete(3, start=5)
+    step_duration_s = 0.5
+
+    def __init__(self, word: str = "") -> None:
+        self.action_meanings = tuple(f"{name} {word}".strip() for name in ("left", "on", "right"))
+        self._word = word
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+        super().reset(seed=seed)
+        self._step = 0
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._step += 1
+        reason = f"goal {self._word}".strip()
+        done = self._step == STEPS
+        return self._observation(), 0.5 * self._step, done, False, {"reason": reason}
+
+    def _observation(self) -> dict[str, Any]:
+        image = np.zeros((8, 12, 3), np.uint8)
+        image[2, 3] = (255, 10 * self._step, 7)
+        return {"image": image, "place": np.array([self._step, -self._step], np.float32)}
+
+    def static_scene(self) -> list[Shape]:
+        ground = (200.0, 200.0, 0.2)
+        return [Shape("ground", "box", (0.0, 0.4, 0.0, 1.0), size=ground, position=(0, 0, -3))]
+
+    def scene(self) -> list[Shape]:
+        red, blue = (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 1.0)
+        corner = np.array([(0.0, 0.0, 5.0), (0.0, 3.0, 5.0), (0.0, 0.0, 9.0)])
+        return [
+            Shape("car", "box", red, size=(4.0, 4.0, 4.0), frame="car"),
+            Shape("label", "text", blue, size=(0, 0, 1), position=(0, 0, 9), text=self._word),
+            *(Shape(k, k, blue, corner, (0.3, 0.6, 0)) for k in ("line", "segments", "triangles")),
+            *(Shape(k, k, blue, corner, (0.3, 0.6, 0)) for k in ("points", "spheres")),
+            Shape("arrow", "arrow", blue, corner[:2], (0.3, 0.6, 0)),
+            Shape("to x", "arrow", blue, size=(2.0, 0.2, 0.2)),
+            Shape("ball", "sphere", blue, size=(1.0, 1.0, 1.0), position=(0, 9, 0)),
+            Shape("post", "cylinder", blue, size=(1.0, 1.0, 5.0), position=(0, -9, 0)),
+        ]
+
+    def static_frames(self) -> list[Frame]:
+        return [Frame("camera", (1.0, 0.0, 0.0), yaw_rotation(0.0), "car")]
+
+    def frames(self) -> list[Frame]:
+        return [Frame("car", (10.0 * self._step, 0.0, 0.0), yaw_rotation(self._step * np.pi / 2))]
+
+    def telemetry(self) -> dict[str, float]:
+        return {"speed_m_s": 20.0, "x_m": 10.0 * self._step}
+
+    def depth_image_m(self) -> Any:
+        depth = np.full((4, 6), np.inf, np.float32)
+        depth[1, 2], depth[0, 0] = 50.0, 0.001
+        return depth
+
+
+def record(path: Path, env: gym.Env[Any, Any], episodes: int = 2) -> Path:
+    with closing(mcaprl.RecordMcap(env, path, camera=True, policy="p")) as recorder:
+        for seed in range(episodes):
+            recorder.reset(seed=seed)
+            for step in range(STEPS):
+                recorder.step(5 + step % 3)
+    return path
+
+
+def with_values(path: Path) -> Path:
+    """Add Q-values of two policies: the value of action k at step t is 10 k + t."""
+    episodes = mcaprl.open(path).episodes
+    out = path.with_name(f"values-{path.name}")
+    q = 10.0 * np.arange(3)[None] + np.arange(STEPS)[:, None]
+    numbers = {name: np.zeros(STEPS) for name in ("value", "advantage", "td_error", "entropy")}
+    columns = {"q": q, "preference": q, **numbers, "policy_action": np.full(STEPS, 7)}
+    columns["agrees"] = np.zeros(STEPS, bool)
+    with annotated_copy(path, out) as copy:
+        for topic in ("/rl/values/cql", "/rl/values/iql"):
+            copy.add_values(topic, [(episode, columns) for episode in episodes])
+    return out
+
+
+def unpacked(data: bytes) -> Any:
+    """Decode packed data as packed.py describes it."""
+    raw = gzip.decompress(data)
+    length = int.from_bytes(raw[:4], "little")
+    start = 4 + length + -(4 + length) % 8
+
+    def array(found: dict[str, Any]) -> Any:
+        if "dtype" not in found:
+            return found
+        count, at = int(np.prod(found["shape"])), start + found["at"]
+        assert at % 8 == 0
+        return np.frombuffer(raw, found["dtype"], count, at).reshape(found["shape"])
+
+    return json.loads(raw[4 : 4 + length], object_hook=array)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return with_values(record(tmp_path_factory.mktemp("page") / "log.mcap", Driver("word")))
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browsing(tmp_path_factory.mktemp("profile")) as found:
+        yield found
+
+
+@contextmanager
+def served(path: Path, **options: Any) -> Iterator[str]:
+    """Serve the page of a log; yield its URL."""
+    stop, is_open, urls = threading.Event(), threading.Event(), list[str]()
+
+    def opened(url: str) -> None:
+        urls.append(url)
+        is_open.set()
+
+    options |= {"show": False, "stop": stop, "on_open": opened}
+    thread = threading.Thread(target=mcaprl.browse, args=(path,), kwargs=options)
+    thread.start()
+    assert is_open.wait(30)
+    try:
+        yield urls[0]
+    finally:
+        stop.set()
+        thread.join()
+
+
+def wait_for_episode(browser: Browser) -> None:
+    browser.wait("!!episode && state.step >= 0")
+
+
+def center_color(browser: Browser) -> Any:
+    """Return the color in the middle of the 3D view, where the followed frame is."""
+    return browser.run(
+        """(() => {
+          scene.render();
+          const gl = scene.renderer.getContext(), pixel = new Uint8Array(4);
+          const [x, y] = [gl.drawingBufferWidth >> 1, gl.drawingBufferHeight >> 1];
+          gl.readPixels(x, y, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+          return [...pixel];
+        })()"""
+    )
+
+
+def is_red(color: list[int]) -> bool:
+    return color[0] > 100 and max(color[1:3]) < 40
+
+
+values = st.recursive(
+    st.one_of(
+        st.text(),
+        st.integers(-(2**53), 2**53),
+        st.booleans(),
+        arrays.arrays(
+            st.sampled_from([np.uint8, np.int32, np.float32, np.float64]),
+            arrays.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=4),
+        ),
+    ),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text("abc"), inner, max_size=4),
+    max_leaves=8,
+)
+
+
+@given(values)
+def test_packed_values_are_read_back(value: Any) -> None:
+    def check(found: Any, expected: Any) -> None:
+        if isinstance(expected, np.ndarray):
+            assert found.dtype == expected.dtype
+            np.testing.assert_array_equal(found, expected)
+        elif isinstance(expected, dict | list):
+            assert len(found) == len(expected)
+            for key in expected if isinstance(expected, dict) else range(len(expected)):
+                check(found[key], expected[key])
+        else:
+            assert found == expected
+
+    check(unpacked(pack(value)), value)
+
+
+def test_the_index_lists_all_episodes(log: Path) -> None:
+    found = unpacked(LogPage(log).index(first=1))
+    assert (found["name"], found["first"]) == ("values-log.mcap", 1)
+    assert found["actions"] == ["left word", "on word", "right word"]
+    assert found["first_action"] == 5
+    assert found["returns"].tolist() == [7.5, 7.5]
+    assert found["lengths"].tolist() == [5, 5]
+    assert [found["reasons"][code] for code in found["reason"]] == ["goal word"] * 2
+
+
+def test_an_episode_has_the_values_of_the_log(log: Path) -> None:
+    found = unpacked(LogPage(log).episode(1))
+    episode = mcaprl.open(log).episodes[1]
+    assert found["times"].tolist() == [0, 0.5, 1, 1.5, 2, 2.5]
+    np.testing.assert_array_equal(found["rewards"], episode.rewards)
+    np.testing.assert_array_equal(found["actions"], episode.actions[None])
+    plots = {plot["title"]: plot for plot in found["plots"]}
+    place = plots["observation/place"]
+    assert place["values"].tolist() == [[0, 1, 2, 3, 4, 5], [0, -1, -2, -3, -4, -5]]
+    assert plots["telemetry"]["names"] == ["speed_m_s", "x_m"]
+    assert plots["telemetry"]["values"].tolist() == [[20] * 6, [0, 10, 20, 30, 40, 50]]
+    cql, iql = found["policies"]
+    assert (cql["name"], iql["name"]) == ("cql", "iql")
+    assert cql["q"][:, :STEPS].tolist() == [
+        [0, 1, 2, 3, 4],
+        [10, 11, 12, 13, 14],
+        [20, 21, 22, 23, 24],
+    ]
+    image, depth = found["images"]
+    assert image["pixels"][3, 2, 3].tolist() == [255, 30, 7]
+    # The colors of depth range from 0 to 50 m; infinite depth is unknown.
+    assert depth["title"] == "depth, 0 to 50 m"
+    assert depth["pixels"][:, 1, 2, 0].tolist() == [255] * 6
+    assert depth["pixels"][0, :2, :2, 0].tolist() == [[1, 0], [0, 0]]
+    assert "episode 1 ends after 5 steps" in found["lines"]["texts"][-1]
+
+
+@pytest.mark.parametrize("sim", ["lane", "powerline"])
+def test_the_scene_is_that_of_the_log(tmp_path: Path, sim: str) -> None:
+    with closing(mcaprl.RecordMcap(make_sim(sim), tmp_path / "log.mcap")) as env:
+        for seed in (3, 4):
+            env.reset(seed=seed)
+            for _ in range(4):
+                env.step(1)
+    reader, episode = (
+        McapReader(tmp_path / "log.mcap"),
+        mcaprl.open(tmp_path / "log.mcap").episodes[1],
+    )
+    found = unpacked(LogPage(tmp_path / "log.mcap").episode(1))["scene"]
+    frames = {frame["name"]: frame for frame in found["frames"]}
+    moments = list(moments_of_episode(reader, episode))
+    assert found["follow"] == moments[0].follow
+    for moment in moments:
+        time_s = (moment.time_ns - moments[0].time_ns) / 1e9
+        for frame in moment.frames:
+            row = max(np.searchsorted(frames[frame.name]["times"], time_s + 1e-9) - 1, 0)
+            pose = frames[frame.name]["poses"][row]
+            np.testing.assert_allclose(pose[:3], frame.position, rtol=1e-6)
+        shown = np.searchsorted(found["moments"]["times"], time_s + 1e-9) - 1
+        first, stop = found["moments"]["starts"][shown : shown + 2]
+        for indexes, shapes in (
+            (found["static"], moment.static),
+            (found["moments"]["indexes"][first:stop], moment.moving),
+        ):
+            assert [found["shapes"]["kinds"][k] for k in indexes] == [s.kind for s in shapes]
+            assert [found["shapes"]["frames"][k] for k in indexes] == [s.frame for s in shapes]
+            for index, shape in zip(indexes, shapes, strict=True):
+                start, end = found["shapes"]["starts"][index : index + 2]
+                points = found["shapes"]["points"][start:end]
+                np.testing.assert_array_equal(points, shape.points.astype(np.float32))
+
+
+def test_many_images_are_thinned_out(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "mcaprl.recorder.viewer.page.episode_data._MOST_IMAGE_BYTES"
+    monkeypatch.setattr(name, 2 * 8 * 12 * 3)
+    image = unpacked(LogPage(log).episode(0))["images"][0]
+    assert image["steps"].tolist() == [0, 3]
+    assert image["pixels"][:, 2, 3, 1].tolist() == [0, 30]
+
+
+def test_the_browser_shows_an_episode(browser: Browser, log: Path) -> None:
+    with served(log, episode=1, speed=2.0) as url:
+        browser.show(url)
+        wait_for_episode(browser)
+        assert browser.problems == []
+        assert {each.removeprefix(url) for each in browser.requests} == {"", "episode/1"}
+        assert browser.run("state.speed") == 2
+        text = browser.run("document.body.innerText")
+        for expected in (
+            "values-log.mcap",
+            "goal word",
+            "Q-values: cql",
+            "TD error",
+            "observation/",
+        ):
+            assert expected.lower() in text.lower(), expected
+        # Step 2 takes action 7, whose reward is 1.5, after rewards of 0.5 and 1.
+        browser.run("seek(1.1)")
+        assert browser.run("get('facts').innerText").split() == (
+            ["action", "right", "word", "reward", "1.5", "return", "so", "far", "1.5"]
+        )
+        cells = browser.run(
+            "[...document.querySelectorAll('.bars .number')].map((e) => e.innerText)"
+        )
+        assert cells == ["2", "12", "22"] * 2
+        assert browser.run("document.querySelectorAll('.taken').length") == 2
+        assert browser.run("getComputedStyle(document.querySelector('.best')).width") != "0px"
+
+
+def test_the_camera_follows_the_vehicle(browser: Browser, log: Path) -> None:
+    with served(log) as url:
+        browser.show(url)
+        wait_for_episode(browser)
+        for time_s in (0.0, 1.1, 2.5):
+            browser.run(f"seek({time_s})")
+            assert is_red(center_color(browser)), time_s
+        browser.press("f")
+        assert browser.run("get('follow').getAttribute('aria-pressed')") == "false"
+        browser.run("seek(0)")
+        assert not is_red(center_color(browser)), "the vehicle leaves a camera at rest"
+        browser.press("f")
+        assert is_red(center_color(browser))
+        assert browser.problems == []
+
+
+def test_images_have_the_pixels_of_the_log(browser: Browser, log: Path) -> None:
+    with served(log) as url:
+        browser.show(url)
+        wait_for_episode(browser)
+        browser.run("seek(2)")
+        pixel = "images[{}].canvas.getContext('2d').getImageData({}, {}, 1, 1).data"
+        assert browser.run(f"[...{pixel.format(0, 3, 2)}]") == [255, 40, 7, 255]
+        near, far, unknown = (
+            browser.run(f"[...{pixel.format(1, *place)}]") for place in ((0, 0), (2, 1), (5, 3))
+        )
+        assert near[2] > near[0]
+        assert far[0] > far[2]
+        assert unknown == [0, 0, 0, 255]
+
+
+def test_keys_and_the_slider_move_the_time(browser: Browser, log: Path) -> None:
+    with served(log) as url:
+        browser.show(url)
+        wait_for_episode(browser)
+        for key, step in (("ArrowRight", 1), ("ArrowRight", 2), ("ArrowLeft", 1), ("End", 5)):
+            browser.press(key)
+            assert browser.run("state.step") == step
+        browser.run("get('time').value = 1.2; get('time').dispatchEvent(new Event('input'))")
+        assert browser.run("state.step") == 2
+        assert "1.20 of 2.50 s, step 2 of 5" in browser.run("get('clock').value")
+        browser.press("PageDown")
+        browser.wait("state.index === 1 && state.time === 0")
+        browser.run("get('speed').value = '16'; get('speed').dispatchEvent(new Event('change'))")
+        browser.press(" ")
+        browser.wait("state.step === 5 && !state.playing")
+        browser.run("get('loop').checked = true")
+        browser.press(" ")
+        browser.wait("state.step === 3")
+        browser.wait("state.step === 1")
+        browser.press(" ")
+        assert browser.run("state.playing") is False
+        assert browser.problems == []
+
+
+def test_a_click_on_a_plot_moves_the_time(browser: Browser, log: Path) -> None:
+    with served(log) as url:
+        browser.show(url, height=2000)
+        wait_for_episode(browser)
+        browser.run(
+            """(() => {
+              const { over } = plots[0].plot, box = over.getBoundingClientRect();
+              const clientX = box.left + 0.8 * box.width;
+              over.dispatchEvent(new PointerEvent("pointerdown", { clientX, buttons: 1 }));
+            })()"""
+        )
+        assert browser.run("state.time") == pytest.approx(0.8 * 2.5, abs=0.02)
+
+
+def test_a_chip_hides_a_series(browser: Browser, log: Path) -> None:
+    with served(log) as url:
+        browser.show(url)
+        wait_for_episode(browser)
+        browser.run("document.querySelector('.chips button').click()")
+        assert browser.run("plots[0].plot.series[1].show") is False
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("width", [390, 1280])
+def test_the_page_fits_phones_and_color_schemes(
+    browser: Browser, log: Path, width: int, dark: bool
+) -> None:
+    with served(log) as url:
+        browser.show(url, width=width, dark=dark)
+        wait_for_episode(browser)
+        assert browser.run("document.documentElement.scrollWidth") <= width
+        style = "getComputedStyle(document.body)"
+        ink, back = (
+            sum(map(int, re.findall(r"\d+", browser.run(f"{style}.{name}"))[:3])) / 3
+            for name in ("color", "backgroundColor")
+        )
+        assert ink - back > 150 if dark else back - ink > 150
+        unnamed = browser.run(
+            "[...document.querySelectorAll('button, input, select')].filter((e) =>"
+            " !(e.innerText || e.labels?.length || e.ariaLabel)).map((e) => e.id)"
+        )
+        assert unnamed == []
+        assert browser.problems == []
+
+
+def test_a_log_without_a_scene_has_plots(browser: Browser, tmp_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(gym.make("Pendulum-v1"), tmp_path / "p.mcap")) as env:
+        env.reset(seed=0)
+        while not env.step(np.array([0.5], np.float32))[3]:
+            pass
+    with served(tmp_path / "p.mcap") as url:
+        browser.show(url)
+        wait_for_episode(browser)
+        assert browser.run("get('view').hidden") is True
+        assert browser.run("plots.map((plot) => plot.options.title)") == [
+            "Reward",
+            "Return so far",
+            "Action",
+            "Observation",
+        ]
+        assert "0.5" in browser.run("get('facts').innerText")
+        assert browser.problems == []
+
+
+def test_a_saved_page_needs_no_network(browser: Browser, log: Path, tmp_path: Path) -> None:
+    page = tmp_path / "episode.html"
+    size = mcaprl.save_page(log, page, episode=1)
+    assert page.stat().st_size == size
+    assert not re.search(
+        r"(src|href)=.?(https?:)?//|@import", page.read_text().split("<script>")[0]
+    )
+    browser.show(page.as_uri())
+    wait_for_episode(browser)
+    assert browser.requests == [page.as_uri(), "data:,"][: len(browser.requests)]
+    assert browser.run("log.numbers.length") == 1
+    assert browser.run("log.numbers[0]") == 1
+    browser.run("seek(1.1)")
+    assert is_red(center_color(browser))
+    assert "three.js authors" in page.read_text()
+    assert browser.problems == []
+
+
+def test_texts_of_a_log_are_not_html(browser: Browser, tmp_path: Path) -> None:
+    path = with_values(record(tmp_path / "log.mcap", Driver(EVIL)))
+    path = path.rename(tmp_path / "<img src=x onerror=window.hit=1>.mcap")
+    mcaprl.save_page(path, tmp_path / "page.html")
+    assert "window.hit" not in (tmp_path / "page.html").read_text()
+    with served(path) as url:
+        for address in (url, (tmp_path / "page.html").as_uri()):
+            browser.show(address)
+            wait_for_episode(browser)
+            browser.run("seek(2.5)")
+            text = browser.run("document.body.innerText")
+            assert "onerror=window.hit" in text
+            assert f"right {EVIL}"[:60] in text
+            assert browser.run("document.images.length") == 0
+            assert browser.run("window.hit") is None
+            assert browser.problems == []
+        # If a text became a script in spite of that, the browser would refuse it.
+        script = "Object.assign(document.createElement('script'), {textContent: 'window.hit = 1'})"
+        browser.run(f"document.body.append({script})")
+        assert browser.run("window.hit") is None
+        assert "Content Security Policy" in browser.problems[0]
+
+
+def test_frames_in_a_circle_are_shown(browser: Browser, tmp_path: Path) -> None:
+    class Circle(Driver):
+        def frames(self) -> list[Frame]:
+            still = (0.0, 0.0, 0.0), yaw_rotation(0.0)
+            return [Frame("car", *still, "b"), Frame("b", *still, "car")]
+
+    mcaprl.save_page(record(tmp_path / "c.mcap", Circle()), tmp_path / "c.html")
+    browser.show((tmp_path / "c.html").as_uri())
+    wait_for_episode(browser)
+    assert browser.run("get('view').hidden") is False
+    assert browser.problems == []
+
+
+def test_a_damaged_episode_is_reported(browser: Browser, tmp_path: Path) -> None:
+    path = record(tmp_path / "log.mcap", Driver("x" * 50), episodes=3)
+    reader = McapReader(path)
+    last = list(reader.message_ranges(reader.channels_of(SCENE)[0]))[-1].chunk
+    assert last is not None
+    raw = bytearray(path.read_bytes())
+    raw[last.chunk_start_offset + last.chunk_length // 2] ^= 255
+    path.write_bytes(raw)
+    with served(path) as url:
+        browser.show(url)
+        browser.wait("!get('problem').hidden")
+        assert "episode 0 cannot be shown: " in browser.run("get('problem').innerText")
+        assert str(path) in browser.run("get('problem').innerText")
+
+
+def answer(url: str, path: str = "/", **headers: str) -> tuple[int, dict[str, str], bytes]:
+    host, port = url.removeprefix("http://").removesuffix("/").split(":")
+    with closing(HTTPConnection(host, int(port), timeout=30)) as connection:
+        connection.putrequest("GET", path, skip_host="Host" in headers)
+        for name, value in headers.items():
+            connection.putheader(name, value)
+        connection.endheaders()
+        found = connection.getresponse()
+        return found.status, dict(found.getheaders()), found.read()
+
+
+def test_the_server_answers_this_machine_alone(log: Path) -> None:
+    with served(log) as url:
+        status, headers, body = answer(url, "/episode/1")
+        assert status == 200
+        assert unpacked(body)["rewards"].tolist() == [0.5, 1, 1.5, 2, 2.5]
+        assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
+        assert headers["X-Content-Type-Options"] == "nosniff"
+        assert answer(url, Origin=url.removesuffix("/"))[0] == 200
+        assert answer(url, Host="localhost")[0] == 200
+        for refused in (
+            {"Host": "evil.example"},
+            {"Host": "127.0.0.1.evil.example"},
+            {"Origin": "http://evil.example"},
+            {"Origin": "null"},
+            {"Origin": "http://127.0.0.1:1"},
+        ):
+            assert answer(url, **refused)[0] == 403, refused
+        for path in ("/episode/2", "/episode/-1", "/../log.mcap", f"/{log}", "/episode/1/..", "*"):
+            assert answer(url, path)[0] == 404, path
+
+
+def test_mistakes_are_one_line(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "page.html"
+    assert run(["replay", str(log), "--save", str(page), "--episode", "1"]) == 0
+    assert re.fullmatch(rf"{page}: episode 1, [\d.]+ kB\n", capsys.readouterr().out)
+    content = page.read_bytes()
+    for command, expected in (
+        (["--save", str(page)], "pass --overwrite"),
+        (["--save", "page.pdf"], "known: .htm, .html"),
+        (["--save", str(tmp_path / "b.html"), "--episode", "2"], "has episodes 0 to 1"),
+        (["--save", str(tmp_path / "b.html"), "--browser"], "run replay once for each"),
+        ([str(log.with_name("log.mcap")), "--browser"], "a page or video shows one log"),
+    ):
+        assert run(["replay", str(log), *command]) != 0, command
+        error = capsys.readouterr().err
+        assert expected in error
+        assert error.count("\n") == 1
+    assert page.read_bytes() == content
+    assert not (tmp_path / "b.html").exists()
+
+
+def test_the_command_serves_until_it_is_interrupted(log: Path) -> None:
+    command = [sys.executable, "-m", "mcaprl.cli", "replay", str(log), "--browser"]
+    default = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=default,
+        env={"PATH": "", "HOME": "/"},
+    ) as server:
+        assert server.stdout is not None
+        url = server.stdout.readline().removeprefix("open ").strip()
+        assert "Ctrl-C" in server.stdout.readline()
+        assert answer(url)[0] == 200
+        server.send_signal(signal.SIGINT)
+        rest, _ = server.communicate(timeout=30)
+    assert (server.returncode, rest) == (0, "ended\n")
+
+
+@pytest.mark.parametrize("display", ["", ":0"])
+def test_the_browser_is_opened_if_there_is_a_display(
+    log: Path, monkeypatch: pytest.MonkeyPatch, display: str
+) -> None:
+    opened: list[str] = []
+    stop = threading.Event()
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    urls: list[str] = []
+    stop.set()
+    mcaprl.browse(log, stop=stop, on_open=urls.append)
+    assert opened == (urls if display else [])
+
+
+def test_the_bundle_is_of_the_locked_versions() -> None:
+    packages = json.loads((VENDOR / "package-lock.json").read_text())["packages"]
+    wanted = json.loads((VENDOR / "package.json").read_text())["devDependencies"]
+    banner = (VENDOR / "libraries.min.js").read_text().splitlines()[0]
+    licenses = (VENDOR / "LICENSES.txt").read_text()
+    for name in ("three", "uplot"):
+        version = packages[f"node_modules/{name}"]["version"]
+        assert wanted[name] == version
+        for text in (banner, licenses):
+            assert f"{name} {version} (MIT)" in text
+
+
+def test_the_scripts_of_the_page_are_short() -> None:
+    for path in (VENDOR.parent / "assets").glob("*.js"):
+        lines = path.read_text().splitlines()
+        assert len(lines) <= 400, path
+        assert max(map(len, lines)) <= 120, path
