@@ -118,8 +118,7 @@ class SceneView {
       for (const point of [this.camera.position, this.controls.target]) {
         point.sub(this.anchor.position).applyAxisAngle(up, turn).add(now.position);
       }
-      this.anchor = now;
-      this.controls.update();
+      this.camera.lookAt(this.controls.target);
     }
     this.anchor = now;
   }
@@ -141,8 +140,8 @@ class SceneView {
     const backward = distance * Math.sin(tilt);
     this.camera.position.copy(this.controls.target).add(new libraries.Vector3(
       -backward * Math.cos(heading), -backward * Math.sin(heading), distance * Math.cos(tilt)));
+    this.camera.lookAt(this.controls.target);
     this.anchor = now;
-    this.controls.update();
     this.render();
   }
 
