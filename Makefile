@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constrain
 # A change of these files reinstalls the environments.
 SETTINGS := pyproject.toml constraints.txt
 
-.PHONY: help demo test faults fuzz check bench bench-learning sim-grid docs docs-test wheel clean
+.PHONY: help demo test faults fuzz check bench bench-learning sim-grid docs docs-test vendor wheel clean
 
 help:
 	@echo "make demo             record a car, train on its log offline, evaluate, and write the replay"
@@ -20,6 +20,7 @@ help:
 	@echo "make sim-grid         train offline on six logs of each sim, four seeds (hours; resumes if interrupted)"
 	@echo "make docs             generate the references and images of the docs, and build their site"
 	@echo "make docs-test        run all commands of the docs as they are written (hours)"
+	@echo "make vendor           bundle the libraries of the page of replay --browser (needs npm)"
 	@echo "make wheel            build the wheel and test it without extras in a fresh environment"
 	@echo "make clean            remove the environments and everything that was built"
 
@@ -65,11 +66,14 @@ docs: $(VENV)/.dev
 docs-test: $(VENV)/.dev tests/node/node_modules
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m slow tests/docs
 
+vendor:
+	cd recorder/viewer/page/vendor && npm ci --silent --no-audit --no-fund && npm run --silent build
+
 wheel: $(VENV)/.dev
 	PYTHON="$(BIN)/python" sh .ci/check-wheel
 
 clean:
-	rm -rf $(VENV) $(BENCH) build dist demo *.egg-info tests/node/node_modules
+	rm -rf $(VENV) $(BENCH) build dist demo *.egg-info tests/node/node_modules recorder/viewer/page/vendor/node_modules
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \

@@ -33,7 +33,7 @@ from mcaprl.recorder.viewer.page.packed import pack
 from mcaprl.recorder.viewer.scene_reader import moments_of_episode
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.scene import Frame, Shape, yaw_rotation
-from tests.support.browser import Browser, browsing
+from tests.recorder.viewer.browser import Browser, browsing
 
 ROOT = Path(__file__).parents[3]
 VENDOR = ROOT / "recorder/viewer/page/vendor"
@@ -384,8 +384,8 @@ def test_keys_and_the_slider_move_the_time(browser: Browser, log: Path) -> None:
         browser.press(" ")
         browser.wait("state.step === 5 && !state.playing")
         browser.run("get('loop').checked = true")
-        browser.run("globalThis.sought = []")
-        browser.run("globalThis.before = seek; seek = (time) => { sought.push(time); before(time); }")
+        browser.run("globalThis.sought = []; globalThis.before = seek")
+        browser.run("seek = (time) => { sought.push(time); before(time); }")
         browser.press(" ")
         browser.wait("sought.filter((time) => time === 0).length > 2")
         browser.press(" ")
