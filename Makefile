@@ -21,7 +21,7 @@ help:
 	@echo "make docs             generate the references and images of the docs, and build their site"
 	@echo "make docs-test        run all commands of the docs as they are written (hours)"
 	@echo "make vendor           bundle the libraries of the page of replay --browser (needs npm)"
-	@echo "make wheel            build the wheel and test it without extras in a fresh environment"
+	@echo "make wheel            build the sdist and wheel twice, compare them, and test the wheel without extras"
 	@echo "make clean            remove the environments and everything that was built"
 
 demo: $(VENV)/.demo
@@ -69,7 +69,7 @@ docs-test: $(VENV)/.dev tests/node/node_modules
 vendor:
 	cd recorder/viewer/page/vendor && npm ci --silent --no-audit --no-fund && npm run --silent build
 
-wheel: $(VENV)/.dev
+wheel: $(VENV)/.dev tests/node/node_modules
 	PYTHON="$(BIN)/python" sh .ci/check-wheel
 
 clean:

@@ -62,7 +62,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     ),
     "merge": ("mcaprl merge data/pilot.mcap data/random.mcap all.mcap --shift",),
     "split": ("mcaprl split all.mcap parts --ratio 8:1:1 --seed 0",),
-    "filter": ("mcaprl filter 'return > 100' data/pilot.mcap good.mcap",),
+    "filter": ("mcaprl filter 'total_reward > 100' data/pilot.mcap good.mcap",),
     "slice": ("mcaprl slice data/pilot.mcap part.mcap --steps 0:1000",),
     "completion": (
         "mcaprl completion bash >> ~/.bashrc",

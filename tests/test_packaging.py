@@ -79,6 +79,7 @@ def test_command_and_changelog_name_the_version() -> None:
     )
     assert done.stdout.strip() == f"mcaprl {mcaprl.__version__}"
     assert f"## [{mcaprl.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
+    assert f"\nversion: {mcaprl.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 @pytest.mark.parametrize("name", modules())

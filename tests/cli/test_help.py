@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import itertools
 import shlex
+from pathlib import Path
 
 import click
 import pytest
 from click.testing import CliRunner
 
+import mcaprl
 from mcaprl.cli import cli
 from mcaprl.cli.help import EXAMPLES, SECTIONS
+from tests.support.paths import GOLDEN
 
 TOP = click.Context(cli, info_name="mcaprl")
 LINES = [(name, line) for name, lines in EXAMPLES.items() for line in lines]
@@ -60,3 +63,11 @@ def test_settings_are_listed_with_the_algorithms_that_have_them() -> None:
     online = help_of("train-online")
     assert "Settings of dqn, double-dqn:" in online
     assert "Settings of ppo:" in online
+
+
+def test_the_condition_of_the_filter_example_is_valid(tmp_path: Path) -> None:
+    ((line,), out) = EXAMPLES["filter"], tmp_path / "out.mcap"
+    condition = shlex.split(line)[2].replace("100", "5")
+    arguments = ["filter", condition, str(GOLDEN / "lane-1.mcap"), str(out)]
+    assert CliRunner().invoke(cli, arguments).exit_code == 0
+    assert len(mcaprl.open(out).episodes) == 1

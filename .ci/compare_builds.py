@@ -1,0 +1,75 @@
+"""Compare two builds of the sdist and the wheel, and check that they contain no stray files."""
+
+from __future__ import annotations
+
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+METADATA = {"METADATA", "RECORD", "WHEEL", "entry_points.txt", "top_level.txt"}
+NEEDED = {"CHANGELOG.md", "CITATION.cff", "LICENSE", "README.md", "SECURITY.md", "pyproject.toml"}
+
+
+def main(first: Path, second: Path, source: Path) -> None:
+    """Exit with a message if the builds differ, or a file is missing or stray."""
+    names = sorted(path.name for path in first.iterdir())
+    if names != sorted(path.name for path in second.iterdir()):
+        sys.exit(f"the builds have different files: {names}")
+    for name in names:
+        if contents(first / name) != contents(second / name):
+            sys.exit(f"{name} is not reproducible: two builds differ")
+    (wheel,) = first.glob("*.whl")
+    expected = {path.relative_to(source).as_posix() for path in modules(source)}
+    if stray := files_of_wheel(wheel) ^ expected:
+        sys.exit(f"{wheel.name} and the packages differ in: {', '.join(sorted(stray))}")
+    (sdist,) = first.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        found = {name.partition("/")[2] for name in archive.getnames()}
+    if missing := NEEDED - found:
+        sys.exit(f"{sdist.name} lacks {', '.join(sorted(missing))}")
+    if strange := sorted(name for name in found if name.startswith(("tests", "docs", ".ci"))):
+        sys.exit(f"{sdist.name} has {', '.join(strange)}")
+    print(f"two builds are the same: {', '.join(names)}")
+
+
+def contents(path: Path) -> bytes | dict[str, bytes]:
+    """Return the bytes of a wheel, or those of each file in a sdist, whose times differ."""
+    if path.suffix == ".whl":
+        return path.read_bytes()
+    with tarfile.open(path) as archive:
+        files = {member.name: archive.extractfile(member) for member in archive}
+        return {name: file.read() for name, file in files.items() if file is not None}
+
+
+def modules(source: Path) -> list[Path]:
+    """Return the files that belong into the wheel, with the names that they have there."""
+    folder = source / "mcaprl"
+    # `mcaprl` has links to the folders of the other packages.
+    roots = [folder, *(path for path in folder.iterdir() if path.is_symlink())]
+    return sorted(
+        path
+        for root in roots
+        for path in root.rglob("*")
+        if path.is_file() and path.suffix != ".pyc" and not is_source_of_vendored(path)
+    )
+
+
+def is_source_of_vendored(path: Path) -> bool:
+    """Return whether a file only serves to bundle the libraries of the page for browsers."""
+    names = ("libraries.min.css", "libraries.min.js", "LICENSES.txt")
+    return "vendor" in path.parts and path.name not in names
+
+
+def files_of_wheel(wheel: Path) -> set[str]:
+    """Return the names of the files in a wheel, without its metadata."""
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+    inside = {name for name in names if ".dist-info/" in name}
+    if strange := {Path(name).name for name in inside} - METADATA - {"LICENSE"}:
+        sys.exit(f"{wheel.name} has unknown metadata: {', '.join(sorted(strange))}")
+    return set(names) - inside
+
+
+if __name__ == "__main__":
+    main(*(Path(argument) for argument in sys.argv[1:4]))
