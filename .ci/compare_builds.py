@@ -66,7 +66,7 @@ def files_of_wheel(wheel: Path) -> set[str]:
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
     inside = {name for name in names if ".dist-info/" in name}
-    if strange := {Path(name).name for name in inside} - METADATA - {"LICENSE"}:
+    if strange := {Path(name).name for name in inside} - METADATA - {"LICENSE", "LICENSES.txt"}:
         sys.exit(f"{wheel.name} has unknown metadata: {', '.join(sorted(strange))}")
     return set(names) - inside
 
