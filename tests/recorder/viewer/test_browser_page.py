@@ -457,6 +457,29 @@ def test_a_log_without_a_scene_has_plots(browser: Browser, tmp_path: Path) -> No
         assert browser.problems == []
 
 
+def test_a_log_of_many_episodes_is_listed_in_part(browser: Browser, tmp_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(gym.make("CartPole-v1"), tmp_path / "many.mcap")) as env:
+        for seed in range(520):
+            env.reset(seed=seed)
+            while not env.step(seed % 2)[2]:
+                pass
+    lengths = mcaprl.open(tmp_path / "many.mcap").episode_lengths
+    with served(tmp_path / "many.mcap") as url:
+        browser.show(url)
+        wait_for_episode(browser)
+        assert browser.run("document.querySelectorAll('#list button').length") == 500
+        assert browser.run("get('more').innerText") == "500 of 520 episodes"
+        browser.run("get('number').value = '519'; get('number').dispatchEvent(new Event('change'))")
+        browser.wait(f"episode.rewards.length === {lengths[519]} && state.step === 0")
+        assert browser.run("document.querySelector('[aria-current]').innerText").split()[0] == "519"
+        browser.run(
+            "get('order').value = 'lengths'; get('order').dispatchEvent(new Event('change'))"
+        )
+        sizes = browser.run("state.order.map((index) => log.lengths[index])")
+        assert sizes == sorted(lengths.tolist())
+        assert browser.problems == []
+
+
 def test_a_saved_page_needs_no_network(browser: Browser, log: Path, tmp_path: Path) -> None:
     page = tmp_path / "episode.html"
     size = mcaprl.save_page(log, page, episode=1)

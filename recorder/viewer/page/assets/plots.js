@@ -68,7 +68,7 @@ class TimePlot {
       Array.from(this.times, (_, k) => (Number.isFinite(values[k]) ? values[k] : null)));
     this.plot = new libraries.uPlot({
       ...this.size(),
-      padding: [8, 8, 0, 0],
+      padding: [8, 16, 0, 0],
       scales: {
         x: { time: false, range: () => [0, this.times.at(-1)] },
         y: names ? { range: [-0.5, names.length - 0.5] } : {},
