@@ -6,16 +6,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 import mcaprl
 from mcaprl.cli.completion import Name
 from mcaprl.cli.help import Command
-from mcaprl.cli.options import PATH, integer_option, mapping_options
+from mcaprl.cli.options import PATH, integer_option, mapping_options, ray_options
 from mcaprl.cli.progress import hint, training_progress, working
 from mcaprl.cli.settings import SettingsCommand
 from mcaprl.cli.show import echo, print_table
+from mcaprl.errors import UsageError
 from mcaprl.page import PAGE_NAME
-from mcaprl.settings import Settings
+from mcaprl.settings import Settings, flag
 from mcaprl.texts import counted
 
 if TYPE_CHECKING:
@@ -61,7 +63,14 @@ def _configs() -> dict[str, Settings]:
     help="Output folder of the HTML page on the choice.",
 )
 @mapping_options
-def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:
+@ray_options
+@click.option(
+    "--sweep",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="With --ray: train with each combination of settings in FILE; see docs/ray.md.",
+)
+def train_offline(data: tuple[str, ...], out: Path, sweep: Path | None, **request: Any) -> None:
     """Train a policy on DATA: files, folders or globs of logs.
 
     A number after a name is a weight: with good.mcap:2 rest/, transitions of good.mcap are drawn
@@ -70,6 +79,9 @@ def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:
     Omitted settings have the algorithm's defaults. With --resume, they have the values of the run.
     """
     given = {name: value for name, value in request.items() if value is not None}
+    if sweep is not None:
+        _sweep(data, out, sweep, request)
+        return
     with training_progress("updates", "loss") as progress:
         summaries = mcaprl.train(data, out, on_data=_print_data, progress=progress, **given)
     from mcaprl.offline.selection.choice import CHOICE_NAME, read_choice
@@ -88,6 +100,20 @@ def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:
             f"curves: tensorboard --logdir {out}; an image of the curves needs matplotlib:"
             " pip install 'mcaprl[report]'"
         )
+
+
+def _sweep(data: tuple[str, ...], out: Path, plan: Path, request: dict[str, Any]) -> None:
+    context = click.get_current_context()
+    for name in request.keys() - {"ray", "workers", "address", "resume"}:
+        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise UsageError(f"{flag(name)} and --sweep: write the setting into {plan}")
+    if not request["ray"]:
+        raise UsageError("--sweep requires --ray")
+    options = {name: request[name] for name in ("workers", "address", "resume")}
+    with working("connecting to Ray") as bar:
+        found = mcaprl.sweep(data, out, plan, progress=bar, **options)
+    print_table(f"{plan}, best first", list(found.table.columns), list(map(list, found.table.rows)))
+    echo(f"policies: {found.results[0].folder} and others; page and table in {out}")
 
 
 def _print_data(algo: str, dataset: mcaprl.Dataset) -> None:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from mcaprl.api.policies import export, load_policy
     from mcaprl.api.record import record
     from mcaprl.api.replay import render, replay, verify
+    from mcaprl.api.sweep import sweep
     from mcaprl.api.train import train, train_online
     from mcaprl.recorder.dataset.dataset import Dataset
     from mcaprl.recorder.dataset.episode import Episode
@@ -70,6 +71,7 @@ __all__ = [
     "slice",
     "split",
     "suggest_mapping",
+    "sweep",
     "torch",
     "train",
     "train_online",
@@ -81,7 +83,7 @@ __getattr__ = lazy_attributes(
     __name__,
     {
         f"mcaprl.api.{name}": [name]
-        for name in ("annotate", "estimate", "evaluate", "layout", "record")
+        for name in ("annotate", "estimate", "evaluate", "layout", "record", "sweep")
     }
     | {
         "mcaprl.api.behavior": ["estimate_behavior"],

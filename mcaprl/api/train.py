@@ -7,6 +7,7 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mcaprl.api.cluster import ClusterOptions
 from mcaprl.api.data import MAPPING_NAME, Data, MappingFile, mapping_tree, open_data
 from mcaprl.api.environments import all_options
 from mcaprl.api.policies import TrainedPolicy, as_names, is_policy, load_policies
@@ -45,6 +46,9 @@ def train(
     trust_code: bool = False,
     budget_minutes: float | None = None,
     report: str | Path | None = None,
+    ray: bool = False,
+    workers: int | None = None,
+    address: str | None = None,
     on_data: Callable[[str, Dataset], None] = lambda algo, dataset: None,
     progress: ProgressCallback = lambda now: None,
     **settings: Any,
@@ -74,7 +78,14 @@ def train(
         trust_code: Whether the mapping may name a Python function.
         budget_minutes: Wall time of `auto`, minutes; None for no bound.
         report: Output folder of the HTML page on the choice of `auto`.
-        on_data: Function called with the algorithm and the dataset before the first update.
+        ray: Whether Ray workers train, each on some of the episodes. The result is that of one
+            process, except for rounding. All workers must see the logs and `out`.
+        workers: Number of Ray workers; default: number of CPUs of the cluster, or with `cuda` its
+            number of GPUs.
+        address: Address of a Ray cluster, `HOST:PORT` or `auto`; default: RAY_ADDRESS, else a
+            local cluster for this call.
+        on_data: Function called with the algorithm and the dataset before the first update; not
+            with `ray`, since no process holds the dataset.
         progress: Function called with each row of metrics.
         **settings: Settings of the algorithm. Missing settings have the algorithm's defaults; with
             `resume`, they have the values of the run.
@@ -90,7 +101,8 @@ def train(
         LogError: The logs cannot be read.
         SpaceError: The algorithm does not support the observations or actions.
         TrainingError: The loss is not finite, or `out` has a run with other data or settings.
-        MissingExtraError: The packages of the `offline` extra are not installed.
+        ClusterError: The Ray cluster cannot be used, or workers died repeatedly.
+        MissingExtraError: The packages of the `offline` extra, or Ray, are not installed.
     """
     from mcaprl.offline.algorithms.registry import choose_algorithm
     from mcaprl.offline.batches.sources import open_weighted
@@ -102,6 +114,8 @@ def train(
 
     check_least(1, seeds=seeds, threads=threads)
     check_least(0, seed=seed)
+    on_cluster = ClusterOptions(ray, workers, address)
+    on_cluster.check()
     out = Path(out)
     if resume:
         earlier = run_to_resume(out)
@@ -117,6 +131,28 @@ def train(
     check_settings(algo, defaults, settings)
     config = type(defaults)(**settings)
     _check_choice(algo, budget_minutes, report, follow, other_data)
+    if ray:
+        if follow or mapping is not None or isinstance(data, Dataset) or algo == AUTO:
+            raise UsageError(
+                "--ray trains one algorithm on the paths of logs, without --follow and --mapping"
+            )
+        from mcaprl.ray.training import TrainingRequest, train_on_ray
+
+        # Paths are absolute, because workers have other working directories.
+        job = TrainingRequest(
+            config,
+            out.absolute(),
+            range(seed, seed + seeds),
+            threads,
+            device,
+            resume,
+            other_data,
+        )
+        with on_cluster.connected():
+            summaries = train_on_ray(as_names(data), job, workers=workers, progress=progress)
+        with suppress(MissingExtraError):
+            draw_curves(out)
+        return summaries
     with torch_threads(threads):
         growing, weights = None, None
         if mapping is not None and not isinstance(data, Dataset):

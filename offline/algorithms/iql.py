@@ -72,7 +72,7 @@ class IQL(Learner):
         )
         advantage = q_a_tm1 - v_tm1.detach().squeeze(1)
         if self.config.normalize_advantages:
-            advantage = self.normalized(advantage)
+            advantage = self.normalized(advantage, batch.factors)
         weight = (self.config.beta * advantage).exp().clamp(max=MAX_WEIGHT)
         logits_tm1 = self.outputs("logits", batch.observations)
         policy_loss = weight * cross_entropy(logits_tm1, batch.actions)
@@ -90,11 +90,12 @@ class IQL(Learner):
         terms = {"q": q_a_tm1, "td_error": (self.targets(batch) - q_a_tm1).abs()}
         return {name: self.in_reward_units(term) for name, term in terms.items()}
 
-    def normalized(self, advantages: Tensor) -> Tensor:
+    def normalized(self, advantages: Tensor, factors: Tensor | None = None) -> Tensor:
         """Return advantages (R,), divided by the root mean square of each seed's batch."""
         of_seeds = advantages.view(len(self.seeds), -1)
-        size = of_seeds.square().mean(1, keepdim=True).sqrt().clamp_min(_SMALLEST_ADVANTAGE)
-        return (of_seeds / size).flatten()
+        squares = advantages.square()
+        squares = self.batch_means(squares if factors is None else squares * factors)
+        return (of_seeds / squares.sqrt().clamp_min(_SMALLEST_ADVANTAGE).unsqueeze(1)).flatten()
 
     @torch.no_grad()
     def targets(self, batch: Batch) -> Tensor:

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mcaprl.networks import Network
 from mcaprl.offline.algorithms.config import TrainingConfig
@@ -80,6 +80,7 @@ class Learner(ABC):
         }
         self.target_networks: dict[str, TargetNetwork] = {}
         self._sync_interval = 0
+        self._losses: nn.Module | None = None
         weights = [model.weights for model in self.models.values()]
         self.optimizer = torch.optim.AdamW(weights, weight_decay=config.weight_decay, fused=True)
         # Create the optimizer state now, so that a checkpoint can be loaded before the first step.
@@ -112,21 +113,24 @@ class Learner(ABC):
         """Run one gradient step on one random batch per seed; sync target networks if it is time.
 
         Returns:
-            The terms of `losses`, without gradients.
+            The terms of `losses` times the factors of the batch, without gradients.
 
         Raises:
             NotFiniteError: The loss is NaN or infinite; the weights have not changed.
         """
-        size = self.config.batch_size
-        rows = torch.cat([self.buffer.sample_rows(size, sampler) for sampler in self.samplers])
-        terms = self.losses(self.buffer.batch(rows.to(self.buffer.device)))
+        share = self.buffer.share
+        rows, factors = share.draw(self.buffer, self.config.batch_size, self.samplers)
+        batch = self.buffer.batch(rows.to(self.buffer.device), factors)
+        if self._losses is None:
+            self._losses = share.wrap(_Losses(self))
+        terms = {name: batch.weighted(term) for name, term in self._losses(batch).items()}
         # A seed's loss depends only on that seed's weights, so one sum yields all gradients.
         loss = terms["loss"].sum()
         terms = {name: term.detach() for name, term in terms.items()}
-        if not math.isfinite(loss.item()):
+        if not math.isfinite(share.average(loss.detach()).item()):
             raise self._not_finite(self.seed_means(terms))
         self.optimizer.zero_grad()
-        torch.autograd.backward(loss / size)
+        torch.autograd.backward(loss / (len(rows) // len(self.seeds)))
         self.optimizer.param_groups[0]["lr"] = self.config.learning_rate_at(self.step)
         self.optimizer.step()
         self.step += 1
@@ -145,7 +149,7 @@ class Learner(ABC):
             interval: Number of updates between two syncs, the same for all target networks.
             next_states: Whether the target network evaluates next states instead of states.
         """
-        rows = self.config.batch_size * interval
+        rows = self.config.batch_size * interval // self.buffer.share.processes
         self._sync_interval = interval
         self.target_networks[name] = TargetNetwork(
             self.models[name], self.buffer, rows, next_states=next_states
@@ -154,10 +158,15 @@ class Learner(ABC):
 
     def seed_means(self, terms: Mapping[str, Tensor]) -> list[dict[str, float]]:
         """Return the mean of each term for each seed; the terms (R,) contain rows of all seeds."""
-        means = {
-            name: term.view(len(self.seeds), -1).mean(1).tolist() for name, term in terms.items()
-        }
+        means = {name: self.batch_means(term).tolist() for name, term in terms.items()}
         return [{name: means[name][k] for name in means} for k in range(len(self.seeds))]
+
+    def batch_means(self, values: Tensor) -> Tensor:
+        """Return each seed's mean (K,) of values (R,), over the batches of all processes.
+
+        For statistics of a batch in `losses`, pass the values through `Batch.weighted` first.
+        """
+        return self.buffer.share.average(values.view(len(self.seeds), -1).mean(1))
 
     def outputs(self, name: str, observations: Observations) -> Tensor:
         """Return a model's outputs, with minus infinity for actions that are not allowed."""
@@ -226,6 +235,20 @@ class Learner(ABC):
                 if not math.isfinite(value):
                     return NotFiniteError(f"{name} of seed {seed} is {value}", self.step + 1)
         return NotFiniteError("the sum of the losses overflows float32", self.step + 1)
+
+
+class _Losses(nn.Module):
+    """Losses of a learner as a module with its weights, whose gradients can be averaged."""
+
+    def __init__(self, learner: Learner) -> None:
+        super().__init__()
+        for name, model in learner.models.items():
+            self.register_parameter(name, model.weights)
+        self._function = learner.losses
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the losses of a batch."""
+        return self._function(batch)
 
 
 def _copy(into: Tensor, tensor: Tensor) -> None:

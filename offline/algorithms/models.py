@@ -48,13 +48,13 @@ class Model(ABC):
         length = sum(parameter.numel() for parameter in parameters.values())
         self._sizes = [*(shape.numel() for shape in self._shapes), -length % _ALIGNMENT]
         device = next(iter(parameters.values())).device
-        self.weights = torch.zeros(len(networks), sum(self._sizes), device=device)
-        for row, network in zip(self.weights, networks, strict=True):
+        weights = torch.zeros(len(networks), sum(self._sizes), device=device)
+        for row, network in zip(weights, networks, strict=True):
             parts = zip(network.parameters(), row.split_with_sizes(self._sizes), strict=False)
             for parameter, part in parts:
                 part.copy_(parameter.detach().flatten())
                 parameter.data = part.view_as(parameter)
-        self.weights.requires_grad_()
+        self.weights = nn.Parameter(weights)
 
     @abstractmethod
     def __call__(self, observations: Observations) -> Tensor:

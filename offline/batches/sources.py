@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.registry import other_format, read_format
 from mcaprl.recorder.dataset.open import find_logs, open_logs
 from mcaprl.remote import RemotePath
+
+Item = TypeVar("Item")
 
 
 def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, NDArray[np.float64]]:
@@ -31,21 +34,46 @@ def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, ND
         LogError: A file is missing, damaged, not an MCAP file, or has no finished episode.
         SpaceError: The spaces of the logs differ.
     """
-    weights: dict[str, float] = {}
-    found: dict[str, Callable[[], Dataset]] = {}
+    found = _weighted(data, lambda name: _readers(name, threads))
+    parts = [read() for read, _ in found]
+    pairs = zip(parts, found, strict=True)
+    each = [np.full(len(part.episodes), weight) for part, (_, weight) in pairs]
+    return Dataset.concatenate(parts), np.concatenate(each)
+
+
+def weighted_logs(data: Sequence[str]) -> list[tuple[Path, float]]:
+    """Return the absolute path of each log in `data` (see `open_weighted`) and its weight.
+
+    Raises:
+        UsageError: A weight is negative or infinite, a file has two weights, or it is a dataset of
+            another tool.
+        LogError: A file is missing.
+    """
+    return _weighted(data, _logs)
+
+
+def _weighted(
+    data: Sequence[str], expand: Callable[[str], Iterator[tuple[str, Item]]]
+) -> list[tuple[Item, float]]:
+    """Return each item to which `data` refers once, with its weight."""
+    found: dict[str, tuple[Item, float]] = {}
     for part in data:
         name, weight = _split_weight(part)
-        for key, read in _readers(name, threads):
-            found.setdefault(key, read)
-            if weights.setdefault(key, weight) != weight:
+        for key, item in expand(name):
+            _, earlier = found.setdefault(key, (item, weight))
+            if earlier != weight:
                 raise UsageError(
-                    f"{key} is named twice, with weights {weights[key]:g} and {weight:g}; name it"
-                    " once"
+                    f"{key} is named twice, with weights {earlier:g} and {weight:g}; name it once"
                 )
-    parts = [read() for read in found.values()]
-    pairs = zip(parts, weights.values(), strict=True)
-    each = [np.full(len(part.episodes), weight) for part, weight in pairs]
-    return Dataset.concatenate(parts), np.concatenate(each)
+    return list(found.values())
+
+
+def _logs(name: str) -> Iterator[tuple[str, Path]]:
+    if other_format(name) is not None:
+        raise UsageError(f"{name} is not a log: convert it first (mcaprl convert)")
+    for path in find_logs(name):
+        key = str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
+        yield key, path if path.is_absolute() else path.absolute()
 
 
 def _readers(name: str, threads: int) -> Iterator[tuple[str, Callable[[], Dataset]]]:

@@ -11,7 +11,7 @@ import warnings
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.batches.buffer import TransitionBuffer, choose_device
 from mcaprl.offline.batches.observations import ObservationEncoder
+from mcaprl.offline.batches.share import Share
 from mcaprl.offline.policy import read_policy, save_policy
 from mcaprl.offline.training.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
 from mcaprl.offline.training.follow import CHECK_INTERVAL, GrowingLogs, with_more_data
@@ -96,30 +97,94 @@ def train(
     place = choose_device(device)
     learner_type, config = choose_algorithm(algo)
     weights = np.ones(len(dataset.episodes)) if weights is None else weights
-    _check_weights(weights, len(dataset.episodes))
+    check_weights(weights, len(dataset.episodes))
     data = fingerprint(dataset, weights)
-    parts = {"algo": learner_type.name, "config": config.to_json(), "data": data}
-    identity = RunIdentity(parts, other_data)
+    identity = RunIdentity(identity_parts(config, data), other_data)
     folder = Path(out)
     with locked_run(folder, resume):
         held_out = choose_held_out(len(weights), config.held_out)
-        encoder, reward_scale = _earlier_scales(folder) if resume and other_data else (None, None)
+        encoder, reward_scale = earlier_scales(folder) if resume and other_data else (None, None)
         buffer = TransitionBuffer.from_dataset(
             dataset,
             config.packing,
             encoder=encoder,
             reward_scale=reward_scale,
-            weights=np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights),
+            weights=without(weights, held_out),
         ).to(place)
         open_run(folder, identity, resume, env_id=dataset.env_id, transitions=len(dataset))
         if message := horizon_warning(config):
             warnings.warn(message, stacklevel=2)
-        gamma = buffer.packing.gamma
-        validation = HeldOut(dataset, buffer, held_out, gamma) if len(held_out) else None
-        limit = largest_return(dataset, gamma)
-        run = _Run(folder, identity, dataset, buffer, validation, limit, held_out, follow)
+        run = _run(folder, identity, dataset, buffer, held_out, follow)
         with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
             return run.train(learner_type, config, range(seed, seed + seeds), report)
+
+
+def train_share(
+    dataset: Dataset,
+    config: TrainingConfig,
+    out: Path,
+    identity: RunIdentity,
+    share: Share,
+    held_out: NDArray[np.int64],
+    seeds: range,
+    *,
+    device: str,
+    scales: tuple[ObservationEncoder | None, float | None],
+    report: ProgressCallback,
+) -> list[OfflineSummary]:
+    """Train in one of several processes; the first one writes the files of the run.
+
+    Args:
+        dataset: Episodes of this process.
+        config: Settings.
+        out: Folder of the run, which exists and is locked; checkpoints in it are continued.
+        identity: Identity of the run.
+        share: The part of all data that the dataset is.
+        held_out: Numbers of the held-out episodes in the dataset.
+        seeds: Seeds of the networks.
+        device: Device of the data, the networks and the updates.
+        scales: Encoder and divisor of the rewards of an earlier run, if they are reused.
+        report: Callback for each row of metrics, called in the first process.
+
+    Returns:
+        One summary for each seed.
+
+    Raises:
+        SpaceError, TrainingError: As for `train`.
+    """
+    encoder, reward_scale = scales
+    buffer = TransitionBuffer.from_dataset(
+        dataset, config.packing, encoder=encoder, reward_scale=reward_scale, share=share
+    ).to(choose_device(device))
+    run = _run(out, identity, dataset, buffer, held_out, None)
+    return run.train(choose_algorithm(config)[0], config, seeds, report)
+
+
+def identity_parts(config: TrainingConfig, data: str) -> dict[str, Any]:
+    """Return the parts of a run's identity; `data` is a fingerprint of the data and weights."""
+    learner_type, _ = choose_algorithm(config)
+    return {"algo": learner_type.name, "config": config.to_json(), "data": data}
+
+
+def without(weights: NDArray[np.float64], held_out: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the weights (E,) of episodes, with 0 for the held-out ones."""
+    return np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights)
+
+
+def _run(
+    folder: Path,
+    identity: RunIdentity,
+    dataset: Dataset,
+    buffer: TransitionBuffer,
+    held_out: NDArray[np.int64],
+    follow: GrowingLogs | None,
+) -> _Run:
+    gamma, share = buffer.packing.gamma, buffer.share
+    validation = None
+    if share.position(len(held_out))[1]:
+        validation = HeldOut(dataset, buffer, held_out, gamma)
+    limit = largest_return(dataset, gamma, share)
+    return _Run(folder, identity, dataset, buffer, validation, limit, held_out, follow)
 
 
 @dataclass(frozen=True)
@@ -166,10 +231,16 @@ class _Run:
     def _starts(self, seeds: range) -> list[dict[int, Checkpoint | None]]:
         """Return seeds with their checkpoints, grouped by the number of finished updates."""
         groups: dict[int, dict[int, Checkpoint | None]] = {}
-        for seed in seeds:
+        # The first process reads for all, so that they continue with the same update.
+        for seed in seeds if self.writes else ():
             checkpoint = read_checkpoint(seed_folder(self.folder, seed), self.identity)
             groups.setdefault(checkpoint.step if checkpoint else 0, {})[seed] = checkpoint
-        return list(groups.values())
+        return self.buffer.share.from_first(list(groups.values()))
+
+    @property
+    def writes(self) -> bool:
+        """Whether this process writes the files of the run."""
+        return self.buffer.share.is_first
 
     def _train_learner(self, learner: Learner, report: ProgressCallback) -> list[OfflineSummary]:
         """Run the remaining updates of a learner's seeds."""
@@ -182,11 +253,13 @@ class _Run:
                 stack.enter_context(
                     closing(MetricsWriter(seed_folder(self.folder, seed), learner.step + 1))
                 )
-                for seed in (seeds if learner.step < updates else ())
+                for seed in (seeds if learner.step < updates and self.writes else ())
             ]
             while learner.step < updates:
                 learner = self._with_new_episodes(learner)
                 before, terms = terms, self._train_to_next_stop(learner, metrics)
+                if not self.writes:
+                    continue
                 warned = warned or self._warn(before, terms)
                 for seed, mine in zip(seeds, terms, strict=True):
                     report(TrainingProgress(seed, learner.step, updates, mine))
@@ -216,9 +289,9 @@ class _Run:
             size = {"transitions": float(len(learner.buffer))}
             values = [mine | size for mine in values]
         rate = config.learning_rate_at(learner.step - 1)
-        for writer, mine in zip(metrics, values, strict=True):
+        for writer, mine in zip(metrics, values, strict=self.writes):
             writer.write(learner.step, rate, mine)
-        if checkpoint_due:
+        if checkpoint_due and self.writes:
             self._save(learner)
         return values
 
@@ -262,7 +335,7 @@ class _Run:
         return False
 
 
-def _earlier_scales(folder: Path) -> tuple[ObservationEncoder | None, float | None]:
+def earlier_scales(folder: Path) -> tuple[ObservationEncoder | None, float | None]:
     """Return the encoder and the reward scale of the run in a folder, or None and None."""
     policies = policy_files(folder)
     if not policies:
@@ -278,6 +351,7 @@ def fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
     return hashlib.sha256(dataset.fingerprint.encode() + weights.tobytes()).hexdigest()
 
 
-def _check_weights(weights: NDArray[np.float64], n_episodes: int) -> None:
+def check_weights(weights: NDArray[np.float64], n_episodes: int) -> None:
+    """Raise a UsageError unless there is one valid weight for each episode."""
     if weights.shape != (n_episodes,) or not np.isfinite(weights).all() or (weights < 0).any():
         raise UsageError(f"weights must be {n_episodes} numbers of at least 0, one per episode")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mcaprl.offline.algorithms.config import BootstrapConfig, TrainingConfig
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline.batches.share import ALONE, Share
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -46,19 +47,23 @@ class HeldOut:
         lengths = dataset.episode_lengths
         rows = np.flatnonzero(np.isin(np.repeat(np.arange(len(lengths)), lengths), episodes))
         returns = monte_carlo_returns(dataset, episodes, gamma)
-        known = np.isfinite(returns)
-        if known.any():
+        share, known = buffer.share, np.isfinite(returns)
+        if share.largest(known.any()):
             rows, returns = rows[known], returns[known]
-        chosen = np.unique(np.linspace(0, len(rows) - 1, MAX_ROWS).round().astype(np.int64))
-        self._rows = torch.from_numpy(rows[chosen]).to(buffer.device)
+        first, total = share.position(len(rows))
+        chosen = np.unique(np.linspace(0, total - 1, MAX_ROWS).round().astype(np.int64))
+        mine = chosen[(chosen >= first) & (chosen < first + len(rows))] - first
+        self._rows, self._total = torch.from_numpy(rows[mine]), len(chosen)
         self._buffer = buffer
-        self.mean_return = float(returns[chosen].mean())
+        self.mean_return = float(np.concatenate(share.gather(returns[mine])).mean())
 
     def terms(self, learner: Learner) -> list[dict[str, float]]:
         """Return each seed's validation metrics; their names have the prefix `held_out_`."""
         seeds = len(learner.seeds)
+        rows = self._rows.expand(seeds, -1)
+        batch = self._buffer.batch(*self._buffer.share.part(rows, self._total, self._buffer.device))
         with torch.no_grad():
-            terms = learner.validate(self._buffer.batch(self._rows.repeat(seeds)))
+            terms = {name: batch.weighted(term) for name, term in learner.validate(batch).items()}
         means = learner.seed_means({f"held_out_{name}": term for name, term in terms.items()})
         has_values = "q" in learner.models and math.isfinite(self.mean_return)
         known = {"held_out_return": self.mean_return} if has_values else {}
@@ -106,11 +111,11 @@ def monte_carlo_returns(
     return np.concatenate(returns) if returns else np.empty(0)
 
 
-def largest_return(dataset: Dataset, gamma: float) -> float:
-    """Return an upper bound on the absolute discounted return of an episode."""
-    longest = float(dataset.episode_lengths.max())
-    steps = longest if gamma == 1 else 1 / (1 - gamma)
-    return float(np.abs(dataset.rewards).max()) * steps
+def largest_return(dataset: Dataset, gamma: float, share: Share = ALONE) -> float:
+    """Return an upper bound on the absolute discounted return of an episode of all data."""
+    longest, reward = share.largest((dataset.episode_lengths.max(), np.abs(dataset.rewards).max()))
+    steps = float(longest) if gamma == 1 else 1 / (1 - gamma)
+    return float(reward) * steps
 
 
 def horizon_warning(config: TrainingConfig) -> str | None:

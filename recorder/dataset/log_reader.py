@@ -22,7 +22,7 @@ from mcaprl.recorder.dataset.episodes import (
     summaries,
 )
 from mcaprl.recorder.dataset.foreign import inferred_metadata, observation_fields
-from mcaprl.recorder.dataset.image_cache import Storage
+from mcaprl.recorder.dataset.image_cache import Storage, fingerprint
 from mcaprl.recorder.dataset.images import read_images
 from mcaprl.recorder.dataset.mapped import Frames
 from mcaprl.recorder.dataset.transitions import Transitions, ranges
@@ -87,6 +87,11 @@ class LogReader:
             return listed
         self._check_fields(COUNTERS)
         return self._finished(episode_lengths(self._steps.read(COUNTERS, self._order), self.path))
+
+    @property
+    def checksum(self) -> str:
+        """SHA-256 of the chunk offsets and CRCs, and of the file's mtime if it lacks CRCs."""
+        return fingerprint(self._reader)
 
     def record_times(self) -> NDArray[np.int64]:
         """Return the log_time of each record of the finished episodes, episode by episode.

@@ -52,6 +52,7 @@ PROSE = {"text", "{toctree}"}
 LARGEST = {"--episodes": 10, "--steps": 200, "--updates": 30, "--seeds": 2}
 ADDED = {
     "train-offline": "--updates 30 --hidden 16,16 --gamma 0.5 --target-interval 3",
+    "train-offline --sweep": "",
     "train-offline bc": "--updates 30 --hidden 16,16",
     "train-online": "--steps 200 --envs 2 --eval-episodes 1 --final-episodes 1 --hidden 16,16",
     "evaluate": "--episodes 2",

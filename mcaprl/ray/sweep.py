@@ -1,0 +1,284 @@
+"""Training of many settings with Ray Tune; poor ones are stopped early by their off-policy score.
+
+OUT/sweep.json             what is tried, and the data; a resumed sweep must have the same
+OUT/NAME/                  run folder of a trial
+OUT/NAME.scores.json       scores so far, or the error that ended the trial
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mcaprl.errors import LogError, McaprlError, OutputExistsError, TrainingError, import_extra
+from mcaprl.files import locked_folder, parse_json, work_folder, write_json
+from mcaprl.offline.batches.sources import open_weighted, weighted_logs
+from mcaprl.offline.estimate.fqe import FQEConfig
+from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
+from mcaprl.offline.policy import read_policy
+from mcaprl.offline.training.train import train
+from mcaprl.progress import Advance, TrainingProgress
+from mcaprl.ray.sweep_file import SweepPlan, Trial
+from mcaprl.ray.workers import MOST_DEATHS, check_machine
+from mcaprl.recorder.dataset.log_reader import LogReader
+from mcaprl.recorder.format.metadata import installed_versions
+
+PLAN_NAME, SCORES_NAME = "sweep.json", "scores.json"
+_SPLIT_SEED = 0
+
+
+@dataclass(frozen=True)
+class Score:
+    """Off-policy score of the policies of a trial at one time.
+
+    Attributes:
+        updates: Number of finished updates.
+        values: Estimated discounted return of each seed's policy.
+        estimator: `WDR`, or `FQE` if the log has no behavior probabilities.
+        trusted: Whether all these estimates are trusted.
+    """
+
+    updates: int
+    values: list[float]
+    estimator: str
+    trusted: bool
+
+    @property
+    def mean(self) -> float:
+        """Mean over the seeds."""
+        return float(np.mean(self.values))
+
+
+@dataclass(frozen=True)
+class TrialResult:
+    """Outcome of a trial.
+
+    Attributes:
+        trial: Algorithm and settings.
+        folder: Run folder, whose policies can be evaluated.
+        scores: Scores in the order of time; empty if the trial failed before the first one.
+        error: Error that ended the trial; empty if there was none.
+    """
+
+    trial: Trial
+    folder: Path
+    scores: tuple[Score, ...]
+    error: str
+
+    @property
+    def status(self) -> str:
+        """`finished`, `stopped early`, or `failed: ` and the reason."""
+        if self.error:
+            return f"failed: {self.error}"
+        updates = self.scores[-1].updates if self.scores else 0
+        return "finished" if updates == self.trial.config.updates else "stopped early"
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What each trial needs to know, besides its number."""
+
+    data: tuple[str, ...]
+    plan: SweepPlan
+    out: Path
+    versions: dict[str, str]
+
+
+def sweep_on_ray(
+    data: Sequence[str],
+    plan: SweepPlan,
+    out: Path,
+    *,
+    workers: int | None,
+    resume: bool,
+    advance: Advance,
+) -> list[TrialResult]:
+    """Run the trials on the cluster that this process is connected to.
+
+    Args:
+        data: Logs and weights, as for `open_weighted`; all workers must see local ones.
+        plan: What to try.
+        out: Folder to create; an absolute path that all workers see.
+        workers: Largest number of trials at a time; default: CPUs of the cluster.
+        resume: Whether to continue the sweep in `out`.
+        advance: Function called with 1 after each trial.
+
+    Returns:
+        The results, best score first.
+
+    Raises:
+        OutputExistsError: `out` exists.
+        TrainingError: All trials failed, or `out` has another sweep or none.
+        McaprlError: The logs cannot be read.
+    """
+    tune = import_extra("ray.tune", "ray")
+    logs = weighted_logs(data)
+    identity = {
+        "trials": [[one.name, one.algo, one.config.to_json()] for one in plan.trials],
+        "seeds": [plan.seed, plan.seeds],
+        "score": asdict(plan.score),
+        "data": [[path.name, LogReader(path).checksum, weight] for path, weight in logs],
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    with locked_folder(out, TrainingError):
+        _open(out, json.loads(json.dumps(identity)), resume)
+        names = tuple(f"{path}:{weight:g}" for path, weight in logs)
+        job = _Job(names, plan, out, installed_versions())
+        with work_folder(out / "tune") as folder:
+            _run(tune, job, folder, workers, advance)
+    results = [_result(one, out) for one in plan.trials]
+    if not any(one.scores for one in results):
+        raise TrainingError(f"{out}: all trials failed; the first one: {results[0].status}")
+    return sorted(results, key=lambda one: -one.scores[-1].mean if one.scores else np.inf)
+
+
+def _open(out: Path, identity: dict[str, Any], resume: bool) -> None:
+    path = out / PLAN_NAME
+    if not resume:
+        if any(one for one in out.iterdir() if not one.name.startswith(".")):
+            raise OutputExistsError(
+                f"{out} exists: choose another folder, or resume its sweep (--resume)"
+            )
+    elif not path.exists():
+        raise TrainingError(f"{out} has no sweep to resume: start a new one without --resume")
+    elif (found := parse_json(path.read_bytes())) != identity:
+        names = [name for name in identity if found.get(name) != identity[name]]
+        raise TrainingError(
+            f"cannot resume: {path} has other {', '.join(names)}; resume with the same sweep file"
+            " and data, or choose another folder"
+        )
+    write_json(path, identity, TrainingError)
+
+
+def _run(tune: Any, job: _Job, folder: Path, workers: int | None, advance: Advance) -> None:
+    plan = job.plan
+    most = max(one.config.updates for one in plan.trials)
+    scheduler = None
+    if plan.stop and most > plan.score.every:
+        scheduler = import_extra("ray.tune.schedulers", "ray").ASHAScheduler(
+            time_attr="updates",
+            metric="score",
+            mode="max",
+            max_t=most,
+            grace_period=plan.score.every,
+            reduction_factor=plan.stop,
+        )
+
+    class Counter(tune.Callback):  # type: ignore[misc]
+        def on_trial_complete(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
+            advance(1)
+
+    # Ray prints a box with its settings otherwise, whatever its verbosity.
+    os.environ.setdefault("RAY_AIR_NEW_OUTPUT", "0")
+    for name in ("ray.tune", "ray.train"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    tuner = tune.Tuner(
+        tune.with_resources(partial(_try, job), {"CPU": 1}),
+        param_space={"number": tune.grid_search(list(range(len(plan.trials))))},
+        tune_config=tune.TuneConfig(scheduler=scheduler, max_concurrent_trials=workers),
+        run_config=tune.RunConfig(
+            name="sweep",
+            storage_path=str(folder),
+            verbose=0,
+            callbacks=[Counter()],
+            failure_config=tune.FailureConfig(max_failures=MOST_DEATHS),
+        ),
+    )
+    found = tuner.fit()
+    for error in found.errors:
+        raise TrainingError(f"{job.out}: {str(error).strip().splitlines()[-1]}")
+
+
+def _try(job: _Job, chosen: dict[str, int]) -> None:
+    """Run one trial, or the rest of it if its worker was killed, in a worker of Ray Tune."""
+    trial = job.plan.trials[chosen["number"]]
+    folder = job.out / trial.name
+    try:
+        check_machine(job.versions, [job.out])
+        _train(job, trial, folder)
+    except McaprlError as error:
+        # Other settings may do better, so the sweep goes on.
+        _save(folder, _result(trial, job.out).scores, str(error))
+
+
+def _train(job: _Job, trial: Trial, folder: Path) -> None:
+    from ray import tune
+
+    plan = job.plan
+    dataset, weights = open_weighted(job.data)
+    learned, kept = _divided(len(weights), plan.score.fraction)
+    evaluator = OffPolicyEvaluator(
+        dataset._take(kept),
+        FQEConfig(gamma=plan.score.gamma, updates=plan.score.updates),
+        _SPLIT_SEED,
+    )
+    earlier = _result(trial, job.out).scores
+    scores = list(earlier)
+    for score in earlier:
+        tune.report({"score": score.mean, "updates": score.updates})
+    done = scores[-1].updates if scores else 0
+
+    def progress(now: TrainingProgress) -> None:
+        nonlocal done
+        is_due = now.done % plan.score.every == 0 or now.done == now.total
+        if now.seed != plan.seed + plan.seeds - 1 or not is_due or now.done <= done:
+            return
+        done = now.done
+        scores.append(_score(folder, plan, evaluator, now.done))
+        _save(folder, scores, "")
+        tune.report({"score": scores[-1].mean, "updates": now.done})
+
+    train(
+        dataset._take(learned),
+        trial.config,
+        folder,
+        seeds=plan.seeds,
+        seed=plan.seed,
+        weights=weights[learned],
+        resume=folder.exists(),
+        progress=progress,
+    )
+
+
+def _score(folder: Path, plan: SweepPlan, evaluator: OffPolicyEvaluator, updates: int) -> Score:
+    values, trusted, estimator = [], True, "FQE"
+    for seed in range(plan.seed, plan.seed + plan.seeds):
+        policy = read_policy(folder / f"seed-{seed}")
+        found = evaluator.evaluate(policy, policy.name, epsilon=plan.score.epsilon)
+        by_name = {one.estimator: one for one in found.estimates}
+        chosen = by_name["WDR"] if by_name["WDR"].value is not None else by_name["FQE"]
+        estimator, trusted = chosen.estimator, trusted and chosen.trusted
+        values.append(float(chosen.value or 0.0))
+    return Score(updates, values, estimator, trusted)
+
+
+def _divided(episodes: int, fraction: float) -> tuple[list[int], list[int]]:
+    """Divide episodes at random into those to learn from and those for scores."""
+    order = np.random.default_rng(_SPLIT_SEED).permutation(episodes)
+    count = max(round(fraction * episodes), 2)
+    if count >= episodes:
+        raise LogError(f"a sweep needs 3 episodes or more, the logs have {episodes}")
+    return np.sort(order[count:]).tolist(), np.sort(order[:count]).tolist()
+
+
+def _save(folder: Path, scores: Sequence[Score], error: str) -> None:
+    content = {"scores": [asdict(one) for one in scores], "error": error}
+    write_json(folder.with_name(f"{folder.name}.{SCORES_NAME}"), content, TrainingError)
+
+
+def _result(trial: Trial, out: Path) -> TrialResult:
+    path = out / f"{trial.name}.{SCORES_NAME}"
+    found: dict[str, Any] = {"scores": [], "error": ""}
+    with suppress(FileNotFoundError):
+        found = parse_json(path.read_bytes())
+    scores = tuple(Score(**one) for one in found["scores"])
+    return TrialResult(trial, out / trial.name, scores, found["error"])

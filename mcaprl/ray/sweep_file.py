@@ -1,0 +1,209 @@
+"""Sweep files: algorithms, settings and seeds to train, in YAML or JSON.
+
+    algos: [bc, cql]              algorithms; or a mapping of each one to its settings
+    settings:                     settings of all these algorithms that have them
+      updates: 4000
+      learning_rate: [3e-4, 1e-3] a list: each value is tried, in all combinations
+    seeds: 2                      number of networks of each combination
+    seed: 0                       seed of the first one
+    score:
+      every: 1000                 updates between two scores
+      fraction: 0.2               part of the episodes that is kept for scores
+      updates: 1000               updates of the model that the estimators use
+      epsilon: 0.1                probability of random actions of the scored policies
+      gamma: 0.97                 discount of the scores
+    stop: 3                       one of this number goes on at each stage; 0: all go on
+
+Only `algos` is required.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from mcaprl.errors import UsageError, import_extra
+from mcaprl.offline.algorithms.config import TrainingConfig
+from mcaprl.offline.algorithms.registry import choose_algorithm
+from mcaprl.settings import check_settings
+
+MOST_TRIALS = 10_000
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """How policies are scored; the module's docstring describes the fields."""
+
+    every: int = 1_000
+    fraction: float = 0.2
+    updates: int = 1_000
+    epsilon: float = 0.1
+    gamma: float = 0.97
+
+    def __post_init__(self) -> None:
+        """Validate the fields."""
+        for name in ("every", "updates"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"score: {name} must be at least 1, got {getattr(self, name)}")
+        if not 0 < self.fraction < 1:
+            raise UsageError(f"score: fraction must be between 0 and 1, got {self.fraction}")
+        for name in ("epsilon", "gamma"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UsageError(f"score: {name} must be within [0, 1], got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One combination of algorithm and settings.
+
+    Attributes:
+        name: Name of its folder, such as `cql-003`.
+        algo: Name of the algorithm.
+        config: Settings.
+        varied: Values of the settings for which the file has several values.
+    """
+
+    name: str
+    algo: str
+    config: TrainingConfig
+    varied: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class SweepPlan:
+    """Content of a sweep file."""
+
+    trials: tuple[Trial, ...]
+    seeds: int = 1
+    seed: int = 0
+    score: Scoring = field(default_factory=Scoring)
+    stop: int = 3
+
+
+def read_plan(source: str | Path | Mapping[str, Any]) -> SweepPlan:
+    """Read and check a sweep file, or a mapping of the same form.
+
+    Raises:
+        UsageError: The file cannot be read, or has an unknown key or a wrong value.
+        MissingExtraError: The packages of the extra `ray` are not installed.
+    """
+    where, tree = ("the sweep", source) if isinstance(source, Mapping) else _load(Path(source))
+    try:
+        return _plan(tree)
+    except UsageError as error:
+        raise UsageError(f"{where}: {error}") from error
+
+
+def _load(path: Path) -> tuple[str, object]:
+    yaml = import_extra("ruamel.yaml", "ray")
+    try:
+        # YAML 1.2 reads JSON, too.
+        return str(path), yaml.YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeError) as error:
+        raise UsageError(f"{path}: cannot be read: {error}") from error
+    except yaml.YAMLError as error:
+        line = getattr(getattr(error, "problem_mark", None), "line", None)
+        place = str(path) if line is None else f"{path}, line {line + 1}"
+        raise UsageError(f"{place}: not YAML: {getattr(error, 'problem', error)}") from error
+
+
+def _plan(tree: object) -> SweepPlan:
+    tree = _mapping("a sweep", tree, ["algos", "settings", "seeds", "seed", "score", "stop"])
+    found = tree.get("algos")
+    if isinstance(found, list):
+        found = {str(name): {} for name in found}
+    if not isinstance(found, Mapping) or not found:
+        raise UsageError("algos must be a list of algorithms, or a mapping to their settings")
+    common = _mapping("settings", tree.get("settings"), None)
+    names = {str(name) for name in common}
+    numbers = {
+        name: _typed(name, tree.get(name, default), default)
+        for name, default in (("seeds", 1), ("seed", 0), ("stop", 3))
+    }
+    if numbers["seeds"] < 1 or numbers["seed"] < 0 or numbers["stop"] not in (0, *range(2, 100)):
+        raise UsageError("seeds must be at least 1, seed at least 0, and stop 0 or 2 to 99")
+    score = _scoring(tree.get("score"))
+    trials: list[Trial] = []
+    for algo, own in found.items():
+        _, defaults = choose_algorithm(str(algo))
+        own = _mapping(f"algos: {algo}", own, None)
+        known = {one.name for one in fields(defaults)}
+        check_settings(str(algo), defaults, map(str, own))
+        names -= known
+        values = {name: value for name, value in common.items() if name in known} | dict(own)
+        trials += _combinations(str(algo), defaults, values, score, len(trials))
+    if names:
+        for name in sorted(names):
+            # The first algorithm's error lists its settings.
+            check_settings(
+                str(next(iter(found))), choose_algorithm(str(next(iter(found))))[1], [name]
+            )
+    return SweepPlan(tuple(trials), score=score, **numbers)
+
+
+def _combinations(
+    algo: str, defaults: TrainingConfig, values: Mapping[str, Any], score: Scoring, first: int
+) -> list[Trial]:
+    choices = {
+        name: [_typed(name, one, getattr(defaults, name)) for one in _listed(name, value, defaults)]
+        for name, value in values.items()
+    }
+    several = [name for name, options in choices.items() if len(options) > 1]
+    found = []
+    for number, chosen in enumerate(itertools.product(*choices.values()), first):
+        if number >= MOST_TRIALS:
+            raise UsageError(f"more than {MOST_TRIALS:,} combinations: remove some values")
+        settings = dict(zip(choices, chosen, strict=True))
+        # Policies are scored when a checkpoint is written.
+        config = type(defaults)(**{"checkpoint_interval": score.every, **settings})
+        if config.checkpoint_interval != score.every:
+            raise UsageError("checkpoint_interval is the `every` of score: set that instead")
+        varied = {name: settings[name] for name in several}
+        found.append(Trial(f"{algo}-{number:03d}", algo, config, varied))
+    return found
+
+
+def _listed(name: str, value: Any, defaults: TrainingConfig) -> list[Any]:
+    """Return the values to try; a flat list is one value of a setting that is a list."""
+    is_list = isinstance(value, list)
+    if isinstance(getattr(defaults, name), tuple):
+        return value if is_list and any(isinstance(one, list) for one in value) else [value]
+    if is_list and not value:
+        raise UsageError(f"{name} has no values")
+    return value if is_list else [value]
+
+
+def _typed(name: str, value: Any, default: Any) -> Any:
+    """Return a value as the type of the default."""
+    kind = type(default)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if kind is tuple and isinstance(value, list | tuple):
+        if all(type(one) is int for one in value):
+            return tuple(value)
+    elif type(value) is kind:
+        return value
+    wanted = {"int": "a whole number", "float": "a number", "bool": "true or false"}
+    text = wanted.get(kind.__name__, "a list of whole numbers" if kind is tuple else "text")
+    raise UsageError(f"{name} must be {text}, got {json.dumps(value, default=str)}")
+
+
+def _scoring(tree: object) -> Scoring:
+    known = {one.name: one.default for one in fields(Scoring)}
+    given = _mapping("score", tree, list(known))
+    return Scoring(**{name: _typed(name, value, known[name]) for name, value in given.items()})
+
+
+def _mapping(what: str, tree: object, known: list[str] | None) -> Mapping[str, Any]:
+    if tree is None and what != "a sweep":
+        return {}
+    if not isinstance(tree, Mapping):
+        raise UsageError(f"{what} must be a mapping of names to values")
+    for name in tree:
+        if known is not None and name not in known:
+            raise UsageError(f"{what} has no key {name!r}; it has {', '.join(known)}")
+    return tree

@@ -1,0 +1,363 @@
+"""Offline training on the workers of a Ray cluster, each of which holds some of the episodes.
+
+Ray Train starts the workers, connects them, and starts all of them again if one is lost. The files
+of the run are those of a local training, written by the first worker; after a restart, training
+continues from its checkpoints.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import ClusterError, McaprlError, SpaceError, UsageError, import_extra
+from mcaprl.files import work_folder
+from mcaprl.offline.algorithms.config import TrainingConfig
+from mcaprl.offline.batches.share import GroupShare, divided
+from mcaprl.offline.batches.sources import weighted_logs
+from mcaprl.offline.training.metrics import OfflineSummary
+from mcaprl.offline.training.train import (
+    check_weights,
+    earlier_scales,
+    identity_parts,
+    train_share,
+    without,
+)
+from mcaprl.offline.training.watch import choose_held_out, horizon_warning
+from mcaprl.progress import ProgressCallback, TrainingProgress
+from mcaprl.ray.cluster import cpus
+from mcaprl.ray.workers import MOST_DEATHS, check_machine
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.log_reader import LogReader
+from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
+from mcaprl.runs import RunIdentity, locked_run, open_run
+
+_POLL_S = 0.2
+
+
+@dataclass(frozen=True)
+class TrainingRequest:
+    """A training; its fields are the arguments of `mcaprl.train`."""
+
+    config: TrainingConfig
+    out: Path
+    seeds: range
+    threads: int
+    device: str
+    resume: bool
+    other_data: bool
+
+
+@dataclass(frozen=True)
+class _Logs:
+    """Summaries of the logs.
+
+    Attributes:
+        paths: Absolute paths.
+        lengths: (E,) number of transitions of each episode of a log, for each log.
+        weights: Weight of a transition of each log.
+        description: Metadata that the logs have in common.
+        fingerprint: SHA-256 of the logs' checksums and weights.
+    """
+
+    paths: list[Path]
+    lengths: list[NDArray[np.int64]]
+    weights: list[float]
+    description: LogMetadata
+    fingerprint: str
+
+    @property
+    def all_lengths(self) -> NDArray[np.int64]:
+        """(E,) number of transitions of each episode of all logs."""
+        return np.concatenate(self.lengths)
+
+    @property
+    def all_weights(self) -> NDArray[np.float64]:
+        """(E,) weight of a transition of each episode of all logs."""
+        return np.repeat(self.weights, list(map(len, self.lengths)))
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What each worker needs to know."""
+
+    request: TrainingRequest
+    logs: _Logs
+    identity: RunIdentity
+    versions: dict[str, str]
+    board: Any
+
+
+class Board:
+    """Actor on which the workers leave what the calling process reads."""
+
+    def __init__(self) -> None:
+        """Begin without messages."""
+        self._news: list[TrainingProgress | str] = []
+        self._summaries: list[OfflineSummary] | None = None
+        self._error: Exception | None = None
+
+    def report(self, news: TrainingProgress | str) -> bool:
+        """Add metrics or a warning; return whether the training shall continue."""
+        self._news.append(news)
+        return self._error is None
+
+    def take(self) -> list[TrainingProgress | str]:
+        """Return what was added since the last call."""
+        news, self._news = self._news, []
+        return news
+
+    def fail(self, error: Exception) -> None:
+        """Store the error that ends the training."""
+        self._error = self._error or error
+
+    def finish(self, summaries: list[OfflineSummary]) -> None:
+        """Store the result."""
+        self._summaries = summaries
+
+    def outcome(self) -> tuple[list[OfflineSummary] | None, Exception | None]:
+        """Return the result and the error; None if there is none."""
+        return self._summaries, self._error
+
+
+def train_on_ray(
+    data: Sequence[str],
+    request: TrainingRequest,
+    *,
+    workers: int | None,
+    progress: ProgressCallback,
+) -> list[OfflineSummary]:
+    """Train on the cluster that this process is connected to.
+
+    Args:
+        data: Logs and weights, as for `open_weighted`; all workers must see local ones.
+        request: The training.
+        workers: Number of workers; default: number of CPUs of the cluster, or with the device
+            `cuda` its number of GPUs.
+        progress: Function called with each row of metrics.
+
+    Returns:
+        One summary for each seed.
+
+    Raises:
+        ClusterError: The cluster has fewer processors, a worker has other versions or does not see
+            a path, or workers died repeatedly.
+        McaprlError: As for a local training.
+    """
+    import ray
+
+    logs = _read_summaries(data)
+    check_weights(logs.all_weights, len(logs.all_weights))
+    count = _workers(workers, request.device, sum(map(len, logs.lengths)))
+    identity = RunIdentity(identity_parts(request.config, logs.fingerprint), request.other_data)
+    with locked_run(request.out, request.resume):
+        transitions = int(logs.all_lengths.sum())
+        open_run(
+            request.out,
+            identity,
+            request.resume,
+            env_id=logs.description.env_id,
+            transitions=transitions,
+        )
+        if message := horizon_warning(request.config):
+            warnings.warn(message, stacklevel=2)
+        board = ray.remote(Board).options(num_cpus=0).remote()
+        job = _Job(request, logs, identity, installed_versions(), board)
+        with _following(board, progress):
+            _fit(job, count)
+        summaries, error = ray.get(board.outcome.remote())
+    if error is not None:
+        raise error
+    assert summaries is not None
+    return list(summaries)
+
+
+def _fit(job: _Job, workers: int) -> None:
+    """Run the workers; an error of theirs is left on the board."""
+    import ray
+
+    train = import_extra("ray.train", "ray")
+    trainer = import_extra("ray.train.torch", "ray").TorchTrainer
+    with work_folder(job.request.out / "ray") as folder:
+        fitted = trainer(
+            partial(_train_on_worker, job),
+            scaling_config=train.ScalingConfig(
+                num_workers=workers,
+                use_gpu=job.request.device == "cuda",
+                resources_per_worker={"CPU": 1}
+                | ({"GPU": 1} if job.request.device == "cuda" else {}),
+            ),
+            run_config=train.RunConfig(
+                name="run",
+                storage_path=str(folder),
+                failure_config=train.FailureConfig(max_failures=MOST_DEATHS),
+            ),
+        )
+        try:
+            fitted.fit()
+        except train.TrainingFailedError as error:
+            _, ours = ray.get(job.board.outcome.remote())
+            if ours is None:
+                raise _failure(job.request.out, error) from error
+
+
+def _failure(out: Path, error: Exception) -> ClusterError:
+    lines = str(error).strip().splitlines()
+    return ClusterError(
+        f"{out}: workers failed repeatedly; its checkpoints are kept, continue with --resume"
+        f" ({lines[-1].strip()})"
+    )
+
+
+def _train_on_worker(job: _Job) -> None:
+    import ray
+
+    if ray.get(job.board.outcome.remote())[1] is not None:
+        # Ray starts all workers again after any error, also after one that would come back.
+        return
+    try:
+        _train(job)
+    except McaprlError as error:
+        ray.get(job.board.fail.remote(error))
+        raise
+    except (RuntimeError, OSError):
+        # Another worker was lost.
+        raise
+    except Exception as error:
+        ray.get(job.board.fail.remote(error))
+        raise
+
+
+def _train(job: _Job) -> None:
+    import ray
+    import torch
+    from ray.train import get_context
+
+    request, logs = job.request, job.logs
+    torch.set_num_threads(request.threads)
+    rank, count = get_context().get_world_rank(), get_context().get_world_size()
+    lengths, weights = logs.all_lengths, logs.all_weights
+    first, stop = divided(lengths, count)[rank]
+    held_out = choose_held_out(len(lengths), request.config.held_out)
+    check_machine(job.versions, [request.out])
+    share = GroupShare(lengths, without(weights, held_out), first, stop)
+    dataset = _read_episodes(job, first, stop)
+
+    def report(news: TrainingProgress | str) -> None:
+        if not ray.get(job.board.report.remote(news)):
+            raise SystemExit("the calling process ended the training")
+
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: report(str(message))
+        summaries = train_share(
+            dataset,
+            request.config,
+            request.out,
+            job.identity,
+            share,
+            held_out[(held_out >= first) & (held_out < stop)] - first,
+            request.seeds,
+            device=request.device,
+            scales=share.from_first(_scales(request)),
+            report=report,
+        )
+    if share.is_first:
+        ray.get(job.board.finish.remote(summaries))
+
+
+def _scales(request: TrainingRequest) -> tuple[Any, Any]:
+    reused = request.resume and request.other_data
+    return earlier_scales(request.out) if reused else (None, None)
+
+
+def _read_episodes(job: _Job, first: int, stop: int) -> Dataset:
+    """Read the episodes `first` to `stop` of all logs."""
+    parts, begin = [], 0
+    for path, lengths in zip(job.logs.paths, job.logs.lengths, strict=True):
+        mine = np.arange(max(first - begin, 0), min(stop - begin, len(lengths)))
+        begin += len(lengths)
+        if len(mine):
+            check_machine(job.versions, [path])
+            parts.append(LogReader(path).read(mine))
+    return Dataset.concatenate(parts)
+
+
+def _read_summaries(data: Sequence[str]) -> _Logs:
+    pairs = weighted_logs(data)
+    paths, weights = [path for path, _ in pairs], [weight for _, weight in pairs]
+    digest = hashlib.sha256(repr(weights if len(set(weights)) > 1 else "").encode())
+    lengths, descriptions = [], []
+    for path in paths:
+        log = LogReader(path)
+        lengths.append(log.lengths)
+        digest.update(log.checksum.encode())
+        descriptions.append(log.description)
+        for role in ("observation_space", "action_space"):
+            spaces = [getattr(descriptions[k], role) for k in (0, -1)]
+            if spaces[0] != spaces[1]:
+                raise SpaceError(f"{path} differs in {role}: {spaces[1]}, not {spaces[0]}")
+    return _Logs(paths, lengths, weights, LogMetadata.common(descriptions), digest.hexdigest())
+
+
+def _workers(wanted: int | None, device: str, episodes: int) -> int:
+    """Return the number of workers; there must be a processor and an episode for each."""
+    import ray
+
+    kind = "GPU" if device == "cuda" else "CPU"
+    available = int(ray.cluster_resources().get("GPU", 0)) if kind == "GPU" else cpus()
+    if available < (wanted or 1):
+        raise ClusterError(
+            f"the cluster has {available} {kind}s for {wanted or 1} workers: start more machines,"
+            " or lower --workers"
+        )
+    if wanted is not None and wanted > episodes:
+        raise UsageError(f"--workers {wanted}: the logs have only {episodes} episodes to divide")
+    return min(wanted or available, episodes)
+
+
+@contextmanager
+def _following(board: Any, progress: ProgressCallback) -> Iterator[None]:
+    """Call `progress` with the news of the board meanwhile; its exceptions end the training."""
+    import ray
+
+    ended = threading.Event()
+    errors: list[BaseException] = []
+
+    def follow() -> None:
+        while not errors:
+            is_last = ended.wait(_POLL_S)
+            for one in ray.get(board.take.remote()):
+                if isinstance(one, str):
+                    texts.append(one)
+                    continue
+                try:
+                    progress(one)
+                except BaseException as error:
+                    errors.append(error)
+                    ray.get(board.fail.remote(ClusterError("stopped")))
+                    return
+            if is_last:
+                return
+
+    texts: list[str] = []
+    thread = threading.Thread(target=follow, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        for text in dict.fromkeys(texts):
+            warnings.warn(text, stacklevel=4)
+    if errors:
+        raise errors[0]
