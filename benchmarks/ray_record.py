@@ -20,7 +20,7 @@ import mcaprl
 import mcaprl.ray
 from benchmarks.measure import Table
 
-EPISODES, WORKERS, SHARDS, ROUNDS = 150, 2, 8, 3
+EPISODES, WORKERS, SHARDS, ROUNDS = 100, 2, 8, 2
 PLAIN = "plain processes"
 GOAL = "at most 1.18 times the time of plain processes, an efficiency of .85"
 
