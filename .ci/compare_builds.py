@@ -51,7 +51,7 @@ def modules(source: Path) -> list[Path]:
         path
         for root in roots
         for path in root.rglob("*")
-        if path.is_file() and path.suffix != ".pyc" and not is_source_of_vendored(path)
+        if path.is_file() and "__pycache__" not in path.parts and not is_source_of_vendored(path)
     )
 
 
