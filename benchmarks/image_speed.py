@@ -35,7 +35,7 @@ HELD_OUT: Final = 5
 """One of this many episodes is held out."""
 LATE: Final = 16
 """Number of decisions after the start from which R^2 is computed separately."""
-VARIANTS: Final = ((1, 0), (4, 0), (4, 8), (4, 16), (4, 32), (1, 32))
+VARIANTS: Final = ((4, 0), (4, 8), (4, 32), (1, 32))
 """Numbers of images and of decisions whose commands are known."""
 ARCHITECTURE: Final = Architecture((256, 256), layer_norm=True, encoder="compact")
 
