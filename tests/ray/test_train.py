@@ -13,6 +13,7 @@ import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import ClusterError, UsageError
 from mcaprl.progress import TrainingProgress
+from mcaprl.recorder.format.metadata import installed_versions
 from mcaprl.runs import read_curve
 from tests.ray.seeded import SEEDED
 
@@ -128,3 +129,12 @@ def test_options_that_cannot_be_used_with_ray(logs: Path, tmp_path: Path) -> Non
     with pytest.raises(ClusterError, match="the cluster has 0 GPUs for 1 workers"):
         train(ray=True, device="cuda")
     assert not (tmp_path / "run").exists()
+
+
+def test_an_error_of_a_worker_ends_the_training_as_one_line(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    versions = {**installed_versions(), "numpy": "1.2.3"}
+    monkeypatch.setattr("mcaprl.ray.training.installed_versions", lambda: versions)
+    with pytest.raises(ClusterError, match=r"the worker at 127\.0\.0\.1 has numpy .* 1\.2\.3: in"):
+        mcaprl.train(logs, tmp_path / "run", algo="bc", updates=1, ray=True, workers=2)
