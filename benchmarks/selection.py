@@ -1,16 +1,18 @@
 """Measure how well the best offline policy can be chosen from a log alone.
 
-    python -m benchmarks.selection FOLDER [--sims lane,racer] [--data weak,expert] [--seeds 4]
+    python -m benchmarks.selection FOLDER [--sims lane,racer] [--data weak,expert] [--seeds 2]
 
 The candidates are algorithms of offline learning. On each log of `sim_data`, each candidate is
 trained with the settings of `sim_grid`. Its true score is measured in the sim. Other scores are
 computed from the log: FQE with and without pessimism, the policy's own values, its Bellman error
-and its support in the log. FOLDER/SIM has one JSON file for each finished log, so an interrupted
-run resumes.
+and its support in the log. FOLDER/SIM has the policies and two JSON files for each log, so an
+interrupted run resumes.
 
 A rule chooses one candidate by the scores from the log. The regret of a rule is the true score of
 the best candidate minus that of the chosen candidate; both scores are means over seeds. The table
-has the mean and the largest regret of each rule over the finished logs.
+has the mean regret of each rule over the finished logs, with a 95 % bootstrap interval over logs,
+and the largest. Its last row is fair to the choice of the rule: on the logs of each sim, it uses
+the rule with the smallest mean regret on the logs of the other sims.
 """
 
 from __future__ import annotations
@@ -19,14 +21,16 @@ import argparse
 import functools
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import torch
+from gymnasium.spaces import Discrete
 
 import mcaprl
 from benchmarks.sim_data import make_logs
@@ -34,6 +38,7 @@ from benchmarks.sim_grid import SETTINGS, normalize_mean, run, settings_of
 from mcaprl.api import load_policies
 from mcaprl.files import write_json
 from mcaprl.offline import EvidenceCollector, fqe_config, train
+from mcaprl.offline.selection.portfolio import DETERMINISTIC
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import PolicyScore, make_pilot, make_sim
 
@@ -48,7 +53,6 @@ CANDIDATES: Final[dict[str, tuple[str, dict[str, Any]]]] = {
 }
 SMALL: Final = {"batch_size": 64, "hidden": (128, 128)}
 """Settings that differ from those of `sim_grid`, so that a log takes minutes."""
-
 SHORT, MODEL_UPDATES, SHORT_MODEL_UPDATES = 1_000, 1_000, 500
 """Updates of the short training, of FQE, and of FQE after the short training."""
 ORDER: Final = ("expert", "weak", "mixed", "replay", "medium", "random")
@@ -114,51 +118,127 @@ def collect(sim: str, log: Path, out: Path, names: list[str]) -> list[Row]:
     return rows
 
 
-def means(rows: list[Row], value: Callable[[Row], float | None]) -> dict[str, float]:
-    """Return the mean of a value over the seeds, for each candidate that has this value."""
-    found: dict[str, list[float]] = {}
-    for row in rows:
-        if (one := value(row)) is not None:
-            found.setdefault(row["candidate"], []).append(one)
-    return {name: float(np.mean(values)) for name, values in found.items()}
+@dataclass(frozen=True)
+class Log:
+    """Finished log.
+
+    Attributes:
+        sim: Name of its sim.
+        name: Name of the log.
+        entropy: Entropy of the behavior by the logged probabilities, from 0 to 1.
+        scores: Mean true score of each candidate.
+        rows: Evidence for each candidate and seed.
+    """
+
+    sim: str
+    name: str
+    entropy: float
+    scores: dict[str, float]
+    rows: list[Row]
+
+    def means(self, label: str, field: str, kind: str = "full") -> dict[str, float]:
+        """Return the mean of a number over the seeds, for each candidate that has it."""
+        found: dict[str, list[float]] = {}
+        for row in self.rows:
+            if row["kind"] == kind and (value := row.get(label, {}).get(field)) is not None:
+                found.setdefault(row["candidate"], []).append(value)
+        return {name: float(np.mean(values)) for name, values in found.items()}
+
+    def regret(self, rule: Rule) -> float:
+        """Return the regret of a rule."""
+        return max(self.scores.values()) - self.scores[rule(self)]
 
 
-def rules() -> dict[str, Callable[[list[Row]], str]]:
-    """Return the rules: functions that choose a candidate by the rows of a log."""
+Rule = Callable[[Log], str]
 
-    def highest(value: Callable[[Row], float | None]) -> Callable[[list[Row]], str]:
-        def choose(rows: list[Row]) -> str:
-            values = means(rows, value)
-            return max(values, key=values.__getitem__)
 
-        return choose
+def largest(values: dict[str, float]) -> str:
+    """Return the name with the largest value."""
+    return max(values, key=values.__getitem__)
 
-    def always(name: str) -> Callable[[list[Row]], str]:
-        return lambda rows: name
+
+def auto(log: Log, threshold: float = DETERMINISTIC, survivors: int | None = None) -> str:
+    """Return the choice of `auto`: pessimistic FQE, or agreement below an entropy."""
+    field = "agreement" if log.entropy < threshold else "first_value"
+    values = log.means("pessimistic", field)
+    if survivors is not None:
+        short = log.means("pessimistic", field, "short")
+        kept = sorted(short, key=short.__getitem__)[-survivors:]
+        values = {name: values[name] for name in kept}
+    return largest(values)
+
+
+def rules(candidates: Iterable[str]) -> dict[str, Rule]:
+    """Return the rules: functions that choose a candidate on a log."""
+
+    def highest(label: str, field: str) -> Rule:
+        return lambda log: largest(log.means(label, field))
+
+    def always(name: str) -> Rule:
+        return lambda log: name
 
     return {
-        **{f"always {name}": always(name) for name in CANDIDATES},
-        "largest own Q": highest(lambda row: row["plain"]["own_value"]),
-        "smallest Bellman error": highest(
-            lambda row: (error := row["plain"]["bellman_error"]) and -error
+        **{f"always {name}": always(name) for name in candidates},
+        "largest own Q": highest("pessimistic", "own_value"),
+        "smallest Bellman error": lambda log: largest(
+            {name: -error for name, error in log.means("pessimistic", "bellman_error").items()}
         ),
-        "FQE, first states": highest(lambda row: row["plain"]["first_value"]),
-        "FQE, all states": highest(lambda row: row["plain"]["mean_value"]),
-        "pessimistic FQE, first states": highest(lambda row: row["pessimistic"]["first_value"]),
-        "pessimistic FQE, all states": highest(lambda row: row["pessimistic"]["mean_value"]),
+        "FQE, first states": highest("plain", "first_value"),
+        "FQE, all states": highest("plain", "mean_value"),
+        "pessimistic FQE, first states": highest("pessimistic", "first_value"),
+        "pessimistic FQE, all states": highest("pessimistic", "mean_value"),
+        "agreement with the behavior": highest("pessimistic", "agreement"),
+        **{f"auto, entropy below {t}": partial(auto, threshold=t) for t in (0.02, 0.05, 0.1, 0.2)},
+        "auto, 3 survivors": partial(auto, survivors=3),
+        "auto, 4 survivors": partial(auto, survivors=4),
     }
+
+
+def read_logs(folder: Path) -> list[Log]:
+    """Return all logs with evidence. Candidates without evidence on each log are left out."""
+    found = []
+    for path in sorted(folder.glob("*/evidence-*.json")):
+        name, sim = path.stem.removeprefix("evidence-"), path.parent.name
+        data = mcaprl.open(path.with_name(f"{name}.mcap"))
+        assert isinstance(data.action_space, Discrete)
+        nats = -np.log(data.behavior_probs.astype(np.float64)).mean()
+        scores = json.loads(path.with_name(f"scores-{name}.json").read_text())
+        means = {candidate: float(np.mean(values)) for candidate, values in scores.items()}
+        rows = json.loads(path.read_text())
+        found.append(Log(sim, name, float(nats / np.log(data.action_space.n)), means, rows))
+    common = set.intersection(*({row["candidate"] for row in log.rows} for log in found))
+    return [
+        replace(
+            log,
+            scores={name: log.scores[name] for name in CANDIDATES if name in common},
+            rows=[row for row in log.rows if row["candidate"] in common],
+        )
+        for log in found
+    ]
 
 
 def show(folder: Path) -> None:
     """Print the regret of each rule over all finished logs."""
-    logs = [json.loads(path.read_text()) for path in sorted(folder.glob("*/selection-*.json"))]
-    print(f"{len(logs)} logs")
-    for rule, choose in rules().items():
-        regrets = []
-        for rows in logs:
-            scores = means(rows, lambda row: row["score"])
-            regrets.append(max(scores.values()) - scores[choose(rows)])
-        print(f"| {rule} | {np.mean(regrets):.3f} | {np.max(regrets):.2f} |")
+    logs = read_logs(folder)
+    names = [f"{log.sim} {log.name}" for log in logs]
+    print(f"{len(logs)} logs: {', '.join(names)}; candidates: {', '.join(logs[0].scores)}")
+    table = rules(logs[0].scores)
+    regrets = {name: np.array([log.regret(rule) for log in logs]) for name, rule in table.items()}
+    fair = np.zeros(len(logs))
+    for sim in {log.sim for log in logs}:
+        mine = np.array([log.sim == sim for log in logs])
+        if not mine.all():
+            best = min(regrets, key=lambda name: regrets[name][~mine].mean())
+            fair[mine] = regrets[best][mine]
+            print(f"the best rule on the other sims than {sim}: {best}")
+    random = np.random.default_rng(0)
+    for name, each in {**regrets, "the best rule on other sims": fair}.items():
+        draws = random.choice(each, (1_000, len(each))).mean(1)
+        low, high = np.percentile(draws, [2.5, 97.5])
+        single = " ".join(f"{regret:.2f}" for regret in each)
+        print(
+            f"| {name} | {each.mean():.3f} ({low:.2f} to {high:.2f}) | {each.max():.2f} | {single}"
+        )
 
 
 def main() -> None:
@@ -168,7 +248,7 @@ def main() -> None:
     parser.add_argument("--sims", default=",".join(SETTINGS))
     parser.add_argument("--data", default=",".join(ORDER))
     parser.add_argument("--algos", default=";".join(CANDIDATES))
-    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--seeds", type=int, default=2)
     given = parser.parse_args()
     torch.set_num_threads(1)
     for name in given.data.split(","):

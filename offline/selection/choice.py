@@ -11,7 +11,7 @@ from mcaprl.errors import TrainingError
 from mcaprl.files import parse_json, write_json
 from mcaprl.offline.estimate.off_policy import LEAST_SAMPLE_SIZE
 from mcaprl.offline.selection.portfolio import LogTraits
-from mcaprl.offline.selection.rule import CONFIDENCE, Rating, ranked
+from mcaprl.offline.selection.rule import Rating
 from mcaprl.page import Section, Table, write_page
 from mcaprl.texts import counted
 
@@ -21,16 +21,16 @@ COLUMNS: Final = (
     "updates",
     "estimate (95 % interval)",
     "best",
-    "likely actions",
+    "as logged",
     "Bellman error",
     "WPDIS",
     "outcome",
 )
 EXPLANATION: Final = (
     "Estimates are discounted returns from the first states of the logged episodes, by pessimistic"
-    " FQE. best: fraction of the resamplings in which the candidate has the largest estimate of the"
-    " candidates that were evaluated with it. likely actions: fraction of the states in which its"
-    " action is likely in the log. WPDIS: estimate by weighted importance sampling, or the"
+    " FQE. best: fraction of the resamplings in which the candidate is the best of those that were"
+    " evaluated with it. as logged: fraction of the states in which it takes the logged action."
+    " WPDIS: estimate by weighted importance sampling, or the"
     " effective number of episodes if there are too few."
 )
 _FEW_EPISODES: Final = 50
@@ -166,20 +166,18 @@ def read_choice(run: Path) -> Choice:
         raise TrainingError(f"{path} cannot be read: {error}") from error
 
 
-def reason_of(chosen: str, ratings: Mapping[str, Rating], default: str) -> str:
+def reason_of(chosen: str, ratings: Mapping[str, Rating], traits: LogTraits) -> str:
     """Return why the rule chose a candidate, in words."""
     if chosen not in ratings:
         return f"{chosen} is used because the budget ended before any candidate was evaluated."
-    mine, first = ratings[chosen], ranked(ratings)[0]
-    value = _with_interval(mine)
-    if chosen == first:
-        count = counted(len(ratings), "candidate")
-        return f"{chosen} has the largest estimated value of {count}: {value}."
-    return (
-        f"{chosen} is the default, with an estimated value of {value}. {first} has a larger"
-        f" estimate, {ratings[first].value:.4g}, but the chance that it is better is"
-        f" {ratings[first].over_default:.0%}, less than the required {CONFIDENCE:.0%}."
-    )
+    mine, count = ratings[chosen], counted(len(ratings), "candidate")
+    if traits.is_deterministic:
+        return (
+            f"{chosen} takes the logged action in {mine.agreement:.0%} of the states, most often of"
+            f" {count}. The behavior is almost deterministic (entropy {traits.entropy:.2f} of 1),"
+            " so the log has no evidence that other actions are better."
+        )
+    return f"{chosen} has the largest estimated value of {count}: {_with_interval(mine)}."
 
 
 def sureness_of(chosen: str, ratings: Mapping[str, Rating]) -> str:
@@ -189,7 +187,7 @@ def sureness_of(chosen: str, ratings: Mapping[str, Rating]) -> str:
     chance = ratings[chosen].best_chance
     return (
         f"In {chance:.0%} of the resamplings of episodes, networks and models, {chosen}"
-        f" has the largest estimate of {len(ratings)} candidates. This does not include the bias"
+        f" is the best of {counted(len(ratings), 'candidate')}. This does not include the bias"
         " of the models, which a log does not show."
     )
 
@@ -223,7 +221,7 @@ def _row(name: str, one: Tried) -> tuple[str, ...]:
         str(one.updates),
         _with_interval(rating) if rating else _NO_VALUE,
         f"{rating.best_chance:.0%}" if rating else _NO_VALUE,
-        _NO_VALUE if one.support is None else f"{one.support:.0%}",
+        f"{rating.agreement:.0%}" if rating else _NO_VALUE,
         _NO_VALUE if one.bellman_error is None else f"{one.bellman_error:.2f}",
         _weighted(one.weighted),
         one.outcome,

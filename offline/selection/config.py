@@ -17,7 +17,7 @@ class AutoConfig(BootstrapConfig):
 
     target_interval: int = 150
     """updates between two updates of the target network"""
-    survivors: int = 3
+    survivors: int = 4
     """number of candidates that are trained with all updates"""
     short_fraction: float = 0.25
     """fraction of the updates after which the candidates are first compared"""

@@ -19,6 +19,8 @@ from mcaprl.recorder.format.probability import is_impossible
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
+DETERMINISTIC: Final = 0.05
+"""Entropy of the behavior below which candidates are compared by their agreement with it."""
 LEAST_COVERAGE: Final = 0.5
 """Fraction of actions; more must be likely under the behavior for Double DQN to be tried."""
 _IQL_INTERVAL: Final = 50
@@ -35,7 +37,8 @@ class LogTraits:
         mean_return: Mean undiscounted return of the episodes.
         return_spread: Standard deviation of these returns.
         terminated: Fraction of the episodes that end in a terminal state.
-        entropy: Mean entropy of the behavior, from 0 (deterministic) to 1 (uniform).
+        entropy: Mean entropy of the behavior, from 0 (deterministic) to 1 (uniform): from logged
+            probabilities if all are valid, otherwise from those of the clone.
         coverage: Mean fraction of the actions that are likely under the behavior.
         probabilities: Whether the log has the probabilities of its actions.
         problems: Problems that the lint found.
@@ -51,6 +54,11 @@ class LogTraits:
     probabilities: bool
     problems: tuple[str, ...]
 
+    @property
+    def is_deterministic(self) -> bool:
+        """Whether the behavior is almost deterministic."""
+        return self.entropy < DETERMINISTIC
+
     def to_json(self) -> dict[str, Any]:
         """Return the attributes as plain JSON types."""
         return {**asdict(self), "problems": list(self.problems)}
@@ -59,9 +67,10 @@ class LogTraits:
 def traits_of(dataset: Dataset, clone: Clone) -> LogTraits:
     """Return the properties of a log, with the behavior as a clone imitates it."""
     chances = by_rows(clone.action_probabilities, dataset.observations).astype(np.float64)
+    behavior = dataset.behavior_probs.astype(np.float64)
+    known = not bool((np.isnan(behavior) | is_impossible(behavior)).any())
     logs = np.log(np.where(chances > 0, chances, 1.0))
-    most = np.log(max(chances.shape[1], 2))
-    behavior = dataset.behavior_probs
+    nats = -np.log(behavior).mean() if known else -(chances * logs).sum(1).mean()
     returns = dataset.statistics.returns
     return LogTraits(
         episodes=len(dataset.episodes),
@@ -69,9 +78,9 @@ def traits_of(dataset: Dataset, clone: Clone) -> LogTraits:
         mean_return=float(returns.mean()),
         return_spread=float(returns.std()),
         terminated=float(dataset.terminated.sum() / len(dataset.episodes)),
-        entropy=float(-(chances * logs).sum(1).mean() / most),
+        entropy=float(nats / np.log(max(chances.shape[1], 2))),
         coverage=float(likely(chances).mean()),
-        probabilities=not bool((np.isnan(behavior) | is_impossible(behavior)).any()),
+        probabilities=known,
         problems=tuple(one.what for one in lint(dataset) if one.severity == "problem"),
     )
 
@@ -105,10 +114,8 @@ class Candidate:
         return replace(defaults, **{**given, "checkpoint_interval": interval, **self.special})
 
 
-DEFAULT: Final = Candidate("bcq", "bcq", {})
-"""Candidate that is chosen unless the log shows that another one is better."""
 PORTFOLIO: Final = (
-    DEFAULT,
+    Candidate("bcq", "bcq", {}),
     Candidate("cql", "cql", {}),
     Candidate("bc", "bc", {}),
     Candidate("cql-alpha-0.1", "cql", {"alpha": 0.1}),
@@ -116,7 +123,7 @@ PORTFOLIO: Final = (
     Candidate("iql", "iql", {"normalize_advantages": True, "beta": 0.3}),
     Candidate("double-dqn", "double-dqn", {}),
 )
-"""All candidates, in the order in which they are trained."""
+"""All candidates, in the order of their training; the first is used if none can be evaluated."""
 
 
 def candidates_for(traits: LogTraits) -> dict[str, str]:

@@ -45,14 +45,13 @@ from mcaprl.offline.selection.choice import (
 )
 from mcaprl.offline.selection.config import AUTO, AutoConfig
 from mcaprl.offline.selection.portfolio import (
-    DEFAULT,
     Candidate,
     LogTraits,
     candidates_for,
     traits_of,
     tried,
 )
-from mcaprl.offline.selection.rule import Rating, choose, ranked, rate, survivors
+from mcaprl.offline.selection.rule import Rating, ranked, rate
 from mcaprl.offline.training.metrics import OfflineSummary
 from mcaprl.offline.training.train import fingerprint, train
 from mcaprl.progress import ProgressCallback, TrainingProgress
@@ -225,16 +224,28 @@ class _Race:
         if not names:
             raise TrainingError(_NO_TIME.format(trying[0].name))
         first = stages.get("short") or self._evaluate(
-            "short", names, clone, _SHORT_MODEL_FRACTION, SHARES[1]
+            "short",
+            names,
+            clone,
+            imitate=traits.is_deterministic,
+            fraction=_SHORT_MODEL_FRACTION,
+            share=SHARES[1],
         )
         going = names
         if first:
-            going = survivors(first.ratings, DEFAULT.name, self._config.survivors)
-            self._publish(choose(first.ratings, DEFAULT.name))
+            going = ranked(first.ratings)[: self._config.survivors]
+            self._publish(going[0])
         for k, name in enumerate(going):
             candidate = next(one for one in trying if one.name == name)
             self._train(candidate, full, self._clock.left_s(SHARES[2]) / (len(going) - k), bar)
-        second = stages.get("full") or self._evaluate("full", going, clone, 1.0, SHARES[3])
+        second = stages.get("full") or self._evaluate(
+            "full",
+            going,
+            clone,
+            imitate=traits.is_deterministic,
+            fraction=1.0,
+            share=SHARES[3],
+        )
         choice = self._choose(traits, skipped, first, second, names)
         self._publish(choice.chosen)
         choice.write(self._out)
@@ -300,8 +311,21 @@ class _Race:
                 progress=progress,
             )
 
+    def _agreements(self, evidence: Evidence) -> NDArray[np.float64]:
+        """Return the fraction of the states of each episode (E,) with the logged action."""
+        lengths = self._dataset.episode_lengths
+        agrees = evidence.agrees.astype(np.float64)
+        return np.add.reduceat(agrees, np.cumsum(lengths) - lengths) / lengths
+
     def _evaluate(
-        self, kind: str, names: Sequence[str], clone: Policy, fraction: float, share: float
+        self,
+        kind: str,
+        names: Sequence[str],
+        clone: Policy,
+        *,
+        imitate: bool,
+        fraction: float,
+        share: float,
     ) -> Stage | None:
         """Evaluate candidates; return None if there is no time for it."""
         policies = [(name, policy) for name in names for policy in self._policies(name)]
@@ -312,20 +336,21 @@ class _Race:
         if updates < min(_LEAST_MODEL_UPDATES, self._config.model_updates * fraction):
             self._in_time = False
             return None
-        values: dict[str, list[NDArray[np.float64]]] = {name: [] for name in names}
         evidence: dict[str, list[Evidence]] = {name: [] for name in names}
         try:
             for member in range(ENSEMBLE):
                 found = self._collect(clone, policies, updates, member, ends)
                 for (name, _), one in zip(policies, found, strict=True):
-                    values[name].append(one.first_values)
                     evidence[name].append(one)
         except _Pause:
             self._in_time = False
-            if not all(values.values()):
+            if not all(evidence.values()):
                 return None
-        tables = {name: np.stack(of_members) for name, of_members in values.items()}
-        ratings = rate(tables, DEFAULT.name)
+        values, agreements = (
+            {name: np.stack([table(one) for one in of_it]) for name, of_it in evidence.items()}
+            for table in (lambda one: one.first_values, self._agreements)
+        )
+        ratings = rate(values, agreements, imitate=imitate)
         stage = Stage(
             {name: self._tried(name, ratings[name], evidence[name]) for name in names},
         )
@@ -391,8 +416,8 @@ class _Race:
         """Return the choice by the last evaluation that there is."""
         last = second or first
         ratings = last.ratings if last else {}
-        chosen = choose(ratings, DEFAULT.name) if ratings else names[0]
         order = ranked(ratings)
+        chosen = order[0] if order else names[0]
         rest = [name for name in ranked(first.ratings) if name not in order] if first else []
         known = {name: Tried(self._updates(name), outcome="not evaluated") for name in names}
         for stage, outcome in ((first, "stopped early"), (second, "")):
@@ -406,7 +431,7 @@ class _Race:
         table |= {name: Tried(outcome=f"not tried: {why}") for name, why in skipped.items()}
         return Choice(
             chosen,
-            reason_of(chosen, ratings, DEFAULT.name),
+            reason_of(chosen, ratings, traits),
             sureness_of(chosen, ratings),
             advice_for(traits, table, self._in_time),
             self._in_time,

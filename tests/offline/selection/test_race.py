@@ -96,15 +96,19 @@ def test_the_traits_are_those_of_the_log(data: Dataset, finished: Path) -> None:
     assert traits.terminated == 1
     assert traits.probabilities
     assert traits.coverage == 1
-    # The behavior's entropy is .97 bits in state 0 and 1 in state 1.
-    assert traits.entropy == pytest.approx(0.985, abs=0.06)
+    expected = -np.log2(data.behavior_probs).mean()
+    assert traits.entropy == pytest.approx(expected)
+    assert not traits.is_deterministic
 
 
 def test_actions_that_are_rare_in_the_log_exclude_double_dqn(tmp_path: Path) -> None:
     data = log(60, acting=np.array([[1.0, 0.0], [1.0, 0.0]]))
     choice, _ = select(data, replace(CONFIG, learning_rate=0.05), tmp_path / "run")
     assert choice.traits.coverage == 0.5
-    assert choice.traits.entropy < 0.2
+    assert choice.traits.is_deterministic
+    assert "almost deterministic" in choice.reason
+    ratings = [one.rating for one in choice.tried.values() if one.rating]
+    assert ratings[0].agreement == ratings[0].score == 1
     assert "double-dqn" not in updates(tmp_path / "run")
     assert choice.tried["double-dqn"].outcome.startswith("not tried: only 50% of the actions")
 
