@@ -33,10 +33,17 @@ class AutoConfig(BootstrapConfig):
 
     @property
     def short_updates(self) -> int:
-        """Number of updates after which the candidates are first compared.
+        """Number of updates after which the candidates are first compared."""
+        return self.candidate_interval * max(
+            1, round(self.updates * self.short_fraction / self.candidate_interval)
+        )
 
-        If it is above `checkpoint_interval`, it is a multiple of it.
+    @property
+    def candidate_interval(self) -> int:
+        """Number of updates between checkpoints of a candidate.
+
+        It is at most a quarter of the short training, so that a candidate whose time is over has a
+        policy.
         """
-        count = max(1, round(self.updates * self.short_fraction))
-        interval = self.checkpoint_interval
-        return count if count <= interval else round(count / interval) * interval
+        quarter = round(self.updates * self.short_fraction / 4)
+        return max(1, min(self.checkpoint_interval, quarter))

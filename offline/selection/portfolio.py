@@ -110,8 +110,8 @@ class Candidate:
         }
         if self.algo == "iql":
             given["target_interval"] = min(_IQL_INTERVAL, shared.target_interval)
-        interval = min(shared.checkpoint_interval, shared.short_updates)
-        return replace(defaults, **{**given, "checkpoint_interval": interval, **self.special})
+        given["checkpoint_interval"] = shared.candidate_interval
+        return replace(defaults, **{**given, **self.special})
 
 
 PORTFOLIO: Final = (

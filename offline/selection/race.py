@@ -428,6 +428,11 @@ class _Race:
             known[name] = replace(known[name], outcome=outcome)
         shown = dict.fromkeys([chosen, *runners, *order, *rest, *names])
         table = {name: known[name] for name in shown}
+        table |= {
+            one.name: Tried(outcome="no checkpoint within the budget")
+            for one in tried(skipped)
+            if one.name not in table
+        }
         table |= {name: Tried(outcome=f"not tried: {why}") for name, why in skipped.items()}
         return Choice(
             chosen,

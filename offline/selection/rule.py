@@ -63,7 +63,7 @@ def rate(
     Args:
         values: Value of each episode's first state, for each of M networks and models (M, E), by
             candidate.
-        agreements: Fraction of each episode's states with the logged action, likewise.
+        agreements: Fraction of each episode's states with the logged action, in the same form.
         imitate: Whether the score is the agreement instead of the value.
         seed: Seed of the resampling.
     """

@@ -167,7 +167,17 @@ def test_a_budget_ends_the_run_with_a_policy(data: Dataset, tmp_path: Path) -> N
     assert not choice.complete
     assert "--budget-minutes" in choice.advice[0]
     assert 0 < max(updates(run).values()) < 100_000
+    assert set(choice.tried) == {candidate.name for candidate in PORTFOLIO}
     assert mcaprl.load_policy(run).act(np.eye(2, dtype=np.float32)).shape == (2,)
+
+
+def test_checkpoints_meet_the_end_of_the_short_training() -> None:
+    assert (CONFIG.candidate_interval, CONFIG.short_updates) == (2, 10)
+    usual = AutoConfig()
+    assert (usual.candidate_interval, usual.short_updates) == (500, 2_000)
+    often = AutoConfig(updates=999, checkpoint_interval=7)
+    assert (often.candidate_interval, often.short_updates) == (7, 252)
+    assert AutoConfig(updates=1).short_updates == 1
 
 
 def test_a_budget_without_time_for_a_checkpoint_is_one_line(data: Dataset, tmp_path: Path) -> None:
