@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 STAGES_NAME: Final = "stages.json"
 ENSEMBLE: Final = 2
 """Models of each kind that evaluate a policy; each has its own halves of the log and weights."""
-SHARES: Final = (0.35, 0.5, 0.85, 1.0)
+SHARES: Final = (0.35, 0.5, 0.8, 0.95)
 """Fractions of the budget after which the short training, its evaluation, the full training and its
 evaluation end."""
 CLONE_UPDATES: Final = 2_000
