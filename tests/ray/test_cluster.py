@@ -148,6 +148,11 @@ def test_without_ray_the_option_names_the_install_command(
         mcaprl.evaluate("random", SEEDED, episodes=1, ray=True)
     with pytest.raises(MissingExtraError):
         mcaprl.ray.read(tmp_path)
+    pytest.importorskip("torch")
+    with pytest.raises(MissingExtraError):
+        mcaprl.train("none.mcap", tmp_path / "run", ray=True)
+    with pytest.raises(MissingExtraError):
+        mcaprl.sweep("none.mcap", tmp_path / "run", {"algos": ["bc"]})
     assert list(tmp_path.iterdir()) == []
 
 
