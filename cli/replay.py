@@ -42,7 +42,9 @@ if TYPE_CHECKING:
     "--save", type=click.Path(path_type=Path), help="Page of one episode to write, .html."
 )
 @click.option("--verify", "verifies", is_flag=True, help="Compare each step with the sim.")
-@click.option("--video", type=click.Path(path_type=Path), help="Video to write, .mp4 or .gif.")
+@click.option(
+    "--video", type=click.Path(path_type=Path), help="Video to write, .mp4, .gif or .webp."
+)
 @click.option("--contact-sheet", type=click.Path(path_type=Path), help="PNG image to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing page, video or image.")
 @click.option("--sim", type=Name(sims), help="Sim to step instead of the logged one.")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+import textwrap
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 import click
 
@@ -13,6 +15,7 @@ from mcaprl.problem import Problem
 from mcaprl.texts import printable
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from mcaprl.api.replay import LiveAddress
@@ -21,8 +24,21 @@ _PIPE_WIDTH = 120
 
 
 def echo(text: object, *, err: bool = False) -> None:
-    """Print a line to stdout or stderr, with control characters escaped."""
-    click.echo(printable(text).replace("\n", r"\n"), err=err)
+    """Print a line to stdout or stderr, with control characters escaped.
+
+    In a terminal, a long line is wrapped between words.
+    """
+    line = printable(text).replace("\n", r"\n")
+    if _is_terminal(sys.stderr if err else sys.stdout):
+        line = "\n".join(_wrapped(line, shutil.get_terminal_size().columns)) or line
+    click.echo(line, err=err)
+
+
+def _wrapped(line: str, width: int) -> list[str]:
+    """Return the lines of a text; words are never broken, and later lines are indented."""
+    return textwrap.wrap(
+        line, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
+    )
 
 
 def print_json(value: Any) -> None:
@@ -48,10 +64,34 @@ def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     """Print a table to stdout: the first column left-aligned, the others right-aligned."""
     from rich.table import Table
 
+    console = _console()
+    cells = list(zip(columns, *rows, strict=True))
     table = Table()
-    for index, column in enumerate(columns):
-        table.add_column(column, justify="left" if index == 0 else "right", overflow="fold")
-    _print(table, title, rows)
+    widths = _widths(cells, console.width - 3 * len(columns) - 1)
+    for index, (column, width) in enumerate(zip(columns, widths, strict=True)):
+        justify: Literal["left", "right"] = "left" if index == 0 else "right"
+        table.add_column(column, justify=justify, overflow="fold", width=width)
+    _print(console, table, title, rows)
+
+
+def _widths(columns: Iterable[Sequence[str]], available: int) -> Sequence[int | None]:
+    """Return the width of each column of texts, such that no word is broken.
+
+    The columns that need the least space beyond their longest word receive it first. If the words
+    do not fit, the widths are None, and rich breaks words.
+    """
+    from rich.cells import cell_len
+
+    texts = [[printable(text) for text in column] for column in columns]
+    widths = [max(cell_len(word) for text in one for word in text.split() or [""]) for one in texts]
+    needs = [max(map(cell_len, one)) - width for one, width in zip(texts, widths, strict=True)]
+    free = available - sum(widths)
+    if free < 0:
+        return [None] * len(widths)
+    for need, index in sorted((need, index) for index, need in enumerate(needs)):
+        widths[index] += min(need, free)
+        free -= min(need, free)
+    return widths
 
 
 def print_facts(title: str, facts: list[tuple[str, str]]) -> None:
@@ -61,16 +101,25 @@ def print_facts(title: str, facts: list[tuple[str, str]]) -> None:
     table = Table(show_header=False)
     table.add_column(style="dim")
     table.add_column(overflow="fold")
-    _print(table, title, facts)
+    _print(_console(), table, title, facts)
 
 
-def _print(table: Table, title: str, rows: Iterable[Iterable[str]]) -> None:
-    from rich.console import Console
+def _print(console: Console, table: Table, title: str, rows: Iterable[Iterable[str]]) -> None:
     from rich.text import Text
 
     table.title, table.title_style, table.title_justify = Text(printable(title)), "bold", "left"
     for row in rows:
         table.add_row(*(Text(printable(cell)) for cell in row))
+    console.print(table)
+
+
+def _console() -> Console:
+    from rich.console import Console
+
     # A file or a pipe has no width, and rich's default of 80 would break lines.
-    is_terminal = sys.stdout is not None and sys.stdout.isatty()
-    Console(width=None if is_terminal else _PIPE_WIDTH).print(table)
+    return Console(width=None if _is_terminal(sys.stdout) else _PIPE_WIDTH)
+
+
+def _is_terminal(stream: TextIO | None) -> bool:
+    """Return whether the stream is a terminal; programs without a console have no streams."""
+    return stream is not None and stream.isatty()

@@ -22,8 +22,10 @@ ProgressBar = Callable[[str, int | None], AbstractContextManager[Advance]]
 shows a progress bar, and yields an `Advance`."""
 FIRST_LINE_S: Final = 5.0
 """Time until the first line of progress if stderr is not a terminal."""
-LINE_INTERVAL_S: Final = 30.0
-"""Time between two lines of progress if stderr is not a terminal."""
+LINE_INTERVAL_S: Final = 10.0
+"""Shortest time between two lines of progress if stderr is not a terminal."""
+LINE_INTERVAL_SHARE: Final = 0.1
+"""Shortest time between two such lines as a share of the elapsed time."""
 
 
 @contextmanager
@@ -92,20 +94,38 @@ class _ProgressLines:
 
     def __init__(self, description: str, total: int | None) -> None:
         self._description, self._total = description, total
-        self._began = time.monotonic()
-        self._next_s, self._done = FIRST_LINE_S, 0
+        self._lines, self._done = _LineTimes(), 0
 
     def advance(self, amount: int) -> None:
         self._done += amount
-        elapsed_s = time.monotonic() - self._began
-        if elapsed_s < self._next_s:
+        if not self._lines.is_due():
             return
-        self._next_s = elapsed_s + LINE_INTERVAL_S
         text = f"{self._description}: {self._done}"
         if self._total is not None:
-            left_s = elapsed_s * (self._total / max(self._done, 1) - 1)
-            text += f" of {self._total}, about {max(left_s, 0):.0f} s left"
+            left_s = _time_left(self._lines.elapsed_s, self._done, self._total)
+            text += f" of {self._total}, about {left_s:.0f} s left"
         print(text, file=sys.stderr, flush=True)
+
+
+class _LineTimes:
+    """Times at which lines of progress are printed: at first often, later less so."""
+
+    def __init__(self) -> None:
+        self._began = time.monotonic()
+        self._next_s = FIRST_LINE_S
+        self.elapsed_s = 0.0
+
+    def is_due(self) -> bool:
+        """Return whether to print a line now."""
+        self.elapsed_s = time.monotonic() - self._began
+        if self.elapsed_s < self._next_s:
+            return False
+        self._next_s = self.elapsed_s + max(LINE_INTERVAL_S, LINE_INTERVAL_SHARE * self.elapsed_s)
+        return True
+
+
+def _time_left(elapsed_s: float, done: int, total: int) -> float:
+    return max(elapsed_s * (total / max(done, 1) - 1), 0.0)
 
 
 @dataclass(frozen=True)
@@ -133,12 +153,14 @@ ProgressCallback = Callable[[TrainingProgress], None]
 def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
     """Show a progress bar for each seed on a terminal: rate, one term and remaining time.
 
+    If stderr is not a terminal, print a line about one seed at long intervals.
+
     Args:
         unit: Unit of the total, such as `updates`.
         term: Name of the term that is shown, such as `loss`.
     """
     if not _stderr_is_terminal():
-        yield lambda _: None
+        yield _training_lines(unit, term)
         return
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
@@ -167,3 +189,24 @@ def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
             bars.update(bar, completed=now.done, rate=rate, shown=value)
 
         yield show
+
+
+def _training_lines(unit: str, term: str) -> ProgressCallback:
+    """Return a callback that prints lines to stderr."""
+    lines = _LineTimes()
+    # Time and progress at the first report of each seed.
+    started: dict[int, tuple[float, int]] = {}
+
+    def show(now: TrainingProgress) -> None:
+        began, first = started.setdefault(now.seed, (time.monotonic(), now.done))
+        if not lines.is_due():
+            return
+        text = f"seed {now.seed}: {now.done} of {now.total} {unit}"
+        if term in now.terms:
+            text += f", {term} {now.terms[term]:.4g}"
+        if now.done > first:
+            left_s = _time_left(time.monotonic() - began, now.done - first, now.total - first)
+            text += f", about {left_s:.0f} s left"
+        print(text, file=sys.stderr, flush=True)
+
+    return show

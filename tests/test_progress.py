@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from mcaprl.progress import terminal_bar
+from mcaprl.progress import TrainingProgress, terminal_bar, terminal_progress
 
 
 class Clock:
@@ -30,7 +30,10 @@ def test_long_work_prints_lines_at_intervals(
     lines = capsys.readouterr().err.splitlines()
     assert lines == [
         "fitting: 50 of 1000, about 95 s left",
+        "fitting: 150 of 1000, about 85 s left",
+        "fitting: 250 of 1000, about 75 s left",
         "fitting: 350 of 1000, about 65 s left",
+        "fitting: 450 of 1000, about 55 s left",
     ]
 
 
@@ -43,6 +46,36 @@ def test_work_without_a_total_prints_what_is_done(
         clock.now_s += 6
         advance(3)
     assert capsys.readouterr().err == "reading: 3\n"
+
+
+def test_lines_become_rare(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr(time, "monotonic", clock.monotonic)
+    with terminal_bar("reading", None) as advance:
+        for _ in range(10_000):
+            clock.now_s += 1
+            advance(1)
+    times_s = [int(line.split()[1]) for line in capsys.readouterr().err.splitlines()]
+    assert times_s[:4] == [5, 15, 25, 35]
+    assert times_s[-1] - times_s[-2] > 500
+
+
+def test_training_prints_lines_about_a_seed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr(time, "monotonic", clock.monotonic)
+    with terminal_progress("updates", "loss") as report:
+        for done in range(100, 1_001, 100):
+            clock.now_s += 2
+            for seed in (0, 1):
+                report(TrainingProgress(seed, done, 1_000, {"loss": 1 / done}))
+    assert capsys.readouterr().err.splitlines() == [
+        "seed 0: 300 of 1000 updates, loss 0.003333, about 14 s left",
+        "seed 0: 800 of 1000 updates, loss 0.00125, about 4 s left",
+    ]
 
 
 def test_short_work_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:

@@ -200,7 +200,7 @@ def render(
         file: Path of the log.
         episode: Index of the episode.
         speed: Simulated seconds per second of the video.
-        video: Video to write: .mp4 or .gif.
+        video: Video to write: .mp4, .gif or .webp.
         contact_sheet: PNG image to write; it shows evenly spaced steps.
         overwrite: Whether existing files are replaced.
         sim: Short name or Gymnasium id to use instead of the logged one.

@@ -16,11 +16,13 @@ from mcaprl.files import replacing
 
 Image = NDArray[np.uint8]
 
-VIDEO_KINDS = (".mp4", ".gif")
+VIDEO_KINDS = (".mp4", ".gif", ".webp")
 MAX_FPS: Final = 50.0
 """Largest frame rate that GIF viewers support; it is close to the frame rate of screens."""
 SMOOTH_FPS: Final = 20.0
 """Frame rate from which motion looks continuous."""
+# WebP with Pillow's default quality of 80 is nearly twice as large.
+_LOOP_OPTIONS: Final[dict[str, dict[str, int]]] = {".gif": {}, ".webp": {"quality": 60}}
 _COLUMNS = 3
 _GAP_PX = 6
 
@@ -48,10 +50,10 @@ def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
 
 
 def write_video(path: Path, images: Iterable[Image], fps: float) -> int:
-    """Write a video frame by frame: an H.264 encoded `.mp4`, or a `.gif` that loops.
+    """Write a video frame by frame: an H.264 encoded `.mp4`, or a `.gif` or `.webp` that loops.
 
     Args:
-        path: Path of the video, `.mp4` or `.gif`.
+        path: Path of the video, `.mp4`, `.gif` or `.webp`.
         images: (height, width, 3) frames of one size with an even height and width.
         fps: Frames per second.
 
@@ -71,12 +73,12 @@ def write_video(path: Path, images: Iterable[Image], fps: float) -> int:
 
 def _write(path: Path, kind: str, images: Iterable[Image], fps: float) -> int:
     imageio = import_extra("imageio.v3", "video")
-    if kind == ".gif":
+    if kind != ".mp4":
         stills = list(images)
         if stills:
-            milliseconds = round(1000 / fps)
-            options = {"extension": kind, "plugin": "pillow", "loop": 0}
-            imageio.imwrite(path, stills, duration=milliseconds, **options)
+            times = {"duration": round(1000 / fps), "loop": 0}
+            options = {"extension": kind, "plugin": "pillow", **times, **_LOOP_OPTIONS[kind]}
+            imageio.imwrite(path, stills, **options)
         return len(stills)
     count = 0
     # The format is given because the name of the temporary file has no suffix.

@@ -170,14 +170,15 @@ def test_videos_of_a_scene_and_of_a_sim(
     for name, size in (("lane", (HEIGHT, WIDTH)), ("cart", (400, 600))):
         arguments = ["replay", f"{name}.mcap", "--contact-sheet", f"{name}.png"]
         assert run([*arguments, "--video", f"{name}.mp4"]) == 0
-        assert run(["replay", f"{name}.mcap", "--video", f"{name}.gif"]) == 0
-        for kind, plugin in (("mp4", "pyav"), ("gif", "pillow")):
+        for kind in ("gif", "webp"):
+            assert run(["replay", f"{name}.mcap", "--video", f"{name}.{kind}"]) == 0
+        for kind, plugin in (("mp4", "pyav"), ("gif", "pillow"), ("webp", "pillow")):
             video = imageio.imread(f"{name}.{kind}", plugin=plugin)
-            # If an image equals the previous image, a GIF stores only a longer duration of the
-            # previous image.
+            # If an image equals the previous image, a GIF or WebP stores only a longer duration of
+            # the previous image.
             count = 26 if name == "lane" else 6
             assert len(video) == count if kind == "mp4" else 2 <= len(video) <= count
-            assert video.shape[1:] == (*size, 3)
+            assert video.shape[1:3] == size
             assert (video[0] != video[-1]).any()
         assert imageio.imread(f"{name}.png").shape[2] == 3
     capsys.readouterr()
