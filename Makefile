@@ -25,7 +25,12 @@ help:
 	@echo "make clean            remove the environments and everything that was built"
 
 demo: $(VENV)/.demo
-	PATH="$(CURDIR)/$(BIN):$$PATH" sh examples/demo.sh demo
+	@PATH="$(abspath $(BIN)):$$PATH" sh examples/demo.sh demo
+	@printf '%s\n' "To use mcaprl yourself:" \
+	  "  . $(BIN)/activate" \
+	  "  mcaprl info demo/data" \
+	  "  mcaprl replay demo/replay.mcap     # live, in Foxglove" \
+	  "Next: docs/tutorial.md, and docs/howto/environment.md for your environment."
 
 test: $(VENV)/.dev $(VENV)/.lerobot $(VENV)/.s3 $(VENV)/.rivals tests/node/node_modules
 	OMP_NUM_THREADS=1 $(BIN)/pytest
@@ -81,10 +86,14 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --upgrade 'pip>=25.1'
 
+# Modules are compiled when they are imported, which takes less time than compiling all of them.
 $(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
-	@echo "installing into $(VENV)"
-	$(PIP) -e '.[sims,offline,report]'
-	@touch $@
+	@echo "installing into $(VENV): PyTorch, Numba and others, about 1.7 GB"
+	@rm -f $@
+	@{ $(BIN)/python -m pip install --disable-pip-version-check --no-compile -c constraints.txt \
+	  -e '.[sims,offline,report,foxglove]' && touch $@; } \
+	  | sed -n 's/^Collecting \([[:alnum:]_.-]*\).*/  \1/p; s/^Installing collected.*/  .../p'
+	@test -f $@
 
 $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
 	@echo "installing into $(VENV)"

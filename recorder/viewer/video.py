@@ -22,7 +22,7 @@ MAX_FPS: Final = 50.0
 SMOOTH_FPS: Final = 20.0
 """Frame rate from which motion looks continuous."""
 # WebP with Pillow's default quality of 80 is nearly twice as large.
-_LOOP_OPTIONS: Final[dict[str, dict[str, int]]] = {".gif": {}, ".webp": {"quality": 60}}
+_LOOP_OPTIONS: Final[dict[str, dict[str, int]]] = {".gif": {}, ".webp": {"quality": 50}}
 _COLUMNS = 3
 _GAP_PX = 6
 
