@@ -34,7 +34,10 @@ def main(first: Path, second: Path, source: Path) -> None:
 
 
 def contents(path: Path) -> bytes | dict[str, bytes]:
-    """Return the bytes of a wheel, or those of each file in a sdist, whose times differ."""
+    """Return the bytes of a wheel, or those of each file in an sdist.
+
+    Two builds of an sdist differ in the modification times of the files.
+    """
     if path.suffix == ".whl":
         return path.read_bytes()
     with tarfile.open(path) as archive:
@@ -43,7 +46,7 @@ def contents(path: Path) -> bytes | dict[str, bytes]:
 
 
 def modules(source: Path) -> list[Path]:
-    """Return the files that belong into the wheel, with the names that they have there."""
+    """Return the files that belong in the wheel, with their names in the wheel."""
     folder = source / "mcaprl"
     # `mcaprl` has links to the folders of the other packages.
     roots = [folder, *(path for path in folder.iterdir() if path.is_symlink())]

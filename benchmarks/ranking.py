@@ -174,7 +174,7 @@ def regret_at_1(estimated: NDArray[np.floating], true: NDArray[np.floating]) -> 
 
 
 def _ranks(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return ranks (N,) from 0; equal values share their mean."""
+    """Return ranks (N,) from 0. Equal values have the mean of their ranks."""
     below = (values[:, None] > values).sum(1)
     equal = (values[:, None] == values).sum(1)
     ranks: NDArray[np.float64] = below + (equal - 1) / 2

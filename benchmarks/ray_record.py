@@ -54,7 +54,7 @@ def _record(folder: Path, **options: Any) -> None:
 
 
 def _cpu_s() -> float:
-    """Return the CPU time of this process and all below it, also of those that have ended."""
+    """Return the CPU time of this process and its descendants, including those that have ended."""
     total, found = 0, [os.getpid()]
     while found:
         process = Path(f"/proc/{found.pop()}")

@@ -1,4 +1,4 @@
-"""Compute on paper what many transitions take, from rates that are measured here.
+"""Estimate the resources for many transitions from rates that are measured here.
 
     python -m benchmarks.ray_sizing [--transitions 1e9] [--sim lane] [--workers 64]
 
@@ -28,7 +28,7 @@ _EPISODE_BYTES = 56
 
 @dataclass(frozen=True)
 class Rates:
-    """What was measured.
+    """Measured sizes and times.
 
     Attributes:
         episode_steps: Transitions of an episode.

@@ -84,7 +84,7 @@ def score(sim: str, policies: list[Any]) -> list[float]:
 
 @functools.cache
 def _references(sim: str) -> tuple[PolicyScore, PolicyScore]:
-    """Return the scores of the random policy and of the pilot, which are 0 and 1 by definition."""
+    """Evaluate the random policy and the pilot, whose normalized scores are 0 and 1."""
     with closing(make_sim(sim)) as env:
         return run(sim, [None]), run(sim, [make_pilot(env)], env)
 

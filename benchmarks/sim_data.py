@@ -124,7 +124,7 @@ def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
 
 
 def _record(path: Path, sim: str, make_behaviors: list[MakeBehavior]) -> None:
-    """Record whole episodes; each behavior policy makes an equal share of STEPS."""
+    """Record whole episodes. Each behavior policy makes an equal share of STEPS."""
     part = path.with_suffix(".part.mcap")
     with (
         closing(make_sim(sim)) as env,

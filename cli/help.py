@@ -159,7 +159,7 @@ class Command(click.Command):
         title: str,
         options: Iterable[click.Option],
     ) -> None:
-        """Write one group of options; hidden options are omitted."""
+        """Write one group of options without its hidden options."""
         records = [record for option in options if (record := option.get_help_record(ctx))]
         if records:
             with formatter.section(title):

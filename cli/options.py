@@ -39,7 +39,7 @@ def mapping_options(command: F) -> F:
         "--mapping",
         type=click.Path(path_type=Path),
         metavar="FILE",
-        help="Mapping of another robot's bag; see docs/bags.md.",
+        help="Mapping that describes a bag; see docs/bags.md.",
     )(code(command))
 
 

@@ -67,8 +67,8 @@ def replay(
 ) -> int:
     """Play LOG... in Foxglove or in the browser, compare it with the sim, or render an episode.
 
-    Several logs play side by side in Foxglove: all start at the same time, each with its own topic
-    prefix.
+    In Foxglove, several logs play side by side. They start at the same time, and the topics of each
+    log have their own prefix.
     """
     draws = video is not None or contact_sheet is not None
     if verifies + browser + (save is not None or draws) > 1:

@@ -34,7 +34,7 @@ class Encoder:
     edge: int | None = None
 
     def pool(self, image_shape: Sequence[int]) -> int:
-        """Return the average-pooling factor for images (height, width, ...); 1 for no pooling."""
+        """Return the average-pooling factor for images (height, width, ...). 1 means no pooling."""
         return 1 if self.edge is None else max(1, round(min(image_shape[:2]) / self.edge))
 
     def pixels(self, image_shape: Sequence[int]) -> int:
@@ -141,6 +141,10 @@ class NetworkSettings(Settings):
         self._require("channels", fits or not self.channels, allowed)
 
     def architecture_for(self, channels: Iterable[int]) -> Architecture:
-        """Return the architecture for images that have these numbers of channels in one frame."""
+        """Return the architecture of the networks.
+
+        Args:
+            channels: Number of channels of each image observation, without frame stacking.
+        """
         encoder = choose_encoder(self.encoder, self.channels, channels)
         return Architecture(self.hidden, self.channels, self.layer_norm, encoder=encoder)

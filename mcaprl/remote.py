@@ -290,7 +290,7 @@ def _divided(start: int, stop: int) -> list[Range]:
 
 
 def _version_of(facts: dict[str, Any]) -> str:
-    """Return the ETags and times that the server reports for a file; they identify its version."""
+    """Return the ETags and timestamps by which the server identifies the version of a file."""
     names = ("ETag", "etag", "mtime", "LastModified", "last_modified", "created", "generation")
     return " ".join(str(facts[name]) for name in names if facts.get(name) is not None)
 

@@ -176,7 +176,7 @@ def _signals_blocked() -> Iterator[None]:
     if sys.platform == "win32":
         yield
         return
-    # Start the resource tracker first, because it unblocks the signals when it starts.
+    # Start the resource tracker before the signals are blocked, because starting it unblocks them.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
     try:

@@ -177,7 +177,10 @@ class Policy:
         return self._encode(_flatten(observations)).stacked(self.frame_stack)
 
     def _stack_onto_stored(self, now: Observations) -> Observations:
-        """Store observations, and return stacks of the last k; copies of the oldest pad them."""
+        """Store observations, and return stacks of the last k.
+
+        In the first steps of an episode, copies of the oldest observation fill the stack.
+        """
         if self._seen and len(self._seen[-1]) != len(now):
             self.begin()
         self._seen.extend([now] * (1 if self._seen else self.frame_stack))

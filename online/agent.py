@@ -221,7 +221,8 @@ class Agent:
         evaluation.resume(
             done // envs, max((p.mean_return for p in self.points), default=-math.inf)
         )
-        # Environment states cannot be restored; another seed avoids repeating the first episodes.
+        # The states of the environments cannot be restored. The new seed prevents the environments
+        # from repeating the first episodes.
         assert self.model.env is not None
         self.model.env.seed(episode_seed(self._seed, done))
 

@@ -41,7 +41,10 @@ class Scale:
     pilot: float
 
     def score(self, mean_return: float) -> float:
-        """Return the score of a mean return: 0 for random, 1 for the pilot; NaN without a pilot."""
+        """Return the score of a mean return: 0 for random, 1 for the pilot.
+
+        Without a pilot, it is NaN.
+        """
         span = self.pilot - self.random
         return (mean_return - self.random) / span if span else math.nan
 

@@ -62,7 +62,7 @@ class FrameReplayBuffer(BaseBuffer):
         pools: Mapping[str, int] | None = None,
         image_shift: int = 0,
     ) -> None:
-        """Reserve the memory; the operating system allocates it as the buffer fills.
+        """Reserve the memory. The operating system allocates it when the buffer is filled.
 
         Args:
             buffer_size: Number of transitions, summed over all environments.

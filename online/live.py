@@ -152,7 +152,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._begin_episode()
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
-        """Reset all environments; viewers see a new episode of the watched one."""
+        """Reset all environments. If viewers watch one of them, they see its new episode."""
         self._observations, infos = self.env.reset(seed=seed, options=options)
         self._begin_episode()
         return self._observations, infos

@@ -185,7 +185,9 @@ def find_preset(name: str) -> Preset:
 
 
 def settings_for(config_type: type, sim: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tuned settings of a sim; empty for other environments and for classic rules.
+    """Return the tuned settings of a sim.
+
+    The dict is empty for classic rules and for other environments.
 
     Args:
         config_type: Type of the algorithm's settings. For types without `n_steps` or

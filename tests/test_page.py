@@ -65,7 +65,7 @@ def colors_at(page: Path, folder: Path, width: int, *, dark: bool) -> tuple[str,
     """Check that a page fits a width and a color scheme; return its text and SVG colors."""
     probed = page.with_name(f"{page.stem}-{width}-{dark}.html")
     probed.write_text(page.read_text() + PROBE)
-    # Chromium's windows are at least 500 pixels wide; a frame can be narrower.
+    # Chromium's windows are at least 500 pixels wide, but an iframe can be narrower.
     outer = folder / "outer.html"
     outer.write_text(
         f'<iframe id="f" src="{probed.as_uri()}" width="{width}" height="900"></iframe><script>'

@@ -70,7 +70,7 @@ def annotate(
         trust_env: Whether to import the module that the logged id names, and to pass the logged
             arguments to environments other than the sims of `SIMS`.
         overwrite: Whether an existing file is replaced.
-        mapping: Mapping of another robot's bag; see `open`.
+        mapping: Mapping that describes a bag; see `open`.
         trust_code: Whether the mapping may name a Python function.
         progress: Function that opens a progress bar.
 

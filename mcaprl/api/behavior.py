@@ -38,7 +38,7 @@ def estimate_behavior(
         updates: Number of gradient steps for each fold.
         seed: Seed of the folds and of the networks.
         threads: Number of threads of PyTorch and of the reader.
-        mapping: Mapping of another robot's bag; see `open`.
+        mapping: Mapping that describes a bag; see `open`.
         trust_code: Whether the mapping may name a Python function.
         progress: Function that opens a progress bar.
 

@@ -1,4 +1,4 @@
-"""The page that shows the episodes of a log in a browser: served on this machine, or saved."""
+"""Page that shows the episodes of a log in a browser, served on this machine or saved."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def browse(
     Args:
         file: Path of the log.
         episode: Index of the episode that the page shows first.
-        speed: Simulated seconds per second at first.
+        speed: Initial playback speed, simulated seconds per second.
         loop: Whether an episode restarts at its end.
         port: Port on 127.0.0.1; 0 for any free port.
         show: Whether to open the page in the browser, if there is a display.
-        on_open: Function called with the URL once the page can be opened.
+        on_open: Function called with the URL when the page can be opened.
         stop: Event that ends the server.
 
     Raises:
@@ -75,7 +75,7 @@ def save_page(
         file: Path of the log.
         page: File to write: .html.
         episode: Index of the episode.
-        speed: Simulated seconds per second at first.
+        speed: Initial playback speed, simulated seconds per second.
         loop: Whether the episode restarts at its end.
         overwrite: Whether an existing file is replaced.
 
@@ -109,6 +109,6 @@ def _page(file: str | Path, episode: int) -> LogPage:
 
 
 def _has_display() -> bool:
-    """Return whether a browser can open a window; without one, `webbrowser` runs text browsers."""
+    """Return whether a browser can open a window. Otherwise, `webbrowser` runs text browsers."""
     has_windows = sys.platform in ("win32", "darwin")
     return has_windows or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))

@@ -26,7 +26,7 @@ class ClusterOptions:
     address: str | None
 
     def check(self, **others: int | None) -> None:
-        """Check the options. Also check numbers that require Ray; they have their argument's name.
+        """Check the options, and that numbers which require Ray are only given with it.
 
         Raises:
             UsageError: An option is given without `ray`, or a number is below 1.

@@ -72,7 +72,7 @@ def convert(
     overwrite: bool = False,
     upload: str | None = None,
 ) -> Conversion:
-    """Read logs, another tool's dataset or another robot's bag, and write a log or a dataset.
+    """Read logs, a bag, or a dataset of another tool, and write a log or a dataset.
 
     Args:
         source: Logs or a dataset of another tool; with a mapping: MCAP files, rosbag2 folders and

@@ -36,7 +36,7 @@ def open_data(
     images: Storage = "auto",
     threads: int = 1,
 ) -> Dataset:
-    """Read logs, another tool's dataset, or another robot's bag by a mapping.
+    """Read logs, a dataset of another tool, or a bag that a mapping describes.
 
     The CRCs of all chunks that are read are checked. If a log was cut off or is still being
     written, its finished episodes are read, with a warning. If there are several logs, those

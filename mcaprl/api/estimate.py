@@ -94,7 +94,7 @@ def estimate(
             from the actions. Otherwise, the logged probabilities are used.
         seed: Seed of the model and of the resampling.
         threads: Number of threads of PyTorch and of the reader.
-        mapping: Mapping of another robot's bag; see `open`.
+        mapping: Mapping that describes a bag; see `open`.
         trust_code: Whether the mapping may name a Python function.
         progress: Function that opens a progress bar.
 

@@ -128,7 +128,7 @@ def info(
         data: File, folder, glob or URL of logs, or several of them; or a dataset of another tool.
         report: Output folder of the HTML report, an image and JSON.
         threads: Number of threads that decompress chunks.
-        mapping: Mapping of another robot's bag; see `open`.
+        mapping: Mapping that describes a bag; see `open`.
         trust_code: Whether the mapping may name a Python function.
 
     Raises:
@@ -242,7 +242,7 @@ def check(
         data: File, folder or glob of logs, or several of them. A path without logs is
             reported as a problem.
         threads: Number of threads that decompress chunks.
-        mapping: Mapping of another robot's bag; see `open`.
+        mapping: Mapping that describes a bag; see `open`.
         trust_code: Whether the mapping may name a Python function.
 
     Raises:

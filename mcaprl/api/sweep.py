@@ -26,7 +26,7 @@ class Sweep:
         out: Folder with `sweep.csv`, `sweep.png`, the page `index.html`, and the run folder of
             each trial.
         results: Outcome of each trial, best score first.
-        table: The same as a table of texts.
+        table: Table of the results, as texts.
     """
 
     out: Path

@@ -73,7 +73,7 @@ def train(
         follow: Whether to also train on episodes that another process adds to the logs during the
             training.
         other_data: Whether `resume` accepts checkpoints trained on other data.
-        mapping: Mapping of another robot's bag; see `open`. The mapping is copied to `out`. With a
+        mapping: Mapping that describes a bag; see `open`. The mapping is copied to `out`. With a
             mapping, paths cannot have weights such as `:2`.
         trust_code: Whether the mapping may name a Python function.
         budget_minutes: Wall time of `auto`, minutes; None for no bound.

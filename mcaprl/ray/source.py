@@ -151,7 +151,7 @@ class LogSource(Datasource):  # type: ignore[misc]
     def get_read_tasks(
         self, parallelism: int, per_task_row_limit: int | None = None, data_context: Any = None
     ) -> list[ReadTask]:
-        """Return one task for each group of episodes; the number that Ray requests is ignored."""
+        """Return one task for each group of episodes. The number that Ray requests is ignored."""
         columns, metadata = self._columns(), described(self.description)
         schema = block_of(columns, metadata).schema
         wanted = _Wanted(

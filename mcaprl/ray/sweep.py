@@ -1,6 +1,6 @@
-"""Training of many settings with Ray Tune; poor ones are stopped early by their off-policy score.
+"""Training with many settings by Ray Tune, which stops those with low off-policy scores early.
 
-OUT/sweep.json             what is tried, and the data; a resumed sweep must have the same
+OUT/sweep.json             trials and data; a sweep can only be resumed with the same
 OUT/NAME/                  run folder of a trial
 OUT/NAME.scores.json       scores so far, or the error that ended the trial
 """
@@ -38,7 +38,7 @@ _SPLIT_SEED = 0
 
 @dataclass(frozen=True)
 class Score:
-    """Off-policy score of the policies of a trial at one time.
+    """Off-policy score of the policies of a trial after a number of updates.
 
     Attributes:
         updates: Number of finished updates.
@@ -65,7 +65,7 @@ class TrialResult:
     Attributes:
         trial: Algorithm and settings.
         folder: Run folder, whose policies can be evaluated.
-        scores: Scores in the order of time; empty if the trial failed before the first one.
+        scores: Scores in chronological order; empty if the trial failed before its first score.
         error: Error that ended the trial; empty if there was none.
     """
 
@@ -85,7 +85,7 @@ class TrialResult:
 
 @dataclass(frozen=True)
 class _Job:
-    """What each trial needs to know, besides its number."""
+    """Arguments that all trials have in common."""
 
     data: tuple[str, ...]
     plan: SweepPlan
@@ -177,7 +177,7 @@ def _run(tune: Any, job: _Job, folder: Path, workers: int | None, advance: Advan
         def on_trial_complete(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
             advance(1)
 
-    # Ray prints a box with its settings otherwise, whatever its verbosity.
+    # Otherwise, Ray prints a box with its settings at any verbosity.
     os.environ.setdefault("RAY_AIR_NEW_OUTPUT", "0")
     for name in ("ray.tune", "ray.train"):
         logging.getLogger(name).setLevel(logging.ERROR)
@@ -199,7 +199,10 @@ def _run(tune: Any, job: _Job, folder: Path, workers: int | None, advance: Advan
 
 
 def _try(job: _Job, chosen: dict[str, int]) -> None:
-    """Run one trial, or the rest of it if its worker was killed, in a worker of Ray Tune."""
+    """Run one trial on a worker of Ray Tune.
+
+    If its worker was killed before, continue the trial.
+    """
     trial = job.plan.trials[chosen["number"]]
     folder = job.out / trial.name
     try:

@@ -1,18 +1,18 @@
 """Sweep files: algorithms, settings and seeds to train, in YAML or JSON.
 
-    algos: [bc, cql]              algorithms; or a mapping of each one to its settings
-    settings:                     settings of all these algorithms that have them
+    algos: [bc, cql]              algorithms, or a mapping from algorithms to their settings
+    settings:                     settings; each applies to the algorithms that have it
       updates: 4000
       learning_rate: [3e-4, 1e-3] a list: each value is tried, in all combinations
     seeds: 2                      number of networks of each combination
-    seed: 0                       seed of the first one
+    seed: 0                       seed of the first network
     score:
       every: 1000                 updates between two scores
       fraction: 0.2               part of the episodes that is kept for scores
       updates: 1000               updates of the model that the estimators use
       epsilon: 0.1                probability of random actions of the scored policies
       gamma: 0.97                 discount of the scores
-    stop: 3                       one of this number goes on at each stage; 0: all go on
+    stop: 3                       1 of 3 trials continues after each stage; 0: all continue
 
 Only `algos` is required.
 """
@@ -36,7 +36,7 @@ MOST_TRIALS = 10_000
 
 @dataclass(frozen=True)
 class Scoring:
-    """How policies are scored; the module's docstring describes the fields."""
+    """Settings for scoring policies. The docstring of the module describes the fields."""
 
     every: int = 1_000
     fraction: float = 0.2
@@ -168,7 +168,7 @@ def _combinations(
 
 
 def _listed(name: str, value: Any, defaults: TrainingConfig) -> list[Any]:
-    """Return the values to try; a flat list is one value of a setting that is a list."""
+    """Return the values to try. If the setting itself is a list, a flat list is one value."""
     is_list = isinstance(value, list)
     if isinstance(getattr(defaults, name), tuple):
         return value if is_list and any(isinstance(one, list) for one in value) else [value]

@@ -54,7 +54,7 @@ def write_table(path: Path, table: Table) -> None:
 
 
 def sweep_figure(results: Sequence[TrialResult]) -> Any:
-    """Draw the score of each trial over its updates; dots are the ends of the trials.
+    """Draw the score of each trial over its updates. A dot marks the end of a trial.
 
     Raises:
         MissingExtraError: Matplotlib is not installed.

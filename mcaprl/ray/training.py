@@ -1,8 +1,8 @@
 """Offline training on the workers of a Ray cluster, each of which holds some of the episodes.
 
-Ray Train starts the workers, connects them, and starts all of them again if one is lost. The files
-of the run are those of a local training, written by the first worker; after a restart, training
-continues from its checkpoints.
+Ray Train starts the workers and connects them. If one is lost, it restarts all of them, and they
+continue from the checkpoints of the run. The first worker writes the files of the run, which are
+those of a local training.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class _Logs:
 
     Attributes:
         paths: Absolute paths.
-        lengths: (E,) number of transitions of each episode of a log, for each log.
-        weights: Weight of a transition of each log.
+        lengths: Array for each log: the number of transitions of each episode.
+        weights: Relative sampling weight of a transition, for each log.
         description: Metadata that the logs have in common.
         fingerprint: SHA-256 of the logs' checksums and weights.
     """
@@ -89,7 +89,7 @@ class _Logs:
 
 @dataclass(frozen=True)
 class _Job:
-    """What each worker needs to know."""
+    """Arguments of the task on each worker."""
 
     request: TrainingRequest
     logs: _Logs
@@ -99,21 +99,21 @@ class _Job:
 
 
 class Board:
-    """Actor on which the workers leave what the calling process reads."""
+    """Actor that stores messages of the workers until the calling process reads them."""
 
     def __init__(self) -> None:
-        """Begin without messages."""
+        """Create a board without messages."""
         self._news: list[TrainingProgress | str] = []
         self._summaries: list[OfflineSummary] | None = None
         self._error: Exception | None = None
 
     def report(self, news: TrainingProgress | str) -> bool:
-        """Add metrics or a warning; return whether the training shall continue."""
+        """Add metrics or a warning. Return False if the training must end."""
         self._news.append(news)
         return self._error is None
 
     def take(self) -> list[TrainingProgress | str]:
-        """Return what was added since the last call."""
+        """Return the metrics and warnings that were added since the last call."""
         news, self._news = self._news, []
         return news
 
@@ -126,7 +126,7 @@ class Board:
         self._summaries = summaries
 
     def outcome(self) -> tuple[list[OfflineSummary] | None, Exception | None]:
-        """Return the result and the error; None if there is none."""
+        """Return the result and the error. Either is None if there is none yet."""
         return self._summaries, self._error
 
 
@@ -183,7 +183,7 @@ def train_on_ray(
 
 
 def _fit(job: _Job, workers: int) -> None:
-    """Run the workers; an error of theirs is left on the board."""
+    """Run the workers. If they fail, their error is on the board."""
     import ray
 
     train = import_extra("ray.train", "ray")
@@ -214,7 +214,7 @@ def _fit(job: _Job, workers: int) -> None:
 def _failure(out: Path, error: Exception) -> ClusterError:
     lines = str(error).strip().splitlines()
     return ClusterError(
-        f"{out}: workers failed repeatedly; its checkpoints are kept, continue with --resume"
+        f"{out}: workers failed repeatedly; the checkpoints are kept: continue with --resume"
         f" ({lines[-1].strip()})"
     )
 
@@ -223,7 +223,7 @@ def _train_on_worker(job: _Job) -> None:
     import ray
 
     if ray.get(job.board.outcome.remote())[1] is not None:
-        # Ray starts all workers again after any error, also after one that would come back.
+        # Ray restarts all workers after any error, even if the error would occur again.
         return
     try:
         _train(job)
@@ -310,7 +310,7 @@ def _read_summaries(data: Sequence[str]) -> _Logs:
 
 
 def _workers(wanted: int | None, device: str, episodes: int) -> int:
-    """Return the number of workers; there must be a processor and an episode for each."""
+    """Return the number of workers. Each of them needs a processor and an episode."""
     import ray
 
     kind = "GPU" if device == "cuda" else "CPU"
@@ -327,7 +327,10 @@ def _workers(wanted: int | None, device: str, episodes: int) -> int:
 
 @contextmanager
 def _following(board: Any, progress: ProgressCallback) -> Iterator[None]:
-    """Call `progress` with the news of the board meanwhile; its exceptions end the training."""
+    """Call `progress` with new results until the block ends.
+
+    If it raises an error, the training ends.
+    """
     import ray
 
     ended = threading.Event()

@@ -1,4 +1,4 @@
-"""Tasks on the worker processes of a Ray cluster; the tasks of a killed worker are repeated."""
+"""Tasks on the worker processes of a Ray cluster. If a worker is killed, its tasks are repeated."""
 
 from __future__ import annotations
 

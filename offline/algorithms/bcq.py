@@ -39,11 +39,14 @@ class BCQ(DQN):
     config: BCQConfig
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of the values and of the clone's logits."""
+        """Return the output shapes of the value network and of the behavior-cloning network."""
         return {**super().output_shapes(), "logits": (self.n_actions,)}
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the temporal-difference loss plus the clone's cross entropy and penalty."""
+        """Return the temporal-difference loss, plus the loss of the behavior-cloning network.
+
+        The latter is the cross entropy plus a penalty on large logits.
+        """
         q_tm1 = self.outputs("q", batch.observations)
         logits_tm1 = self.outputs("logits", batch.observations)
         target_tm1 = self.targets(batch, self.target_outputs(batch))

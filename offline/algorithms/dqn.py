@@ -74,7 +74,7 @@ class DQN(Learner):
 
     @torch.no_grad()
     def targets(self, batch: Batch, q_t: Tensor) -> Tensor:
-        """Return the targets (R,) or (R, N) for the values of the next states.
+        """Return the targets (R,) for values, or the targets (R, N) for quantiles.
 
         Args:
             batch: Transitions.
@@ -97,6 +97,6 @@ class DoubleDQN(DQN):
 
     @torch.no_grad()
     def targets(self, batch: Batch, q_t: Tensor) -> Tensor:
-        """Return the targets; the learning network selects actions, and `q_t` evaluates them."""
+        """Return the targets. The learning network selects actions, and `q_t` evaluates them."""
         q_t_selector = self.outputs("q", batch.next_observations)
         return double_q_learning_target(batch.rewards, batch.discounts, q_t, q_t_selector)

@@ -110,7 +110,9 @@ class Learner(ABC):
         return self.losses(batch)
 
     def update(self) -> dict[str, Tensor]:
-        """Run one gradient step on one random batch per seed; sync target networks if it is time.
+        """Run one gradient step on one random batch per seed.
+
+        Update target networks if this is due.
 
         Returns:
             The terms of `losses` times the factors of the batch, without gradients.
@@ -157,7 +159,10 @@ class Learner(ABC):
         return self.target_networks[name]
 
     def seed_means(self, terms: Mapping[str, Tensor]) -> list[dict[str, float]]:
-        """Return the mean of each term for each seed; the terms (R,) contain rows of all seeds."""
+        """Return the mean of each term for each seed.
+
+        Each term (R,) contains the rows of all seeds.
+        """
         means = {name: self.batch_means(term).tolist() for name, term in terms.items()}
         return [{name: means[name][k] for name in means} for k in range(len(self.seeds))]
 
@@ -186,7 +191,11 @@ class Learner(ABC):
         return self.models[name].networks[self.seeds.index(seed)]
 
     def state(self, seed: int) -> dict[str, Tensor]:
-        """Return all state of a seed except `step`: weights, optimizer moments, generator."""
+        """Return the state of the training of one seed, without `step`.
+
+        The state consists of the weights, the moments of the optimizer, and the state of the random
+        generator.
+        """
         k = self.seeds.index(seed)
         models = self.all_models()
         tensors = {f"{name}.weights": models[name].weights.detach()[k] for name in models}

@@ -73,7 +73,7 @@ def expected_sarsa_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, pi_t: Te
 
 
 def square_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:
-    """Return half the squared error (B,) of Q(s, a); it is smallest at the mean target."""
+    """Return half the squared error (B,) of Q(s, a), whose minimum is at the mean target."""
     _check_actions(q_tm1, a_tm1)
     _check_shape("target_tm1", target_tm1, (len(q_tm1),))
     return 0.5 * (chosen(q_tm1, a_tm1) - target_tm1).square()
@@ -171,7 +171,7 @@ def mean_values(q: Tensor) -> Tensor:
 
 
 def best_actions(q: Tensor) -> Tensor:
-    """Return the actions (B,) with the largest mean value; ties go to the first."""
+    """Return the actions (B,) with the largest mean value. In a tie, return the first one."""
     return mean_values(q).argmax(1)
 
 

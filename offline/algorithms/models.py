@@ -154,12 +154,15 @@ class TargetNetwork:
         self.reset()
 
     def reset(self) -> None:
-        """Drop the computed outputs; needed after each change of the weights."""
+        """Drop the computed outputs. Call this method after each change of the weights."""
         self._table = None
 
     @torch.no_grad()
     def outputs(self, batch: Batch) -> Tensor:
-        """Return the outputs (R, ...) for the states or next states in a batch; no gradient."""
+        """Return the outputs (R, ...) for the states or next states of a batch.
+
+        No gradients are computed.
+        """
         if not self._use_table:
             return self.model(batch.next_observations if self._next_states else batch.observations)
         if self._table is None:

@@ -70,7 +70,10 @@ class Observations:
         return [self.like(parts) for parts in zip(*columns, strict=True)]
 
     def stacked(self, count: int) -> Observations:
-        """Return stacks of `count` successive observations; a mask is that of the last one."""
+        """Return stacks of `count` successive observations.
+
+        The mask of a stack is that of its last observation.
+        """
         if count == 1:
             return self
         rows = self.vector.shape[0] // count

@@ -1,4 +1,4 @@
-"""The part of the training data that one process holds, and what the processes add up.
+"""The part of the training data that one process holds, and sums over all processes.
 
 Several processes train together if each of them holds some of the episodes. In each update all of
 them draw the same transitions from all data, and each computes the losses of those that it holds.
@@ -27,7 +27,9 @@ Floats = NDArray[np.float64]
 
 
 class Share:
-    """All data, held by one process; `GroupShare` is a part of the data.
+    """Share of a process that holds all data.
+
+    `GroupShare` is the share of one of several processes.
 
     Attributes:
         processes: Number of processes that train together.
@@ -59,16 +61,17 @@ class Share:
         """Draw `count` transitions for each of K seeds.
 
         Returns:
-            Rows (R,) of the buffer, and factors (R,) of these rows in means over the batch: the
-            batch's mean is the mean over processes of the mean over rows of factor times value.
-            None if all factors are 1.
+            Rows (R,) of the buffer, and a factor (R,) for each row. The mean over the batch is
+            computed in two steps: each process averages factor times value over its rows, and
+            these averages are averaged over the processes. If all factors are 1, None is returned
+            instead of them.
         """
         return torch.cat([buffer.sample_rows(count, one) for one in generators]), None
 
     def part(
         self, chosen: Tensor, total: int, device: torch.device
     ) -> tuple[Tensor, Tensor | None]:
-        """Return rows and factors, as `draw`, for rows (K, n) that this process has chosen.
+        """Return rows and factors like `draw`, for rows (K, n) that this process has chosen.
 
         Args:
             chosen: Rows of the buffer.
@@ -78,7 +81,7 @@ class Share:
         return chosen.flatten().to(device), None
 
     def moments(self, count: int, mean: Any, deviation: Any) -> tuple[Any, Any]:
-        """Return mean and standard deviation over all processes, from those of this process."""
+        """Return mean and standard deviation over all processes, given those of this process."""
         parts = self.gather((count, mean, deviation))
         if len(parts) == 1:
             return mean, deviation
@@ -92,7 +95,7 @@ class Share:
         return np.max(self.gather(values), axis=0)
 
     def position(self, count: int) -> tuple[int, int]:
-        """Return how many items the processes before this one have, and how many all have."""
+        """Return the number of items of the processes before this one, and of all processes."""
         return 0, count
 
 
@@ -152,10 +155,10 @@ class GroupShare(Share):
     def draw(
         self, buffer: TransitionBuffer, count: int, generators: Sequence[torch.Generator]
     ) -> tuple[Tensor, Tensor]:
-        """Draw the rows that one process would draw; return those that this process holds."""
+        """Draw the rows that a single process would draw. Return those that this process holds."""
         drawn = torch.stack([self.sample_rows(count, one) for one in generators]) - self._first_row
         mine = (drawn >= 0) & (drawn < self._rows)
-        # All seeds have equally many rows, and at least one, so the shorter ones are padded.
+        # All seeds need the same number of rows, at least one. Seeds with fewer rows are padded.
         most = max(int(mine.sum(1).max()), 1)
         order = mine.int().argsort(stable=True, dim=1, descending=True)[:, :most]
         held = mine.gather(1, order)
@@ -189,7 +192,7 @@ class GroupShare(Share):
         return self._starts[episodes] + steps
 
     def position(self, count: int) -> tuple[int, int]:
-        """Return how many items the processes before this one have, and how many all have."""
+        """Return the number of items of the processes before this one, and of all processes."""
         counts = self.gather(count)
         return sum(counts[: self.rank]), sum(counts)
 

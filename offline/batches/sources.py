@@ -55,7 +55,7 @@ def weighted_logs(data: Sequence[str]) -> list[tuple[Path, float]]:
 def _weighted(
     data: Sequence[str], expand: Callable[[str], Iterator[tuple[str, Item]]]
 ) -> list[tuple[Item, float]]:
-    """Return each item to which `data` refers once, with its weight."""
+    """Return the items to which `data` refers, with their weights. Each item occurs once."""
     found: dict[str, tuple[Item, float]] = {}
     for part in data:
         name, weight = _split_weight(part)

@@ -269,7 +269,7 @@ class _Source:
 
 
 class _Rows:
-    """Items of a block, in order; the first call of `gather` reads the block."""
+    """Items of a block, in order. The block is read at the first call of `gather`."""
 
     def __init__(
         self, source: _Source, options: ItemOptions, parts: list[_Part], rows: NDArray[np.int64]

@@ -64,7 +64,7 @@ class FoldScore:
 
 @dataclass(frozen=True)
 class ReliabilityRange:
-    """Calibration in one range of predicted probabilities; each step has a prediction per action.
+    """Calibration in one range of predicted probabilities. Each step has one prediction per action.
 
     Attributes:
         low, high: Range (low, high].

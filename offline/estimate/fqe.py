@@ -50,7 +50,10 @@ class FQEConfig(TrainingConfig):
 
     @property
     def packing(self) -> Packing:
-        """Settings for single-step transitions; n-step returns depend on the behavior policy."""
+        """Settings for single-step transitions.
+
+        n-step returns are not used, because they depend on the behavior policy.
+        """
         return Packing(gamma=self.gamma)
 
     @property

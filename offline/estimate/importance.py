@@ -160,7 +160,9 @@ def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
 
 
 def mean_weight(estimator: str, episodes: EpisodeTable) -> RatioEstimate | None:
-    """Return the mean importance weight of an unbiased estimator; its expectation is 1.
+    """Return the mean importance weight of an unbiased estimator.
+
+    The expectation of this mean is 1.
 
     A mean far below 1 shows that the log does not cover the policy's actions: rare episodes with
     large weights are missing. The result is None for the weighted estimators, because they divide

@@ -160,7 +160,10 @@ def _with_last(observations: Any, next_observations: Any) -> Any:
 
 
 def _stacked(observations: Any, count: int) -> Any:
-    """Return frame stacks (T + 1, count, ...), oldest frame first; a count of 1 adds no axis."""
+    """Return frame stacks (T + 1, count, ...), oldest frame first.
+
+    If `count` is 1, no axis is added.
+    """
     if count == 1:
         return observations
     if isinstance(observations, dict):

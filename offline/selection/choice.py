@@ -1,4 +1,4 @@
-"""Outcome of `auto`: what was tried, what was chosen and why, as `choice.json` of the run."""
+"""Outcome of `auto`, stored as `choice.json` of the run: the candidates, the choice, the reason."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ COLUMNS: Final = (
 )
 EXPLANATION: Final = (
     "Estimates are discounted returns from the first states of the logged episodes, by pessimistic"
-    " FQE. best: fraction of the resamplings in which the candidate is the best of those that were"
-    " evaluated with it. as logged: fraction of the states in which it takes the logged action."
-    " WPDIS: estimate by weighted importance sampling, or the"
-    " effective number of episodes if there are too few."
+    " FQE. best: fraction of the resamplings in which the candidate is the best of all candidates that"
+    " were evaluated at the same time. as logged: fraction of the states in which the candidate takes"
+    " the logged action. WPDIS: estimate by weighted importance sampling, or the effective number of"
+    " episodes if there are too few."
 )
 _FEW_EPISODES: Final = 50
 _LOW_COVERAGE: Final = 0.5
@@ -40,13 +40,14 @@ _NO_VALUE: Final = "-"
 
 @dataclass(frozen=True)
 class Tried:
-    """One candidate and what is known about it.
+    """Results of one candidate.
 
     Attributes:
-        updates: Number of its updates when it was last evaluated, or now without an evaluation.
+        updates: Number of its updates at its last evaluation. If it was never evaluated, the
+            current number.
         rating: Its estimate; None if it was not evaluated.
-        support: Fraction of the states in which its action is likely under the behavior.
-        bellman_error: Its relative Bellman error; None without Q-values.
+        support: Fraction of the states in which its action is likely under the behavior policy.
+        bellman_error: Its relative Bellman error; None if it has no Q-values.
         weighted: Estimate by WPDIS, and the effective number of its episodes; None if the log
             has no action probabilities.
         outcome: `chosen`, `runner-up`, `stopped early`, or why it was not trained.

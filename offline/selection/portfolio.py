@@ -1,4 +1,4 @@
-"""What `auto` looks at in a log, and the candidates that it trains."""
+"""Properties of a log that `auto` considers, and the candidates that it trains."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
 DETERMINISTIC: Final = 0.05
-"""Entropy of the behavior below which candidates are compared by their agreement with it."""
+"""If the entropy of the behavior policy is lower, candidates are rated by agreement with it."""
 LEAST_COVERAGE: Final = 0.5
-"""Fraction of actions; more must be likely under the behavior for Double DQN to be tried."""
+"""Fraction of the actions that must be likely in the log before Double DQN is tried."""
 _IQL_INTERVAL: Final = 50
 _OWN: Final = ("survivors", "short_fraction", "model_updates")
 
@@ -37,9 +37,9 @@ class LogTraits:
         mean_return: Mean undiscounted return of the episodes.
         return_spread: Standard deviation of these returns.
         terminated: Fraction of the episodes that end in a terminal state.
-        entropy: Mean entropy of the behavior, from 0 (deterministic) to 1 (uniform): from logged
-            probabilities if all are valid, otherwise from those of the clone.
-        coverage: Mean fraction of the actions that are likely under the behavior.
+        entropy: Mean entropy of the behavior policy, from 0 (deterministic) to 1 (uniform). If all
+            logged probabilities are valid, it is computed from them, otherwise from the clone.
+        coverage: Mean fraction of the actions that are likely under the behavior policy.
         probabilities: Whether the log has the probabilities of its actions.
         problems: Problems that the lint found.
     """
@@ -65,7 +65,7 @@ class LogTraits:
 
 
 def traits_of(dataset: Dataset, clone: Clone) -> LogTraits:
-    """Return the properties of a log, with the behavior as a clone imitates it."""
+    """Return the properties of a log. The clone imitates its behavior policy."""
     chances = by_rows(clone.action_probabilities, dataset.observations).astype(np.float64)
     behavior = dataset.behavior_probs.astype(np.float64)
     known = not bool((np.isnan(behavior) | is_impossible(behavior)).any())
@@ -100,7 +100,7 @@ class Candidate:
     special: Mapping[str, Any]
 
     def config(self, shared: AutoConfig) -> TrainingConfig:
-        """Return the settings of the algorithm: the shared ones, then its special ones."""
+        """Return the settings of the algorithm. Its special settings override the shared ones."""
         _, defaults = choose_algorithm(self.algo)
         names = {field.name for field in fields(defaults)}
         given = {

@@ -1,14 +1,15 @@
-"""Training of a portfolio of candidates side by side, with an early end for the poor ones.
+"""Training of several candidates, of which only the best are trained to the end.
 
     RUN/config.json       settings of `auto` and the data
-    RUN/clone             clone of the behavior, which tells likely actions from rare ones
+    RUN/clone             clone of the behavior policy, which tells likely actions from rare ones
     RUN/candidates/NAME   run of a candidate
     RUN/stages.json       evaluations of the candidates after the short and the full training
     RUN/choice.json       what was chosen, and why
     RUN/seed-K            policy of the chosen candidate
 
-All candidates make a fraction of the updates; the best of them, by `rule`, make the rest. From the
-end of the first candidate's short training on, RUN/seed-K has a policy, also after an interruption.
+All candidates are trained with a fraction of the updates (the short training). The best of them, by
+`rule`, are trained with the rest. After the first candidate's short training, RUN/seed-K always has
+a policy, also if the run is interrupted.
 """
 
 from __future__ import annotations
@@ -62,12 +63,17 @@ if TYPE_CHECKING:
 
 STAGES_NAME: Final = "stages.json"
 ENSEMBLE: Final = 2
-"""Models of each kind that evaluate a policy; each has its own halves of the log and weights."""
+"""Number of models that evaluate a policy.
+
+Each has its own halves of the log and its own weights.
+"""
 SHARES: Final = (0.35, 0.5, 0.8, 0.95)
-"""Fractions of the budget after which the short training, its evaluation, the full training and its
-evaluation end."""
+"""Fractions of the budget after which the four phases end.
+
+The phases are the short training, its evaluation, the full training and its evaluation.
+"""
 CLONE_UPDATES: Final = 2_000
-"""Maximum number of updates of the clone of the behavior."""
+"""Maximum number of updates of the clone of the behavior policy."""
 _NO_TIME: Final = "the budget ended before {} had a checkpoint: give more minutes"
 _PROBE_UPDATES: Final = 10
 _LEAST_MODEL_UPDATES: Final = 100
@@ -75,7 +81,7 @@ _SHORT_MODEL_FRACTION: Final = 0.5
 
 
 class _Pause(Exception):
-    """Exception by which a progress callback stops a training."""
+    """Exception that a progress callback raises to stop a training."""
 
 
 @dataclass(frozen=True)
@@ -116,13 +122,13 @@ def select(
     budget_minutes: float | None = None,
     progress: ProgressCallback = lambda now: None,
 ) -> tuple[Choice, list[OfflineSummary]]:
-    """Train the portfolio on a dataset, and choose one policy by the log alone.
+    """Train all candidates on a dataset, and choose one policy from the log alone.
 
     Args:
         dataset: Dataset with discrete actions.
         config: Settings.
         out: Folder of the run; it must be empty or not exist.
-        seeds: Number of networks of each candidate; the estimate is the mean over them.
+        seeds: Number of networks of each candidate, over which estimates are averaged.
         seed: Seed of the first network.
         weights: (E,) relative sampling weight of each transition of an episode; default: all equal.
         resume: Whether to resume the run in `out`.
@@ -184,7 +190,7 @@ class _Clock:
         return time.perf_counter() - self._began
 
     def left_s(self, share: float) -> float:
-        """Return the seconds until a fraction of the budget is used, at least 0."""
+        """Return the seconds until a fraction of the budget is used; 0 if it has been used."""
         return max(0.0, share * self._budget_s - self.elapsed_s)
 
 
@@ -252,7 +258,7 @@ class _Race:
         return choice, self._summaries(choice.chosen)
 
     def _look(self) -> tuple[Policy, LogTraits]:
-        """Train the clone of the behavior, and look at the log."""
+        """Clone the behavior policy, and determine the properties of the log."""
         count = min(self._config.updates, CLONE_UPDATES)
         shared = replace(self._config, updates=count, held_out=0.0)
         config = Candidate("clone", "bc", {}).config(shared)
@@ -272,7 +278,7 @@ class _Race:
         return clone, traits_of(self._dataset, clone)
 
     def _train(self, candidate: Candidate, until: int, share_s: float, bar: _Bar) -> None:
-        """Train a candidate up to an update, or until its share of the time is used."""
+        """Train a candidate until it has `until` updates or its share of the time is used."""
         if self._updates(candidate.name) >= until:
             return
         if not share_s > 0:
@@ -296,7 +302,7 @@ class _Race:
     def _train_into(
         self, folder: Path, config: TrainingConfig, seeds: range, progress: ProgressCallback
     ) -> None:
-        """Start or resume a run, until it ends or the callback pauses it."""
+        """Start or resume a run. Return when it ends, or when the callback pauses it."""
         folder.parent.mkdir(exist_ok=True)
         with suppress(_Pause):
             train(
@@ -327,7 +333,7 @@ class _Race:
         fraction: float,
         share: float,
     ) -> Stage | None:
-        """Evaluate candidates; return None if there is no time for it."""
+        """Evaluate candidates. Return None if the time is too short."""
         policies = [(name, policy) for name in names for policy in self._policies(name)]
         ends = time.perf_counter() + self._clock.left_s(share)
         updates = round(self._config.model_updates * fraction)
@@ -367,7 +373,7 @@ class _Race:
         ends: float,
         ticks: list[float] | None = None,
     ) -> list[Evidence]:
-        """Return the evidence for each policy by one model; raise `_Pause` if time is over."""
+        """Return the evidence for each policy by one model. Raise `_Pause` if the time is up."""
 
         def check() -> None:
             now = time.perf_counter()
@@ -383,7 +389,7 @@ class _Race:
     def _affordable(
         self, clone: Policy, policies: Sequence[tuple[str, Policy]], ends: float
     ) -> int:
-        """Return how many updates of the models the time allows, measured by a few of them."""
+        """Run a few updates of the models, and estimate how many fit into the time."""
         ticks: list[float] = []
         try:
             self._collect(clone, policies, _PROBE_UPDATES, 0, ends, ticks)
@@ -413,7 +419,7 @@ class _Race:
         second: Stage | None,
         names: Sequence[str],
     ) -> Choice:
-        """Return the choice by the last evaluation that there is."""
+        """Return the choice according to the latest evaluation."""
         last = second or first
         ratings = last.ratings if last else {}
         order = ranked(ratings)
@@ -448,7 +454,10 @@ class _Race:
         return self._out / "candidates" / name
 
     def _updates(self, name: str) -> int:
-        """Return the number of updates of a candidate's saved policies, 0 without one."""
+        """Return the number of updates of a candidate's saved policies.
+
+        If a seed has no saved policy, the number is 0.
+        """
         files = policy_files(self._folder(name)) if self._folder(name).exists() else []
         if len(files) < len(self._seeds):
             return 0
@@ -493,7 +502,7 @@ class _Race:
 
 
 class _Bar:
-    """Progress of all candidates together, as that of one training."""
+    """Progress of all candidates together, reported as if it were one training."""
 
     def __init__(self, report: ProgressCallback, total: int) -> None:
         self._report, self._total = report, total

@@ -4,9 +4,9 @@ Each candidate has an estimated value of the first state of each episode: pessim
 that was trained on other episodes (`mcaprl.offline.estimate.evidence`). The rule:
 
 1. The score of a candidate is the mean value of the episodes' first states, over its networks and
-   the models that evaluate them. If the behavior is almost deterministic, the log has no evidence
-   on other actions; the score is then the fraction of the states in which the candidate takes the
-   logged action.
+   the models that evaluate them. If the behavior policy is almost deterministic, the log has no
+   evidence on other actions. In this case, the score is the fraction of the states in which the
+   candidate takes the logged action.
 2. The candidate with the largest score is chosen.
 3. Episodes are resampled, together with the networks and models. The chance that a candidate is the
    best is the fraction of the resamplings in which its score is the largest.
@@ -61,9 +61,10 @@ def rate(
     """Rate candidates by numbers of each episode.
 
     Args:
-        values: Value of each episode's first state, for each of M networks and models (M, E), by
-            candidate.
-        agreements: Fraction of each episode's states with the logged action, in the same form.
+        values: Arrays (M, E) by candidate: the value of the first state of each of E episodes, for
+            each of M pairs of a network and a model.
+        agreements: Arrays (M, E) by candidate: the fraction of the states of each episode in which
+            the candidate takes the logged action.
         imitate: Whether the score is the agreement instead of the value.
         seed: Seed of the resampling.
     """
@@ -90,5 +91,5 @@ def ranked(ratings: Mapping[str, Rating]) -> list[str]:
 
 
 def _counts(random: np.random.Generator, size: int) -> Floats:
-    """Return how often each of `size` elements is in each resampling, as fractions (B, size)."""
+    """Return the fraction (B, size) of each of B resamplings that each element makes up."""
     return random.multinomial(size, np.full(size, 1 / size), RESAMPLES) / size

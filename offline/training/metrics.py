@@ -106,7 +106,7 @@ def describe_seeds(summaries: Sequence[OfflineSummary]) -> list[str]:
 
 
 def _rows_before(path: Path, update: int) -> list[str]:
-    """Return the header and the complete rows of earlier updates; a kill can cut off a row."""
+    """Return the header and the rows of earlier updates, without a row that a kill cut off."""
     if update == 1 or not path.exists():
         return []
     header, *rows = path.read_text().splitlines(keepends=True)

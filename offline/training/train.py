@@ -132,7 +132,7 @@ def train_share(
     scales: tuple[ObservationEncoder | None, float | None],
     report: ProgressCallback,
 ) -> list[OfflineSummary]:
-    """Train in one of several processes; the first one writes the files of the run.
+    """Train in one of several processes. The first process writes the files of the run.
 
     Args:
         dataset: Episodes of this process.
@@ -231,7 +231,8 @@ class _Run:
     def _starts(self, seeds: range) -> list[dict[int, Checkpoint | None]]:
         """Return seeds with their checkpoints, grouped by the number of finished updates."""
         groups: dict[int, dict[int, Checkpoint | None]] = {}
-        # The first process reads for all, so that they continue with the same update.
+        # The first process reads the checkpoints for all processes, so that they continue with the
+        # same update.
         for seed in seeds if self.writes else ():
             checkpoint = read_checkpoint(seed_folder(self.folder, seed), self.identity)
             groups.setdefault(checkpoint.step if checkpoint else 0, {})[seed] = checkpoint
@@ -296,7 +297,10 @@ class _Run:
         return values
 
     def _with_new_episodes(self, learner: Learner) -> Learner:
-        """Add new episodes every `CHECK_INTERVAL` updates; return the old or a replaced learner."""
+        """Add new episodes every `CHECK_INTERVAL` updates.
+
+        If there are any, return a new learner.
+        """
         if self.follow is None or learner.step % CHECK_INTERVAL or not self.follow.grow():
             return learner
         return with_more_data(learner, self.follow.dataset, self.held_out_episodes)

@@ -58,7 +58,7 @@ class HeldOut:
         self.mean_return = float(np.concatenate(share.gather(returns[mine])).mean())
 
     def terms(self, learner: Learner) -> list[dict[str, float]]:
-        """Return each seed's validation metrics; their names have the prefix `held_out_`."""
+        """Return each seed's validation metrics, whose names have the prefix `held_out_`."""
         seeds = len(learner.seeds)
         rows = self._rows.expand(seeds, -1)
         batch = self._buffer.batch(*self._buffer.share.part(rows, self._total, self._buffer.device))
@@ -71,7 +71,9 @@ class HeldOut:
 
 
 def choose_held_out(n_episodes: int, fraction: float) -> NDArray[np.int64]:
-    """Choose about `fraction` of the episodes; at least one of ten or more episodes, never all.
+    """Choose about `fraction` of the episodes, but never all of them.
+
+    If `fraction` is above 0 and there are ten or more episodes, at least one is chosen.
 
     The choice depends only on the number of episodes, so it is the same for all seeds.
     """

@@ -109,7 +109,10 @@ class MessageType:
         return leaf_kinds(self._definitions.types, self.name)
 
     def leaf_dtype(self, path: str) -> np.dtype[Any]:
-        """Return the dtype of a leaf field; int64 for times, `object` for strings and lists."""
+        """Return the dtype of a leaf field.
+
+        It is int64 for timestamps, and `object` for strings and lists.
+        """
         kind = self.kinds.get(path, "").split("[")[0]
         return np.dtype("i8") if kind == "time" else np.dtype(ROS_TO_NUMPY.get(kind, object))
 
@@ -180,7 +183,8 @@ class MessageType:
                     walk.take_texts(name, count)
                     return
                 if name is not None:
-                    # Lists of messages are decoded one by one.
+                    # Messages that contain a list of messages have no layout. They are decoded one
+                    # by one.
                     raise _NoLayout
                 for _ in range(count):
                     self._pass(walk, element, path)

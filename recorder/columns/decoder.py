@@ -231,7 +231,7 @@ class Decoder:
 
 
 def _nanoseconds(times: NDArray[Any]) -> NDArray[np.int64]:
-    """Convert times with the fields `sec` and `nanosec` to nanoseconds."""
+    """Convert timestamps with the fields `sec` and `nanosec` to nanoseconds."""
     found: NDArray[np.int64] = times["sec"].astype(np.int64)
     found *= 10**9
     found += times["nanosec"]
@@ -239,7 +239,10 @@ def _nanoseconds(times: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def _value_at(message: Any, path: str) -> Any:
-    """Return the value of the field with this dotted path; times are converted to nanoseconds."""
+    """Return the value of the field with this dotted path.
+
+    Timestamps are converted to nanoseconds.
+    """
     found = message
     for name in path.split("."):
         found = getattr(found, name)

@@ -78,7 +78,7 @@ def release(file: FileIO) -> None:
 
 
 def replaced(path: Path, locked: FileIO, length: int) -> FileIO:
-    """Replace a file with a locked copy of its first bytes; current readers keep the old file.
+    """Replace a file with a locked copy of its first bytes. Current readers keep the old file.
 
     The old file is released once the copy is in place; an error leaves the old file unchanged.
 

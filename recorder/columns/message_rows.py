@@ -108,7 +108,7 @@ def message_index(file: memoryview, offset: int, channel_id: int) -> NDArray[Any
 
 
 class MessageRange:
-    """Messages of one channel, either in one chunk or outside of chunks; `len()` counts them.
+    """Messages of one channel, in one chunk or outside of chunks. `len()` returns their number.
 
     Attributes:
         chunk: Chunk with the messages; None for unchunked messages.
@@ -127,7 +127,9 @@ class MessageRange:
 
     @cached_property
     def index(self) -> NDArray[Any]:
-        """Array of `INDEX_ENTRY`, one entry for each message; read from the file at first use.
+        """Array of `INDEX_ENTRY`, one entry for each message.
+
+        It is read from the file at first use.
 
         Raises:
             CorruptLogError: The index is damaged.
@@ -182,5 +184,8 @@ def _are_adjacent(offsets: NDArray[Any], size: int, end: int) -> bool:
 
 @lru_cache(maxsize=2)
 def adjacent_offsets(first: int, last: int, size: int) -> NDArray[np.uint64]:
-    """Return the offsets of adjacent messages; cached, because full chunks have equal offsets."""
+    """Return the offsets of adjacent messages.
+
+    They are cached, because full chunks have equal offsets.
+    """
     return np.arange(first, last + 1, size, dtype=np.uint64)

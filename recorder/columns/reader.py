@@ -136,7 +136,7 @@ class McapReader:
         return self._remote is not None
 
     def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Fetch ranges of bytes of a remote file; no effect on a local file.
+        """Fetch ranges of bytes of a remote file. Do nothing for a local file.
 
         Raises:
             LogError: The file cannot be reached.
@@ -145,7 +145,7 @@ class McapReader:
             self._remote.fetch(ranges)
 
     def fetch_chunks(self, parts: Iterable[MessageRange]) -> None:
-        """Fetch chunks and indexes of message ranges in parallel; no effect on a local file."""
+        """Fetch chunks and indexes of message ranges in parallel. Do nothing for a local file."""
         if self._remote is not None:
             chunks = [part.chunk for part in parts]
             if None in chunks:
@@ -176,7 +176,7 @@ class McapReader:
         try:
             now, before = os.stat(self.path), self._state
         except OSError:
-            # The path was removed; the mapped content remains.
+            # The file was removed from its path, but its content remains mapped.
             return
         if not os.path.samestat(now, before):
             return
@@ -449,7 +449,7 @@ class McapReader:
         return found
 
     def _check_data_crc(self) -> None:
-        """Check the CRC of the data section; no other CRC covers unchunked messages."""
+        """Check the CRC of the data section, the only one that covers unchunked messages."""
         offset, opcode, content = next(self.records(self.data_end), (0, 0, memoryview(b"")))
         if opcode == Opcode.DATA_END:
             (crc,) = struct.unpack_from("<I", content)

@@ -37,7 +37,8 @@ from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, RE
 RECORD_HEADER = struct.Struct("<BQ")
 # The first fields of a message: channel, sequence number, log_time.
 MESSAGE_START = struct.Struct("<HIQ")
-# An attachment: two times, the lengths and bytes of name, media type and data, and a CRC.
+# An attachment consists of two timestamps, the lengths and bytes of the name, the media type and
+# the data, and a CRC.
 _ATTACHMENT_TIMES_BYTES = 16
 _TEXT_LENGTH, _DATA_LENGTH, _CRC = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<I")
 _FOOTER_BYTES = RECORD_HEADER_BYTES + 20

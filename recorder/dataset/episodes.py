@@ -105,7 +105,10 @@ class EpisodeTopic:
 
     @cached_property
     def lengths(self) -> NDArray[np.int64]:
-        """(E,) number of transitions of each episode; empty if messages are out of order."""
+        """(E,) number of transitions of each episode.
+
+        If messages are out of order, the array is empty.
+        """
         if not self._is_ours or not (np.diff(self._columns["end_time_ns"]) > 0).all():
             return np.empty(0, np.int64)
         return self._columns["length"].astype(np.int64)

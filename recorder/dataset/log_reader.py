@@ -66,7 +66,9 @@ class LogReader:
 
     @cached_property
     def description(self) -> LogMetadata:
-        """Metadata of the log; inferred from the first episode if another program wrote the log.
+        """Metadata of the log.
+
+        If another program wrote the log, it is inferred from the first episode.
 
         Raises:
             LogError: The metadata must be inferred, and the first episode cannot be read.

@@ -70,7 +70,7 @@ def open_logs(
 def _call_each(
     logs: Sequence[LogReader], function: Callable[[LogReader], Result]
 ) -> list[tuple[LogReader, Result]]:
-    """Call a function on each log; skip logs without finished episodes if there are several logs.
+    """Call a function on each log. If there are several logs, skip those without finished episodes.
 
     Raises:
         NoEpisodesError: No log has a finished episode.

@@ -99,7 +99,7 @@ def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
 
 
 def _strings(logs: Sequence[FinishedLog], metadata: LogMetadata) -> dict[str, str]:
-    """Return the metadata record of the logs if it is the same in all; else encode `metadata`."""
+    """Return the logs' metadata record if it is the same in all. Otherwise, encode `metadata`."""
     found = [log.reader.metadata.get(METADATA_NAME) for log in logs if log.has_steps]
     first = found[0]
     if first is not None and all(one == first for one in found):

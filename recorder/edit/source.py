@@ -1,4 +1,4 @@
-"""Finished log from which messages are copied, and the times of its episodes."""
+"""Finished log from which messages are copied, and the log_times of its episodes."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class FinishedLog:
 
     @cached_property
     def lengths(self) -> NDArray[np.int64]:
-        """(E,) number of transitions of each episode; empty without `/rl/step`.
+        """(E,) number of transitions of each episode. Without `/rl/step`, the array is empty.
 
         Raises:
             LogError: The log has no episode, or its records are damaged.

@@ -1,4 +1,4 @@
-"""Delay of the times inside of messages, for logs whose log_times are delayed."""
+"""Delay of the timestamps in messages, for logs whose log_times are delayed."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ Fields = Mapping[str, Any]
 
 
 class Delay:
-    """Callable that adds a delay to the times inside of messages.
+    """Callable that adds a delay to the timestamps in messages.
 
-    It changes the times of `/rl/episode` and the fields of type `builtin_interfaces/Time`. A field
-    is changed only if its value is in the range of the file's log_times, extended by 10 s on each
-    side.
+    It changes the timestamps in `/rl/episode` and the fields of type `builtin_interfaces/Time`. A
+    field is changed only if its value is in the range of the file's log_times, extended by 10 s on
+    each side.
     """
 
     def __init__(self, reader: McapReader, span: tuple[int, int], delay_ns: int) -> None:
-        """Find the times in the types of all channels.
+        """Find the timestamps in the message types of all channels.
 
         Args:
             reader: Reader of the file.
@@ -55,7 +55,7 @@ class Delay:
                 self._changes[channel.id] = self._change_of(channel)
 
     def __call__(self, channel: Channel, time_ns: int, payload: memoryview) -> None:
-        """Change the times of one message in place.
+        """Change the timestamps of one message in place.
 
         Raises:
             CorruptLogError: The message does not fit its type.
@@ -72,7 +72,7 @@ class Delay:
             ) from error
 
     def _change_of(self, channel: Channel) -> Callable[[memoryview], None] | None:
-        """Return the function that delays the times in messages; None if they have no times."""
+        """Return the function that delays the timestamps in messages; None if they have none."""
         schema = self._reader.schemas.get(channel.schema_id)
         if (
             schema is None
@@ -113,7 +113,7 @@ class Delay:
 
 
 class _Walk:
-    """Cursor that moves through one CDR message and collects the positions of its times."""
+    """Cursor that moves through one CDR message and collects the offsets of its timestamps."""
 
     def __init__(self, data: memoryview, types: Fields) -> None:
         self.order, self.times = _order_of(data), list[int]()

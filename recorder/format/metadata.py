@@ -134,7 +134,10 @@ class LogMetadata:
         return dict(zip(values, meanings, strict=True))
 
     def is_failure(self, reason: str) -> bool:
-        """Return whether an episode that ends for this reason fails; False if that is unknown."""
+        """Return whether `reason` is the end reason of a failure.
+
+        Return False if that is unknown.
+        """
         return bool(self.success_reasons) and reason not in (*self.success_reasons, INTERRUPTED)
 
     def to_strings(self) -> dict[str, str]:

@@ -16,7 +16,7 @@ LARGEST: Final = 1 + 1e-6
 
 
 def is_impossible(probs: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return a mask of the numbers outside (0, 1]; NaN, which means unknown, is accepted."""
+    """Return a mask of the numbers outside (0, 1]. NaN means unknown and is accepted."""
     found: NDArray[np.bool_] = ~(np.isnan(probs) | ((probs >= SMALLEST) & (probs <= LARGEST)))
     return found
 

@@ -117,7 +117,7 @@ def telemetry_message(values: Iterable[float]) -> bytes:
 
 
 def action_constants(names: Mapping[int, str]) -> dict[str, int]:
-    """Return ROS constants that name the actions; viewers then display `BRAKE (0)` for 0.
+    """Return ROS constants that name the actions, so that viewers display `BRAKE (0)` for 0.
 
     Names are converted to upper case; text in parentheses is removed, and characters other than
     letters and digits become underscores. Names without letters have no constant.

@@ -318,7 +318,7 @@ class _Copy:
 
 
 def _check_times(source: Source, chunk: ChunkIndex, indexes: Mapping[int, NDArray[Any]]) -> None:
-    """Raise CorruptLogError if the times of a chunk do not match its messages."""
+    """Raise CorruptLogError if the log_times of a chunk do not match its messages."""
     times = [index["log_time"] for index in indexes.values() if len(index)]
     bounds = (
         [min(int(one.min()) for one in times), max(int(one.max()) for one in times)]

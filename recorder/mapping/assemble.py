@@ -206,5 +206,8 @@ def _repeated(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
 
 
 def _common_space(found: list[spaces.Space[Any]]) -> spaces.Space[Any]:
-    """Return the largest Discrete space of the runs; Box spaces are equal in all runs."""
+    """Return a space for all runs.
+
+    This is the largest Discrete space, or the Box space, which is the same in all runs.
+    """
     return max(found, key=lambda space: int(getattr(space, "n", 0)))

@@ -263,7 +263,7 @@ class Place:
     """Line numbers of the keys of a mapping file, for error messages."""
 
     def __init__(self, path: str = "mapping", tree: Any = None) -> None:
-        """Store the path of the file and its YAML tree; without a tree, keys have no line."""
+        """Store the path of the file and its YAML tree. If the tree is None, keys have no line."""
         self.path, self._tree = path, tree
 
     @contextmanager
@@ -277,7 +277,10 @@ class Place:
             raise UsageError(f"{self.of(*keys)}: {error}") from error
 
     def of(self, *keys: Any) -> str:
-        """Return `FILE:LINE: key.key`; a missing key has the line of its innermost parent."""
+        """Return `FILE:LINE: key.key`.
+
+        For a missing key, LINE is that of the closest existing parent.
+        """
         tree: Any = self._tree
         line = None
         for key in keys:

@@ -41,6 +41,7 @@ FUNCTIONS: Final[dict[str, tuple[Callable[..., Any], int]]] = {
 NEXT: Final = "next"
 """Name of the function that evaluates its argument at the next step."""
 _MAX_CHARACTERS, _MAX_DEPTH = 4000, 50
+_STRING = "a string can only be compared with a string, using == or !="
 
 _BINARY: Final[dict[type[ast.operator], Callable[..., Any]]] = {
     ast.Add: operator.add,
@@ -228,7 +229,7 @@ def _number(value: Any) -> Any:
     """
     found = np.asarray(value)
     if found.dtype.kind not in "biuf":
-        raise TypeError("a string can only be compared")
+        raise TypeError(_STRING)
     return found.astype(np.float64)
 
 
@@ -236,6 +237,6 @@ def _compared(op: ast.cmpop, left: Any, right: Any) -> Any:
     are_texts = [np.asarray(side).dtype.kind not in "biuf" for side in (left, right)]
     if any(are_texts):
         if not all(are_texts) or not isinstance(op, ast.Eq | ast.NotEq):
-            raise TypeError("a string can only be compared with a string, using == or !=")
+            raise TypeError(_STRING)
         left, right = np.asarray(left, object), np.asarray(right, object)
     return _COMPARED[type(op)](left, right)

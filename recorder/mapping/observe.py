@@ -140,7 +140,10 @@ def _match(
 
 
 def _rows(run: Run, match: Matches) -> NDArray[np.int64]:
-    """Return, for each step, the index of its message in the topic; `NONE` without a message."""
+    """Return the index in the topic of each step's message.
+
+    For a step without a message, the index is `NONE`.
+    """
     rows = np.full(len(match.rows), NONE)
     rows[match.rows != NONE] = run.rows[match.rows[match.rows != NONE]]
     return rows

@@ -68,7 +68,10 @@ class TopicStream:
 
     @cached_property
     def runs(self) -> list[Run]:
-        """Runs of messages between resets of the clock; one empty run without messages."""
+        """Runs of messages between resets of the clock.
+
+        If there are no messages, there is one empty run.
+        """
         times_ns = self.times_ns
         resets = np.flatnonzero(np.diff(times_ns) < -self._gap_ns) + 1
         found = []

@@ -1,4 +1,4 @@
-"""Poses of frames in other frames, from the transforms of a bag."""
+"""Poses of coordinate frames in other frames, from the transforms of a bag."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class _Edge(NamedTuple):
 
 
 class Transforms:
-    """Tree of the frames of a bag."""
+    """Tree of the coordinate frames of a bag."""
 
     def __init__(self, bag: Bag, *, by_header: bool = False) -> None:
         """Read all transforms.

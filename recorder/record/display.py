@@ -126,13 +126,13 @@ class Display:
 
     @property
     def shown(self) -> ShownTopics:
-        """The scene and telemetry topics; available after the first call of `begin`."""
+        """The scene and telemetry topics. They are available after the first call of `begin`."""
         assert self._shown is not None, "no episode has begun"
         return self._shown
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """Names of all display topics; defined after the first `begin`."""
+        """Names of all display topics. They are known after the first call of `begin`."""
         return (*self.shown.channels, *((DEPTH,) if self._depth_images else ()))
 
     def begin(self, start_ns: int, step_ns: int) -> None:
@@ -214,7 +214,7 @@ class Display:
             self._pending = None
 
     def _emit_motion(self, time_ns: int, frames: Sequence[Frame]) -> None:
-        """Add the poses of the frames between the previous step and the step at `time_ns`."""
+        """Add the poses of the coordinate frames since the previous step, up to `time_ns`."""
         end = (time_ns, frames)
         if self._moment is not None:
             inner = self._motion.motion() if self._motion is not None else ()

@@ -258,7 +258,7 @@ class _Screens:
         return [self._put("Gauge!speed", panel)]
 
     def _indicator(self) -> list[Node]:
-        """Add the state of the episode; failures are red if the success reasons are known."""
+        """Add the state of the episode. If the success reasons are known, failures are red."""
         if PHASE_TOPIC not in self.topics:
             return []
         successes = self.metadata.success_reasons

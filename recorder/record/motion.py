@@ -17,7 +17,7 @@ from mcaprl.recorder.format import messages
 from mcaprl.recorder.record.scene import Frame, stamped_transform
 
 Moment = tuple[int, Sequence[Frame]]
-"""log_time in nanoseconds, and the moving frames at that time."""
+"""log_time in nanoseconds, and the moving coordinate frames at that time."""
 
 _TOLERANCE_M = 0.04
 _TOLERANCE_ROTATION = 0.01

@@ -103,27 +103,27 @@ class Frame(Protocol):
 
 @runtime_checkable
 class SceneSource(Protocol):
-    """An environment that provides shapes and frames."""
+    """An environment that provides shapes and coordinate frames."""
 
     def static_scene(self) -> Sequence[Shape]:
-        """Return the shapes that stay the same in an episode; their frames may move."""
+        """Return the shapes that stay the same in an episode. Their coordinate frames may move."""
 
     def scene(self) -> Sequence[Shape]:
         """Return the current shapes that change from step to step."""
 
     def static_frames(self) -> Sequence[Frame]:
-        """Return the frames that are fixed in their parents."""
+        """Return the coordinate frames that are fixed in their parents."""
 
     def frames(self) -> Sequence[Frame]:
-        """Return the moving frames at their current poses."""
+        """Return the moving coordinate frames with their current poses."""
 
 
 @runtime_checkable
 class MotionSource(Protocol):
-    """An environment that provides its moving frames within a step."""
+    """An environment that provides the poses of its moving coordinate frames within a step."""
 
     def motion(self) -> Sequence[tuple[float, Sequence[Frame]]]:
-        """Return the moving frames at moments within the last step, in order of time.
+        """Return the moving coordinate frames at moments within the last step, in order of time.
 
         Each element is a pair: the number of seconds before the end of the step, which is more than
         0, and the frames at that moment. The sequence is empty after `reset`.
@@ -143,7 +143,10 @@ class DepthSource(Protocol):
     """An environment with a depth camera."""
 
     def depth_image_m(self) -> NDArray[np.float32]:
-        """Return (height, width) distances along the rays in meters; infinity if nothing is hit."""
+        """Return the distances (height, width) along the rays in meters.
+
+        A distance is infinite if the ray hits nothing.
+        """
 
 
 @runtime_checkable
@@ -166,13 +169,13 @@ def marker_array(shapes: Iterable[Shape]) -> bytes:
 
 
 def transforms(frames: Iterable[Frame], time_ns: int) -> bytes:
-    """Encode frames as one `tf2_msgs/msg/TFMessage`."""
+    """Encode coordinate frames as one `tf2_msgs/msg/TFMessage`."""
     stamped = [stamped_transform(frame, time_ns) for frame in frames]
     return messages.encode(messages.new("tf2_msgs/msg/TFMessage", transforms=stamped))
 
 
 def stamped_transform(frame: Frame, time_ns: int) -> Any:
-    """Return a frame as `geometry_msgs/msg/TransformStamped`."""
+    """Return a coordinate frame as `geometry_msgs/msg/TransformStamped`."""
     return messages.new(
         "geometry_msgs/msg/TransformStamped",
         header=messages.header(time_ns, frame.parent),
@@ -286,7 +289,10 @@ def _unstamped(frame: str) -> Any:
 
 @lru_cache(maxsize=1)
 def _unused_fields() -> dict[str, Any]:
-    """Return the fields that are equal in all markers. A lifetime of 0 means no expiration."""
+    """Return the marker fields that have the same value in all markers.
+
+    A lifetime of 0 means that a marker never expires.
+    """
     new, nothing = messages.new, np.empty(0, np.uint8)
     image = "sensor_msgs/msg/CompressedImage"
     return {

@@ -64,13 +64,13 @@ class Arrays:
         return store_value
 
     def put(self, column: NDArray[Any]) -> None:
-        """Copy the first values to a column; they also stay in the buffer."""
+        """Copy the first values to a column, and keep them in the buffer."""
         if len(column):
             waiting = np.frombuffer(self._waiting.getbuffer(), self._dtype, column.size)
             column[:] = waiting.reshape(column.shape)
 
     def drop(self, count: int | None = None) -> None:
-        """Drop the first `count` values; default: all values."""
+        """Drop the first `count` values, by default all values."""
         rest = b"" if count is None else self._waiting.getvalue()[count * self._bytes_each :]
         self._waiting.seek(0)
         self._waiting.truncate()
@@ -102,11 +102,11 @@ class Integers:
         return store_value
 
     def put(self, column: NDArray[Any]) -> None:
-        """Copy the first values to a column; they also stay in the buffer."""
+        """Copy the first values to a column, and keep them in the buffer."""
         column[:] = self._waiting[: len(column)]
 
     def drop(self, count: int | None = None) -> None:
-        """Drop the first `count` values; default: all values."""
+        """Drop the first `count` values, by default all values."""
         del self._waiting[:count]
 
 
@@ -133,7 +133,10 @@ class StepColumns:
         self.store_reward: Store = self._rewards.append
 
     def store_behavior_prob(self, prob: float) -> None:
-        """Store the probability of the latest action; earlier actions without one get NaN."""
+        """Store the probability of the latest action.
+
+        Earlier actions without a probability get NaN.
+        """
         unknown = len(self._rewards) - len(self._probs)
         if unknown:
             self._probs.extend([math.nan] * unknown)
@@ -238,7 +241,10 @@ class ImageColumn:
         return self._first_step + len(self._rows)
 
     def append(self, image: NDArray[Any]) -> None:
-        """Store the image of the next step; any dtype is valid if the number of bytes is equal."""
+        """Store the image of the next step.
+
+        Its dtype must have as many bytes as that of the space.
+        """
         self._images.append(image)
 
     def flush(self, stop: int) -> None:
@@ -315,7 +321,7 @@ def reward_number(reward: Any) -> float:
     """
     array = np.asarray(reward)
     if array.size != 1 or array.dtype.kind not in "biuf":
-        raise SpaceError(f"the reward is {reward!r:.60}; a log can store one number")
+        raise SpaceError(f"the reward is {reward!r:.60}: it must be a single number")
     return float(array.item())
 
 

@@ -282,7 +282,10 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         truncated: NDArray[np.bool_],
         infos: dict[str, Any],
     ) -> None:
-        """End these environments' episodes; in same-step mode, begin their next episodes."""
+        """End the episodes of these environments.
+
+        In same-step mode, also begin their next episodes.
+        """
         same_step = self._autoreset is AutoresetMode.SAME_STEP
         ended = infos.get("final_info", {}) if same_step else infos
         for number in numbers.tolist():

@@ -343,7 +343,7 @@ class LiveStream(ViewerServer):
         self._moment = moments[-1] if moments else None
 
     def _send_static(self, source: SceneSource, time_ns: int) -> None:
-        """Send the static shapes and frames if they have changed."""
+        """Send the static shapes and coordinate frames if they have changed."""
         shapes = source.static_scene()
         if shapes is not self._static_shapes:
             self._static_shapes = shapes

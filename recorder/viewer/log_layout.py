@@ -1,4 +1,4 @@
-"""The layout of an existing log, from its topics, schemas and first frame."""
+"""The layout of an existing log, from its topics, schemas and first coordinate frame."""
 
 from __future__ import annotations
 

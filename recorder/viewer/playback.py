@@ -210,7 +210,10 @@ class Player:
         return sorted(due, key=lambda message: message.time_ns)
 
     def _played(self, found: Callable[[Track, int], _Messages]) -> list[Played]:
-        """Return the messages that `found` yields for each log; times are on the player's clock."""
+        """Return the messages that `found` yields for each log.
+
+        Their times are those of the player's clock.
+        """
         return [
             Played(number, channel.id, time_ns + shift, data)
             for number, (track, shift) in enumerate(zip(self.tracks, self.shifts_ns, strict=True))

@@ -29,7 +29,7 @@ _EVENT_TOPICS = (EPISODE_TOPIC, LOG_TOPIC)
 
 
 class LiveServer(ViewerServer):
-    """Server that plays logs to all connected viewers; playback starts at the first subscription.
+    """Server that plays logs to all connected viewers. Playback starts at the first subscription.
 
     Viewers can set two parameters: `episode` seeks to the start of an episode, and `loop` sets
     whether playback restarts at the end.

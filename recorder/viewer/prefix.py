@@ -1,4 +1,4 @@
-"""Prefixes for the topics and frames of several logs in one viewer."""
+"""Prefixes for the topics and coordinate frames of several logs in one viewer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from mcaprl.recorder.format import messages
 
 WORLD = "map"
-"""Name of the frame that all logs share."""
+"""Name of the coordinate frame that all logs share."""
 _MARKERS, _FRAMES = "visualization_msgs/msg/MarkerArray", "tf2_msgs/msg/TFMessage"
 PREFIXED_TYPES = (_MARKERS, _FRAMES)
 """Types of messages that contain frame names; these names get a prefix."""
@@ -93,7 +93,7 @@ def _in_a_row(nodes: Sequence[Any]) -> Any:
 
 
 def _prefixed_layout(layout: dict[str, Any], prefix: str) -> dict[str, Any]:
-    """Add a prefix to the topics, frames, variables and panels of a layout."""
+    """Add a prefix to the topics, coordinate frames, variables and panels of a layout."""
     if not prefix:
         return layout
     text = json.dumps(layout)

@@ -96,7 +96,7 @@ def _findings_section(findings: Sequence[Problem]) -> Section:
 
 
 def _calibration_section(dataset: Dataset) -> list[Section]:
-    """Return the section about behavior probabilities; an empty list if they are unknown."""
+    """Return the section about behavior probabilities. If they are unknown, the list is empty."""
     found = calibration(dataset.behavior_probs, dataset.action_space)
     if found is None:
         return []
@@ -240,7 +240,9 @@ def _bars(axes: Any, counts: Mapping[str, int], label: str) -> None:
 
 
 def tracks_of(dataset: Dataset) -> list[Positions]:
-    """Return the positions (T + 1, 2) of each episode in meters; (0, 2) if they are unknown.
+    """Return the positions (T + 1, 2) of each episode in meters.
+
+    If the positions are unknown, the arrays have the shape (0, 2).
 
     Raises:
         LogError: A file of the dataset is missing or damaged.
@@ -261,7 +263,10 @@ def _positions_in(path: Path) -> tuple[NDArray[np.int64], Positions] | None:
 def _positions_at(
     times: NDArray[np.int64], logs: Sequence[tuple[NDArray[np.int64], Positions]]
 ) -> Positions:
-    """Return the positions at `times`; empty if no single log has positions at all `times`."""
+    """Return the positions at `times`.
+
+    If no single log has positions at all these times, the array is empty.
+    """
     for known, positions in logs:
         start = int(np.searchsorted(known, times[0]))
         stop = start + len(times)

@@ -1,4 +1,4 @@
-"""Reader of a log's scene: the shapes and frames at and between the steps of an episode."""
+"""Reader of a log's scene: the shapes and coordinate frames at and between steps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ADD = 0
 
 @dataclass(frozen=True)
 class SeenShape:
-    """A marker with the attributes of `scene.Shape`; rotations other than about z are ignored."""
+    """A marker with the attributes of `scene.Shape`. Only rotations about z are considered."""
 
     name: str
     kind: str
@@ -115,7 +115,10 @@ def _moments(times_ns: list[int], parts: int) -> Iterator[tuple[int, int]]:
 
 
 def _frames_at(stamped: list[tuple[int, SeenFrame]], time_ns: int) -> list[SeenFrame]:
-    """Interpolate the frames at `time_ns`; outside the range of stamps, use the nearest stamp."""
+    """Interpolate the coordinate frames at `time_ns`.
+
+    Outside the range of stamps, use the nearest stamp.
+    """
     by_name: dict[str, list[tuple[int, SeenFrame]]] = {}
     for stamp_ns, frame in stamped:
         by_name.setdefault(frame.name, []).append((stamp_ns, frame))
@@ -137,7 +140,7 @@ def _frame_at(poses: list[tuple[int, SeenFrame]], time_ns: int) -> SeenFrame:
 
 
 def frames_of(data: bytes) -> list[tuple[int, SeenFrame]]:
-    """Return the frames of a `tf2_msgs/msg/TFMessage` with their stamps in nanoseconds.
+    """Return the coordinate frames in a `tf2_msgs/msg/TFMessage` and their stamps in nanoseconds.
 
     Raises:
         CorruptLogError: The message is damaged.

@@ -143,7 +143,10 @@ def verify(
 
 
 def _needed(episodes: tuple[Episode, ...], only: int | None) -> tuple[Episode, ...]:
-    """Return `only` and the episodes that its start depends on; all episodes if `only` is None."""
+    """Return episode `only` and the episodes that its start depends on.
+
+    If `only` is None, return all episodes.
+    """
     if only is None:
         return episodes
     first = only

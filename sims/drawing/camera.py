@@ -1,4 +1,4 @@
-"""Software rasterizer for depth images of triangle meshes; needs one CPU core and no display.
+"""Software rasterizer for depth images of triangle meshes on one CPU core, without a display.
 
 The z-buffer stores inverse depths. On a plane, 1/z is linear in image coordinates, so one division
 per triangle suffices. Pixels that no triangle covers are 0.

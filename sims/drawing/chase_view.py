@@ -40,7 +40,7 @@ _ROUND = np.array([(math.cos(a), math.sin(a)) for a in np.arange(12) * math.pi /
 
 
 class Pose(NamedTuple):
-    """Pose of a frame in the map."""
+    """Pose of a coordinate frame in the map."""
 
     axes: Floats
     """(3, 3) axes of the frame as columns."""
@@ -140,7 +140,7 @@ class ChaseView:
 
 
 def poses_of(frames: Iterable[Frame]) -> dict[str, Pose]:
-    """Return the pose of each frame in the map, with its parents' poses applied.
+    """Return the pose of each coordinate frame in the map, with its parents' poses applied.
 
     >>> car = Frame("car", (3.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     >>> lamp = Frame("lamp", (1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0), parent="car")

@@ -158,7 +158,10 @@ class DepthCamera:
         return inverse
 
     def image_m(self, position_m: tuple[float, float, float], axes: Floats) -> NDArray[np.float32]:
-        """Render the downsampled image: (h, w) meters along each ray; infinity without a hit."""
+        """Render the downsampled image: the distances (h, w) along the rays in meters.
+
+        A distance is infinite if the ray hits nothing.
+        """
         small = np.empty(self._small, dtype=np.float32)
         shrink(self.inverse_distance(position_m, axes), self._rows, self._columns, small)
         if len(self._wires):

@@ -38,7 +38,7 @@ def arc(start: Pose, end: Pose, share: float) -> Pose:
 
 
 def car_moments(start: Pose, end: Pose, duration_s: float) -> list[Sequence[Frame]]:
-    """Return frames of a car on an arc, at equal intervals of at most 0.05 s up to the end."""
+    """Return the car's poses on an arc, at equal intervals of at most 0.05 s up to the end."""
     count = math.ceil(duration_s / LONGEST_S - 1e-9)
     return [(car_frame(*arc(start, end, (1 + k) / count)),) for k in range(count)]
 

@@ -67,7 +67,7 @@ def slip_of(steering_rad: float) -> float:
 
 @inlined
 def steering_of(slip_sine: float) -> float:
-    """Return the steering angle, radians, for sin(beta); inverts `slip_of`."""
+    """Return the steering angle in radians for sin(beta). This is the inverse of `slip_of`."""
     return math.atan2(2.0 * slip_sine, math.sqrt(1.0 - slip_sine * slip_sine))
 
 

@@ -40,7 +40,7 @@ def drawn_pose(
 def pose_from_options(
     options: dict[str, Any], courses: Sequence[Course], others: Sequence[Car], own: Car
 ) -> Pose:
-    """Return the pose from the options of `reset`; the default speed is the car's current speed.
+    """Return the pose from the options of `reset`. The default speed is the car's current speed.
 
     Raises:
         UsageError: An option is unknown, or the pose is malformed, occupied, or not on a lane.

@@ -1,4 +1,4 @@
-"""Depth camera of the lane sim's car; renders the ground, rails, barriers and buildings."""
+"""Depth camera of the lane sim's car, which renders the ground, rails, barriers and buildings."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class CarCamera:
         self._cameras = [DepthCamera(lane_mesh(world), LENS, IMAGE_SHAPE) for world in worlds]
 
     def image_m(self, car: Car) -> NDArray[np.float32]:
-        """Return (84, 84) distances along each ray, meters; infinity where a ray hits nothing."""
+        """Return distances (84, 84) along the rays in meters, infinite where a ray hits nothing."""
         x_m = car.x_m + CAMERA_FORWARD_M * math.cos(car.yaw_rad)
         y_m = car.y_m + CAMERA_FORWARD_M * math.sin(car.yaw_rad)
         camera = self._cameras[world_at(car.along_m) if len(self._cameras) > 1 else NO_BARRIERS]

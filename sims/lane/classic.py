@@ -52,7 +52,7 @@ def classic_distance(x_m: float, y_m: float) -> float:
 
 @compiled
 def classic_reward(distance_m: float, speed_m_s: float) -> float:
-    """Return the reward (exp(-3 d) - 0.5) + ((v - 10) / (300 - 10) - 0.5); -3 beyond 3.5 m.
+    """Return the reward: -3 beyond 3.5 m, else (exp(-3 d) - 0.5) + ((v - 10) / (300 - 10) - 0.5).
 
     The distance is d in meters, and the speed is v in m/s.
     """

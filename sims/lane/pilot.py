@@ -82,7 +82,7 @@ def pursuit_value(car: Car, substeps: int = SUBSTEPS) -> float:
 
 @compiled
 def choose(car: Car, substeps: int = SUBSTEPS) -> int:
-    """Choose the pursuit action if `HORIZON` decisions of pursuit are safe; else search.
+    """Choose the pursuit action if `HORIZON` decisions of pursuit are safe. Otherwise, search.
 
     The search tries all pairs of two actions, each followed by pursuit. The result is the first
     action of the best pair.

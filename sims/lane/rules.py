@@ -165,7 +165,7 @@ def driven(motion: Motion, steering: float, is_braking: bool) -> Motion:
 
 @inlined
 def steering_for(action: int, last: float) -> float:
-    """Return the steering command of an action; braking keeps the last command."""
+    """Return the steering command of an action. When braking, it is the last command."""
     return last if action == BRAKE else STEERING[action]
 
 

@@ -42,7 +42,7 @@ def fly_all(
     winds_m_s: NDArray[np.float64],
     duration_s: float,
 ) -> None:
-    """Advance K of N drones in place; the results are those of `fly`.
+    """Advance K of N drones in place. The results are the same as those of `fly`.
 
     Args:
         plant: As in `fly`.

@@ -1,4 +1,4 @@
-"""Depth camera of the drone; renders the ground, the firs, the towers and the conductors.
+"""Depth camera of the drone, which renders the ground, the firs, the towers and the conductors.
 
 The mesh is in ROS axes, like the scene for viewers. Towers are rendered as solids without lattice.
 Conductors are drawn one pixel wide at any distance, because a conductor with the real diameter of
@@ -113,7 +113,7 @@ class DroneCamera:
         self._camera = DepthCamera(world_mesh(), LENS, IMAGE_SHAPE, world_wires())
 
     def image_m(self, drone: Drone) -> NDArray[np.float32]:
-        """Return (84, 84) distances along each ray, meters; infinity where a ray hits nothing."""
+        """Return distances (84, 84) along the rays in meters, infinite where a ray hits nothing."""
         return self._camera.image_m(*self.pose(drone))
 
     def without_wires(self, drone: Drone) -> Floats:

@@ -55,7 +55,7 @@ def classic_end(position_m: Vector, hit: bool) -> int:
 
 @compiled
 def classic_reward(position_m: Vector, speed_m_s: float, hit: bool) -> float:
-    """Return the reward (exp(-d) - 0.5) + (speed - 0.5); -10 beyond 7 m, -100 for a collision.
+    """Return the reward: -100 for a collision, -10 beyond 7 m, else (exp(-d) - 0.5) + speed - 0.5.
 
     The distance d to the nearest infinite line is in meters, and the speed is in m/s.
     """

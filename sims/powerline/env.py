@@ -170,7 +170,7 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
         return {**powerline_scene.telemetry(self.flight), **self.fleet.info(0)}
 
     def depth_image_m(self) -> NDArray[np.float32]:
-        """Return (84, 84) distances along each ray, meters; infinity where a ray hits nothing."""
+        """Return distances (84, 84) along the rays in meters, infinite where a ray hits nothing."""
         return self.fleet.depth_image_m(0)
 
     def depth_focal_px(self) -> tuple[float, float]:

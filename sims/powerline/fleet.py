@@ -169,7 +169,7 @@ class PowerlineFleet(Fleet):
         return {key: np.stack([each[key] for each in seen]) for key in ("depth", "motion")}
 
     def depth_image_m(self, i: int) -> NDArray[np.float32]:
-        """Return (84, 84) distances along the rays of drone i, meters; infinity without a hit."""
+        """Return distances (84, 84) along the rays of drone i in meters, infinite without a hit."""
         if i not in self._depth_m:
             if self._camera is None:
                 self._camera = DroneCamera(self.camera_view)

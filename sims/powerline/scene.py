@@ -62,7 +62,7 @@ def ros(ned: Vector) -> tuple[float, float, float]:
 
 
 def _shaded(name: str, triangles: Floats, color: tuple[float, float, float]) -> list[Shape]:
-    """Return triangles (T, 3, 3), shaded by their angle to the sun; one shape per brightness."""
+    """Shade triangles (T, 3, 3) by their angle to the sun. Return one shape for each brightness."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     light = np.clip(normals @ SUN / np.linalg.norm(normals, axis=1), 0.0, 1.0)
     classes = np.minimum((light * SHADES).astype(np.int64), SHADES - 1)

@@ -19,7 +19,7 @@ CAR_LENGTH_PX, CAR_WIDTH_PX = 30.0, 14.0
 
 
 class Car(NamedTuple):
-    """State of one car; the first 12 values of a row in an (N, 13) array of cars."""
+    """State of one car: the first 12 values of its row in an (N, 13) array of cars."""
 
     x_px: float
     y_px: float

@@ -186,7 +186,7 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
         return self.car
 
     def _moments(self, before: Car, action: int) -> list[Sequence[Frame]]:
-        # The rules turn a car at once and then move it; a viewer shows an arc.
+        # By the rules, a car turns at once and then moves. A viewer shows an arc instead.
         start, end = racer_scene.pose_of(before), racer_scene.pose_of(self.car)
         return car_moments(start, end, self.step_duration_s)
 

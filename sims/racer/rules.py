@@ -239,5 +239,5 @@ def car_info(cars: NDArray[np.float64], info: NDArray[np.float64]) -> None:
 
 @compiled
 def speed_of(car: Car) -> float:
-    """Return a car's speed, m/s; negative backward."""
+    """Return a car's speed in m/s. It is negative when the car drives backward."""
     return car.speed_px * METERS_PER_PX / STEP_S

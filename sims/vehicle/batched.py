@@ -210,7 +210,7 @@ def _seeds_of(seed: int | Sequence[int | None] | None, count: int) -> list[int |
 
 
 def _mask_of(mask: Any, count: int) -> Bools:
-    """Validate `reset_mask`; None selects all vehicles."""
+    """Validate `reset_mask`. If it is None, select all vehicles."""
     if mask is None:
         return np.ones(count, dtype=np.bool_)
     chosen = np.asarray(mask)

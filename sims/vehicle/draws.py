@@ -48,7 +48,10 @@ class Draws:
         self._generators: list[Any] = [None] * count
 
     def use_generator(self, i: int, generator: np.random.Generator) -> None:
-        """Assign a generator to vehicle i; discard the numbers drawn from another generator."""
+        """Assign a generator to vehicle i.
+
+        If this replaces another generator, discard the numbers that were drawn from that one.
+        """
         if self._generators[i] is not generator:
             self._generators[i], self.used[i] = generator, _AHEAD
 

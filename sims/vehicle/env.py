@@ -163,10 +163,11 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         return list(self._trail)
 
     def motion(self) -> list[tuple[float, Frames]]:
-        """Return the moving frames within the last step, at most 0.05 s apart, in order of time.
+        """Return the poses of the moving coordinate frames within the last step, in order of time.
 
-        Each element consists of the seconds before the end of the step, and the frames at that
-        moment. The list is empty after `reset` and before the first read of `trail`.
+        The moments are at most 0.05 s apart. Each element consists of the number of seconds before
+        the end of the step and the coordinate frames at that moment. The list is empty after
+        `reset` and before the first read of `trail`.
         """
         if self._last_step is None:
             return []
@@ -195,7 +196,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
 
     @abstractmethod
     def _moments(self, before: Any, action: int) -> list[Frames]:
-        """Return the moving frames at equal intervals within the last step and at its end.
+        """Return the moving coordinate frames at equal intervals in the last step and at its end.
 
         Args:
             before: State of the vehicle before the step.
@@ -211,9 +212,9 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
 
 
 def before_end(moments: Sequence[Frames], duration_s: float) -> list[tuple[float, Frames]]:
-    """Return the frames within a step, with the time from each moment to the end of the step.
+    """Return the coordinate frames within a step, and the time to the end of the step for each.
 
-    The frames at the end of the step are omitted.
+    The coordinate frames at the end of the step are omitted.
 
     Args:
         moments: Frames at equal intervals of the step; the last moment is the end of the step.

@@ -80,7 +80,7 @@ class Fleet(ABC):
 
     @abstractmethod
     def advance(self) -> None:
-        """Advance each vehicle by one step; `actions` contains the actions."""
+        """Advance each vehicle by one step with its action in `actions`."""
 
     def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
         """Advance the only vehicle of a fleet of one, with a valid action.

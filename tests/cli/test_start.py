@@ -1,4 +1,4 @@
-"""Start of the commands: few modules are imported before the first output; pipes and --quiet."""
+"""Tests of the start of the commands: imported modules, pipes, and `--quiet`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs the code of the page about Ray on the cluster of the tests."""
+"""Fixture that runs the code of the page about Ray on the Ray cluster of the tests."""
 
 from __future__ import annotations
 

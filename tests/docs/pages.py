@@ -115,7 +115,10 @@ class Run:
         )
 
     def shell(self, example: Example) -> None:
-        """Run the commands of an `sh` block in one shell; in a quick run, in this process."""
+        """Run the commands of an `sh` block in one shell.
+
+        In a quick run, run them in this process.
+        """
         script: list[str] = []
         for line in commands(example.parsed):
             words = shlex.split(line)
@@ -139,7 +142,7 @@ class Run:
         assert same, f"{example.path}:{example.line}: the output is\n{got}"
 
     def _other_program(self, words: list[str]) -> bool:
-        """Return whether a command is not run; the files that it names must exist.
+        """Return whether a command is not run, and check that the files in it exist.
 
         Installations, targets of the Makefile and benchmarks need other environments and up to
         hours. Examples take minutes, so a quick run omits them.
@@ -221,7 +224,7 @@ def _sh(script: list[str]) -> None:
 
 
 def _serve(words: list[str]) -> int:
-    """Start a server, and stop it with Ctrl-C after it prints that Ctrl-C stops it."""
+    """Start a server, and interrupt it when it prints that Ctrl-C stops it."""
     command = [sys.executable, "-m", "mcaprl.cli", *words[1:], "--port", "0"]
     with subprocess.Popen(
         command, stdout=-1, stderr=-2, text=True, preexec_fn=_allow_interrupts

@@ -42,7 +42,10 @@ class OneBatch:
 
 
 def model_of(kind: type[DQN], max_grad_norm: float = 10.0, gamma: float = 0.5) -> Any:
-    """Make a model; in the next state, the online network prefers action 1, the target action 0."""
+    """Make a model.
+
+    In the next state, the online network prefers action 1, and the target network prefers action 0.
+    """
     model: Any = kind(
         "MlpPolicy",
         gym.make("CartPole-v1"),

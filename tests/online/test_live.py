@@ -117,8 +117,8 @@ def test_a_viewer_receives_what_is_recorded(tmp_path: Path) -> None:
     assert counts["/scene/static"] >= 1
     steps, learner = decoded(seen, "/rl/step"), decoded(seen, "/rl/learner")
     log, reported = mcaprl.open(tmp_path / "log.mcap"), read_learner(tmp_path / "log.mcap")
-    # The log has the episodes of all environments in the order of their ends. Find those of the
-    # first environment by their observations.
+    # The log contains the episodes of all environments, in the order in which they ended. Find the
+    # steps of the first environment by their observations.
     places = {row.tobytes(): i for i, row in enumerate(log.observations)}
     rows = [places[observation.tobytes()] for observation in steps["observation"]]
     for name, column in (("reward", log.rewards), ("behavior_prob", log.behavior_probs)):

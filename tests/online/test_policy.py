@@ -55,7 +55,10 @@ def observations_of(space: spaces.Space[Any], count: int = 20) -> Any:
 
 
 def rewrite(path: Path, out: Path, **members: bytes | None) -> Path:
-    """Copy a zip with other members; None omits a member. In names, `_pth` means `.pth`."""
+    """Copy a zip file with other members.
+
+    If the new content of a member is None, the member is omitted. In names, `_pth` means `.pth`.
+    """
     changed = {
         name.replace("_pth", ".pth").replace("_json", ".json"): c for name, c in members.items()
     }

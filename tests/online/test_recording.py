@@ -197,8 +197,8 @@ def test_probabilities_are_those_of_the_behavior_policy(tmp_path: Path) -> None:
 
 
 def test_probabilities_do_not_depend_on_other_predictions(tmp_path: Path) -> None:
-    # With a learning rate of next to nothing, the network at the end is that of all steps; an
-    # evaluation after each one asks the network for other actions.
+    # The learning rate is so small that the network does not change. After each step, an evaluation
+    # makes other predictions with the network.
     _, log = trained(
         tmp_path / "run",
         learning_rate=1e-30,

@@ -1,4 +1,4 @@
-"""Sweeps with Ray Tune, and their files."""
+"""Tests of sweeps with Ray Tune, and of their files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_file_has_each_combination_of_its_values(tmp_path: Path) -> None:
     pairs = [(3e-4, 0.5), (3e-4, 1.0), (1e-3, 0.5), (1e-3, 1.0)]
     assert varied == [*pairs, (3e-4,), (1e-3,)]
     assert {one.config.hidden for one in plan.trials} == {(8, 8)}
-    # The setting gamma is of cql alone, and the checkpoints are when policies are scored.
+    # Only cql has the setting gamma. Checkpoints are written when policies are scored.
     assert plan.trials[0].config.to_json()["gamma"] == 0.9
     assert {one.config.checkpoint_interval for one in plan.trials} == {10}
     assert (plan.seeds, plan.seed, plan.stop, plan.score.every) == (2, 0, 3, 10)

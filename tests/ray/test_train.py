@@ -1,4 +1,7 @@
-"""Training on a Ray cluster: the weights of one process, also if a worker is killed."""
+"""Tests of training on a Ray cluster.
+
+The weights must equal those of one process, also if a worker is killed.
+"""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ BEGIN, END = "<!-- fault figures: begin -->\n", "<!-- fault figures: end -->\n"
 
 
 def with_table(page: str, figures: str) -> str:
-    """Return the page with the figures in its table; each line of them is `fault: result`."""
+    """Return the page with the figures in its table. Each line of `figures` is `fault: result`."""
     before, _, rest = page.partition(BEGIN)
     _, _, after = rest.partition(END)
     assert rest, "the page has no place for figures"

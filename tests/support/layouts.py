@@ -13,8 +13,8 @@ from rosbags.typesys import get_types_from_msg
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.record.layout import LAYOUT_NAME
 
-# The area for panels in a window of 1280 x 720 whose sidebar is open, the height of a row of tabs,
-# and the smallest useful panel, pixels.
+# Sizes in pixels. AREA_PX is the area for panels in a window of 1280 x 720 whose sidebar is open.
+# TABS_PX is the height of a row of tabs. LEAST_PX is the size of the smallest useful panel.
 AREA_PX, TABS_PX, LEAST_PX = (960, 600), 30, (150, 90)
 _TOPIC = re.compile(r"(?:/\w+)+")
 _PART = re.compile(r"\.(?P<field>\w+)|\[(?P<slice>\d+|:)\]|\{(?P<filter>[^{}]+)\}")

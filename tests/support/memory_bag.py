@@ -25,7 +25,10 @@ class MemoryBag:
         kinds: Mapping[str, str] | None = None,
         types: Mapping[str, str] | None = None,
     ) -> None:
-        """Store `(times_s, columns)` of each topic; lists of unequal parts become objects."""
+        """Store the `(times_s, columns)` of each topic.
+
+        A column of lists with different lengths becomes an array with dtype `object`.
+        """
         self._times: dict[str, NDArray[np.int64]] = {}
         self._columns: dict[str, dict[str, NDArray[Any]]] = {}
         self.topics: dict[str, TopicInfo] = {}

@@ -38,7 +38,10 @@ class Returns:
     skewed_seeds: bool = False
 
     def draw(self, random: np.random.Generator) -> Floats:
-        """Draw returns (S, E); half of an episode's variance is the variance of its start."""
+        """Draw returns (S, E) of S seeds and E episodes.
+
+        The start of an episode causes half of its variance.
+        """
         of_seeds = _effects(random, (self.seeds, 1), skewed=self.skewed_seeds)
         of_starts = _effects(random, (1, self.episodes), skewed=self.skewed)
         of_both = _effects(random, (self.seeds, self.episodes), skewed=self.skewed)

@@ -59,7 +59,7 @@ def stored_infos(infos: Mapping[str, Any]) -> tuple[dict[str, StoredInfo], list[
 def masked(
     values: NDArray[Any], is_missing: NDArray[np.bool_], dtype: np.dtype[Any] | None = None
 ) -> np.ma.MaskedArray[Any, Any]:
-    """Return an info as the environment returned it; the inverse of `stored_infos`.
+    """Return an info as the environment returned it. This is the inverse of `stored_infos`.
 
     Args:
         values: (F, *shape) stored values.

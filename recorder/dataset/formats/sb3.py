@@ -256,7 +256,10 @@ def _check_integers(name: str, space: spaces.Space[Any]) -> None:
 def _converted(
     space: spaces.Space[Any], order_of: Callable[[spaces.Space[Any]], Order | None]
 ) -> spaces.Space[Any]:
-    """Permute the axes of each Box in a space by `order_of(box)`; None keeps the axes."""
+    """Permute the axes of each Box in a space by `order_of(box)`.
+
+    If that is None, keep the axes.
+    """
     if isinstance(space, spaces.Dict):
         return spaces.Dict([(key, _converted(part, order_of)) for key, part in space.items()])
     order = order_of(space)
@@ -290,7 +293,10 @@ def _is_image(space: spaces.Space[Any]) -> bool:
 
 
 def _reordered(values: NDArray[Any], order: Order | None) -> NDArray[Any]:
-    """Permute the axes of each row of `values` (N, *shape) by `order`; None keeps the order."""
+    """Permute the axes of each row of `values` (N, *shape) by `order`.
+
+    If it is None, do nothing.
+    """
     return values if order is None else values.transpose(0, *(axis + 1 for axis in order))
 
 

@@ -47,7 +47,7 @@ _SCENE_TYPES = {
     TF_STATIC: "tf2_msgs/msg/TFMessage",
 }
 _VALUES_FIELDS = ("q", "preference", "policy_action", "value", "advantage", "td_error")
-# Uncompressed size of the images of one topic above which some steps have no image.
+# If the images of one topic are larger than this without compression, some are left out.
 _MOST_IMAGE_BYTES = 2**26
 _MOST_CHANNELS = 4
 
@@ -133,7 +133,7 @@ class LogPage:
             )
 
     def _plots(self, dataset: Dataset, episode: Episode) -> Iterator[dict[str, Any]]:
-        """Yield groups of series: title, names, and values (series, T or T + 1)."""
+        """Yield plots: a title, the names of the series, and their values (series, T or T + 1)."""
         leaves = observation_leaves(dataset.observation_space)
         for leaf in leaves:
             if leaf.encoding is None:
@@ -165,7 +165,7 @@ class LogPage:
                 yield {"name": name, **values}
 
     def _depth_images(self, episode: Episode) -> Iterator[dict[str, Any]]:
-        """Yield the depth images as numbers from 1 (near) to 255 (far); 0 is unknown."""
+        """Yield the depth images as numbers from 1 (near) to 255 (far). 0 means unknown."""
         if _type_of(self._reader, DEPTH) != "sensor_msgs/msg/Image":
             return
         topic = Topic(self._reader, DEPTH)
@@ -248,13 +248,19 @@ def _plot(title: str, names: Sequence[str], values: NDArray[Any]) -> dict[str, A
 
 
 def _rows_at(topic: Topic, times_ns: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[np.int32]]:
-    """Return the rows of a topic at increasing log_times, and their indexes in `times_ns`."""
+    """Return the rows of a topic whose log_times are in `times_ns`, and their indexes there.
+
+    `times_ns` is increasing.
+    """
     rows = np.flatnonzero(np.isin(topic.times, times_ns))
     return rows, np.searchsorted(times_ns, topic.times[rows]).astype(np.int32)
 
 
 def _type_of(reader: McapReader, topic: str) -> str:
-    """Return the type of a topic's messages; empty if there is none, or if there are several."""
+    """Return the type of a topic's messages.
+
+    If there is not exactly one type, the string is empty.
+    """
     names = {reader.schema_of(channel).name for channel in reader.channels_of(topic)}
     return names.pop() if len(names) == 1 else ""
 

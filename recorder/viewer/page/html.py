@@ -27,7 +27,7 @@ def page_html(log: bytes, episode: bytes = b"") -> str:
     policy = [
         "default-src 'none'",
         f"script-src {' '.join(map(_hash, scripts))}",
-        # uPlot and OrbitControls set the styles of elements by scripts, which this allows.
+        # uPlot and OrbitControls set the styles of elements by scripts, which this policy allows.
         f"style-src {_hash(style)}",
         "img-src data:",
         "base-uri 'none'; form-action 'none'",

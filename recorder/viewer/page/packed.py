@@ -32,7 +32,10 @@ def pack(value: Any) -> bytes:
 
 
 def _without_arrays(value: Any, arrays: bytearray) -> Any:
-    """Append the arrays of a value to `arrays`; return the value with their descriptions."""
+    """Append the arrays of a value to `arrays`.
+
+    Return the value with descriptions in their place.
+    """
     if isinstance(value, np.ndarray):
         described = {"dtype": value.dtype.name, "shape": value.shape, "at": len(arrays)}
         arrays += _padded(value.astype(value.dtype.newbyteorder("<")).tobytes())

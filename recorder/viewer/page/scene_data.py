@@ -98,7 +98,7 @@ class _Moments:
         self._indexes: list[NDArray[np.int32]] = []
 
     def add(self, time_s: float, indexes: NDArray[np.int32]) -> None:
-        """Add the shapes at a time, which is not before the times added so far."""
+        """Add the shapes at a time, which must not be before an earlier added time."""
         self._times_s.append(time_s)
         self._indexes.append(indexes)
 
@@ -113,13 +113,16 @@ class _Moments:
 
 
 def _poses(stamped: Sequence[tuple[int, SeenFrame]], start_ns: int) -> list[dict[str, Any]]:
-    """Return each frame with the times and poses (position, quaternion) in its first parent."""
+    """Return the poses of each coordinate frame in its first parent, with their times.
+
+    A pose is a position and a quaternion.
+    """
     found: dict[str, list[tuple[int, SeenFrame]]] = {}
     for stamp_ns, frame in stamped:
         found.setdefault(frame.name, []).append((stamp_ns, frame))
     frames = []
     for name, poses in found.items():
-        # A pose at the time of a step is in two messages.
+        # The pose at the time of a step is in two messages.
         rows = dict(sorted(poses, key=lambda pose: pose[0]))
         times = np.array([(stamp_ns - start_ns) / 1e9 for stamp_ns in rows], np.float64)
         values = [(*frame.position, *frame.rotation) for frame in rows.values()]

@@ -1,8 +1,8 @@
 """An HTTP server on 127.0.0.1 for the page of one log.
 
-It answers two kinds of requests: `/` is the page, and `/episode/K` the packed data of an episode.
-No request names a file. A web page of another site cannot read the answers: browsers send its
-origin, or the host name that it resolves to this machine, and both are checked.
+It answers two kinds of requests: `/` returns the page, and `/episode/K` the packed data of an
+episode. No request names a file. A web page of another site cannot read the answers, because the
+server checks the origin and the host name that browsers send with a request.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def handle_error(self, *_: Any) -> None:
-        """Ignore connections that a browser closed early; print other errors."""
+        """Ignore errors of connections that a browser closed early, and print all others."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(*_)
 
@@ -119,4 +119,4 @@ class _Handler(BaseHTTPRequestHandler):
         )
 
     def log_message(self, *_: Any) -> None:
-        """Print nothing for a request."""
+        """Print no line for a request."""

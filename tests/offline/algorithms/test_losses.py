@@ -117,8 +117,9 @@ def test_square_penalty_ignores_actions_that_are_not_allowed() -> None:
 
 
 def test_quantile_regression_by_hand() -> None:
-    # Quantiles at tau 1/4 and 3/4, both 0; samples -2 and 1. Quantile 1: the sample above pulls up
-    # with 1/4 (Huber of 1 is 1/2), the one below down with 3/4 (Huber of 2 is 3/2).
+    # The quantiles at tau 1/4 and 3/4 are both 0, and the samples are -2 and 1. In the loss of
+    # quantile 1, the sample above has the weight 1/4 and the Huber loss 1/2. The sample below has
+    # the weight 3/4 and the Huber loss 3/2.
     z_tm1 = torch.zeros(1, 2, 2)
 
     def loss_of(z_tm1: Tensor) -> Tensor:

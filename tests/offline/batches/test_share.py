@@ -1,4 +1,4 @@
-"""Shares of the data: the draws of one process, divided among several."""
+"""Tests of shares of the data: the draws of one process are divided among several."""
 
 from __future__ import annotations
 
@@ -63,7 +63,11 @@ def whole_buffer(weights: list[float]) -> TransitionBuffer:
 
 @pytest.mark.usefixtures("group")
 def test_a_process_gets_its_rows_padded_with_factors_of_zero() -> None:
-    """Rows 3 to 7 of ten are held; the mean over all rows needs the factors M / B."""
+    """Draw rows for a process that holds rows 3 to 7 of ten.
+
+    B = 40 rows are drawn for each seed, and M is the larger number of rows that the process holds
+    of a seed. Its mean over M rows, padded with zeros, needs the factor M / B.
+    """
     share = GroupShare(LENGTHS, np.ones(4), 1, 3)
     buffer = whole_buffer([1, 1, 1, 1])
     generators = [torch.Generator().manual_seed(seed) for seed in (0, 1)]

@@ -70,7 +70,7 @@ def test_effective_sample_sizes_by_hand() -> None:
 
 
 def test_mean_weights_by_hand() -> None:
-    # rho is 2, 1, 1 and 3, 3, 3; discounts 1, 1/2, 1/4.
+    # In the two episodes, rho is 2, 1, 1 and 3, 3, 3. The discounts are 1, 1/2, 1/4.
     whole, steps = mean_weight("TIS", BY_HAND), mean_weight("PDIS", BY_HAND)
     assert whole is not None
     assert whole.values(ONCE) == pytest.approx([(1 + 3) / 2])

@@ -109,7 +109,8 @@ def test_degrees_of_freedom_by_hand() -> None:
 
 
 def test_students_t_quantile_by_the_table() -> None:
-    # 97.5 % of Student's t: 12.706 for one degree, 2.228 for ten; normal distribution: 1.960.
+    # 97.5 % quantiles: 12.706 of Student's t with one degree of freedom, 2.228 with ten degrees,
+    # and 1.960 of the normal distribution.
     assert student_factor(1.0) == pytest.approx(12.706 / 1.960, rel=1e-3)
     assert student_factor(10.0) == pytest.approx(2.228 / 1.960, rel=1e-3)
     assert student_factor(1e9) == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""Runs of `auto`: choice, early end, resume, budget, interruption and report."""
+"""Tests of runs of `auto`: choice, early end, resume, budget, interruption and report."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ CONFIG = AutoConfig(**TINY)
 
 
 class Interrupted(Exception):
-    """Raised by a callback, as Ctrl-C would."""
+    """Exception that a callback raises, in place of Ctrl-C."""
 
 
 def updates(run: Path) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""The rule by which `auto` chooses, worked by hand."""
+"""Tests of the rule by which `auto` chooses, with numbers worked by hand."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ def test_the_estimate_is_the_mean_over_episodes_networks_and_models() -> None:
 
 
 def test_chances_of_two_episodes_by_hand() -> None:
-    # Of the four equally likely resamplings, two have one of each episode, so that a is better by
-    # 1; the one with episode 0 twice makes it worse by 2, the one with episode 1 better by 4.
+    # There are four equally likely resamplings. In two of them, each episode occurs once, and a is
+    # better than b by 1. If episode 0 occurs twice, a is worse by 2. If episode 1 occurs twice, a
+    # is better by 4.
     values = {"a": np.array([[0.0, 4.0]]), "b": np.array([[2.0, 0.0]])}
     found = rate(values, HALF, imitate=False)
     assert found["a"].best_chance == pytest.approx(0.75, abs=0.05)

@@ -51,8 +51,8 @@ def test_returns_of_short_truncated_episodes_are_unknown() -> None:
         next_observations=observations,
     )
     returns = monte_carlo_returns(data, np.array([0]), 0.5)
-    # Five steps before the truncation, the first missing reward has the discount 1/32; four steps
-    # before, 1/16.
+    # Five steps before the truncation, the first missing reward has the discount 1/32. Four steps
+    # before the truncation, it has the discount 1/16.
     assert np.isnan(returns).tolist() == [False, False, True, True, True, True]
 
 

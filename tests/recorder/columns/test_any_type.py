@@ -49,7 +49,7 @@ DEFINITIONS = st.tuples(
 
 
 class Maker:
-    """Generator of random messages of a type; sometimes strings and arrays change in length."""
+    """Generator of random messages of a type. Some strings and arrays differ in length."""
 
     def __init__(self, text: str, seed: int) -> None:
         self.store = get_typestore(Stores.EMPTY)

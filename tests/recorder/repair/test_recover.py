@@ -405,7 +405,10 @@ def test_scanning_for_records_does_not_copy_the_file(log_path: Path) -> None:
 
 
 def test_an_episode_without_any_record_is_named(log_path: Path) -> None:
-    """Name an episode whose chunk is damaged; only `/rl/episode` and its number still show it."""
+    """Report an episode whose chunk is damaged.
+
+    It is only known from `/rl/episode` and from the gap in the episode numbers.
+    """
     with closing(mcaprl.RecordMcap(gym.make("CartPole-v1"), log_path)) as recorder:
         for seed in range(30):
             recorder.reset(seed=seed)

@@ -27,7 +27,7 @@ def browsing(profile: Path) -> Iterator[Browser]:
     need(BROWSER is not None, "Chromium is not installed (Debian: apt-get install chromium)")
     (in_read, in_write), (out_read, out_write) = os.pipe(), os.pipe()
     flags = ["--headless", "--no-sandbox", "--remote-debugging-pipe", f"--user-data-dir={profile}"]
-    # WebGL on machines without a GPU.
+    # Use WebGL on machines without a GPU.
     flags += ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     process = subprocess.Popen(
         ["bash", "-c", _START, str(in_read), str(out_write), str(BROWSER), *flags, "about:blank"],
@@ -82,7 +82,10 @@ class Browser:
         self.wait("document.readyState === 'complete' && location.href !== 'about:blank'")
 
     def run(self, script: str) -> Any:
-        """Return the value of an expression in the page; promises are awaited."""
+        """Return the value of an expression in the page.
+
+        If it is a promise, wait for its result.
+        """
         found = self._call(
             "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
         )

@@ -1,4 +1,4 @@
-"""The page of `mcaprl replay --browser` and `--save`: data, server, and what a browser shows."""
+"""Tests of the page of `mcaprl replay`: its data, its server, and its content in a browser."""
 
 from __future__ import annotations
 
@@ -258,7 +258,7 @@ def test_an_episode_has_the_values_of_the_log(log: Path) -> None:
     ]
     image, depth = found["images"]
     assert image["pixels"][3, 2, 3].tolist() == [255, 30, 7]
-    # The colors of depth range from 0 to 50 m; infinite depth is unknown.
+    # The colors of depth range from 0 to 50 m. Infinite depth is shown as unknown.
     assert depth["title"] == "depth, 0 to 50 m"
     assert depth["pixels"][:, 1, 2, 0].tolist() == [255] * 6
     assert depth["pixels"][0, :2, :2, 0].tolist() == [[1, 0], [0, 0]]
@@ -514,7 +514,7 @@ def test_texts_of_a_log_are_not_html(browser: Browser, tmp_path: Path) -> None:
             assert browser.run("document.images.length") == 0
             assert browser.run("window.hit") is None
             assert browser.problems == []
-        # If a text became a script in spite of that, the browser would refuse it.
+        # If a text became a script nevertheless, the browser would not run it.
         script = "Object.assign(document.createElement('script'), {textContent: 'window.hit = 1'})"
         browser.run(f"document.body.append({script})")
         assert browser.run("window.hit") is None

@@ -26,7 +26,7 @@ from mcaprl.sims.lane.rules import (
 
 
 def their_car(x_m: float, y_m: float, yaw_rad: float, speed_m_s: float) -> Vehicle:
-    """Return a car whose length is our wheelbase; highway-env uses the length as the wheelbase."""
+    """Return a car whose length is our wheelbase. highway-env uses the length as the wheelbase."""
     car = Vehicle(None, np.array([x_m, y_m]), yaw_rad, speed_m_s)
     car.LENGTH = WHEELBASE_M
     return car

@@ -39,7 +39,7 @@ def made(**kwargs: Any) -> HighwayLaneEnv:
     [("lane-keeping-v0", LaneKeepingEnv, math.pi / 3), (TRACK, RacetrackEnv, math.pi / 4)],
 )
 def test_it_drives_as_highway_env_does(road: str, theirs: Any, range_rad: float) -> None:
-    """The same seed and steering give bit-identical results; only the sign of y differs."""
+    """The same seed and steering give bit-identical results, except for the sign of y."""
     ours, inner = made(road=road, start="line"), theirs()
     ours.reset(seed=4)
     inner.reset(seed=4)

@@ -41,7 +41,8 @@ def lane(rules: str = "classic", **kwargs: Any) -> LaneKeepingEnv:
 @pytest.mark.parametrize(
     ("x_m", "y_m", "speed_m_s", "action", "hit", "reward", "text", "code"),
     [
-        # In the middle at 10 m/s, the reward is (1 - .5) + (0 - .5) = 0; at rest, 10 / 290 less.
+        # In the middle at 10 m/s, the reward is (1 - .5) + (0 - .5) = 0. At rest, it is 10 / 290
+        # less.
         (60.0, 1.0, 10.0, STRAIGHT, False, 0.0, DRIVING, DRIVING),
         (60.0, 1.0, 0.0, BRAKE, False, -0.034483, DRIVING, DRIVING),
         # The next action is not the brake. By the published text, 5 m/s or less is too slow.
@@ -54,7 +55,8 @@ def lane(rules: str = "classic", **kwargs: Any) -> LaneKeepingEnv:
         (60.0, 1.5, 10.0, STRAIGHT, False, -0.776870, DRIVING, DRIVING),
         # 1 m beside the line, at 20 m/s: e^-3 - 1 + 10 / 290.
         (130.0 + 1.0, -60.0, 20.0, RIGHT, False, -0.915730, DRIVING, DRIVING),
-        # 3.4 m beside it, at 20 m/s: e^-10.2 - 1 + 10 / 290 is above -1. At 9 m/s, it is below -1.
+        # 3.4 m beside the line, at 20 m/s: e^-10.2 - 1 + 10 / 290, which is above -1. At 9 m/s, the
+        # reward is below -1.
         (60.0, 4.4, 20.0, STRAIGHT, False, -0.965480, DRIVING, DRIVING),
         (60.0, 4.4, 9.0, STRAIGHT, False, -1.003411, LOW_REWARD, LOW_REWARD),
         # At rest, the reward reaches -1 at ln(29) / 3 = 1.1224 m, because e^-3d is 10 / 290 there.
@@ -140,7 +142,11 @@ def test_ends_are_named(rules: str) -> None:
 
 
 def test_the_two_published_ends_differ() -> None:
-    """Starting from rest is too slow by the text; a collision with a rail is an end by the code."""
+    """Compare the ends of episodes in the published text and in the published code.
+
+    By the text, an episode that starts from rest ends because the car is too slow. By the code, an
+    episode ends when the car hits a rail.
+    """
     slow, through_a_rail = {"pose": (60.0, 1.0, 0.0, 0.0)}, {"pose": (120.0, 1.0, 0.0, 20.0)}
     reasons = {}
     for rules in ("classic", "classic-code"):

@@ -45,7 +45,8 @@ def in_a_box(x_m: float, y_m: float) -> bool:
         (-math.pi / 2, 4.0),
         (math.pi / 4, 4.0 * math.sqrt(2.0)),
         (-math.pi / 4, 4.0 * math.sqrt(2.0)),
-        # Ahead, the rail after the first corner, at x = 134; behind the car, the one at x = -4.
+        # The rail after the first corner is ahead of the car, at x = 134. The rail behind the car
+        # is at x = -4.
         (0.0, 74.0),
         (math.pi, 64.0),
         (math.radians(30.0), 8.0),

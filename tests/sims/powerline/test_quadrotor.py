@@ -190,7 +190,11 @@ def test_energy_is_the_work_of_rotors_and_drag() -> None:
     ],
 )
 def test_rotors_turn_the_body_the_right_way(rotors: Rotors, sign: tuple[int, int, int]) -> None:
-    """More thrust on the left rolls right, in front pitches up, on the first pair yaws right."""
+    """Check the signs of the rotation.
+
+    More thrust of the left rotors rolls the drone to the right. More thrust of the front rotors
+    pitches it up. More thrust of the first pair of rotors yaws it to the right.
+    """
     drone = move(resting()._replace(thrusts_n=rotors), rotors, ZERO)
     assert tuple(np.sign(np.round(drone.rates_rad_s, 12)).astype(int)) == sign
 

@@ -261,7 +261,7 @@ def _labels(feature: Feature) -> tuple[str, ...]:
 
 
 def _info_rows(values: NDArray[Any]) -> Any:
-    """Convert the steps' values (T, *shape) to an info (T + 1, *shape); the reset has no info."""
+    """Convert values of T steps to an info with T + 1 rows. The row of the reset is masked."""
     plain = values[:, 0] if values.shape[1:] == (1,) else values
     rows = np.concatenate([np.zeros((1, *plain.shape[1:]), plain.dtype), plain])
     mask = np.zeros(rows.shape, bool)

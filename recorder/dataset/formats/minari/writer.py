@@ -115,7 +115,7 @@ def _put(group: Any, name: str, values: NDArray[Any], **settings: Any) -> None:
 
 
 def _put_info(group: Any, name: str, info: StoredInfo) -> None:
-    """Write an info and the flags of its missing rows; skip an info without any value."""
+    """Write an info and the flags of its missing rows. If all rows are missing, write nothing."""
     if info.is_missing.all():
         return
     is_text = info.values.dtype.kind == "U"

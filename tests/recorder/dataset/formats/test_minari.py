@@ -389,7 +389,7 @@ def test_spaces_that_a_log_cannot_hold_are_refused_by_name(
 
 
 def _change(path: Path, **fields: Any) -> None:
-    """Replace fields of the metadata; None removes one."""
+    """Replace fields of the metadata. If the new value is None, remove the field."""
     file = path / "data/metadata.json"
     raw = {**json.loads(file.read_text()), **fields}
     file.write_text(json.dumps({key: value for key, value in raw.items() if value is not None}))
