@@ -41,8 +41,8 @@ def convert(
 ) -> None:
     """Read SRC, and write its transitions to DST.
 
-    SRC is a log or a dataset of another tool. With --mapping, SRC is the bag of another robot: an
-    MCAP file of any writer, a rosbag2 folder or database, or a ROS 1 bag. For a bag, begin with
+    SRC is a log or a dataset of another tool. With --mapping, SRC is a bag: an MCAP file of any
+    writer, a rosbag2 folder or database, or a ROS 1 bag. For a bag, begin with
     `mcaprl convert --suggest BAG > robot.yaml`. DST is a log if it ends with .mcap. Otherwise, DST
     is a dataset in the format that --to names: lerobot, minari, parquet, npz, d3rlpy or hdf5.
     """
