@@ -42,7 +42,7 @@ def convert(
     """Read SRC, and write its transitions to DST.
 
     SRC is a log or a dataset of another tool. With --mapping, SRC is a bag: an MCAP file of any
-    writer, a rosbag2 folder or database, or a ROS 1 bag. For a bag, begin with
+    writer, a rosbag2 folder or database, or a ROS 1 bag. To write a mapping for a bag, begin with
     `mcaprl convert --suggest BAG > robot.yaml`. DST is a log if it ends with .mcap. Otherwise, DST
     is a dataset in the format that --to names: lerobot, minari, parquet, npz, d3rlpy or hdf5.
     """

@@ -29,9 +29,9 @@ COLUMNS: Final = (
 EXPLANATION: Final = (
     "Estimates are discounted returns from the first states of the logged episodes, by pessimistic"
     " FQE. best: fraction of the resamplings in which the candidate is the best of all candidates"
-    " that were evaluated at the same time. as logged: fraction of the states in which the candidate"
-    " takes the logged action. WPDIS: estimate by weighted importance sampling, or the effective"
-    " number of episodes if there are too few."
+    " that were evaluated at the same time. as logged: fraction of the states in which the"
+    " candidate takes the logged action. WPDIS: estimate by weighted importance sampling, or the"
+    " effective number of episodes if there are too few."
 )
 _FEW_EPISODES: Final = 50
 _LOW_COVERAGE: Final = 0.5
