@@ -83,7 +83,7 @@ def _mirror(observations: Any) -> None:
 
 
 def differs(variant: str, task: Task, default: Task) -> bool:
-    """Return whether to run a variant: it is the default, or its training differs from it."""
+    """Return whether a variant is the default, or differs from the default in its training."""
     if variant == MIRRORED:
         return task.sim == "lane"
     return variant == "default" or task.config != default.config

@@ -2,8 +2,8 @@
 
     python -m benchmarks.ray_sizing [--transitions 1e9] [--sim lane] [--workers 64]
 
-Rates are CPU time in one process, on a log of a few thousand transitions. The prices are examples;
-give those of your provider. Nothing here measures a network or several machines.
+Rates are CPU time in one process, on a log of a few thousand transitions. The prices are examples:
+replace them with those of your provider. Nothing here measures a network or several machines.
 """
 
 from __future__ import annotations

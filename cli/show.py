@@ -35,7 +35,7 @@ def echo(text: object, *, err: bool = False) -> None:
 
 
 def _wrapped(line: str, width: int) -> list[str]:
-    """Return the lines of a text; words are never broken, and later lines are indented."""
+    """Wrap a text without breaking words, and indent all lines but the first."""
     return textwrap.wrap(
         line, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
     )
@@ -121,5 +121,5 @@ def _console() -> Console:
 
 
 def _is_terminal(stream: TextIO | None) -> bool:
-    """Return whether the stream is a terminal; programs without a console have no streams."""
+    """Return whether the stream is a terminal. Programs without a console have no streams."""
     return stream is not None and stream.isatty()

@@ -37,7 +37,7 @@ def show(epsilon):
 show(epsilon=0.6)
 
 # %% [markdown]
-# The greedy policy is not: after 20 steps, about one random episode in a million agrees with it.
+# The greedy policy is too different: about one random episode in a million agrees for 20 steps.
 # All estimates are refused, although some of their intervals look narrow. Do not use a number
 # beside a refusal.
 

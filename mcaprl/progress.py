@@ -108,7 +108,7 @@ class _ProgressLines:
 
 
 class _LineTimes:
-    """Times at which lines of progress are printed: at first often, later less so."""
+    """Moments at which lines of progress are printed: often at first, less often later."""
 
     def __init__(self) -> None:
         self._began = time.monotonic()

@@ -1,4 +1,8 @@
-"""The numbered examples are short and run; the notebooks have their code and their output."""
+"""Tests of the numbered examples.
+
+The examples must be short and run without errors. Each notebook must contain the code of its
+example and the output of this code.
+"""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ _MOST_NAMES = 12
 
 
 def table_of(results: Sequence[TrialResult]) -> Table:
-    """Return a table with a row for each trial; `score` is the mean over the seeds."""
+    """Return a table with a row for each trial. `score` is the mean over the seeds."""
     varied = list(dict.fromkeys(name for one in results for name in one.trial.varied))
     columns = ["trial", *varied, "score", "lowest", "highest", "estimator", "updates", "status"]
     rows = []

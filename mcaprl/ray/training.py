@@ -47,7 +47,7 @@ _POLL_S = 0.2
 
 @dataclass(frozen=True)
 class TrainingRequest:
-    """A training; its fields are the arguments of `mcaprl.train`."""
+    """Request for a training. Its fields are the arguments of `mcaprl.train`."""
 
     config: TrainingConfig
     out: Path

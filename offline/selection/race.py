@@ -89,7 +89,7 @@ class Stage:
     """Evaluations of candidates after the same number of updates.
 
     Attributes:
-        tried: What is known of each candidate.
+        tried: Results of each candidate.
     """
 
     tried: dict[str, Tried]
@@ -214,7 +214,7 @@ class _Race:
         self._in_time = True
 
     def run(self) -> tuple[Choice, list[OfflineSummary]]:
-        """Run both stages; return the choice, and a summary for each seed."""
+        """Run both stages. Return the choice, and a summary for each seed."""
         clone, traits = self._look()
         skipped = candidates_for(traits)
         trying = tried(skipped)
@@ -318,7 +318,10 @@ class _Race:
             )
 
     def _agreements(self, evidence: Evidence) -> NDArray[np.float64]:
-        """Return the fraction of the states of each episode (E,) with the logged action."""
+        """Return the fraction of agreement in each episode (E,).
+
+        A policy agrees in a state if it takes the logged action.
+        """
         lengths = self._dataset.episode_lengths
         agrees = evidence.agrees.astype(np.float64)
         return np.add.reduceat(agrees, np.cumsum(lengths) - lengths) / lengths

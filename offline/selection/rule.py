@@ -58,7 +58,7 @@ def rate(
     imitate: bool,
     seed: int = 0,
 ) -> dict[str, Rating]:
-    """Rate candidates by numbers of each episode.
+    """Rate candidates by their values or by their agreement with the log.
 
     Args:
         values: Arrays (M, E) by candidate: the value of the first state of each of E episodes, for

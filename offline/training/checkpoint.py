@@ -20,7 +20,7 @@ from mcaprl.tensor_files import read_tensors, write_tensors
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Stored state of one seed.
+    """Stored state of the training of one seed.
 
     Attributes:
         path: Path of the file.
@@ -45,7 +45,7 @@ class Checkpoint:
 
 
 def save_checkpoint(folder: Path, learner: Learner, seed: int, identity: RunIdentity) -> None:
-    """Replace the checkpoint in a folder with the current state of a seed."""
+    """Replace the checkpoint in a folder with the current training state of a seed."""
     description = {"step": learner.step, **identity.parts}
     write_tensors(folder / CHECKPOINT_NAME, learner.state(seed), description)
 

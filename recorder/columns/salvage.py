@@ -83,7 +83,8 @@ def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidReco
 def _ends_data(view: memoryview, offset: int, content: memoryview) -> bool:
     """Return whether a DataEnd record is the end of the data section.
 
-    The CRC of the record must match all data before it. If it has no CRC, no chunk may follow it.
+    The CRC in the record must match all data before the record. If the record has no CRC, no chunk
+    may follow it.
     """
     (crc,) = struct.unpack("<I", content)
     if crc:
