@@ -6,7 +6,8 @@ A training has 5000 updates with batch size 64, learning rate 1e-3, gamma .99, a
 200 updates, and layer widths 256x256. Its result is the mean return of the last three evaluations
 (after 4000, 4500 and 5000 updates) of 10 episodes each. d3rlpy is trained with one seed if it is
 installed. FOLDER/grid.json has the results of finished trainings, so an interrupted run resumes.
-The table is written to docs/results.md, followed by conditions on the results and their verdicts.
+The table is written to docs/results.md. Below it is a list of conditions that the results should
+meet, each with `holds` or `does not hold`.
 """
 
 from __future__ import annotations
