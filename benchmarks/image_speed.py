@@ -12,22 +12,21 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
+import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
 from mcaprl.networks import Architecture, ImageInput, Network
-from mcaprl.online.features import Parts
-from mcaprl.sims import make_sims
-from mcaprl.sims.lane.pilot import choose
-from mcaprl.sims.lane.rules import ACTION_MEANINGS, MAX_SPEED_M_S
+from mcaprl.sims import make_pilot, make_sim
 
-CARS: Final = 16
-STEPS: Final = 2_500
+DECISIONS: Final = 40_000
+MAX_SPEED_M_S: Final = 30.0
 EPSILONS: Final = (0.05, 0.1, 0.2, 0.3, 0.5)
 UPDATES: Final = 4_000
 BATCH: Final = 64
@@ -40,9 +39,16 @@ VARIANTS: Final = ((4, 0), (4, 8), (4, 32), (1, 32))
 ARCHITECTURE: Final = Architecture((256, 256), layer_norm=True, encoder="compact")
 
 
+class Inputs(NamedTuple):
+    """Batch of observations in the form that `Network` accepts."""
+
+    vector: Tensor
+    images: tuple[Tensor, ...]
+
+
 @dataclass(frozen=True)
 class Drives:
-    """Decisions of several cars, one array row for each decision of each car.
+    """Decisions of a car, one array row for each decision.
 
     Attributes:
         images: (R, 42, 42) uint8 images before the decision.
@@ -63,52 +69,45 @@ class Drives:
         before = np.minimum(np.arange(count)[::-1], self.ages[rows, None])
         return torch.from_numpy(np.moveaxis(self.images[rows[:, None] - before], 1, -1))
 
-    def inputs(self, rows: NDArray[np.int64], images: int, decisions: int) -> Parts:
+    def inputs(self, rows: NDArray[np.int64], images: int, decisions: int) -> Inputs:
         """Return the network's inputs in these rows."""
         commands = torch.from_numpy(self.commands[rows, : 2 * decisions])
-        return Parts(commands, (self.stacks(rows, images),))
-
-
-class _Moment(NamedTuple):
-    images: NDArray[np.uint8]
-    commands: NDArray[np.float32]
-    speeds: NDArray[np.float32]
-    ages: NDArray[np.int64]
-    episodes: NDArray[np.int64]
+        return Inputs(commands, (self.stacks(rows, images),))
 
 
 def drive() -> Drives:
-    """Drive all cars, and return their decisions, car after car."""
-    moments = list(_moments(np.random.default_rng(0)))
-    columns = (np.stack(column, 1) for column in zip(*moments, strict=True))
-    return Drives(*(column.reshape(-1, *column.shape[2:]) for column in columns))
+    """Drive the car, and return its decisions."""
+    random = np.random.default_rng(0)
+    with closing(make_sim("lane", observation="depth-commands")) as env:
+        decisions = list(_decisions(env, random))
+    return Drives(*(np.array(column) for column in zip(*decisions, strict=True)))
 
 
-def _moments(random: np.random.Generator) -> Iterator[_Moment]:
-    ages, episodes = np.zeros(CARS, np.int64), np.arange(CARS)
-    epsilons = random.choice(EPSILONS, CARS)
-    mode = {"autoreset_mode": "SameStep", "observation": "depth-commands"}
-    with closing(make_sims("lane", CARS, **mode)) as envs:
-        fleet: Any = envs.unwrapped.fleet  # type: ignore[attr-defined]
-        seen, infos = envs.reset(seed=0)
-        for _ in range(STEPS):
-            speeds = (infos["speed_m_s"] / MAX_SPEED_M_S).astype(np.float32)
-            yield _Moment(
-                _averaged(seen["depth"]), seen["commands"], speeds, ages.copy(), episodes.copy()
-            )
-            actions = np.array([choose(fleet.car(i)) for i in range(CARS)])
-            explores = random.random(CARS) < epsilons
-            actions[explores] = random.integers(len(ACTION_MEANINGS), size=explores.sum())
-            seen, _, terminated, truncated, infos = envs.step(actions)
-            ended = terminated | truncated
-            ages = np.where(ended, 0, ages + 1)
-            episodes[ended] = episodes.max() + 1 + np.arange(ended.sum())
-            epsilons[ended] = random.choice(EPSILONS, ended.sum())
+def _decisions(
+    env: gym.Env[Any, Any], random: np.random.Generator
+) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float32], np.float32, int, int]]:
+    """Yield the columns of `Drives` for each decision."""
+    pilot, actions = make_pilot(env), int(cast(spaces.Discrete, env.action_space).n)
+    age = episode = 0
+    seen, info = env.reset(seed=0)
+    epsilon = random.choice(EPSILONS)
+    for _ in range(DECISIONS):
+        speed = np.float32(info["speed_m_s"] / MAX_SPEED_M_S)
+        yield _averaged(seen["depth"]), seen["commands"].copy(), speed, age, episode
+        action = int(pilot.act({name: value[None] for name, value in seen.items()})[0])
+        if random.random() < epsilon:
+            action = int(random.integers(actions))
+        seen, _, terminated, truncated, info = env.step(action)
+        age += 1
+        if terminated or truncated:
+            age, episode = 0, episode + 1
+            seen, info = env.reset()
+            epsilon = random.choice(EPSILONS)
 
 
-def _averaged(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Average images (N, 84, 84, 1) over squares of 2x2 pixels."""
-    squares = images.reshape(len(images), 42, 2, 42, 2).mean((2, 4))
+def _averaged(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Average an image (84, 84, 1) over squares of 2x2 pixels."""
+    squares = image.reshape(42, 2, 42, 2).mean((1, 3))
     averaged: NDArray[np.uint8] = np.rint(squares).astype(np.uint8)
     return averaged
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import mcaprl
-from mcaprl.offline.batches.buffer import TransitionBuffer
-from mcaprl.recorder.dataset.log_reader import LogReader
+from mcaprl.offline import TransitionBuffer
+from mcaprl.recorder import LogReader
 
 EPISODES = 60
 FILE_BYTES = 1e9

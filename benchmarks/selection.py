@@ -37,8 +37,7 @@ from benchmarks.sim_data import make_logs
 from benchmarks.sim_grid import SETTINGS, normalize_mean, run, settings_of
 from mcaprl.api import load_policies
 from mcaprl.files import write_json
-from mcaprl.offline import EvidenceCollector, fqe_config, train
-from mcaprl.offline.selection.portfolio import DETERMINISTIC
+from mcaprl.offline import DETERMINISTIC, EvidenceCollector, fqe_config, train
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import PolicyScore, make_pilot, make_sim
 

@@ -23,6 +23,7 @@ for _package in ("torch", "safetensors", "tensorboard"):
 __all__ = [
     "ALGORITHMS",
     "CQL",
+    "DETERMINISTIC",
     "ESTIMATORS",
     "BootstrapConfig",
     "CQLConfig",
@@ -57,6 +58,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.offline.batches.buffer": ("TransitionBuffer",),
         "mcaprl.offline.estimate.evidence": ("EvidenceCollector", "fqe_config"),
         "mcaprl.offline.estimate.fqe": ("FQEConfig",),
+        "mcaprl.offline.selection.portfolio": ("DETERMINISTIC",),
         "mcaprl.offline.estimate.importance": ("ESTIMATORS", "EpisodeTable"),
         "mcaprl.offline.estimate.off_policy": ("OffPolicyEvaluator",),
         "mcaprl.offline.policy": ("Scores",),

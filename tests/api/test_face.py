@@ -24,22 +24,28 @@ ROOT = Path(__file__).parent.parent.parent
 PACKAGES = ("api", "offline", "online", "recorder", "sims")
 CLASSES = ("Dataset", "Episode", "RecordMcap", "RecordVecMcap")
 FUNCTIONS = {
-    "train-offline": ("train",),
+    "train-offline": ("train", "sweep"),
     "train-online": ("train_online",),
     "convert": ("convert", "suggest_mapping"),
     "evaluate": ("evaluate", "estimate"),
-    "replay": ("replay", "verify", "render"),
+    "replay": ("replay", "verify", "render", "browse", "save_page"),
+    "completion": (),
 }
-"""Functions of commands that have several functions, or a function with another name."""
+"""Functions of commands that have several functions, a function with another name, or none, since
+only a shell needs them."""
 ONLY_OPTIONS = {
     "help": "click adds it",
+    "quiet": "a function prints nothing unless the caller passes `progress`",
     "json": "a function returns a dataclass, whose to_json the command prints",
     "convert --dry-run": "out=None",
     "convert --from": "`from` is a keyword of Python: source_format",
     "convert --suggest": "it selects the function suggest_mapping",
     "info --strict": "an exit code",
+    "replay --browser": "it selects the function browse",
+    "replay --save": "it selects the function save_page",
     "replay --verify": "it selects the function verify",
     "record --no-scene": "scene=False",
+    "train-offline --sweep": "it selects the function sweep",
     "train-online --from": "`from` is a keyword of Python: sources",
 }
 """Options that are not arguments of the function, with the reason."""
