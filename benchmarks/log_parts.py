@@ -27,7 +27,10 @@ DEPTH = rivals.DEPTH
 def tables(
     folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.MinariFolder
 ) -> list[Table]:
-    """Return all tables; files are written to `folder`, and `log` has the transitions of `data`."""
+    """Return all tables.
+
+    The benchmarks write their files to `folder`. `log` is a log of the transitions in `data`.
+    """
     return [
         _short_episodes(folder),
         _episode(folder, log, data, minari),
@@ -52,7 +55,7 @@ def _short_episodes(folder: Path) -> Table:
 
 
 def _episode(folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.MinariFolder) -> Table:
-    """Measure reading one episode; other readers select it by time, rows or number."""
+    """Measure reading one episode. Other readers select it by time, by row or by number."""
     episodes = mcaprl.open(log, columns=[]).episodes
     number = len(episodes) // 2
     start, stop = (int(episodes[number].log_time_ns[row]) for row in (0, -1))

@@ -47,7 +47,10 @@ def run_env(env: gym.Env[Any, Any], episodes: int, steps: int = EPISODE_STEPS) -
 
 
 def vectors(transitions: int) -> mcaprl.Dataset:
-    """Return transitions of random numbers, which hardly compress: 19 float32, 9 actions."""
+    """Return transitions of random numbers, which hardly compress.
+
+    An observation has 19 float32 values. There are 9 actions.
+    """
     random = np.random.default_rng(0)
     episodes = transitions // EPISODE_STEPS
     frames = random.standard_normal((episodes, EPISODE_STEPS + 1, 19), np.float32)
@@ -60,7 +63,7 @@ def vectors(transitions: int) -> mcaprl.Dataset:
 
 
 def images(transitions: int) -> mcaprl.Dataset:
-    """Return depth images of a plane with noise, and vectors."""
+    """Return transitions with two observations: a vector, and a depth image of a noisy plane."""
     random = np.random.default_rng(0)
     frames = transitions + transitions // EPISODE_STEPS
     plane = np.add.outer(np.arange(84), np.arange(84) // 2).astype(np.uint8)

@@ -37,7 +37,7 @@ def hint(text: str) -> None:
 
 
 def working(text: str) -> AbstractContextManager[ProgressBar]:
-    """Show on a terminal that a command is working, until it opens a progress bar.
+    """Show on a terminal that a command is working, until the command opens a progress bar.
 
     Args:
         text: What the command does first, such as `reading data`.

@@ -59,7 +59,7 @@ class UnknownNameError(UsageError):
         self._arguments = (kind, name, names, more)
 
     def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, str, list[str], list[str]]]:
-        """Return the constructor's arguments for pickle, which would otherwise pass the message."""
+        """Return the constructor's arguments. By default, pickle would pass the message instead."""
         return type(self), self._arguments
 
 

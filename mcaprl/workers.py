@@ -23,7 +23,8 @@ _Kind = Literal["message", "done", "interrupted", "error"]
 _STOPS = [
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 ]
-# Signal that ends a worker. Background processes ignore SIGINT, and Windows has no SIGTERM.
+# Signal that ends a worker: SIGTERM, because background processes ignore SIGINT. Windows has no
+# SIGTERM, so SIGINT is used there.
 _END = signal.SIGINT if sys.platform == "win32" else signal.SIGTERM
 
 
@@ -142,7 +143,7 @@ def _send(to: Connection, content: Any) -> None:
 
 
 def _end_with(parent: Connection) -> None:
-    """Interrupt the main thread when the parent ends or closes its end of the pipe."""
+    """Interrupt the main thread when the parent exits or closes the pipe."""
     with suppress(EOFError, OSError):
         parent.recv()
     if sys.platform == "win32":
@@ -172,11 +173,11 @@ def _ignore(*_: Any) -> None:
 
 @contextmanager
 def _signals_blocked() -> Iterator[None]:
-    """Block signals in this thread and in new processes, which unblock them when they are ready."""
+    """Block signals in this thread and in new processes. A process unblocks them when ready."""
     if sys.platform == "win32":
         yield
         return
-    # Start the resource tracker before the signals are blocked, because starting it unblocks them.
+    # Start the resource tracker first: its start unblocks the signals.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
     try:

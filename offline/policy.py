@@ -114,7 +114,7 @@ class Policy:
         """Return the best actions (B,) in `action_space`; a tie selects the lowest action.
 
         A policy with `frame_stack` k > 1 stores the observations of the last k calls since `begin`.
-        It also accepts (B, k, *shape), oldest first, and then stores nothing.
+        It also accepts stacks (B, k, *shape), oldest first; it stores nothing in this case.
 
         Raises:
             PolicyError: The shape of the observations is not (B, *shape).
@@ -177,7 +177,7 @@ class Policy:
         return self._encode(_flatten(observations)).stacked(self.frame_stack)
 
     def _stack_onto_stored(self, now: Observations) -> Observations:
-        """Store observations, and return stacks of the last k.
+        """Store observations, and return stacks of the last k observations.
 
         In the first steps of an episode, copies of the oldest observation fill the stack.
         """
@@ -295,7 +295,7 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
 
 
 def _image_input(image: ImageInput, number: int, weights: dict[str, Tensor]) -> ImageInput:
-    """Return the input with its normalization. Remove the normalization from `weights`."""
+    """Return the input with its normalization, which is removed from `weights`."""
     if _IMAGE_SHIFT.format(number) not in weights:
         return image
     shift = weights.pop(_IMAGE_SHIFT.format(number)).numpy()

@@ -154,6 +154,6 @@ def _draw_run(axes: Any, run: RunCurve, color: str, value: str) -> None:
 
 
 def _on_common_steps(run: RunCurve, value: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the steps at which all seeds were evaluated, and their values (seeds, steps)."""
+    """Return the steps at which all seeds have values, and these values (seeds, steps)."""
     length = min(len(seed["step"]) for seed in run.seeds)
     return run.seeds[0]["step"][:length], np.array([seed[value][:length] for seed in run.seeds])

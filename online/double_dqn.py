@@ -28,8 +28,8 @@ class WarmDQN(DQN):
 
     Attributes:
         skips_random_steps: Whether the steps before learning follow the policy instead of taking
-            random actions. These steps are needed, because learning from too few transitions would
-            destroy the pretrained weights (https://arxiv.org/abs/2412.07762).
+            random actions. Learning does not start earlier, because learning from too few
+            transitions would destroy the pretrained weights (https://arxiv.org/abs/2412.07762).
     """
 
     skips_random_steps = False

@@ -133,7 +133,7 @@ class Evaluation(EvalCallback):
         return going_on
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
-        """Record the end of an episode. SB3 calls this method after each step of the evaluation."""
+        """Store the result of an ended episode. SB3 calls this after each evaluation step."""
         super()._log_success_callback(locals_, globals_)
         if locals_["done"]:
             episode = locals_["info"]["episode"]
@@ -177,7 +177,7 @@ class FirstEpisodes(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         return self._observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step all environments; record the environments that are in their first episode."""
+        """Step all environments; record each environment until its first episode ends."""
         result = self.env.step(actions)
         observations, rewards, terminated, truncated, infos = result
         numbers = np.flatnonzero(self._open)

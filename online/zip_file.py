@@ -96,7 +96,7 @@ def _read(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
         ValueError: The member has more than `most` bytes.
         KeyError: There is no such member.
     """
-    # `zipfile` reads at most the declared size.
+    # A check of the declared size is sufficient, because `zipfile` reads at most this size.
     size = archive.getinfo(name).file_size
     if size > most:
         raise ValueError(

@@ -19,7 +19,7 @@ _MAX_SHOWN = 200
 def all_options(
     observation: str | None, rules: str | None, others: Mapping[str, Any] | None
 ) -> dict[str, Any]:
-    """Return the arguments of a sim without those that are None.
+    """Return the arguments of a sim, except arguments that are None.
 
     >>> all_options("depth", None, {"road": "racetrack-v0"})
     {'observation': 'depth', 'road': 'racetrack-v0'}

@@ -70,7 +70,7 @@ def record_file(
 
 
 def try_request(request: FileRequest) -> None:
-    """Create the file of a request without episodes, and remove it again, to find errors early.
+    """Create the file of a request and remove it, to find errors before the first episode.
 
     Raises:
         McaprlError: The sim, the policy or another argument is not valid.

@@ -237,7 +237,7 @@ def render(
     if movie is not None:
         step_ns = float(np.median(np.diff(one.log_time_ns)))
         shown, images_per_s = shown_steps(one.length, speed * 1e9 / step_ns)
-        # Images between two steps can be drawn from a scene, but not by the sim.
+        # A logged scene can be drawn at times between two steps. The sim renders only the steps.
         parts = parts_of_step(images_per_s) if has_scene else 1
         images = draw(shown, parts) if has_scene else draw(shown)
         with progress(f"drawing {movie}", (len(shown) - 1) * parts + 1) as advance:

@@ -29,7 +29,8 @@ from mcaprl.recorder.dataset.open import Episodes, episode_indexes
 from mcaprl.recorder.dataset.tables import described
 from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
 
-# Smaller blocks take more time in total. They are used only if blocks of this size are too few.
+# Preferred minimum size of a block, because smaller blocks take more time in total. Blocks are
+# smaller only if there would otherwise be too few of them.
 _LEAST_BYTES = 16 << 20
 
 
@@ -141,7 +142,7 @@ class LogSource(Datasource):  # type: ignore[misc]
         return "McapLogs"
 
     def supports_projection_pushdown(self) -> bool:
-        """Return True, because only the columns that later steps need are read."""
+        """Return True: the source reads only the columns that later steps need."""
         return True
 
     def estimate_inmemory_data_size(self) -> int:
@@ -176,7 +177,7 @@ class LogSource(Datasource):  # type: ignore[misc]
         """Return the wanted columns without rows."""
         every = empty_columns(self.description)
         names = self._get_data_columns()
-        # Without a column, a block would have no rows.
+        # A block without columns would have no rows, so read at least one column.
         return {name: every[name] for name in (every if names is None else names or ["episode"])}
 
     def _divided(self, blocks: int | None, least: int, most_bytes: int) -> Iterator[_Group]:
@@ -199,7 +200,11 @@ class LogSource(Datasource):  # type: ignore[misc]
     def _chosen_episodes(
         self,
     ) -> Iterator[tuple[Path, int, NDArray[np.int64], NDArray[np.int64]]]:
-        """Yield each log's path, index of the first episode, chosen episodes, and their lengths."""
+        """Yield the path and the chosen episodes of each log.
+
+        The items of each tuple are the path, the index of the log's first episode over all logs,
+        the indexes of the chosen episodes in the log, and the lengths of these episodes.
+        """
         first = 0
         for path, lengths in zip(self._paths, self._lengths, strict=True):
             mine = np.arange(len(lengths))

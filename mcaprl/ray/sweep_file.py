@@ -3,12 +3,12 @@
     algos: [bc, cql]              algorithms, or a mapping from algorithms to their settings
     settings:                     settings; each applies to the algorithms that have it
       updates: 4000
-      learning_rate: [3e-4, 1e-3] a list: each value is tried, in all combinations
+      learning_rate: [3e-4, 1e-3] each value of a list is tried, in all combinations
     seeds: 2                      number of networks of each combination
     seed: 0                       seed of the first network
     score:
       every: 1000                 updates between two scores
-      fraction: 0.2               part of the episodes that is kept for scores
+      fraction: 0.2               part of the episodes that is used only for scores
       updates: 1000               updates of the model that the estimators use
       epsilon: 0.1                probability of random actions of the scored policies
       gamma: 0.97                 discount of the scores
@@ -61,10 +61,10 @@ class Trial:
     """One combination of algorithm and settings.
 
     Attributes:
-        name: Name of its folder, such as `cql-003`.
+        name: Name of the folder of the trial, such as `cql-003`.
         algo: Name of the algorithm.
         config: Settings.
-        varied: Values of the settings for which the file has several values.
+        varied: This trial's values of the settings that have several values in the file.
     """
 
     name: str
@@ -138,7 +138,8 @@ def _plan(tree: object) -> SweepPlan:
         trials += _combinations(str(algo), defaults, values, score, len(trials))
     if names:
         for name in sorted(names):
-            # The first algorithm's error lists its settings.
+            # No algorithm has this setting. Raise the error of the first algorithm, which lists
+            # the settings that it has.
             check_settings(
                 str(next(iter(found))), choose_algorithm(str(next(iter(found))))[1], [name]
             )
@@ -158,7 +159,7 @@ def _combinations(
         if number >= MOST_TRIALS:
             raise UsageError(f"more than {MOST_TRIALS:,} combinations: remove some values")
         settings = dict(zip(choices, chosen, strict=True))
-        # Policies are scored when a checkpoint is written.
+        # Policies are scored at each checkpoint, so `every` is the checkpoint interval.
         config = type(defaults)(**{"checkpoint_interval": score.every, **settings})
         if config.checkpoint_interval != score.every:
             raise UsageError("checkpoint_interval is the `every` of score: set that instead")
@@ -168,7 +169,11 @@ def _combinations(
 
 
 def _listed(name: str, value: Any, defaults: TrainingConfig) -> list[Any]:
-    """Return the values to try. If the setting itself is a list, a flat list is one value."""
+    """Return the values to try.
+
+    If each value of the setting is a list, a flat list is one value, and a list of lists contains
+    several values.
+    """
     is_list = isinstance(value, list)
     if isinstance(getattr(defaults, name), tuple):
         return value if is_list and any(isinstance(one, list) for one in value) else [value]

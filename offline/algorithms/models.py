@@ -35,7 +35,8 @@ class Model(ABC):
     Attributes:
         networks: K networks; their parameters share memory with `weights`.
         weights: (K, P), one row of weights per network.
-        bulk_gain: Time per row in a small batch, relative to a batch of a thousand rows.
+        bulk_gain: Time per row in a small batch, divided by the time per row in a batch of a
+            thousand rows.
     """
 
     bulk_gain: ClassVar[float] = 1.0
@@ -82,7 +83,7 @@ class AnyModel(Model):
 
 
 class StackedMLP(Model):
-    """Plain fully connected networks on vectors: one batched matrix product per layer."""
+    """Fully connected networks on vectors, computed with one batched matrix product per layer."""
 
     bulk_gain = 2.0
 
@@ -123,10 +124,11 @@ def build_model(networks: Sequence[Network]) -> Model:
 
 
 class TargetNetwork:
-    """Copy of a model that is trained; the copy is updated at intervals.
+    """Copy of a model in training. The copy is updated at intervals.
 
-    Between two updates, the outputs do not change. If it is faster than a forward pass for each
-    batch, the outputs for the whole dataset are computed once after each update and then looked up.
+    Between two updates, the outputs do not change. Therefore, the outputs for the whole dataset are
+    computed once after each update and then looked up, unless a forward pass for each batch is
+    faster.
 
     Attributes:
         model: K target networks.
@@ -135,7 +137,7 @@ class TargetNetwork:
     def __init__(
         self, model: Model, buffer: TransitionBuffer, rows_per_sync: int, *, next_states: bool
     ) -> None:
-        """Copy `model`; the copy evaluates the states or next states of a buffer.
+        """Copy `model`, to evaluate the states or next states of a buffer.
 
         `rows_per_sync` is the approximate number of rows per seed between two calls of `sync`.
         """

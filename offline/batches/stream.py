@@ -55,7 +55,7 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
 
     Pass it to `DataLoader(stream, batch_size=None, num_workers=K)`, or iterate it directly. An
     epoch contains each item once over all workers and ranks. All workers of all ranks have the same
-    number of batches. Exceptions are epochs with fewer items than workers, and a `batch_size` of 1.
+    number of batches, unless an epoch has fewer items than workers or `batch_size` is 1.
     Parts of the logs are read in random order. Several parts form a block of `buffer` items, which
     are shuffled. The order depends only on `seed`, the epoch, and the numbers of workers and ranks.
 
@@ -87,7 +87,7 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
             batch_size: Number of items of a batch. The last batches of an epoch have fewer.
             buffer: Number of items that are read and shuffled at a time; at least one episode.
             seed: Seed of the order.
-            shuffle: Whether the order is random; otherwise it is that of the logs.
+            shuffle: Whether the order is random; otherwise, items are in the order of the logs.
             drop_last: Whether batches with fewer than `batch_size` items are left out.
             n_steps: Number of rewards in a return; returns at the end of an episode have fewer.
             gamma: Discount per step.
@@ -112,8 +112,8 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         part_items = max(buffer // _PARTS_PER_BLOCK, 1)
         self._parts = self._source.parts(self._options, part_items)
         self._count = sum(part.items for part in self._parts)
-        # The epoch, and the number of its batches to skip. They are in shared memory, so that
-        # workers see changes.
+        # The epoch, and the number of batches to skip in this epoch. Both numbers are in shared
+        # memory, so that workers see changes.
         self._position = torch.zeros(2, dtype=torch.int64)
         self._position.share_memory_()  # type: ignore[no-untyped-call]
         self._done = 0
@@ -140,7 +140,7 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         return {"seed": self._seed, "epoch": self.epoch, "batches": done}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Continue the epoch of a state after the batches that the state counts.
+        """Continue the epoch of a saved state; skip the batches that the state counts.
 
         The rest of the epoch is the same as in the interrupted run if the options and the numbers
         of workers and ranks are the same.
@@ -185,8 +185,8 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         full = [self._batch_size] * min(count // self._batch_size, number - 1)
         rest = count - sum(full)
         if rest == 0 and full and self._batch_size > 1:
-            # Other shards have one more item, which forms one more batch. To have the same number
-            # of batches, split the last batch of this shard.
+            # Some shards have one item more than this shard, and that item forms one more batch.
+            # Split the last batch of this shard, so that all shards have equally many batches.
             full[-1] -= 1
             rest = 1
         return [*full, rest] if rest else full
@@ -317,7 +317,7 @@ def _grouped(shares: list[_Share], size: int) -> Iterator[list[_Share]]:
 
 
 def _rank_of(rank: int | None, world_size: int | None) -> tuple[int, int]:
-    """Return rank and world size: as given, else from `torch.distributed`, else 0 and 1.
+    """Return rank and world size. The default is that of `torch.distributed`, or 0 and 1.
 
     Raises:
         UsageError: Only one of the two is given, or the rank is outside the world size.

@@ -62,8 +62,8 @@ class Estimate:
         estimator: `FQE` or one of `importance.ESTIMATORS`.
         value: Discounted return; None if it cannot be computed.
         interval: 95 % bootstrap-t interval over episodes; None for FQE or if `value` is None.
-        effective_sample_size: Number of episodes of the policy itself that would give an equally
-            precise estimate.
+        effective_sample_size: Number of episodes that would give an equally precise estimate if the
+            policy itself were recorded.
         verdict: `ok`, or `refused: ` or `no interval: ` with a reason. FQE is never `ok`.
             A verdict based on estimated behavior probabilities ends with `BY_ESTIMATES`.
     """

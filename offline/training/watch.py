@@ -95,8 +95,8 @@ def monte_carlo_returns(
         gamma: Discount.
 
     Returns:
-        One sum for each transition of these episodes. The sum is NaN if rewards after a truncation
-        are missing and would have a discount above 5 %.
+        One sum for each transition of these episodes. The sum is NaN if the episode was truncated
+        and the discount factor of the first missing reward is above 5 %.
     """
     returns = []
     ends = np.cumsum(dataset.episode_lengths)
@@ -114,14 +114,14 @@ def monte_carlo_returns(
 
 
 def largest_return(dataset: Dataset, gamma: float, share: Share = ALONE) -> float:
-    """Return an upper bound on the absolute discounted return of an episode of all data."""
+    """Return an upper bound on the absolute value of the discounted return of any episode."""
     longest, reward = share.largest((dataset.episode_lengths.max(), np.abs(dataset.rewards).max()))
     steps = float(longest) if gamma == 1 else 1 / (1 - gamma)
     return float(reward) * steps
 
 
 def horizon_warning(config: TrainingConfig) -> str | None:
-    """Return a warning if the settings have too few target updates for their horizon."""
+    """Return a warning if the number of target updates is too low for the horizon of gamma."""
     if not isinstance(config, BootstrapConfig) or config.horizon_fraction >= MIN_HORIZON_FRACTION:
         return None
     target_updates = config.updates // config.target_interval
@@ -136,7 +136,8 @@ def divergence_warning(before: float, value: float, limit: float) -> str | None:
     """Return a warning if values grow beyond twice the largest possible return.
 
     Args:
-        before: Mean value of an earlier batch; values of untrained networks can be large.
+        before: Mean value of an earlier batch. There is no warning unless `value` is larger,
+            because values of untrained networks can be large.
         value: Mean value of this batch.
         limit: Largest possible return.
     """

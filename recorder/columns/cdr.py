@@ -74,7 +74,7 @@ class Layout:
         return bool(self.matching(payloads).all())
 
     def matching(self, payloads: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which messages have this layout."""
+        """Return a mask of the messages that have this layout."""
         found = np.ones(len(payloads), bool)
         for name, value in self.constants.items():
             found &= payloads[name] == value
@@ -209,7 +209,7 @@ class _Walk:
             raise _NoLayout
         dtype = np.dtype(code).newbyteorder(self._order)
         alignment = 1 if dtype.kind == "S" else dtype.itemsize
-        # An empty sequence is not aligned.
+        # There is no padding before the elements of an empty sequence.
         if count:
             self.position += -(self.position - ENCAPSULATION_BYTES) % alignment
         if self.position + count * dtype.itemsize > len(self._data):
@@ -219,7 +219,7 @@ class _Walk:
         self.position += count * dtype.itemsize
 
     def take_time(self, name: str, wanted: Collection[str]) -> None:
-        """Move past a time and record it as one field, and `sec` and `nanosec` if requested."""
+        """Move past a time. Record it as one field, and also `sec` and `nanosec` if requested."""
         self.position += -(self.position - ENCAPSULATION_BYTES) % 4
         start, self.position = self.position, self.position + 8
         if self.position > len(self._data):

@@ -218,17 +218,17 @@ class McapReader:
     def message_ranges(self, channel: Channel) -> list[MessageRange]:
         """Return the positions of the messages of a channel, in file order.
 
-        Only chunks without an index are decompressed. If the index lengths agree with the message
-        count in the summary, the index of a chunk with a single channel is not read yet, but when
-        it is first used. Reading a few rows of a large file therefore needs only a few indexes.
+        Only chunks without an index are decompressed. The index of a chunk with a single channel is
+        read when it is first used, if the index lengths agree with the message count in the
+        summary. Reading a few rows of a large file therefore needs only a few indexes.
 
         Raises:
             CorruptLogError: An index is damaged, or the indexes and the summary disagree.
         """
         if channel.id not in self._ranges:
             if self._remote is not None:
-                # Fetch the indexes of all chunks with several channels at once, to avoid one
-                # request for each chunk.
+                # Of chunks with several channels, fetch all indexes together. Otherwise, each
+                # chunk would need a request.
                 places = [one for one in self.chunks if len(one.message_index_offsets) > 1]
                 starts = [one.chunk_start_offset + one.chunk_length for one in places]
                 self.fetch(zip(starts, map(end_of, places), strict=True))
@@ -478,7 +478,7 @@ class McapReader:
         return {number for number, one in self.channels.items() if one.schema_id in schemas}
 
     def _is_listed(self, opcode: int, content: memoryview) -> bool:
-        """Return whether the summary has this schema or channel; both records begin with an id."""
+        """Return whether the summary has this schema or channel. Both records begin with an id."""
         number = int.from_bytes(content[:2], "little")
         return (opcode == Opcode.SCHEMA and number in self.schemas) or (
             opcode == Opcode.CHANNEL and number in self.channels
@@ -512,5 +512,5 @@ class McapReader:
 
 
 def end_of(chunk: ChunkIndex) -> int:
-    """Return the first byte after a chunk and its message indexes."""
+    """Return the offset of the first byte after a chunk and its message indexes."""
     return chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length

@@ -86,7 +86,7 @@ class Episode:
         )
 
 
-# Reprs and pickles contain this public import path.
+# Reprs and pickles name the class by this public import path.
 Episode.__module__ = "mcaprl"
 
 

@@ -117,7 +117,7 @@ def _parts(
     """Divide `count` episodes into parts, and return the start and stop index of each part.
 
     Raises:
-        UsageError: Not exactly one of `episodes` and `ratio` is given, its value is invalid, or a
+        UsageError: `episodes` and `ratio` are both given or both missing, a value is invalid, or a
             part would be empty.
     """
     if (episodes is None) == (ratio is None):

@@ -62,7 +62,8 @@ def merge_logs(
     records, attachments = _other_records(logs, strings)
     top_level = [*records, *topics.records(), *attachments]
     with replacing(Path(out), LogError, overwrite=overwrite) as unfinished:
-        # Use the MCAP profile of a log: a file of another program may have a different profile.
+        # Copy the MCAP profile from a file with episodes, because files of other programs may have
+        # a different profile.
         like = next((log.reader for log in logs if log.has_steps), None)
         copied = copy_selected(sources, unfinished, top_level, like=like)
     episodes = sum(len(log.lengths) for log in logs)
@@ -73,11 +74,11 @@ def merge_logs(
 def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
     """Return the metadata of the joined log; None if none of the logs has metadata.
 
-    Some fields may differ between the logs. Such a field is empty if it does differ.
+    If a field differs between the logs and is allowed to differ, it is empty in the result.
 
     Raises:
         SpaceError: The spaces differ.
-        LogError: Another field that must be equal differs, or only some logs have metadata.
+        LogError: Another field differs that must be equal, or only some logs have metadata.
     """
     found = [described(log.reader) for log in logs]
     described_ones = [(log, one) for log, one in zip(logs, found, strict=True) if one is not None]
@@ -94,12 +95,13 @@ def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
         _check_same(first.path, metadata, log.path, other)
     _check_types(logs, are_described=True)
     common = LogMetadata.common([one for _, one in described_ones])
-    # In older logs, the id lacks the environment's module. The longest id includes the module.
+    # Older logs store the id of the environment without its module. If a log stores the id with
+    # the module, this id is the longest.
     return replace(common, env_id=max((one.env_id for _, one in described_ones), key=len))
 
 
 def _strings(logs: Sequence[FinishedLog], metadata: LogMetadata) -> dict[str, str]:
-    """Return the logs' metadata record if it is the same in all. Otherwise, encode `metadata`."""
+    """Return the metadata record of all logs; if their records differ, encode `metadata`."""
     found = [log.reader.metadata.get(METADATA_NAME) for log in logs if log.has_steps]
     first = found[0]
     if first is not None and all(one == first for one in found):
@@ -124,9 +126,9 @@ def _check_types(logs: Sequence[FinishedLog], *, are_described: bool) -> None:
 
     Args:
         logs: Logs of episodes.
-        are_described: Whether the logs have metadata. If so, the type of `/rl/step` is not
-            compared, because it follows from the spaces. The metadata of the other channels must
-            then be equal.
+        are_described: Whether the logs have metadata. If they do, the type of `/rl/step` is not
+            compared, because it follows from the spaces, and the metadata of the other channels
+            must be equal, too.
     """
     known: dict[str, tuple[Path, object]] = {}
     for log in logs:
@@ -208,7 +210,7 @@ def _leave_out_repeated(logs: Sequence[FinishedLog], sources: Sequence[Source]) 
 def _repeated(source: Source, other: Source) -> dict[int, Times]:
     """Find the messages that are in both sources.
 
-    The result contains the log_times of these messages in `other`, by the channel id in `other`.
+    The result maps channel ids in `other` to the log_times of these messages in `other`.
     """
     by_new = {new: old for old, new in source.ids.items()}
     found = {}

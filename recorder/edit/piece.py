@@ -109,7 +109,7 @@ def _window_of_steps(log: FinishedLog, steps: Bounds) -> tuple[int, int]:
         raise UsageError(f"{log.path} has the steps 0 to {count - 1}: none of them is in this part")
     ends = np.cumsum(log.lengths)
     first, last = (int(np.searchsorted(ends, step, side="right")) for step in (start, stop - 1))
-    # Each earlier episode has one more record than transitions, so add the number of episodes.
+    # Add the number of earlier episodes, because each has one more record than transitions.
     low = int(log.times[start + first]) if start else 0
     if stop == count:
         return low, _LAST_TIME

@@ -17,8 +17,8 @@ from mcaprl.recorder.format.reading import ROS_TO_NUMPY, McapReader, definitions
 _NS_PER_S = 10**9
 _TIME = "builtin_interfaces/msg/Time"
 _HEAD_BYTES = 4
-# A time in a message that is more than this many nanoseconds outside of the file's log_times
-# belongs to another clock or is not set.
+# Margin before and after the file's log_times, nanoseconds. If a time in a message is outside of
+# this range, it belongs to another clock or is not set.
 _MARGIN_NS = 10 * _NS_PER_S
 # Byte offset of the start and end times in a message of `/rl/episode`. The CDR header and
 # `total_reward` precede them.
@@ -178,7 +178,7 @@ class _Walk:
 
 @lru_cache(maxsize=256)
 def _flat(descriptions: tuple[Any, ...]) -> tuple[int, int] | None:
-    """Return the bytes per field and the number of fields.
+    """Return the size of one field in bytes, and the number of fields.
 
     Return None if not all fields are numbers of the same size.
     """

@@ -1,8 +1,9 @@
 """Images of a bag as observations: decoded, cropped, resized and converted to gray.
 
 Raw `sensor_msgs/Image` messages of the encodings in `_RAW` and compressed images of every format
-that Pillow reads are supported. Colors become uint8 (H, W, 3) or, if gray, (H, W, 1). Depth becomes
-float32 meters (H, W, 1), 0 where there is no surface; with `range_m`, depth becomes uint8.
+that Pillow reads are supported. Colors become uint8 (H, W, 3) or, if gray, (H, W, 1). Depth
+becomes float32 meters (H, W, 1), with the value 0 where there is no surface. If the mapping sets
+`range_m`, depth becomes uint8 instead.
 """
 
 from __future__ import annotations
@@ -165,7 +166,7 @@ def _compressed_image(topic: str, kind: str, data: bytes) -> Any:
         if image.mode in ("I;16", "I", "F"):
             return _meters(np.asarray(image), 1.0 if image.mode == "F" else 1e-3)
         wanted = "L" if image.mode in ("L", "1") else "RGB"
-        # Converting to the same mode would copy the image.
+        # Do not convert an image that has this mode, because the conversion would copy it.
         return image if image.mode == wanted else image.convert(wanted)
     # Pillow raises errors of many types for damaged images.
     except Exception as error:

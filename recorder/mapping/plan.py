@@ -37,7 +37,7 @@ class Plan:
     Attributes:
         bag: Bag to read.
         mapping: Mapping of the bag's topics.
-        place: Positions of the mapping's keys, for errors.
+        place: Positions of the mapping's keys in its file, for error messages.
         quantities: Observed and other quantities, by name.
         behavior_prob: Probability of the action; None if unknown.
         commands: Fields of the action.

@@ -85,7 +85,7 @@ def run_count(streams: dict[str, TopicStream]) -> int:
     """Return the number of runs, which is the same for all topics with messages.
 
     Raises:
-        UsageError: The topics' clocks were not all reset the same number of times.
+        UsageError: The clocks of two topics were reset different numbers of times.
     """
     counts = {name: len(stream.runs) for name, stream in streams.items() if len(stream.times_ns)}
     if len(set(counts.values())) > 1:

@@ -64,8 +64,8 @@ class EpisodeLog:
             SpaceError, OutputExistsError, LogError: Raised by `LogWriter`.
         """
         self._description = description
-        # A relative path refers to the current working directory, even if the process changes it
-        # later.
+        # Relative paths are resolved in this folder, even if the process later changes to another
+        # folder.
         self._folder = Path.cwd()
         self.step_ns = description.step_duration_ns
         first_ns = time.time_ns() if start_time_ns is None else start_time_ns

@@ -63,7 +63,7 @@ class OpenSteps(OpenRows[StepRows]):
     """Rows of `/rl/step` of all open episodes."""
 
     def end(self, environment: int, summary: EpisodeSummary, step_ns: int) -> None:
-        """Number an episode's rows, set its end flags, and write the rows."""
+        """Set the numbers and the end flags in the rows of an episode, and write the rows."""
         rows, count, last = self._rows, summary.length + 1, summary.length - 1
         rows.number((environment, slice(count)), summary.episode, np.arange(count))
         rows.put("terminated", (environment, last), summary.terminated)

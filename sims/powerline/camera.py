@@ -62,7 +62,7 @@ def ground_triangles() -> Floats:
 
 
 def grid_triangles(x_m: Floats, y_m: Floats) -> Floats:
-    """Return the triangles of the ground for the cells of a grid, (T, 3, 3) meters, facing up.
+    """Return two triangles of the ground for each grid cell, (T, 3, 3) meters, facing up.
 
     The grid's x and y are in NED axes. The triangles are in ROS axes, ordered by cell.
     """
@@ -117,7 +117,7 @@ class DroneCamera:
         return self._camera.image_m(*self.pose(drone))
 
     def without_wires(self, drone: Drone) -> Floats:
-        """Return the inverse distances at full size, (144, 256) 1/m, without conductors."""
+        """Return the inverse distances without conductors, at full size (144, 256), in 1/m."""
         return self._camera.inverse_distance(*self.pose(drone))
 
     def pose(self, drone: Drone) -> tuple[tuple[float, float, float], Floats]:

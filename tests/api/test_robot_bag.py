@@ -39,7 +39,7 @@ def test_the_bag_gives_the_transitions_of_the_native_log(native: Path, form: str
     assert read.episode_lengths.tolist() == recorded.episode_lengths.tolist()
     differences = np.abs(read.frames - recorded.frames).max(axis=0)
     # The last odometry before a step is at most 20 ms old. In 20 ms, braking changes the speed by
-    # at most 0.16 m/s.
+    # at most 0.16 m/s. The observation is the speed divided by 30 m/s.
     speed = recorded.observation_names.index("speed")
     assert differences[speed] < 0.16 / 30
     assert np.delete(differences, speed).max() < 1e-6
@@ -75,5 +75,6 @@ def test_the_suggested_mapping_uses_frequent_topics(native: Path, tmp_path: Path
     assert "joint_states_position" in observed
     assert "lane_data_10" in observed
     assert not any(name.startswith(("e_stop", "joint_states_velocity")) for name in observed)
-    # The clock is not aligned with the lane detector, so some steps are in the pauses.
+    # The mapping's steps are not aligned with the messages of the lane detector. Therefore, some
+    # steps are in the pauses between drives and are not read.
     assert len(found.dataset) > 0.9 * len(mcaprl.open(native))

@@ -23,7 +23,7 @@ LOADED = "print(*sorted({name.split('.')[0] for name in sys.modules}), file=sys.
 
 
 def loaded_by(*code: str) -> set[str]:
-    """Return the names of the packages that a new interpreter has imported after the code."""
+    """Run code in a new interpreter; return the names of the packages that it has imported."""
     done = subprocess.run(
         [sys.executable, "-c", RUN + "\n".join(code) + "\n" + LOADED],
         capture_output=True,
@@ -48,7 +48,7 @@ def test_commands_on_logs_import_no_engine_and_no_writer() -> None:
 
 
 def on_a_terminal(*arguments: str, stdout: int | None = None, **env: str) -> tuple[bytes, bytes]:
-    """Run a command whose stderr, and stdout unless it is given, is a terminal.
+    """Run a command with a terminal as its stderr, and as its stdout if `stdout` is None.
 
     Returns:
         Output on the terminal, and output on stdout if stdout is a pipe.
@@ -66,7 +66,7 @@ def on_a_terminal(*arguments: str, stdout: int | None = None, **env: str) -> tup
     while True:
         try:
             part = os.read(terminal, 65_536)
-        except OSError:  # The other end is closed.
+        except OSError:  # The command has closed the terminal.
             break
         if not part:
             break

@@ -20,7 +20,7 @@ from mcaprl.torch import TransitionDataset, TransitionStream
 
 
 def numbered(lengths: list[int], terminated: list[bool] | None = None) -> mcaprl.Dataset:
-    """Return episodes of these lengths; observation, action and reward are a running number."""
+    """Return episodes of these lengths; observations, actions and rewards count up from 0."""
     ends = terminated or [True] * len(lengths)
     frames = np.arange(sum(lengths) + len(lengths), dtype=np.float32)[:, np.newaxis]
     firsts = np.cumsum([0, *(length + 1 for length in lengths[:-1])])
@@ -64,7 +64,8 @@ def test_an_item_is_a_transition() -> None:
 
 
 def test_returns_of_several_steps_stop_at_ends() -> None:
-    # Rewards are 0, 1, 2 and 3, 4. The first episode terminates, and the second is truncated.
+    # The first episode has the rewards 0, 1 and 2, and terminates. The second episode has the
+    # rewards 3 and 4, and is truncated.
     batch = TransitionDataset(numbered([3, 2], [True, False]), n_steps=2, gamma=0.5)[:]
     assert batch["reward"].tolist() == [0.5, 2.0, 2.0, 5.0, 4.0]
     assert batch["next_observation"][:, 0].tolist() == [2.0, 3.0, 3.0, 6.0, 6.0]
@@ -92,7 +93,8 @@ def test_sequences_are_padded_after_the_end() -> None:
     assert batch["next_observation"][..., 0].tolist() == [[1, 2], [3, 0], [5, 0]]
     assert batch["action"].tolist() == [[0, 1], [2, 0], [3, 0]]
     assert batch["step"].tolist() == [[0, 1], [2, 0], [0, 0]]
-    # 0 + 0.5 (1 + 0.5 * 2) = 1, 1 + 0.5 * 2 = 2, then 2 and 3.
+    # The first episode has the rewards 0, 1 and 2, so its returns are 0 + 0.5 (1 + 0.5 * 2) = 1,
+    # 1 + 0.5 * 2 = 2, and 2. The second episode has one reward, 3.
     assert batch["return_to_go"].tolist() == [[1, 2], [2, 0], [3, 0]]
     assert batch["truncated"].tolist() == [[False, False], [True, False], [False, False]]
     assert "discount" not in batch

@@ -246,8 +246,8 @@ def test_an_incomplete_row_after_a_kill_is_dropped(tmp_path: Path) -> None:
 
 
 def test_the_checkpoint_is_written_after_the_policy(tmp_path: Path) -> None:
-    # In the opposite order, a kill between the two at the last update would leave an old policy
-    # beside the checkpoint of a finished run.
+    # If the last checkpoint were written first, a kill before the policy is written would leave an
+    # old policy beside the checkpoint of a finished run.
     train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
     folder = tmp_path / "run" / "seed-0"
     names = ("policy.safetensors", "policy.json", "checkpoint.safetensors")
@@ -362,7 +362,8 @@ def test_a_file_is_no_run_folder(tmp_path: Path) -> None:
 
 
 def test_a_loss_that_is_not_finite_stops_with_step_term_and_checkpoint(tmp_path: Path) -> None:
-    # After a step of 1e15 in each of four layers, outputs exceed float32.
+    # The first update changes the weights of each of the four layers by about 1e15. The outputs
+    # then exceed the range of float32.
     wild = {"learning_rate": 1e15, "hidden": (16, 16, 16), "checkpoint_interval": 1}
     with pytest.raises(TrainingError) as caught:
         train(

@@ -146,7 +146,7 @@ class ReusesBuffer(gym.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.values["image"] += 1
         self.values["x"] += 1
-        action[:] = 99  # also overwrite the argument
+        action[:] = 99  # The environment overwrites the action, too.
         return self.values, 1.0, False, bool(self.values["x"][0] == 3), {}
 
 
@@ -257,7 +257,7 @@ def test_actions_are_stored_or_refused(log_path: Path, space: Any, action: Any, 
 
 
 def test_large_observations_make_small_chunks(log_path: Path) -> None:
-    """Limit the bytes of a chunk, because readers refuse larger chunks."""
+    """The recorder limits the size of a chunk, because readers refuse larger chunks."""
     image = spaces.Box(0, 255, (720, 1280, 3), np.uint8)
     rows = [(np.full(image.shape, k, np.uint8), 0.0, False, k == 9) for k in range(10)]
     env = mcaprl.RecordMcap(ScriptedEnv(image, spaces.Discrete(3), [rows]), log_path)
@@ -532,7 +532,10 @@ def test_killed_recorder_loses_only_the_open_episode(log_path: Path) -> None:
 
 
 def test_a_deferred_signal_keeps_no_references() -> None:
-    """A buffer that is in use when a signal arrives can be resized before the signal is handled."""
+    """A pending signal keeps no references to buffers.
+
+    A signal arrives while a buffer is in use. The buffer is resized before the signal is handled.
+    """
     buffer = BytesIO(b"12345678")
     # If a shell starts pytest in the background, pytest ignores Ctrl-C.
     usual = signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -60,8 +60,8 @@ def test_one_episode_needs_few_requests_and_bytes(server: RangeServer) -> None:
     url, size = f"{server.url}/images.mcap", (server.folder / "images.mcap").stat().st_size
     found = mcaprl.open(url, episodes=25)
     assert found.fingerprint == mcaprl.open(server.folder / "images.mcap", episodes=25).fingerprint
-    # The requests are for the summary and the start of the file, the chunks of `/rl/episode` and
-    # `/rl/step`, and the chunks of images.
+    # There are requests for three parts: the start and the summary of the file; the chunks of
+    # `/rl/episode` and `/rl/step`; and the chunks of images.
     assert len(server.sent) <= 7
     assert sum(server.sent) < 0.3 * size
     # A chunk of images contains 50 images or more.

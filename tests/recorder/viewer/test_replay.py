@@ -85,7 +85,7 @@ def stamps(message: Any) -> list[int]:
 
 
 def test_frames_at_each_step_reach_to_the_next(log: Path) -> None:
-    """Each message has the poses from its step until the next step, at multiples of 0.05 s."""
+    """Each message has poses from its step to the next step, 0.05 s or a multiple apart."""
     found = read(log, "/tf", "tf2_msgs/msg/TFMessage")
     times = step_times(log)
     assert [time for time, _ in found] == [time for episode in times for time in episode]
@@ -337,8 +337,8 @@ def test_segments_are_cut_into_pieces() -> None:
 def test_depth_images_have_a_camera(log: Path) -> None:
     """The focal lengths follow from the field of view.
 
-    An angle of 90 degrees on 84 pixels gives 42 in x. The view has the aspect ratio 256 : 144,
-    which gives 42 * 256 / 144 in y.
+    In x, 84 pixels cover 90 degrees, so the focal length is 84 / 2 = 42 pixels. The 84 x 84 image
+    shows a view with the aspect ratio 256 : 144, so the focal length in y is 42 * 256 / 144.
     """
     ((time, info),) = read(log, "/camera/camera_info", "sensor_msgs/msg/CameraInfo")
     assert time == step_times(log)[0][0]

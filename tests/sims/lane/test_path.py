@@ -19,7 +19,7 @@ from mcaprl.sims.lane.path import (
 )
 from mcaprl.sims.lane.rules import AHEAD_M, BACK_M, LOOKAHEADS_M
 
-# Subnormal numbers are excluded: rounding moves such a distance from before the start to after it.
+# Subnormal numbers are excluded: rounding moves such a distance across the start.
 along = st.one_of(
     st.floats(-20, 5000, allow_subnormal=False), st.sampled_from(COURSE.along_m.tolist())
 )

@@ -53,14 +53,14 @@ def test_the_car_is_in_the_middle_of_the_image() -> None:
 
 
 def test_the_car_points_where_it_is_heading() -> None:
-    """Along x, the car is longer from left to right; along y, it is longer from top to bottom."""
+    """If the car heads along x, its image is wider than high; along y, it is higher than wide."""
     for yaw_rad, wide in ((0.0, True), (math.pi / 2, False)):
         rows, columns = np.nonzero(near(image_at((50.0, 1.0, yaw_rad)), PAINT))
         assert (np.ptp(columns) > 1.5 * np.ptp(rows)) == wide
 
 
 def test_north_is_up_and_east_is_right() -> None:
-    """10 m before the corner at (130, 1), there is grass 8 m to the north, but not to the east."""
+    """The car is 10 m west of the corner at (130, 1), where the road turns north."""
     grass = near(image_at((120.0, 1.0, 0.0)), GRASS)
     ten_meters_px = round(10 * 600 / 55)
     assert grass[300 - ten_meters_px // 2, 250]
@@ -77,7 +77,7 @@ def test_a_window_shows_each_step() -> None:
 
 
 def test_rendering_needs_a_mode() -> None:
-    """Without a mode, the unwrapped environment renders nothing. Gymnasium's wrapper would warn."""
+    """The environment is unwrapped, because Gymnasium's wrapper warns if there is no mode."""
     env = gym.make(ENV_ID).unwrapped
     env.reset(seed=0)
     assert env.render() is None

@@ -108,7 +108,11 @@ def moved_by_theirs(body: Any, drone: Drone, command: Vector, wind: Vector) -> D
     ids=["step", "hover in wind", "step in wind"],
 )
 def test_rotorpys_body_with_our_controllers_flies_equally(command: Vector, wind: Vector) -> None:
-    """The two differ by at most 2 cm/s and 1 degree in the response, and by 2 % at its end."""
+    """The velocities differ by at most 2 cm/s, and the attitudes by at most 1 degree.
+
+    In the end, rotorpy's velocity differs from the command by less than 2 % of the sum of the
+    speeds of the command and the wind.
+    """
     body, ours = their_body(), cruising(ZERO, ZERO)
     theirs = ours
     for _ in range(30):
@@ -123,7 +127,7 @@ def test_rotorpys_body_with_our_controllers_flies_equally(command: Vector, wind:
 
 
 def test_unequal_rotors_turn_rotorpys_body_equally() -> None:
-    """Each of several asymmetric sets of thrusts acts for a tenth of a second."""
+    """Five random sets of unequal thrusts act for a tenth of a second each."""
     random = np.random.default_rng(2)
     body = their_body()
     for _ in range(5):

@@ -42,8 +42,8 @@ def lengths_of(track: Track, x_px: float, y_px: float) -> dict[str, float]:
         (275.0, 150.5, 0, 2, BACK, 0, DRIVING),
         (275.0, 150.0, 0, 3, BACK, 0, DRIVING),
         (281.0, 150.5, 0, 0, NONE, 1, DRIVING),
-        # From 295 to 305, the car crosses the gate without facing it nearby. Facing the gate from
-        # the other side counts.
+        # The car moves from 295 to 305, and the gate at 300 is not ahead at the end of the step.
+        # Facing the gate from the other side counts.
         (295.0, 150.5, 0, 10, NONE, 0, DRIVING),
         (310.0, 150.5, 180, 0, NONE, 1, DRIVING),
         # The car is near the gate, but faces sideways.
@@ -97,7 +97,11 @@ def test_fault_forward_drives_backward() -> None:
 
 
 def test_fault_corner_rays_cross_the_nose_and_start_at_the_center() -> None:
-    """The car is at (500.5, 130.5). The corners are at 515.5, and hits are rounded down to 515."""
+    """The car's center is at (500.5, 130.5), and its front corners are at x = 515.5.
+
+    Hits are rounded down to pixels: x = 515 is 14.5 pixels from the center. The walls at y = 200
+    and y = 100 are 69.5 and 30.5 pixels from the center.
+    """
     seen = lengths_of(corridor(), 500.5, 130.5)
     assert seen["left_corner_sideways"] == pytest.approx(math.hypot(14.5, 69.5))
     assert seen["right_corner_sideways"] == pytest.approx(math.hypot(14.5, 30.5))
@@ -106,7 +110,7 @@ def test_fault_corner_rays_cross_the_nose_and_start_at_the_center() -> None:
 
 
 def test_fault_hits_are_floored_to_pixels() -> None:
-    """In the middle between walls at 100.5 and 199.5, the two observed distances differ."""
+    """The car at 150 is midway between walls at 100.5 and 199.5, but observes 50 and 49."""
     seen = lengths_of(corridor(100.5, 199.5), 500.5, 150.0)
     assert seen["left_90"] == pytest.approx(math.hypot(50.0, 0.5))
     assert seen["right_90"] == pytest.approx(math.hypot(49.0, 0.5))
@@ -136,7 +140,10 @@ def test_fault_a_joint_of_walls_costs_twice() -> None:
 
 
 def test_fault_a_gate_crossed_unseen_is_lost() -> None:
-    """A step from 295 to 305 crosses the gate at 300, but the car never faces it from nearby."""
+    """The car moves from x = 295 to 305 in one step, and the gate at 300 is not counted.
+
+    The classic rules test only whether the gate is ahead at the end of a step.
+    """
     track = corridor()
     car = car_in(track, 295.0, 150.5, 0, 10)
     over = drive(track, car, NONE, True, False)

@@ -33,8 +33,8 @@ Under this key, the writer stores the data that Minari's format cannot store.
 """
 MISSING = "missing_infos"
 """Subgroup of an episode's group `OWN`: for each info, an array that marks its missing rows."""
-# The first version of Minari that reads images without JPEG. Minari refuses datasets whose version
-# is newer than its own.
+# Minari version in the metadata of written datasets: the oldest one that reads images without JPEG,
+# because Minari refuses datasets of a version that is newer than its own.
 _MINARI_VERSION = "0.5.4"
 _ABOUT = (
     "author",
@@ -241,7 +241,7 @@ def _env_of(raw: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     try:
         spec = parse_json(raw["env_spec"])
         kwargs = dict(spec.get("kwargs") or {})
-        # `render_mode` concerns the recording, not the environment.
+        # `render_mode` is a choice of the recording, not a property of the environment.
         kwargs.pop("render_mode", None)
         return str(spec["id"]), kwargs
     except (KeyError, ValueError, TypeError, AttributeError):
