@@ -29,7 +29,7 @@ Act = Callable[[NDArray[Any]], int]
 
 
 def make_logs(folder: Path) -> dict[str, mcaprl.Dataset]:
-    """Create all five logs if one of them is missing, and read them."""
+    """Read the five logs; if one of them is missing, create all five first."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = {name: folder / f"{name}.mcap" for name in NAMES}
     if not all(path.exists() for path in paths.values()):

@@ -1,4 +1,7 @@
-"""Measure conversions to and from datasets of other tools, relative to the tools' functions."""
+"""Measure conversions to and from datasets of other tools.
+
+Times are relative to the functions of those tools.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ SHARE = 0.05
 
 
 def tables(folder: Path) -> list[Table]:
-    """Measure each format, with files in `folder`."""
+    """Measure each format; the benchmarks write their files to `folder`."""
     data, log = vectors(TRANSITIONS), folder / "part.mcap"
     data.save(log)
     minari = rivals.MinariFolder(folder / "minari")

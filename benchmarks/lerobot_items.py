@@ -2,9 +2,9 @@
 
     make .venv/.lerobot && python -m benchmarks.lerobot_items
 
-LeRobot reads a dataset that mcaprl writes. It runs in its own Python environment, `.venv/lerobot`
-or that of the interpreter MCAPRL_LEROBOT_PYTHON. The program prints LeRobot's CPU time for each
-transition, relative to ours.
+LeRobot reads a dataset that mcaprl writes. It runs in a separate Python environment:
+`.venv/lerobot`, or the environment of the interpreter that MCAPRL_LEROBOT_PYTHON names. The program
+prints LeRobot's CPU time for each transition, relative to ours.
 """
 
 from __future__ import annotations

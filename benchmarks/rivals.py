@@ -52,7 +52,7 @@ def write_mcap(encoded: list[bytes], path: Path) -> None:
 
 
 def write_interleaved(encoded: list[bytes], path: Path) -> None:
-    """Write with mcap's Writer, mixed with messages of other lengths on another topic."""
+    """Write with mcap's Writer, together with messages of varying length on `/chatter`."""
     from mcap.writer import CompressionType, Writer
 
     with path.open("wb") as file:
@@ -199,7 +199,7 @@ class MinariFolder:
         return f"bench/{what}-{data_format}-v0"
 
     def read(self, name: str, episodes: list[int] | None = None) -> list[Any]:
-        """Read observations, actions and rewards of the given, or of all, episodes into arrays."""
+        """Read observations, actions and rewards of episodes (default: all) into arrays."""
         import minari
 
         found = list(minari.load_dataset(name).iterate_episodes(episodes))
@@ -230,7 +230,10 @@ class _NoSpec(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def columns_of(data: mcaprl.Dataset) -> dict[str, NDArray[Any]]:
-    """Return the columns for table formats; the next rows contain the next observations."""
+    """Return the columns for table formats.
+
+    Next observations have no column: they are the observations of the next row.
+    """
     here = data.observations
     return {
         **(here if isinstance(here, dict) else {"observation": here}),
@@ -242,7 +245,7 @@ def columns_of(data: mcaprl.Dataset) -> dict[str, NDArray[Any]]:
 
 
 def write_h5py(data: mcaprl.Dataset, path: Path) -> None:
-    """Write one chunked HDF5 file with h5py and gzip 1, because HDF5 has no built-in zstd."""
+    """Write one chunked HDF5 file with h5py and gzip level 1; HDF5 has no built-in zstd."""
     import h5py
 
     with h5py.File(path, "w") as file:
@@ -261,7 +264,7 @@ def read_h5py(path: Path, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
 
 
 def write_parquet(data: mcaprl.Dataset, path: Path) -> None:
-    """Write with pyarrow, with zstd 1."""
+    """Write with pyarrow, compressed with zstd level 1."""
     import pyarrow
     import pyarrow.parquet
 

@@ -45,7 +45,7 @@ def add_markdown(app: Sphinx, error: Exception | None) -> None:
 
 
 def _in_order(app: Sphinx, name: str) -> list[str]:
-    """Return the pages below a page in the order of the tables of contents."""
+    """Return the pages below a page, in the order in which tables of contents list them."""
     found = []
     for one in app.env.toctree_includes.get(name, []):
         found += [one, *_in_order(app, one)]
@@ -60,5 +60,5 @@ def _summary(app: Sphinx, name: str) -> str:
 
 
 def setup(app: Sphinx) -> None:
-    """Register what happens after the build."""
+    """Register `add_markdown` to run after the build."""
     app.connect("build-finished", add_markdown)

@@ -103,7 +103,7 @@ class ActionDescriber:
         self._recorder, self._model = recorder, model
         self._were_greedy = False
         if isinstance(model, DQN):
-            # SB3 runs the network only if it selects greedy actions, so a hook can detect this. A
+            # SB3 does not run the network when it explores, so a hook detects greedy actions. A
             # second forward pass at each step would take longer than recording.
             model.q_net.register_forward_hook(self._on_forward)
 
@@ -120,7 +120,7 @@ class ActionDescriber:
         self.reset()
 
     def reset(self) -> None:
-        """Ignore the last forward pass, because it did not select the next actions."""
+        """Treat the next actions as random unless a forward pass selects them."""
         self._were_greedy = False
 
     def _on_forward(self, network: nn.Module, *_: Any) -> None:

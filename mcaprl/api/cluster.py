@@ -26,7 +26,7 @@ class ClusterOptions:
     address: str | None
 
     def check(self, **others: int | None) -> None:
-        """Check the options, and that numbers which require Ray are only given with it.
+        """Check that numbers are at least 1, and that cluster options are given only with `ray`.
 
         Raises:
             UsageError: An option is given without `ray`, or a number is below 1.
@@ -38,7 +38,7 @@ class ClusterOptions:
                 raise UsageError(f"{flag(name)} requires --ray")
 
     def connected(self) -> AbstractContextManager[Any]:
-        """Connect to the cluster within the context; raise the same errors as `ray.cluster`."""
+        """Return a context that connects to the cluster; its errors are those of `ray.cluster`."""
         from mcaprl.ray.cluster import cluster
 
         return cluster(self.address, workers=self.workers)

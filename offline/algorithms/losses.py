@@ -7,7 +7,7 @@ size, A the number of actions, N the number of quantiles.
     discount_t      gamma (B,), to the power of n for n-step returns, or 0 after termination
     q_t             values (B, A) of the target network, or quantiles (B, A, N)
     q_t_selector    values (B, A) or quantiles (B, A, N) of the network that selects the next action
-    q_t_value       values (B, A) or quantiles (B, A, N) of the network that evaluates it
+    q_t_value       values (B, A) or quantiles (B, A, N) of the network that evaluates this action
     a_t             next actions (B,), int64
     pi_t            probabilities (B, A) of the evaluated policy in the next states
     q_tm1, z_tm1    values (B, A) or quantiles (B, A, N) of the learning network
@@ -16,8 +16,9 @@ size, A the number of actions, N the number of quantiles.
     v_tm1           values (B, 1) of states
     logits_tm1      unnormalized log probabilities (B, A)
 
-Actions are selected by their mean quantile. Outputs of actions that are not allowed are minus
-infinity. A loss returns one value per transition; autograd computes its gradient.
+In the equations, s' and a' are the next state and action, and Q' is the network that evaluates
+them. With quantiles, the action with the largest mean is selected. Outputs of actions that are not
+allowed are minus infinity. A loss returns one value per transition; autograd computes its gradient.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def square_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tenso
 
 
 def temporal_difference_loss(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:
-    """Return `huber_regression` of values (B, A), or `quantile_regression` of quantiles."""
+    """Return `huber_regression` for values (B, A), or `quantile_regression` for quantiles."""
     regression = huber_regression if q_tm1.ndim == 2 else quantile_regression
     return regression(q_tm1, a_tm1, target_tm1)
 
@@ -88,8 +89,9 @@ def temporal_difference_loss(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -
 def huber_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:
     """Return the Huber loss (B,) of Q(s, a) - target: quadratic up to 1, linear beyond.
 
-    This is the error clipping of the DQN paper: the gradient of a rare, large error (a crash, a new
-    target network) is no larger than that of an error of 1.
+    This is the error clipping of the DQN paper: the gradient is never larger than at an error
+    of 1. This limits the effect of rare, large errors, such as those after a crash or after a
+    change of the target network.
     """
     _check_actions(q_tm1, a_tm1)
     _check_shape("target_tm1", target_tm1, (len(q_tm1),))
@@ -119,8 +121,8 @@ def cross_entropy(logits_tm1: Tensor, a_tm1: Tensor) -> Tensor:
     """Return -log pi(a_data | s) (B,) with pi = softmax(logits): the loss of behavior cloning.
 
     With Q-values as logits, this is the CQL(H) penalty logsumexp_a Q(s, a) - Q(s, a_data), which
-    is never negative. Its gradient lowers all values and raises that of the logged action. See
-    "Conservative Q-Learning for Offline Reinforcement Learning", equation 4,
+    is never negative. A gradient step lowers all values and raises the value of the logged
+    action. See "Conservative Q-Learning for Offline Reinforcement Learning", equation 4,
     https://arxiv.org/abs/2006.04779.
     """
     _check_actions(logits_tm1, a_tm1)
@@ -133,7 +135,7 @@ def square_penalty(logits_tm1: Tensor) -> Tensor:
 
 
 def expectile_regression(v_tm1: Tensor, target_tm1: Tensor, expectile: float) -> Tensor:
-    """Return the asymmetric square loss |expectile - 1{u < 0}| u^2 (B,), u = target - V(s).
+    """Return the asymmetric square loss |expectile - 1{u < 0}| u^2 (B,), where u = target - V(s).
 
     At expectile 0.5, the best V(s) is the mean target. As the expectile approaches 1, the best V(s)
     approaches the largest target.
@@ -156,11 +158,11 @@ def allowed_only(outputs: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def likely_actions(logits: Tensor, threshold: float) -> Tensor:
-    """Return whether pi(a|s) / max_a pi(a|s) >= threshold (B, A), with pi = softmax(logits).
+    """Return a mask (B, A) of the actions with pi(a|s) / max_a pi(a|s) >= threshold.
 
-    This is the filter of discrete BCQ; a threshold of 0 admits all actions, and 1 admits only the
-    most likely one. See "Benchmarking Batch Deep Reinforcement Learning Algorithms", algorithm 1,
-    https://arxiv.org/abs/1910.01708.
+    The policy pi is softmax(logits). This is the filter of discrete BCQ; a threshold of 0 admits
+    all actions, and 1 admits only the most likely one. See "Benchmarking Batch Deep
+    Reinforcement Learning Algorithms", algorithm 1, https://arxiv.org/abs/1910.01708.
     """
     return (logits - logits.amax(1, keepdim=True)).exp() >= threshold
 

@@ -54,7 +54,7 @@ class GrowingLogs:
             time.sleep(_POLL_S)
 
     def grow(self) -> bool:
-        """Read the episodes finished since the last call; return whether there were any."""
+        """Read the episodes that ended since the last call; return whether there were any."""
         parts = self._read_more()
         if parts:
             self.dataset = Dataset.concatenate([self.dataset, *parts])

@@ -264,7 +264,7 @@ def chunk_records(file: memoryview, offset: int, scratch: Scratch | None = None)
 
 
 def _decompress(data: memoryview, header: ChunkHeader, offset: int, scratch: Scratch) -> memoryview:
-    """Decompress at most one byte more than the header declares, to stop compression bombs."""
+    """Decompress a chunk up to one byte beyond its declared size, to stop compression bombs."""
     limit = header.uncompressed_bytes + 1
     try:
         match header.compression:
@@ -284,7 +284,10 @@ def _decompress(data: memoryview, header: ChunkHeader, offset: int, scratch: Scr
 
 
 def _inflate_zstd(data: memoryview, scratch: Scratch, limit: int) -> memoryview:
-    """Decompress at most `limit` bytes, in one call if the frame header states the size."""
+    """Decompress at most `limit` bytes.
+
+    If the frame header states the size, one call of the decompressor is enough.
+    """
     memory, count = scratch.take(limit), 0
     with scratch.zstd.stream_reader(data) as reader:
         while count < limit:

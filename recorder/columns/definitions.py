@@ -15,8 +15,7 @@ from mcaprl.errors import LogError
 TIME_TYPES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 ROS1 = "ros1msg"
 # The definition of a service event may lack the definitions of the request and the response. By
-# default, ROS leaves the request and the response out of the event, so that their definitions are
-# not needed to read it.
+# default, events contain neither requests nor responses, and can be read without these definitions.
 _EVENT, _PARTS = "_Event", ("_Request", "_Response")
 _UNKNOWN: Any = ([], [("unknown", (Nodetype.BASE, ("uint8", 0)))])
 _IDL_LINE = "=" * 80 + "\n"

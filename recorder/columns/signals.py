@@ -23,7 +23,7 @@ _HELD = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 
 
 class HoldSignals:
-    """Context manager that delays signals; they are handled as usual at its end.
+    """Context manager that delays signals until its end, where they are handled as usual.
 
     A context has an effect only in the main thread, where Python runs all handlers. A nested
     context has no effect.

@@ -175,7 +175,7 @@ class _Copy:
     ) -> None:
         self._view, self._writer, self._topics, self._damages = view, writer, topics, damages
         # Offsets of the chunks read so far, by the CRC and length of their records. A second chunk
-        # with equal records is dropped as a repetition. It is kept if an intact summary lists it.
+        # with equal records is dropped as a repetition, unless an intact summary lists it.
         self._seen: dict[tuple[int, int], list[int]] = {}
         self._listed = {
             record.chunk_start_offset

@@ -1,4 +1,4 @@
-"""Storage of image observations in memory, or on disk in uncompressed chunks."""
+"""Storage of image observations: in memory, or in a file of uncompressed chunks."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def image_cache(
             if cache.complete and cache.metadata.get(CACHE_METADATA) == description:
                 return cache
         except LogError:
-            # The file is not a copy of these images: replace it.
+            # The existing file is not a readable log: replace it.
             pass
     from mcaprl.recorder.format.writing import McapWriter
 
@@ -84,7 +84,10 @@ def image_cache(
 
 
 def fingerprint(reader: McapReader) -> str:
-    """Return the SHA-256 of a log's chunk offsets and CRCs, and of its mtime if it lacks CRCs."""
+    """Return the SHA-256 of the offsets, sizes and CRCs of a log's chunks.
+
+    If a chunk has no CRC, the hash includes the mtime of the log.
+    """
     digest = hashlib.sha256(str(len(reader.view)).encode())
     has_crcs = bool(reader.chunks)
     for chunk in reader.chunks:

@@ -21,7 +21,7 @@ from mcaprl.recorder.format.writing import finished_state
 from mcaprl.recorder.record.display import CAMERA_INFO, SCENE, SCENE_STATIC, TF, TF_STATIC
 from mcaprl.remote import as_path
 
-# Topics on which each message is valid until the next message of the topic.
+# On these topics, a message is valid until the next message of the same topic.
 _STATES = (SCENE, SCENE_STATIC, TF, TF_STATIC, CAMERA_INFO, PHASE_TOPIC)
 _LAST_TIME = np.iinfo(np.int64).max
 
@@ -169,8 +169,8 @@ class FinishedLog:
         """Return the times of the messages that are still valid at the start of each time range.
 
         Display topics that are not repeated at each step, such as the static scene, have such
-        messages. So have the topics that ROS calls latched or transient local. On these topics, the
-        last message before a range is still valid.
+        messages. The topics that ROS calls latched or transient local also have such messages. On
+        these topics, the last message before a range is still valid.
 
         Args:
             spans: (S, 2) first and last log_times of the S copied time ranges.

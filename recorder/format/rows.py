@@ -46,7 +46,7 @@ class TopicRows:
 
     @classmethod
     def of_text(cls, text: str, channel_id: int, most: int, write: Write) -> Self:
-        """Preallocate records of the fixed-size message that `text` defines.
+        """Preallocate records for messages of the type that `text` defines; their size is fixed.
 
         Args:
             text: ROS 2 definition of the message.

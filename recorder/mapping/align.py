@@ -86,8 +86,8 @@ def interpolated(
 
     Returns:
         Values (N,) or (N, K), which are NaN where missing, and the matches. `rows` of the matches
-        are the messages before the steps. `age_s` is the age of the nearer of the two messages
-        between which a value is interpolated.
+        are the messages before the steps. `age_s` is the age of one of the two messages
+        between which a value is interpolated: the message that is nearer in time.
     """
     low = np.searchsorted(times_ns, steps_ns, side="right") - 1
     exact = (low >= 0) & (times_ns[np.maximum(low, 0)] == steps_ns) if len(times_ns) else low >= 0

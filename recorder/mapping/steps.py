@@ -165,7 +165,7 @@ class StepReader:
         return found
 
     def _usable(self, quantities: dict[str, Values], count: int) -> NDArray[np.bool_]:
-        """Return a mask of the steps that have all observations, none older than `gap_s`."""
+        """Return a mask of the steps that have all observations, each at most `gap_s` old."""
         usable = np.ones(count, bool)
         for name, quantity in self._mapping.observation.items():
             if quantity.missing is None or quantity.image is not None:

@@ -139,7 +139,7 @@ class EpisodeCheck:
         return fits and len(channels) == 1
 
     def _prepare(self) -> None:
-        """Map each chunk to its message ranges and the rows that they fill."""
+        """Assign to each chunk its message ranges and the destinations of their values."""
         start = 0
         for decoder, messages in self._steps.parts:
             stop = start + len(messages)

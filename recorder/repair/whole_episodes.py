@@ -51,7 +51,7 @@ class RowAction(IntEnum):
 
     DROP = DROP
     KEEP = KEEP
-    # Actions for the last transition and the last record of an episode whose end is missing.
+    # If the end of an episode is missing: actions for its last transition and its last record.
     TRUNCATE = 2
     MAKE_FINAL = 3
 
@@ -189,8 +189,7 @@ class _Run:
 
     Attributes:
         start: Row of the first record.
-        last: Row of the last record that has all its images and has no earlier record without
-            images.
+        last: Row before the first record that lacks an image; if there is none, the last row.
         records: Number of records, including records without their images.
         begins: Whether the run begins with step 0.
         is_whole: Whether the run is a whole episode.
@@ -276,7 +275,7 @@ def _with_images(reader: McapReader, times: NDArray[np.int64]) -> NDArray[np.boo
 
 
 def _listed_episodes(reader: McapReader) -> dict[int, int]:
-    """Return the episode numbers on `/rl/episode` by the log_time of each episode's last record."""
+    """Return the episodes on `/rl/episode`: a dict from the end time, in ns, to the number."""
     topic, names = Topic(reader, EPISODE_TOPIC), ("end_time_ns", "episode")
     if not set(names) <= set(topic.fields):
         return {}
@@ -285,7 +284,10 @@ def _listed_episodes(reader: McapReader) -> dict[int, int]:
 
 
 def _missing(columns: Columns, listed: Iterable[int]) -> Iterator[DroppedEpisode]:
-    """Yield the episodes without records: their number is in `listed`, or is skipped in the log."""
+    """Yield the episodes without records.
+
+    The number of such an episode is in `listed`, or is missing between two numbers in the log.
+    """
     known = np.unique(columns["episode"]).astype(np.int64)
     gaps = np.diff(known)
     between = [

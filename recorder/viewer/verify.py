@@ -53,7 +53,7 @@ class Difference:
         step: Step of the observation; 0 after `reset`.
         time_ns: log_time of the observation.
         time_s: Time of the observation since the start of the episode.
-        fields: Values that differ, limited to the first `_MOST_FIELDS`.
+        fields: The first values that differ, at most `_MOST_FIELDS`.
     """
 
     episode: int
@@ -143,7 +143,7 @@ def verify(
 
 
 def _needed(episodes: tuple[Episode, ...], only: int | None) -> tuple[Episode, ...]:
-    """Return episode `only` and the episodes that its start depends on.
+    """Return the episode `only`, and the episodes on which the start of this episode depends.
 
     If `only` is None, return all episodes.
     """

@@ -76,7 +76,8 @@ def walls_hit(track: Track, car: Car) -> int:
         along_x, along_y = wall[2] - wall[0], wall[3] - wall[1]
         away = (wall[0] - car.x_px) * along_y - (wall[1] - car.y_px) * along_x
         if away * away > CORNER_PX_2 * (along_x * along_x + along_y * along_y):
-            # The wall cannot hit the car: its line is farther from the center than any corner.
+            # The wall cannot hit the car: the line through the wall is farther from the center of
+            # the car than any corner of the car.
             continue
         for i in range(4):
             (x, y), (end_x, end_y) = corners[i], corners[(i + 1) % 4]
@@ -127,7 +128,7 @@ def crosses_gate(before: Car, after: Car, gate: NDArray[np.float64]) -> bool:
 
 @compiled
 def sees_gate(car: Car, gate: NDArray[np.float64]) -> bool:
-    """Return whether a gate (4,) is less than 20 pixels ahead: the classic rule for passing it."""
+    """Return whether a gate (4,) is less than 20 pixels ahead, which passes it in classic rules."""
     dx, dy = LOOK_PX * math.cos(car.course_rad), LOOK_PX * math.sin(car.course_rad)
     share, along_gate = crossing(car.x_px, car.y_px, dx, dy, gate)
     if not (0.0 < share < 1.0 and 0.0 < along_gate < 1.0):

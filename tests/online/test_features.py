@@ -146,7 +146,7 @@ def test_images_have_mean_0_and_deviation_1_after_normalization() -> None:
 
 
 def test_averaged_images_have_the_same_values() -> None:
-    """In training, images are averaged when they are stored; to act, the network averages them."""
+    """Images are averaged before they are stored for training, or by the network when it acts."""
     env = Camera(vector=True)
     model = model_of(env, Architecture((8, 8), encoder="compact"))
     blocks = np.random.default_rng(0).integers(0, 256, (5, 1, 42, 42), dtype=np.uint8)
@@ -188,7 +188,7 @@ def test_sb3s_network_is_used_if_it_is_asked_for(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("observation", ["dashboard", "depth-commands"])
 def test_a_resumed_agent_has_the_same_images(tmp_path: Path, observation: str) -> None:
-    """The replay buffer contains averaged images, and the checkpoint their normalization."""
+    """The replay buffer contains averaged images; the checkpoint contains their normalization."""
     models: list[Any] = []
     for resume in (False, True):
         task = Task.for_sim("lane", None, {"observation": observation}, **SHORT)

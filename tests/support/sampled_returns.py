@@ -21,13 +21,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Returns:
-    """Distribution of returns: the sum of effects of the seed, of the start, and of both.
+    """Distribution of returns. A return is the sum of effects of the seed, the start and the pair.
 
     Attributes:
         seeds: Number of training seeds.
         episodes: Number of episodes of each seed; all seeds have the same starts.
         skewed: Whether the effects of starts and episodes are lognormal instead of normal.
-        spread: Standard deviation of the seeds' effects; that of the episodes is 1.
+        spread: Standard deviation of the effects of seeds. For the effects of episodes, it is 1.
         skewed_seeds: Whether the effects of seeds are lognormal.
     """
 
@@ -40,7 +40,7 @@ class Returns:
     def draw(self, random: np.random.Generator) -> Floats:
         """Draw returns (S, E) of S seeds and E episodes.
 
-        The start of an episode causes half of its variance.
+        With several seeds, half of the variance between episodes is due to their starts.
         """
         of_seeds = _effects(random, (self.seeds, 1), skewed=self.skewed_seeds)
         of_starts = _effects(random, (1, self.episodes), skewed=self.skewed)

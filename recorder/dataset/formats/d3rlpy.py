@@ -210,7 +210,7 @@ def _joined(observations: Sequence[Any]) -> Any:
 
 
 def _flags(episode: Mapping[str, Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the terminals and the timeouts of an episode; one of them is set at the last step."""
+    """Return the terminals and the timeouts of an episode. The last step has one of these flags."""
     flags = np.zeros((2, len(episode["rewards"])), np.float32)
     flags[0 if episode["terminated"] else 1, -1] = 1
     return flags[0], flags[1]
@@ -219,7 +219,7 @@ def _flags(episode: Mapping[str, Any]) -> tuple[NDArray[np.float32], NDArray[np.
 def _dataset_of(
     episodes: Sequence[Mapping[str, Any]], action_space: spaces.Space[Any] | None, where: object
 ) -> Dataset:
-    """Convert d3rlpy's episodes to a dataset; infer the spaces, except `action_space` if given."""
+    """Convert d3rlpy's episodes to a dataset; infer the spaces that are not given."""
     if not episodes:
         raise LogError(f"{where} has no episodes")
     frames = [_frames(episode) for episode in episodes]

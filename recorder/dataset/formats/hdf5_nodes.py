@@ -43,7 +43,7 @@ def opened(path: Path) -> Iterator[Any]:
     """Open a file for reading.
 
     Raises:
-        LogError: The file is missing, or the caller reads damaged data.
+        LogError: The file is missing, or data that is read in the context is damaged.
         MissingExtraError: h5py is not installed.
     """
     h5py = import_extra("h5py", EXTRA)

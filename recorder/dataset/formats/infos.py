@@ -22,7 +22,7 @@ _MAX_EXACT = 2**53
 
 
 class StoredInfo(NamedTuple):
-    """An info with a value in each row.
+    """An info with a value in each of F rows.
 
     Attributes:
         values: (F, *shape) numbers, flags or strings.

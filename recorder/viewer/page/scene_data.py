@@ -24,8 +24,8 @@ def scene_data(track: Track, start_ns: int, end_ns: int) -> dict[str, Any]:
     Returns:
         `shapes`: all different shapes; see `_Shapes.columns`.
         `static`: (S,) indexes of the static shapes.
-        `moments`: seconds from the start at which the moving shapes change, with the range of
-        `indexes` of the shapes at each.
+        `moments`: times at which the moving shapes change, in seconds from the start, and the
+        indexes of the shapes at each time; see `_Moments.columns`.
         `frames`: coordinate frames with their parents and stamped poses.
         `follow`: name of the first moving frame; empty if there is none.
     """
@@ -103,7 +103,10 @@ class _Moments:
         self._indexes.append(indexes)
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return the times, and the shapes of time k: rows `starts[k]` to `starts[k + 1]`."""
+        """Return the times, and the rows of the shapes at each time.
+
+        The rows for time k are `indexes[starts[k] : starts[k + 1]]`.
+        """
         indexes = [np.empty(0, np.int32), *self._indexes]
         return {
             "times": np.array(self._times_s, np.float64),

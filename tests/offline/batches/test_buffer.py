@@ -20,7 +20,11 @@ from mcaprl.recorder.dataset.dataset import Dataset
 
 
 def numbered(n_rows: int, **changes: Any) -> Dataset:
-    """Make transitions; row k is (k, -k) to (k + 100, 100 - k), action 3 + k % 2, reward k / 2."""
+    """Make transitions with different values in each row.
+
+    Row k has the observation (k, -k), the next observation (k + 100, 100 - k), the action
+    3 + k % 2 and the reward k / 2.
+    """
     k = np.arange(n_rows)
     observations = np.stack([k, -k], axis=1).astype(np.float32)
     columns: dict[str, Any] = {
@@ -82,7 +86,8 @@ def test_n_step_returns_by_hand() -> None:
         walks([3, 2], [True, False]), Packing(gamma=0.5, n_steps=2)
     )
     batch = whole(buffer)
-    # Rewards are 1, 2, 4 and 1, 2. A return has two rewards, or one at the end of an episode.
+    # The rewards are 1, 2, 4 in the first episode and 1, 2 in the second. A 2-step return sums two
+    # rewards; at the last step of an episode, it has one.
     assert batch.rewards.tolist() == [1 + 0.5 * 2, 2 + 0.5 * 4, 4, 1 + 0.5 * 2, 2]
     assert batch.next_observations.vector.flatten().tolist() == [2, 3, 3, 12, 12]
     # The first episode terminated; the second was truncated.
@@ -189,7 +194,7 @@ def test_rows_are_sampled_by_their_episodes_weights(weights: list[float]) -> Non
     rows = buffer.sample_rows(60_000, torch.Generator().manual_seed(0))
     share = torch.bincount(rows, minlength=6) / 60_000
     each = np.repeat(weights, [2, 3, 1])
-    # The largest standard deviation of a frequency is .002.
+    # The standard deviation of a frequency is at most sqrt(.25 / 60,000) = .002.
     np.testing.assert_allclose(share.numpy(), each / each.sum(), atol=0.01)
     assert share[2:5].sum() == 0
 
@@ -268,8 +273,8 @@ def test_a_value_that_is_not_finite_is_reported(column: str, bad: float) -> None
 
 
 def test_rewards_are_scaled_by_the_spread_of_returns() -> None:
-    # Returns with gamma .5 are 2, 2, 0 and 4 in two episodes, so their standard deviation is
-    # sqrt(2).
+    # With gamma .5, the returns are 1 + .5 x 2 = 2 and 2 in the first episode, and -2 + .5 x 4 = 0
+    # and 4 in the second one. Their standard deviation is sqrt(2).
     data = Dataset.from_arrays(
         observations=np.zeros((4, 1), np.float32),
         actions=np.zeros(4, np.int64),

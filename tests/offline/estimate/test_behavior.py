@@ -21,7 +21,7 @@ STATES, ACTIONS = 4, 3
 
 
 def tabular(episodes: int = 60, length: int = 25, seed: int = 0) -> mcaprl.Dataset:
-    """Return an epsilon-greedy log: the greedy action is the state modulo 3, without noise."""
+    """Return a log of an epsilon-greedy policy, whose greedy action is the state modulo 3."""
     random = np.random.default_rng(seed)
     count = episodes * length
     states = random.integers(STATES, size=count + 1)
@@ -75,7 +75,8 @@ def test_an_episode_is_predicted_by_networks_that_did_not_see_it() -> None:
         **arrays,
     )
     second = estimate_behavior(other, updates=40)
-    # The estimated probability is one of three predicted probabilities, whose sum is 1.
+    # The three logs have different actions in the first rows. The probabilities of these three
+    # actions sum to 1.
     third_actions = (changed[:25] + 1) % ACTIONS
     changed = data.actions.copy()
     changed[:25] = third_actions

@@ -140,7 +140,7 @@ def test_a_wrong_return_is_reported(log_path: Path) -> None:
 
 
 def resealed(data: bytearray) -> bytes:
-    """Update the CRCs of a changed file's data and summary, so that only the change is wrong."""
+    """Update the CRCs of data and summary of a changed file; the change is then the only fault."""
     footer = len(data) - 8 - 29
     summary_start, _ = struct.unpack_from("<QQ", data, footer + 9)
     struct.pack_into("<I", data, summary_start - 4, zlib.crc32(data[: summary_start - 13]))

@@ -1,4 +1,4 @@
-"""A headless browser that tests control by the DevTools protocol, through pipes."""
+"""A headless browser. Tests control it through pipes with the DevTools protocol."""
 
 from __future__ import annotations
 

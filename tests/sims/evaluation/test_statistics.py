@@ -41,7 +41,7 @@ def test_means_by_hand() -> None:
 
 def test_improvement_by_hand() -> None:
     first, second = np.array([[1.0, 3.0]]), np.array([[2.0], [3.0]])
-    # 1 loses twice; 3 wins against 2 and ties with 3.
+    # In `first`, 1 is below 2 and 3; 3 is above 2 and equal to 3, which counts as half.
     assert improvement_probability(first, second) == (0 + 0 + 1 + 0.5) / 4
     assert improvement_probability(second, first) == 1 - 1.5 / 4
     assert improvement_probability(first, first) == 0.5
@@ -81,7 +81,7 @@ def test_the_interval_of_an_improvement_holds_it() -> None:
         (Returns(4, 30, skewed=True), 0.94, 0.98),
         (Returns(4, 30, spread=0), 0.94, 1.0),
         (Returns(10, 30), 0.94, 0.98),
-        # The skewness of the distribution is not visible in a few seeds.
+        # Four seeds are too few to show that their distribution is skewed, so coverage is lower.
         (Returns(4, 30, skewed_seeds=True), 0.86, 0.97),
     ],
 )
@@ -94,7 +94,8 @@ def test_intervals_of_the_mean_cover_as_often_as_documented(
 
 
 def test_interval_of_the_mean_by_hand() -> None:
-    # The means 1 and 3 have the standard error 1. Student's t with one degree of freedom is 12.706.
+    # The means of the two seeds are 1 and 3, so the standard error of their mean is 1. The 97.5 %
+    # quantile of Student's t distribution with one degree of freedom is 12.706.
     assert mean_interval(np.array([[1.0], [3.0]])) == pytest.approx((2 - 12.7062, 2 + 12.7062))
     # Each seed has one episode, or two equal episodes. The variation between starts adds nothing.
     twice = np.array([[1.0, 1.0], [3.0, 3.0]])
@@ -103,7 +104,7 @@ def test_interval_of_the_mean_by_hand() -> None:
     # Student's t.
     assert mean_interval(twice.T) == pytest.approx((2 - 12.7062, 2 + 12.7062))
     assert mean_interval(np.array([[1.0, 3.0]])) == pytest.approx((2 - 12.7062, 2 + 12.7062))
-    # The squares of both deviations add up.
+    # The seeds and the starts each contribute a standard error of 1; together they have sqrt(2).
     both = np.array([[0.0, 2.0], [2.0, 4.0]])
     assert mean_interval(both) == pytest.approx((2 - 12.7062 * 2**0.5, 2 + 12.7062 * 2**0.5))
 

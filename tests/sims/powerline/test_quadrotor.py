@@ -103,7 +103,7 @@ def test_a_small_step_follows_the_closed_form(axis: int) -> None:
 
 
 def test_a_step_by_numbers() -> None:
-    """A command of 2 m/s is half reached after about 0.33 s; the overshoot is at most 1 %."""
+    """After a command of 2 m/s, the speed is 1 m/s at about 0.33 s; overshoot is at most 1 %."""
     speeds = [speed_along(0, 2.0, 0.1 * k) for k in range(60)]
     assert 0.9 < speeds[3] < 1.2
     assert max(speeds) < 2.02
@@ -163,7 +163,10 @@ def energy_j(drone: Drone) -> float:
 
 
 def test_energy_is_the_work_of_rotors_and_drag() -> None:
-    """In a sideways climb in wind, both agree within 1 % of the rotors' work."""
+    """Compare the gain of energy with the work, in a sideways climb in wind.
+
+    The difference is at most 1 % of the work of the rotors' thrust.
+    """
     wind, command = Vector(3.0, -2.0, 0.0), Vector(2.0, 3.0, -2.0)
     drone = resting()
     before_j, lift_j, drag_j, turn_j = energy_j(drone), 0.0, 0.0, 0.0
@@ -206,7 +209,11 @@ def test_rotors_keep_their_limits(wanted: tuple[float, float, float]) -> None:
 
 
 def test_the_wanted_acceleration_by_hand() -> None:
-    """Forward: 2.5 (2 - 1) + .25 x 2 + .3 = 3.3. Right: 2.5 x 4 + 1, limited to 6. Down: .25."""
+    """Add gain times velocity error, drag times command, and the integral.
+
+    Forward: 2.5 (2 - 1) + .25 x 2 + .3 = 3.3. Right: 2.5 x 4 + .25 x 4 = 11, limited to 6.
+    Down: 2.5 (0 - .1) + .5 = .25.
+    """
     drone = resting()._replace(
         velocity_m_s=Vector(1.0, 0.0, 0.1), integral_m_s2=Vector(0.3, 0.0, 0.5)
     )

@@ -36,18 +36,21 @@ FORWARD_LEFT, FORWARD_RIGHT = 7, 8
     [
         (50.0, 150.0, 0, 0, NONE, 0, DRIVING),
         (50.0, 150.0, 0, 0, FORWARD, 0, DRIVING),
-        # The car crosses the gate at 300, from 295 to 301 or from 290 to the gate.
+        # The car crosses the gate at x = 300: it moves from 295 to 301, or from 290 to 300.
         (295.0, 150.0, 0, 4, FORWARD, 1, DRIVING),
         (290.0, 150.0, 0, 8, FORWARD, 1, DRIVING),
-        # From 289 to 299, the car is before the gate. Facing a near gate does not count.
+        # The car moves from x = 289 to 299, which is before the gate at 300. Only crossing a gate
+        # counts, not facing a gate that is near.
         (289.0, 150.0, 0, 8, FORWARD, 0, DRIVING),
         (285.0, 150.0, 0, 0, NONE, 0, DRIVING),
         # The car crosses the gate at 600, which is not the next gate.
         (595.0, 150.0, 0, 10, NONE, 0, DRIVING),
-        # The left side of the car is 7 pixels from its middle: 101 and 99, with a wall at 100.
+        # The left side of the car is 7 pixels from its center, so it is at y = 101 in the first
+        # case and at y = 99 in the second. The wall is at y = 100.
         (500.0, 108.0, 0, 0, NONE, 0, DRIVING),
         (500.0, 106.0, 0, 0, NONE, -1, CRASH),
-        # The nose of the car is 15 pixels ahead: 999 and 1001, with a wall at 1000.
+        # The nose of the car is 15 pixels ahead of its center: at x = 999, and at x = 1001 after
+        # FORWARD. The wall is at x = 1000.
         (984.0, 150.0, 0, 0, NONE, 0, DRIVING),
         (984.0, 150.0, 0, 0, FORWARD, -1, CRASH),
         (984.0, 150.0, 0, 0, BACK, 0, DRIVING),

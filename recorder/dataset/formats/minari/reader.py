@@ -53,8 +53,8 @@ class _Stored:
         infos: Arrays by dotted name.
         attributes: `seed`, `options` and others.
         own: Arrays that only the writer of this package stores: `behavior_probs` and `log_time_ns`.
-        missing: Flags (T + 1,) of the rows in which an info is missing, and the info's dtype, by
-            the info's dotted name.
+        missing: Flags (T + 1,) of the rows without an info, and the dtype of this info. The keys
+            are the dotted names of the infos.
     """
 
     observations: Sequence[Any]
@@ -87,7 +87,7 @@ def read_episodes(path: Path) -> tuple[LogMetadata, list[EpisodeArrays]]:
     if description.form not in forms:
         raise LogError(f"{path}: unknown data format '{description.form}' of Minari")
     reader = _Reader(path, description)
-    # `closing` also closes the file if an episode is refused.
+    # `closing` closes the file even if an episode raises an error.
     with closing(forms[description.form](data_folder(path), description)) as stored:
         episodes = [reader.episode(index, part) for index, part in enumerate(stored)]
     episodes = reader.with_equal_infos(episodes)
