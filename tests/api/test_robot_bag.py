@@ -75,6 +75,6 @@ def test_the_suggested_mapping_uses_frequent_topics(native: Path, tmp_path: Path
     assert "joint_states_position" in observed
     assert "lane_data_10" in observed
     assert not any(name.startswith(("e_stop", "joint_states_velocity")) for name in observed)
-    # The mapping's steps are not aligned with the messages of the lane detector. Therefore, some
-    # steps are in the pauses between drives and are not read.
+    # The clock of the suggested mapping is not aligned with the messages of the lane detector.
+    # Therefore, some steps are in the pauses between the drives.
     assert len(found.dataset) > 0.9 * len(mcaprl.open(native))

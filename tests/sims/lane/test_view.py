@@ -60,7 +60,7 @@ def test_the_car_points_where_it_is_heading() -> None:
 
 
 def test_north_is_up_and_east_is_right() -> None:
-    """The car is 10 m west of the corner at (130, 1), where the road turns north."""
+    """The car is 10 m west of the corner at (130, 1), where a road leads north."""
     grass = near(image_at((120.0, 1.0, 0.0)), GRASS)
     ten_meters_px = round(10 * 600 / 55)
     assert grass[300 - ten_meters_px // 2, 250]
