@@ -48,7 +48,7 @@ def contents(path: Path) -> bytes | dict[str, bytes]:
 def modules(source: Path) -> list[Path]:
     """Return the files that belong in the wheel, with their names in the wheel."""
     folder = source / "mcaprl"
-    # `mcaprl` has links to the folders of the other packages.
+    # `mcaprl` contains symbolic links to the folders of the other packages.
     roots = [folder, *(path for path in folder.iterdir() if path.is_symlink())]
     return sorted(
         path
@@ -59,7 +59,7 @@ def modules(source: Path) -> list[Path]:
 
 
 def is_source_of_vendored(path: Path) -> bool:
-    """Return whether a file only serves to bundle the libraries of the page for browsers."""
+    """Return whether a file is only an input for bundling the libraries of the browser page."""
     names = ("libraries.min.css", "libraries.min.js", "LICENSES.txt")
     return "vendor" in path.parts and path.name not in names
 

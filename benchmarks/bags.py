@@ -80,7 +80,10 @@ def _rerun(path: Path, topic: str, fields: Sequence[str]) -> list[Any]:
 
 
 def _arrow_field(batch: Any, field: str) -> NDArray[Any]:
-    """Return one field of all messages as an array; each message is a list of one struct."""
+    """Return one field as an array with a row for each message.
+
+    The column stores each message as a list of one struct.
+    """
     messages = next(
         column
         for name, column in zip(batch.schema.names, batch.columns, strict=True)
@@ -136,7 +139,7 @@ def _open(path: Path) -> Any:
 
 
 def _gigabyte(path: Path) -> Table:
-    """Measure reading images in a separate process, so that no other work uses its memory."""
+    """Measure reading images in a separate process, whose memory no other work uses."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         seconds, memory = pool.submit(_cost, path).result()
     table = Table(

@@ -17,7 +17,10 @@ _COPY = "copy of the files"
 
 
 def tables(folder: Path) -> list[Table]:
-    """Compare each command with copying its files. Both sync their output to disk."""
+    """Compare the time of each command with that of copying the same files.
+
+    The commands and the copies sync their output to disk.
+    """
     log, parts, out = folder / "edited.mcap", folder / "parts", folder / "edits"
     vectors(_TRANSITIONS).save(log)
     episodes = len(mcaprl.open(log, columns=()).episodes)

@@ -57,7 +57,10 @@ def main() -> None:
 def _estimates(
     seed: int, arguments: argparse.Namespace
 ) -> dict[tuple[str, str], tuple[float, float, float]]:
-    """Return the value and interval from one log, by estimator and kind of behavior_prob."""
+    """Return the value and the interval of each estimate from one log.
+
+    A key is the estimator and the kind of `behavior_prob`: `logged` or `estimated`.
+    """
     data = _log(seed, arguments.episodes)
     estimated = mcaprl.estimate_behavior(data, updates=arguments.updates, seed=seed)
     config = FQEConfig(gamma=task.GAMMA, updates=arguments.updates)

@@ -83,7 +83,10 @@ def _mirror(observations: Any) -> None:
 
 
 def differs(variant: str, task: Task, default: Task) -> bool:
-    """Return whether a variant is the default, or differs from the default in its training."""
+    """Return whether to run a variant.
+
+    Besides the default, only variants that change the training of this task are run.
+    """
     if variant == MIRRORED:
         return task.sim == "lane"
     return variant == "default" or task.config != default.config

@@ -52,7 +52,8 @@ def beside_scope_rl(logs: int) -> dict[str, float]:
     worst = dict.fromkeys(SCOPE_RL_NAMES, 0.0)
     for seed in range(logs):
         table = task.play(None, episodes=300, seed=seed)
-        # Choose pi, mu and Q of two actions so that they result in the table's ratios, Q and V.
+        # SCOPE-RL needs pi, mu and Q of two actions. They are chosen so that the ratios, Q and V
+        # equal those of the table.
         given = _as_scope_rl(table)
         for name, theirs in SCOPE_RL_NAMES.items():
             estimator = getattr(basic_estimators, theirs)()
@@ -66,7 +67,8 @@ def beside_scope_rl(logs: int) -> dict[str, float]:
 def _as_scope_rl(table: EpisodeTable) -> dict[str, Any]:
     """Return an episode table in SCOPE-RL's format. All logged actions have the number 0."""
     pi = np.minimum(0.5, table.ratios / 4).ravel()
-    # Action 1 has the remaining probability, and the Q that results in the table's V.
+    # Action 1 gets the remaining probability. Its Q is chosen so that the mean of Q under pi is the
+    # table's V.
     other = (table.v.ravel() - pi * table.q.ravel()) / (1 - pi)
     return {
         "step_per_trajectory": table.rewards.shape[1],
@@ -145,7 +147,10 @@ def ours(columns: dict[str, Any], policy: Balance, seed: int) -> float:
 
 
 def d3rlpys(columns: dict[str, Any], policy: Balance, seed: int) -> float:
-    """Return d3rlpy's FQE with the same settings: the mean value of the first states."""
+    """Return the estimate of d3rlpy's FQE with the same settings.
+
+    The estimate is the mean value of the first states.
+    """
     import d3rlpy
     from d3rlpy.ope.fqe import DiscreteFQE
     from d3rlpy.ope.fqe import FQEConfig as TheirConfig

@@ -113,7 +113,8 @@ class DQNConfig(OnlineConfig):
         return {
             **super().arguments(),
             **{name: getattr(self, name) for name in same},
-            # `sys.maxsize` disables SB3's own target updates; a callback makes them instead.
+            # `sys.maxsize` disables SB3's own updates of the target network. A callback updates it
+            # instead.
             **({"target_update_interval": sys.maxsize} if self.target_update_episodes else {}),
             "buffer_size": min(self.buffer_size, self.steps + self.envs),
             # SB3 counts calls of `step`; each call steps every environment.

@@ -136,9 +136,10 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         algo: str,
         source: Callable[[int | None], object],
     ) -> None:
-        """Wrap `env`; `source` returns an object with the scene of the watched environment.
+        """Wrap `env`, and store the source of the scene.
 
-        The argument of `source` is the last action of that environment, or None after a reset.
+        `source` returns an object with the scene of the watched environment. Its argument is the
+        last action of this environment, or None after a reset.
         """
         super().__init__(env)
         self.model: BaseAlgorithm | None = None
@@ -236,7 +237,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             total_reward=self._return_so_far,
             terminated=terminated,
             truncated=truncated,
-            # The start and end times are 0 here; `LiveStream.end_episode` replaces them.
+            # `LiveStream.end_episode` sets the start and end times.
             start_time_ns=0,
             end_time_ns=0,
             reason=reason_of(None if reasons is None else reasons[WATCHED], terminated),

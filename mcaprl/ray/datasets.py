@@ -89,8 +89,8 @@ def write(
     """Write a dataset of Ray Data as logs, one for each block, and write a manifest of the logs.
 
     The rows have the columns of `read`; `log_time_ns` and `behavior_prob` may be missing. All rows
-    of an episode must be in one block. The logs are numbered in the order of the blocks. They have
-    new times, and no seeds or policies of the logs that were read.
+    of an episode must be in one block. The logs are numbered in the order of the blocks. The
+    times in the logs are new. The seeds and policies of the logs that were read are dropped.
 
     Args:
         rows: Dataset to write; this function runs its steps.

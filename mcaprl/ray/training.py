@@ -1,8 +1,8 @@
 """Offline training on the workers of a Ray cluster, each of which holds some of the episodes.
 
-Ray Train starts the workers and connects them. If one is lost, it restarts all of them, and they
-continue from the checkpoints of the run. The first worker writes the files of the run, which are
-those of a local training.
+Ray Train starts the workers and connects them. If a worker is lost, Ray Train restarts all workers,
+and they continue from the checkpoints of the run. The first worker writes the same files as a local
+training.
 """
 
 from __future__ import annotations
@@ -78,12 +78,12 @@ class _Logs:
 
     @property
     def all_lengths(self) -> NDArray[np.int64]:
-        """(E,) number of transitions of each episode of all logs."""
+        """Number of transitions (E,) in each of the E episodes of all logs."""
         return np.concatenate(self.lengths)
 
     @property
     def all_weights(self) -> NDArray[np.float64]:
-        """(E,) weight of a transition of each episode of all logs."""
+        """Weight (E,) of one transition in each of the E episodes of all logs."""
         return np.repeat(self.weights, list(map(len, self.lengths)))
 
 
@@ -126,7 +126,7 @@ class Board:
         self._summaries = summaries
 
     def outcome(self) -> tuple[list[OfflineSummary] | None, Exception | None]:
-        """Return the result and the error. Either is None if there is none yet."""
+        """Return the result and the error; None for each that does not exist yet."""
         return self._summaries, self._error
 
 
@@ -140,10 +140,10 @@ def train_on_ray(
     """Train on the cluster that this process is connected to.
 
     Args:
-        data: Logs and weights, as for `open_weighted`; all workers must see local ones.
+        data: Logs and weights, as for `open_weighted`; all workers must see local logs.
         request: The training.
-        workers: Number of workers; default: number of CPUs of the cluster, or with the device
-            `cuda` its number of GPUs.
+        workers: Number of workers; default: number of CPUs of the cluster, or number of
+            GPUs if the device is `cuda`.
         progress: Function called with each row of metrics.
 
     Returns:
@@ -183,7 +183,7 @@ def train_on_ray(
 
 
 def _fit(job: _Job, workers: int) -> None:
-    """Run the workers. If they fail, their error is on the board."""
+    """Run the workers. If they fail, the board contains the error."""
     import ray
 
     train = import_extra("ray.train", "ray")
@@ -231,7 +231,7 @@ def _train_on_worker(job: _Job) -> None:
         ray.get(job.board.fail.remote(error))
         raise
     except (RuntimeError, OSError):
-        # Another worker was lost.
+        # These errors occur if another worker was lost. They are not stored on the board.
         raise
     except Exception as error:
         ray.get(job.board.fail.remote(error))
@@ -281,7 +281,7 @@ def _scales(request: TrainingRequest) -> tuple[Any, Any]:
 
 
 def _read_episodes(job: _Job, first: int, stop: int) -> Dataset:
-    """Read the episodes `first` to `stop` of all logs."""
+    """Read the episodes from `first` up to, but not including, `stop`, counted over all logs."""
     parts, begin = [], 0
     for path, lengths in zip(job.logs.paths, job.logs.lengths, strict=True):
         mine = np.arange(max(first - begin, 0), min(stop - begin, len(lengths)))
@@ -329,7 +329,7 @@ def _workers(wanted: int | None, device: str, episodes: int) -> int:
 def _following(board: Any, progress: ProgressCallback) -> Iterator[None]:
     """Call `progress` with new results until the block ends.
 
-    If it raises an error, the training ends.
+    If `progress` raises an error, the training ends.
     """
     import ray
 

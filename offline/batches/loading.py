@@ -145,8 +145,8 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
                 )
             return {"paths": self._paths, "options": self._items.options}
         if self._shared is None:
-            # This process also uses the shared memory from now on. Without a reference to it,
-            # PyTorch would free the memory before a worker has opened it.
+            # From now on, this process uses the shared memory, too. If this process had no
+            # reference to the memory, PyTorch would free it before a worker has opened it.
             self._shared = _Shared(
                 frames=tuple(_shared(leaf) for leaf in columns.frames),
                 columns={name: _shared(getattr(columns, name)) for name in _COLUMNS},

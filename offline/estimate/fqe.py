@@ -50,7 +50,7 @@ class FQEConfig(TrainingConfig):
 
     @property
     def packing(self) -> Packing:
-        """Settings for single-step transitions.
+        """Settings by which the log is divided into single-step transitions.
 
         n-step returns are not used, because they depend on the behavior policy.
         """
@@ -91,8 +91,8 @@ class FQE(Learner):
             seeds: Seeds of the weights and batches of each of K policies. Equal seeds give equal
                 initial weights and batches, which reduces the noise of differences.
             pi_t: Probabilities (K, N, A) of each policy in each next state.
-            fixed_v_t: Values (K, N) of next states that are fixed instead of learned; NaN for
-                learned values. Default: all are learned.
+            fixed_v_t: Fixed values (K, N) of next states; NaN where the value is learned. Default:
+                all values are learned.
         """
         super().__init__(config, buffer, seeds)
         self._pi_t = pi_t.flatten(0, 1)

@@ -36,11 +36,11 @@ SMALL_CHUNK_BYTES = 2**16
 _MERGED_BYTES = 2**20
 # Compaction must remove at least this many chunks to be worth the time.
 _MIN_CHUNKS_SAVED = 8
-# Maximum number of copied bytes for each chunk that compaction removes. Copying more bytes would
-# take more time than readers save.
+# For each chunk that it removes, compaction copies at most this number of bytes. Copying more bytes
+# would take longer than the time that readers save.
 _MAX_BYTES_PER_CHUNK = 2**20
-# The summary is incomplete if a record with one of these opcodes is between two chunks that the
-# summary lists.
+# Opcodes of records that cannot be between two chunks that the summary lists. If there is such a
+# record, the summary is incomplete.
 _CHUNK_RECORDS = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX)
 
 
@@ -80,13 +80,13 @@ def compact(
 def groups_of(chunks: Iterable[ChunkIndex]) -> list[list[ChunkIndex]]:
     """Group the source chunks, so that each group becomes one chunk of the compacted file.
 
-    Groups are in file order. A merged chunk takes the place of its last source chunk, so that all
-    top-level records that it needs come before it.
+    Groups are in file order. A merged chunk takes the place of its last source chunk. Thus all
+    top-level records that the merged chunk needs come before it.
     """
     chunks = list(chunks)
     kinds = _kinds(chunks)
     groups: list[list[ChunkIndex]] = []
-    # By kind: the last group of this kind, and the total size of the group's records in bytes.
+    # For each kind: its last group, and the uncompressed size of this group in bytes.
     current: dict[int, tuple[list[ChunkIndex], int]] = {}
     for chunk in chunks:
         size = chunk.uncompressed_size

@@ -38,7 +38,7 @@ class ProbabilityRange:
     Attributes:
         probability: Mean action probability.
         steps: Number of steps.
-        actions: Estimated mean number of actions per state whose probability is in the range.
+        actions: Estimated number of actions with a probability in the range, averaged over states.
     """
 
     probability: float
@@ -100,8 +100,8 @@ def calibration(
     """Compare the logged action probabilities (N,) with the size of the action space.
 
     Returns:
-        None if the actions are not discrete, a probability is unknown or not in (0, 1], or there
-        are fewer than two steps.
+        The result of the comparison. It is None if the actions are not discrete, if a probability
+        is unknown or not in (0, 1], or if there are fewer than two steps.
     """
     if not isinstance(action_space, spaces.Discrete) or len(behavior_probs) < 2:
         return None

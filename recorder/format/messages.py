@@ -120,7 +120,7 @@ def stored_seed(seed: int | None) -> int:
 
 
 def seed_of(stored: int) -> int | None:
-    """Return the seed that `stored_seed` stored."""
+    """Convert a signed integer from `stored_seed` back to the seed."""
     return None if stored == -1 else stored % 2**64
 
 

@@ -273,7 +273,8 @@ def _env_id(env: Any) -> str:
     """Return the id that `gymnasium.make` needs for an environment; empty if unknown."""
     if env.spec is None:
         return ""
-    # `make_sim` stores the module whose import registers the id, if the caller named a module.
+    # If the caller of `make_sim` named a module whose import registers the id, `make_sim` stores
+    # the name of the module in `env_module`.
     module = getattr(env.unwrapped, "env_module", "")
     return f"{module}:{env.spec.id}" if module else str(env.spec.id)
 

@@ -268,7 +268,7 @@ class Place:
 
     @contextmanager
     def named(self, *keys: Any) -> Iterator[None]:
-        """Add a key of the mapping to errors of the `with` block that do not name a key."""
+        """Add the position of a key to errors of the `with` block that have no position yet."""
         try:
             yield
         except UsageError as error:

@@ -48,8 +48,8 @@ DEPTH, CAMERA_INFO = "/camera/depth", "/camera/camera_info"
 # Buffered display messages are written when their total size exceeds this number of bytes, and at
 # the end of an episode.
 _CHUNK_BYTES = 2**20
-# The message with the tracks is written again only after display messages of at least this many
-# times its size.
+# The tracks are written again only after other display messages were written, with a total size of
+# at least this many times the size of the tracks.
 _BYTES_PER_TRACKS = 4
 # Period at which moving shapes are written, simulated time. Shapes that are fixed to a moving frame
 # follow this frame at each step.
@@ -120,8 +120,8 @@ class Display:
         # Latest shapes that are not in a message yet. If no later message contains them, they are
         # written at the end of the episode.
         self._pending: tuple[int, Sequence[Shape]] | None = None
-        # Frames at the latest step. They are written at the next step, because one message contains
-        # them and the poses up to that step.
+        # Frames at the latest step. They are written at the next step, in one message with all
+        # poses between the two steps.
         self._moment: Moment | None = None
 
     @property

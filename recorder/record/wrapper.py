@@ -173,7 +173,8 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             raise gym.error.ResetNeeded("call reset() before step(): no episode is open")
         step = episode.steps + 1
         probability = self.behavior_prob
-        # A comparison is faster than a call: call `check_probability` only for invalid values.
+        # Call `check_probability` only for invalid values, because a comparison is faster than a
+        # call.
         if probability is not _UNKNOWN and not SMALLEST <= probability <= 1.0:
             check_probability(probability, "behavior_prob")
         try:

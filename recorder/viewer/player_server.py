@@ -65,12 +65,13 @@ class LiveServer(ViewerServer):
         self._lock = threading.Lock()
         self._looked_at = self._seeked = False
         self._ticks_to_latest = 0
-        # Number of subscribers by channel, and the channels with a new subscriber.
+        # Number of subscribers of each channel, and set of channels that have a new subscriber.
         self._subscribers: Counter[int] = Counter()
         self._joined: set[int] = set()
         # Time up to which all events have been sent.
         self._sent_ns = -1
-        # `_latest` returns the messages at the start time; after this seek, `advance` skips them.
+        # Seek, so that `advance` skips the messages at the start time. `_latest` returns these
+        # messages.
         player.seek(player.start_ns)
         self._channels = dict(
             pair for number in range(len(prefixes)) for pair in self._announced(number)

@@ -185,7 +185,10 @@ def _card(kind: str, episode: Episode, track: Positions, places: Positions, comm
 
 
 def _thumbnail(episode: Episode, track: Positions, places: Positions) -> str:
-    """Plot an episode's track on top of all positions, or its cumulative reward without a track."""
+    """Plot an episode's track on top of all positions.
+
+    If the episode has no track, plot its cumulative reward instead.
+    """
     figure, axes = new_figure((3.2, 2.2))
     if len(track):
         stride = max(1, len(places) // 4000)

@@ -100,7 +100,7 @@ class LaneFleet(Fleet):
         return Car._make(self._cars[i, :STARTED_AT].tolist())
 
     def substeps(self, before: Car, action: int) -> list[Car]:
-        """Return the states of a car after each 0.05 s of a decision, including its end."""
+        """Return the states of a car after each 0.05 s of a decision; the last is at the end."""
         if not self._classic:
             return [drive(before, action, 1 + k) for k in range(SUBSTEPS)]
         cars = [before]
@@ -202,7 +202,7 @@ class LaneFleet(Fleet):
         return {"depth": depth, **numbers} if numbers else depth
 
     def _numbers(self) -> dict[str, NDArray[np.float32]]:
-        """Return the observed arrays other than images, by key; empty if there is no Dict."""
+        """Return the non-image arrays of Dict observations by key; empty for other observations."""
         if self._has_dashboard:
             return {"motion": self._motions()}
         if self._has_commands:

@@ -56,9 +56,9 @@ def start_on_line(
 
 
 def start_anywhere(random: np.random.Generator, wind: Vector) -> Flight:
-    """Return a flight along the line from a random position, at a random speed.
+    """Return a flight that begins at a random position and moves along the line.
 
-    The velocity is rounded to 0.5 m/s on each axis.
+    The speed is random. The velocity is rounded to 0.5 m/s on each axis.
     """
     along_m = float(random.uniform(0.0, LENGTH_M - LAST_START_M))
     point = point_on_line(along_m)

@@ -1,4 +1,4 @@
-"""Tests of the buffer that stores frames once against SB3's buffers, which store them twice."""
+"""Comparison of the buffer that stores each frame once with SB3's buffers that store it twice."""
 
 from __future__ import annotations
 

@@ -124,8 +124,9 @@ def test_sizes_come_from_the_summaries(folder: Path, monkeypatch: pytest.MonkeyP
     data = mcaprl.open(folder)
     monkeypatch.setattr("mcaprl.recorder.dataset.log_reader.LogReader.read", None)
     source = LogSource([folder / "a.mcap", folder / "b.mcap"])
-    # Numbers, flags and action need 8 + 8 + 8 + 8 + 1 + 1 + 4 + 8 bytes. Each of two observations
-    # needs 12 + 64 bytes.
+    # A row has 46 bytes without observations: 8 each for `episode`, `step`, `log_time_ns` and
+    # `reward`, 1 for each flag, 4 for `behavior_prob`, and 8 for the action. Each of its two
+    # observations has a vector of 12 bytes and an image of 64 bytes.
     assert source.estimate_inmemory_data_size() == (46 + 2 * 76) * len(data)
     tasks = source.get_read_tasks(-1)
     assert sum(task.metadata.num_rows for task in tasks) == len(data)

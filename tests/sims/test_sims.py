@@ -185,7 +185,8 @@ def test_names_and_metadata_fit_the_sim(name: str, kwargs: dict[str, Any]) -> No
     if sim.observation_names:
         assert (len(sim.observation_names),) == sim.observation_space.shape
     if name == "racer" or kwargs.get("rules", "default") == "default":
-        # Metadata are attributes of the class. Decisions of the classic car and drone are longer.
+        # `metadata` is an attribute of the class, so its frame rate is that of the default rules.
+        # The decisions of the classic car and drone are longer.
         assert sim.step_duration_s * sim.metadata["render_fps"] == pytest.approx(1.0)
     assert {"x_m", "y_m", "speed_m_s"} <= set(sim.telemetry())
     before = sim.telemetry()

@@ -39,9 +39,10 @@ def true_value() -> float:
 
 
 def play(policy: NDArray[np.float64] | None, *, episodes: int, seed: int) -> EpisodeTable:
-    """Sample episodes of a policy (None: BEHAVIOR), with the ratios and true Q and V of EVALUATED.
+    """Sample episodes of a policy; None means BEHAVIOR.
 
-    Episodes are cut off after 60 steps, which one in 30 million episodes reaches.
+    The table has the ratios, the true Q and the true V of EVALUATED. Episodes are cut off after 60
+    steps; only one in 30 million episodes is that long.
     """
     acting = BEHAVIOR if policy is None else policy
     random = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""Conversion of the arrays of each episode, which most formats store, to a dataset."""
+"""Conversion of separate arrays for each episode, as in most formats, to a dataset."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def _times(episodes: Sequence[EpisodeArrays]) -> NDArray[np.int64]:
 
 
 def _last_rows(lengths: NDArray[np.int64], flags: Sequence[bool]) -> NDArray[np.bool_]:
-    """Return a column (N,): each episode's flag in its last row, and False in all other rows."""
+    """Return a column (N,) with each flag in its episode's last row, and False in other rows."""
     column = np.zeros(int(lengths.sum()), bool)
     column[np.cumsum(lengths) - 1] = flags
     return column

@@ -20,8 +20,8 @@ from mcaprl.recorder.dataset.formats.flat import joined_trees, rows_of_tree
 def read_demos(file: Any, path: Path) -> Dataset:
     """Read all demonstrations, in the order of their numbers.
 
-    A demonstration is terminated if `dones` is set at its last step; otherwise it is truncated. The
-    last step of a truncated demonstration without `next_obs` is left out, because the next
+    A demonstration is terminated if `dones` is set at its last step; otherwise it is truncated.
+    If a truncated demonstration has no `next_obs`, its last step is left out, because the next
     observation of this step is unknown.
 
     Args:
@@ -85,7 +85,7 @@ def _check_follows(here: Any, there: Any, where: str) -> None:
 
 
 def _bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the bytes of an array. Bytes of equal NaN values compare as equal, unlike floats."""
+    """Return the bytes of an array, because NaN is equal to NaN as bytes, but not as floats."""
     return np.frombuffer(array.tobytes(), np.uint8)
 
 

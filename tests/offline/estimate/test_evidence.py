@@ -62,7 +62,7 @@ def test_values_of_policies_side_by_side_are_the_true_ones() -> None:
 
 
 def test_a_rare_action_ends_the_episode_at_a_low_value() -> None:
-    # In state 1, action 1 has a hundredth of the probability of action 0 under the clone.
+    # In state 1, the clone's probability of action 1 is a hundredth of that of action 0.
     clone = Table(np.array([[0.5, 0.5], [0.99, 0.0099]]))
     data = log(1_000)
     both = [Fixed([0, 0]), Fixed([1, 1])]
@@ -71,7 +71,8 @@ def test_a_rare_action_ends_the_episode_at_a_low_value() -> None:
     assert likely.support == 1
     assert rare.support == pytest.approx(data.observations[:, 0].mean())
     low = EvidenceCollector(data, clone, CONFIG).low_value
-    # V(0) = r + gamma (1 - ends) ((1 - p) V(0) + p low), where p leads to state 1.
+    # V(0) = r + gamma (1 - ends) ((1 - p) V(0) + p low). A step from state 0 that does not end the
+    # episode leads to state 1 with probability p. There, the episode ends with the value `low`.
     stays = task.GAMMA * (1 - task.ENDS) * np.array([1 - task.TO_ONE[0, 1], task.TO_ONE[0, 1]])
     expected = (task.PAYS[0, 1] + stays[1] * low) / (1 - stays[0])
     assert rare.first_value == pytest.approx(expected, abs=0.15)
@@ -93,8 +94,8 @@ def test_own_values_and_bellman_error_by_hand() -> None:
     collector = EvidenceCollector(data, Table(task.BEHAVIOR), fqe_config(0.5, 10, (4,)))
     (found,) = collector.collect([policy])
     assert found.own_value == 3
-    # The errors are 5 - 3 and 1 - 1, with a root mean square of sqrt(2). The standard deviation of
-    # Q is 1.
+    # The errors r - Q are 5 - 3 and 1 - 1, so their root mean square is sqrt(2). It is divided by
+    # the standard deviation of Q, which is 1.
     assert found.bellman_error == pytest.approx(np.sqrt(2))
     assert found.agreement == 0.5
 

@@ -140,7 +140,8 @@ def test_commands_become_named_actions_and_bins_and_boxes() -> None:
     data, report = read(bag, action=named)
     assert data.actions.tolist() == [1, 0, 2]
     assert data.action_names == {0: "stop", 1: "go", 2: "turn"}
-    # The distance of the third command from `turn` is 0.4, more than a quarter of the range.
+    # The third command is assigned to `turn`. Its `v` differs from that of `turn` by 0.4, which is
+    # more than a quarter of the range.
     assert report.far_actions == pytest.approx(1 / 3)
     assert report.action_counts == {"stop": 1, "go": 1, "turn": 1}
     binned = {"fields": fields, "edges": [[0.3, 0.8], [0.0]]}

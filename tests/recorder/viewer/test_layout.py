@@ -139,7 +139,7 @@ def test_sizes_are_shares_of_the_area() -> None:
     panels: dict[str, Any] = {"Tab!x": {"tabs": [{"layout": "Plot!c"}]}, "Plot!a": {}, "Plot!c": {}}
     tree = {"first": "Plot!a", "second": "Tab!x", "direction": "column", "splitPercentage": 25.0}
     found = dict(sizes_of(tree, panels, (960, 600)))
-    # `Plot!a` takes a quarter of the height of 600 px. The row of tabs takes 30 px of the rest.
+    # `Plot!a` takes a quarter of the 600 px. The row of tabs takes 30 px of the other 450 px.
     assert found == {"Plot!a": (960, 150), "Tab!x": (960, 450), "Plot!c": (960, 420)}
     # The row takes 64 px, and the title and the axis take 60 px. The screen has 570 px.
     assert share_of_transitions(1) == 124 / 570

@@ -155,7 +155,7 @@ def test_layouts_are_combined_side_by_side(log: Path) -> None:
     layout = layout_of_log(McapReader(log))
     both = side_by_side([layout, layout], ["a", "b"])
     panels = both["configById"]
-    # The panels of both logs share one panel of tabs.
+    # The panels of both logs are in the same panel of tabs.
     assert len(panels) == 2 * len(layout["configById"]) - 1
     assert panels["3D!b scene"]["followTf"] == "b/car"
     assert panels["3D!b scene"]["topics"].keys() == {"/b/scene", "/b/scene/static"}
@@ -298,7 +298,7 @@ def test_time_comes_before_the_messages_after_a_restart_and_a_jump_back(log: Pat
         for i in seeks:
             after = [pair for pair in wire[i + 1 :] if pair[0] != "state"]
             assert after[0] == ["time", starts[0]]
-            # Next comes the current message of each topic.
+            # After the new time, the server sends the current message of each topic.
             sent = dict([pair for pair in after if pair[0] != "time"][: len(shown_topics)])
             assert sent == dict.fromkeys(shown_topics, starts[0])
 

@@ -83,8 +83,8 @@ def test_the_image_shows_the_car_on_its_road() -> None:
     rows, columns = np.nonzero(near(image, PAINT))
     assert (abs(rows.mean() - 300) < 3, abs(columns.mean() - 300) < 5) == (True, True)
     assert near(image, OTHER_PAINT).sum() > 100
-    # 80 m are 600 pixels. The left edge of the left lane is 19 pixels up. Two lanes are 75 pixels
-    # wide.
+    # The scale is 7.5 pixels per meter. The left edge of the left lane is 19 pixels above the
+    # middle of the image. The two lanes are 75 pixels wide.
     column = image[250:400, 330]
     rows = np.flatnonzero(near(column, ASPHALT))
     assert rows.min() == pytest.approx(50 - 19, abs=3)

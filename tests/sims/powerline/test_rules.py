@@ -154,7 +154,7 @@ def test_rewards_by_hand(along_m: float, to_m: float, z: float, end: int, expect
 
 
 def test_distance_costs_an_exponential() -> None:
-    """The third leg is inclined. 4 m above the leg, the distance is 4 m times the cosine."""
+    """At a height of 4 m above the inclined third leg, the distance is 4 m times the cosine."""
     before, after = moved(300.0, 302.5, z=-4.0)
     cosine = math.hypot(*TANGENTS[2, :2])
     assert reward_of(before.furthest_m, after, FLYING) == pytest.approx(math.exp(-cosine), abs=1e-6)
@@ -215,7 +215,7 @@ def test_a_flight_ends_within_its_decision() -> None:
 
 
 def test_gusts_are_stationary_and_decorrelate() -> None:
-    """The standard deviation is always 1.5 m/s; successive decisions correlate by e^-1/4."""
+    """The standard deviation is always 1.5 m/s. Successive gusts have a correlation of e^(-1/4)."""
     noise = np.random.default_rng(0).standard_normal((20000, 3))
     gusts = [ZERO]
     for row in noise:

@@ -70,7 +70,10 @@ def test_all_are_driven_counter_clockwise(seed: int | None) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_asphalt_covers_what_is_between_the_walls(seed: int | None) -> None:
-    """The triangles have one orientation and the whole area, so there are no overlaps or gaps."""
+    """All triangles have the same orientation, and the sum of their areas is the whole area.
+
+    Thus the triangles have no overlaps or gaps.
+    """
     track = make_track(seed)
     left, right = sides(track)
     areas = [area(triangle) for triangle in asphalt(track).reshape(-1, 3, 2)]

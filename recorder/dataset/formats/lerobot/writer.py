@@ -58,8 +58,8 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, video: bool = Fa
         One sentence for each thing that was left out or changed.
 
     Raises:
-        SpaceError: LeRobot cannot hold a space or dtype, or images would become video, and `lossy`
-            is not set.
+        SpaceError: `lossy` is not set, and LeRobot cannot store a space or dtype, or images would
+            become video.
         MissingExtraError: PyArrow, Pillow or PyAV is not installed.
     """
     lost = _losses(dataset, lossy=lossy, video=video)
@@ -71,7 +71,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, video: bool = Fa
 
 
 def frames_per_second(step_duration_ns: int) -> int | float:
-    """Return the frame rate, as an integer if this does not change the step duration."""
+    """Return the frame rate. It is rounded to an integer if this keeps the step duration."""
     rate = 1e9 / step_duration_ns
     whole = round(rate)
     return whole if whole and round(1e9 / whole) == step_duration_ns else rate
