@@ -124,7 +124,7 @@ class ActionDescriber:
         self._were_greedy = False
 
     def _on_forward(self, network: nn.Module, *_: Any) -> None:
-        # Outside of training mode, a forward pass selects actions.
+        # A forward pass outside of training mode selects actions; one in training mode does not.
         self._were_greedy = not network.training
 
 

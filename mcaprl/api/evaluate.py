@@ -213,9 +213,10 @@ def _set_policy(recorder: RecordMcap | None, name: str) -> None:
 
 
 def _behavior(data: str, env: gym.Env[Any, Any], record: Path | None) -> LoggedReturns:
-    """Return the episode returns in logs.
+    """Compute statistics of the returns in logs.
 
-    Check that the logs were recorded in this environment and are not overwritten.
+    Raises:
+        UsageError: A log was recorded in another environment, or is the output log `record`.
     """
     if record is not None and record.resolve() in [path.resolve() for path in find_logs(data)]:
         raise UsageError(f"{record} is in --behavior {data}: record the episodes elsewhere")

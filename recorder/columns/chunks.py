@@ -162,7 +162,7 @@ def chunk_header(file: memoryview, offset: int) -> ChunkHeader:
 
 
 def chunk_index_record(chunk: ChunkIndex) -> bytes:
-    """Serialize a ChunkIndex record, twenty times as fast as the `mcap` library."""
+    """Serialize a ChunkIndex record. The `mcap` library takes twenty times as long."""
     offsets, name = chunk.message_index_offsets, chunk.compression.encode()
     start = _INDEX_START.pack(
         chunk.message_start_time,

@@ -75,7 +75,7 @@ def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidReco
             damages.append(Damage(offset, 0, "the data section does not match its CRC"))
         yield offset, opcode, content
         offset += RECORD_HEADER_BYTES + len(content)
-        # Compare lengths first, so that `bytes` does not copy the rest of the file for each record.
+        # Compare lengths first; otherwise, `bytes` would copy the rest of the file for each record.
         if len(view) - offset == len(MCAP0_MAGIC) and bytes(view[offset:]) == MCAP0_MAGIC:
             return
 
@@ -155,7 +155,7 @@ def _next_record(view: memoryview, damaged: int) -> int:
         is_valid = (
             following < len(view) and view[following] in _KNOWN and _valid_record(view, following)
         )
-        # A wrong length can point to a later chunk; check that no valid chunk would be skipped.
+        # A wrong length can point beyond valid chunks; check that none would be skipped.
         if is_valid and _next_chunk(view, damaged + 1, following) == following:
             return following
     near = min(damaged + _NEAR_BYTES, len(view))

@@ -9,8 +9,8 @@ from types import FrameType, TracebackType
 from typing import Any, ClassVar
 
 try:
-    # The `signal` module wraps the functions of `_signal` to return enums, which takes ten times as
-    # long.
+    # These functions return plain numbers. Their wrappers in `signal` convert the numbers to enums,
+    # which takes ten times as long.
     from _signal import getsignal  # type: ignore[import-not-found]
     from _signal import signal as set_handler
 except ImportError:

@@ -76,7 +76,7 @@ class TopicRows:
         return self._rows.itemsize
 
     def blank(self, *shape: int) -> Self:
-        """Return a block of another shape, filled with copies of the first row."""
+        """Return a block of the given shape; all its rows are copies of this block's first row."""
         rows = np.empty(shape, self._rows.dtype)
         rows[...] = self._rows.flat[0]
         return type(self)(rows, self._write)

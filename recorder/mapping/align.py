@@ -38,7 +38,7 @@ def last(
     Args:
         times_ns: (M,) times of the messages, not descending.
         steps_ns: (N,) times of the steps.
-        tolerance_s: Age in seconds above which a message does not match; None for no limit.
+        tolerance_s: Maximum age of a matching message in seconds; None for no limit.
     """
     rows = np.searchsorted(times_ns, steps_ns, side="right") - 1
     return _within(times_ns, steps_ns, rows, tolerance_s)

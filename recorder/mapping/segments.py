@@ -71,7 +71,7 @@ def segments(marks: Marks, max_steps: int | None) -> list[Segment]:
     """
     count = len(marks.usable)
     begins = marks.usable if marks.begin is None else marks.usable & _edges(marks.begin)
-    # An episode ends at a step in `ends`, or just before a step where `cuts` is true.
+    # An episode ends at a step of `ends`, or one step before a step at which `cuts` is true.
     ends = np.flatnonzero(marks.terminated | marks.truncated | ~marks.acted)
     cuts = marks.gap_before | ~marks.usable
     if marks.begin is not None:

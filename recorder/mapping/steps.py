@@ -112,7 +112,7 @@ class StepReader:
         if not runs:
             return np.empty(0, np.int64)
         first, last = min(int(t[0]) for t in runs), max(int(t[-1]) for t in runs)
-        # The tolerance keeps the last step if the duration is a whole number of periods.
+        # If the duration is a whole number of periods, rounding must not remove the last step.
         count = int((last - first) * clock.rate_hz / NS_PER_S + 1e-6) + 1
         if count > _MAX_STEPS:
             raise UsageError(

@@ -62,7 +62,7 @@ class Transforms:
             fixed: Reference frame of the pose.
             steps_ns: (N,) times of the steps.
             align: Selection of each transform: `last`, `nearest` or `linear` (interpolated).
-            tolerance_s: Age in seconds beyond which a transform is missing.
+            tolerance_s: Maximum age of a transform in seconds; older transforms count as missing.
 
         Returns:
             (N, 3) x, y and yaw, NaN where missing; and (N,) age of the oldest transform, seconds.

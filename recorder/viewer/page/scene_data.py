@@ -58,7 +58,7 @@ class _Shapes:
         self._shapes: list[SeenShape] = []
 
     def indexes(self, shapes: Iterable[SeenShape]) -> NDArray[np.int32]:
-        """Add the shapes that are new, and return the row of each shape."""
+        """Return the row of each shape; add a row for each new shape."""
         return np.array([self._row(shape) for shape in shapes], np.int32)
 
     def _row(self, shape: SeenShape) -> int:

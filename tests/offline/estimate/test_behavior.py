@@ -47,8 +47,8 @@ def test_estimates_approach_the_probabilities_of_the_policy() -> None:
     data = tabular()
     found = estimate_behavior(data, updates=300)
     true, estimated = data.behavior_probs, found.dataset.behavior_probs
-    # The probabilities are 0.8 and 0.1. With 1,200 steps for 4 states, the classifier estimates
-    # them to about 0.03.
+    # The greedy action has the probability 0.8, and the two others 0.1. With 1,200 steps for
+    # 4 states, the classifier estimates them to about 0.03.
     assert np.abs(true - estimated).max() < 0.08
     assert np.abs(true - estimated).mean() < 0.02
     assert found.calibration_error < 0.02

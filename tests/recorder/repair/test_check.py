@@ -1,4 +1,4 @@
-"""`check` reports each contradiction in a log, with its position and the advised next step."""
+"""Tests that `check` reports each contradiction in a log, its position and what to do next."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ def test_interval_of_the_mean_by_hand() -> None:
     # The means of the two seeds are 1 and 3, so the standard error of their mean is 1. The 97.5 %
     # quantile of Student's t distribution with one degree of freedom is 12.706.
     assert mean_interval(np.array([[1.0], [3.0]])) == pytest.approx((2 - 12.7062, 2 + 12.7062))
-    # Each seed has one episode, or two equal episodes. The variation between starts adds nothing.
+    # Each seed has two equal episodes, so the starts add no variance to the case above.
     twice = np.array([[1.0, 1.0], [3.0, 3.0]])
     assert mean_interval(twice) == pytest.approx((2 - 12.7062, 2 + 12.7062))
     # All usable bootstrap samples of two episodes have the same mean, so the interval is that of

@@ -69,7 +69,7 @@ def write_own(path: Path, dataset: Dataset, observations: Sequence[Feature]) -> 
     lasts = np.cumsum(dataset.episode_lengths + 1) - 1
     finals = {}
     for leaf, name in zip(leaves_of(dataset.observation_space), names, strict=True):
-        # Final observations are stored without loss, even if the other observations are video.
+        # Final observations are stored without loss, even if other observations are lossy video.
         kept = feature_of(name, leaf)
         values = np.asarray(leaf.of(dataset.frames)[lasts])
         finals[name] = kept.encode(values.reshape(len(lasts), *kept.shape))
