@@ -125,7 +125,10 @@ def settings_of(sim: str, algo: str, special: dict[str, Any]) -> TrainingConfig:
 
 
 def run(sim: str, policies: Sequence[Policy | None], env: Any = None) -> PolicyScore:
-    """Run the same episodes for each policy: one by one in `env`, or in a batch if it is None."""
+    """Run the same episodes for each policy.
+
+    They run one by one in `env`, or in a batch if `env` is None.
+    """
     with closing(make_sim(sim)) as own, closing(make_sims(sim, EPISODES)) as envs:
         return evaluate(
             env or own,

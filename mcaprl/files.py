@@ -357,7 +357,7 @@ def json_text(value: Any) -> str:
 
 
 def write_json(path: Path, value: Any, error_type: type[McaprlError] | None = None) -> None:
-    """Write `json_text` of a value with `replacing`."""
+    """Write a value to a file atomically, as the JSON text that `json_text` returns."""
     write_atomically(path, f"{json_text(value)}\n".encode(), error_type)
 
 

@@ -232,7 +232,11 @@ def upload(path: str | Path, url: str) -> None:
 
 
 def upload_all(paths: Sequence[Path], url: str) -> None:
-    """Copy one file to the URL of a file, or files into the URL of a folder; see `upload`."""
+    """Copy files to a URL; see `upload`.
+
+    If there is one file and the URL ends with its suffix, it is copied to this URL. Otherwise, the
+    copies have the files' names in the folder at the URL.
+    """
     if len(paths) == 1 and url.endswith(paths[0].suffix):
         upload(paths[0], url)
         return

@@ -51,8 +51,8 @@ def save_checkpoint(
         model: Model between two rollouts.
         task: Task of the run.
         extra: JSON object for `load_checkpoint` to return.
-        best: Contents of the best policy's file so far, for `load_checkpoint` to return; empty if
-            there is no such file.
+        best: Contents of the file of the best policy so far, for `load_checkpoint` to return; empty
+            if there is no such file.
 
     Raises:
         TrainingError: The file cannot be written.

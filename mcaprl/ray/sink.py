@@ -25,7 +25,7 @@ from mcaprl.remote import check_upload, is_url, upload
 
 
 class LogSink(Datasink[LogFile | None]):  # type: ignore[misc]
-    """Folder or URL of logs, one for each write task."""
+    """Sink that writes one log for each write task to a folder or URL."""
 
     def __init__(
         self, folder: str | Path, description: LogMetadata | None, compression: str
@@ -71,7 +71,10 @@ class LogSink(Datasink[LogFile | None]):  # type: ignore[misc]
         return found
 
     def on_write_complete(self, write_result: Any) -> None:
-        """Move the logs to the folder, and write the manifest."""
+        """Move the logs from the hidden folder to the target folder, and write the manifest.
+
+        If the target is a URL, only write the manifest.
+        """
         files = sorted(filter(None, write_result.write_returns), key=lambda file: file.name)
         if self._url is not None:
             with tempfile.TemporaryDirectory() as folder:

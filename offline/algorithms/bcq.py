@@ -30,7 +30,7 @@ from mcaprl.offline.batches.buffer import Batch
 
 
 class BCQ(DQN):
-    """Q-learning that selects next actions only among likely ones."""
+    """Q-learning that selects next actions only among actions that are likely in the log."""
 
     name = "bcq"
     config_type = BCQConfig

@@ -195,6 +195,6 @@ def default_configs() -> dict[str, TrainingConfig]:
     """
     if not entry_points(group=ENTRY_POINT_GROUP):
         return {name: config_type() for name, config_type in CONFIGS.items()}
-    from mcaprl.offline.algorithms.registry import all_algorithms  # imports torch
+    from mcaprl.offline.algorithms.registry import all_algorithms  # This module imports torch.
 
     return {name: learner.config_type() for name, learner in all_algorithms().items()}

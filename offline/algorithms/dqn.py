@@ -63,8 +63,8 @@ class DQN(Learner):
     def validate(self, batch: Batch) -> dict[str, Tensor]:
         """Return the values of the logged actions, and their absolute TD errors.
 
-        The learning network computes the targets. The target network would be up to date in one
-        validation and outdated in the next.
+        The targets are computed with the learning network. The target network is not used, because
+        it may be up to date in one validation and outdated in the next.
         """
         q_a_tm1 = chosen(mean_values(self.outputs("q", batch.observations)), batch.actions)
         target_tm1 = self.targets(batch, self.outputs("q", batch.next_observations))

@@ -115,7 +115,7 @@ class Learner(ABC):
         Update target networks if this is due.
 
         Returns:
-            The terms of `losses` times the factors of the batch, without gradients.
+            The terms of `losses`, multiplied by the factors of the batch, and detached.
 
         Raises:
             NotFiniteError: The loss is NaN or infinite; the weights have not changed.
@@ -207,7 +207,9 @@ class Learner(ABC):
 
     @torch.no_grad()
     def load_state(self, seed: int, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Restore the tensors that `state` returned; `step` must be the same for all seeds.
+        """Restore the tensors that `state` returned, and the number of finished updates.
+
+        All seeds share this number, so `step` must be the same in the calls for all seeds.
 
         Raises:
             KeyError: A tensor is missing.
@@ -247,7 +249,7 @@ class Learner(ABC):
 
 
 class _Losses(nn.Module):
-    """Losses of a learner as a module with its weights, whose gradients can be averaged."""
+    """Wrapper of `Learner.losses` as a module, so that its gradients can be averaged."""
 
     def __init__(self, learner: Learner) -> None:
         super().__init__()

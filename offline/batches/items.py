@@ -61,12 +61,12 @@ class ItemOptions:
             raise UsageError("n_steps and length exclude each other")
 
     def counts(self, lengths: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the number of items (E,) of episodes with these numbers of transitions."""
+        """Return how many items (E,) each episode has, given how many transitions each has."""
         return -(-lengths // self.stride)
 
 
 class Items:
-    """Items of all episodes of a dataset, in order."""
+    """Training items from all episodes, in the order of the dataset."""
 
     def __init__(self, dataset: Dataset, options: ItemOptions) -> None:
         """Compute the returns of all transitions."""
@@ -90,7 +90,10 @@ class Items:
         return len(self._starts)
 
     def batch(self, items: NDArray[np.int64]) -> Arrays:
-        """Return the items (B,) as arrays; `mcaprl.torch.TransitionDataset` lists the arrays."""
+        """Return the items with these indexes (B,) as arrays.
+
+        The docstring of `mcaprl.torch.TransitionDataset` lists the arrays.
+        """
         rows = self._starts[items]
         return self._transitions(rows) if self.options.length is None else self._sequences(rows)
 
@@ -156,10 +159,10 @@ def n_step_returns(
         gamma: Discount per step.
 
     Returns:
-        Two arrays. The first, (2, N), contains for each transition the frame indexes of its
-        observation and of the observation up to n steps later. The second, (2, N), contains the
-        discounted sum of the rewards between these two observations, and the discount of the value
-        of the later observation.
+        Two arrays. The first, (2, N), contains two frame indexes for each transition: the index of
+        its observation, and the index of the observation n steps later, or of the episode's last
+        observation if that comes earlier. The second, (2, N), contains the discounted sum of the
+        rewards between these two observations, and the discount for the later observation's value.
     """
     n_rows, lengths = len(dataset), dataset.episode_lengths
     rows = np.arange(n_rows)

@@ -4,8 +4,8 @@ A message has the log_time of the observation that the environment returned with
 message is written if the info is missing. Scalars are messages of std_msgs; arrays are flattened to
 the field `data` of `mcaprl_msgs/msg/Info...`. The channel's metadata contains the name and the
 shape of the info. In the topic, dots of the name become slashes, and characters other than letters,
-digits and `_` become `_`. If the name has such characters, or a dot that is not between two words,
-the CRC-32 of the name is appended to the topic.
+digits and `_` become `_`. If the name has such characters, starts or ends with a dot, or has two
+successive dots, the CRC-32 of the name is appended to the topic.
 """
 
 from __future__ import annotations

@@ -55,8 +55,8 @@ class Source:
         ids: Channel id in the new file, by channel id in this file.
         spans: (S, 2) first and last time of each kept time range, increasing.
         also: Times of additional messages to keep, by channel id.
-        without: Times of messages to drop although `spans` or `also` contains their times, by
-            channel id.
+        without: Times of messages to drop, by channel id, even if `spans` or `also` contains these
+            times.
         changed: (S, 2) first and last time of each time range whose messages are passed to
             `change`, by channel id. Messages that get other times or ids are always passed to it.
         change: Function that changes a message.

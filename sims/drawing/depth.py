@@ -103,7 +103,8 @@ def shrink(
         sums[:], hits[:] = 0.0, 0.0
         for k in range(rows.weights.shape[1]):
             line, weight = inverse[rows.first[i] + k], rows.weights[i, k]
-            # Most output rows overlap fewer than K input rows; their remaining weights are 0.
+            # All output rows have the same number of weights. Rows that overlap fewer input rows
+            # have weights of 0 at the end.
             if weight > 0.0:
                 for column in range(width):
                     sums[column] += weight * line[column]

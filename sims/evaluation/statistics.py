@@ -72,11 +72,11 @@ def interquartile_mean(returns: Floats) -> Floats:
 def mean_interval(returns: Floats, *, seed: int = 0) -> tuple[float, float]:
     """Return the 95 % interval of the mean.
 
-    With several seeds, the result combines two intervals: the interval of Student's t for the means
-    of the seeds, which covers the variation between seeds; and the bootstrap-t interval for the
-    means of the starts, which covers the variation between starts. If the lower
-    limits of the two intervals are a and b below the mean, the lower limit of the result is
-    sqrt(a^2 + b^2) below the mean. The upper limit is computed in the same way.
+    With several seeds, the result combines two intervals. The interval of Student's t for the means
+    of the seeds covers the variation between seeds. The bootstrap-t interval for the means of the
+    start states covers the variation between start states. If the lower limits of these intervals
+    are a and b below the mean, the lower limit of the result is sqrt(a^2 + b^2) below the mean. The
+    upper limit is computed in the same way.
 
     Args:
         returns: (S, E) returns.

@@ -36,7 +36,7 @@ class Projection(NamedTuple):
 
 
 def closed_path(corners: ArrayLike) -> Path:
-    """Return the path through corners (N + 1, 2), meters; the last one equals the first.
+    """Return the path through corners (N + 1, 2), meters; the last corner equals the first.
 
     Raises:
         ValueError: The corners do not form a closed polyline of legs longer than 0.
@@ -69,7 +69,7 @@ def sine(angle_rad: float) -> float:
     """Return the sine of an angle from -45 to 45 degrees, accurate to about the last bit.
 
     The function has no branches or calls, so that the compiler can vectorize loops. The series is
-    x - x^3/3! + x^5/5! - ...; relative to the sine, the first omitted term is below 6e-17.
+    x - x^3/3! + x^5/5! - ...; the first omitted term is below 6e-17 times the sine.
     """
     square = angle_rad * angle_rad
     rest = 1.0 / 6227020800.0 - square * (1.0 / 1307674368000.0)
@@ -114,7 +114,8 @@ def heading_of(yaw_rad: float) -> Heading:
 
     Like `sine`, the function has no branches or calls. It splits the angle into quarter turns and
     a remainder of at most 45 degrees, and computes the sine and cosine of the remainder. The number
-    of quarter turns determines which of the two is the cosine of the yaw, and their signs.
+    of quarter turns determines which of these two values is the cosine of the yaw, and the signs
+    of both.
     """
     quarters = np.floor(yaw_rad * (2.0 / math.pi) + 0.5)
     rest_rad = (yaw_rad - quarters * _QUARTER_RAD) - quarters * _QUARTER_REST_RAD

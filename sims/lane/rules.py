@@ -135,7 +135,7 @@ def wheel_angle(steering: float, speed_m_s: float) -> float:
 
 @inlined
 def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Car:
-    """Return the state of the car after a motion; its position along the path is near `near_m`."""
+    """Return the car after a motion; search its position along the path near `near_m`."""
     place = course_project(motion.x_m, motion.y_m, near_m - BACK_M, near_m + AHEAD_M)
     return Car(
         motion.x_m,
@@ -165,7 +165,7 @@ def driven(motion: Motion, steering: float, is_braking: bool) -> Motion:
 
 @inlined
 def steering_for(action: int, last: float) -> float:
-    """Return the steering command of an action. When braking, it is the last command."""
+    """Return the steering command of an action; BRAKE keeps the command `last`."""
     return last if action == BRAKE else STEERING[action]
 
 

@@ -101,7 +101,7 @@ class Fleet(ABC):
 
     @cached_property
     def _step(self) -> Callable[[], None]:
-        """Function of `_kernel` with bound arguments, compiled on first use."""
+        """Function that `_kernel` returns, with its arguments bound; compiled on first use."""
         return ready(*self._kernel())
 
     @cached_property

@@ -93,8 +93,8 @@ def step_of(model: Any, **columns: list[float]) -> float:
     ],
 )
 def test_the_target_by_hand(columns: dict[str, list[float]], target: float) -> None:
-    # The gradient of the Huber loss is -1 beyond an error of 1, and -error below. SGD changes the
-    # value by .1 times the gradient.
+    # If the error is above 1, the gradient of the Huber loss is -1. If it is between 0 and 1, the
+    # gradient is minus the error. SGD subtracts .1 times the gradient from the value.
     assert step_of(model_of(DoubleDQN), **columns) == pytest.approx(0.1 * min(target, 1.0))
     small = {**columns, "rewards": [columns.get("rewards", [1.0])[0] - target + 0.5]}
     assert step_of(model_of(DoubleDQN), **small) == pytest.approx(0.05)
@@ -113,7 +113,8 @@ def test_with_gamma_0_only_the_reward_counts() -> None:
 
 
 def test_dqn_uses_the_target_networks_maximum() -> None:
-    # The target of DQN is 1 + .5 x max(5, 3) = 3.5. If the reward is 3 less, the error is .5.
+    # With the reward -2, the target of DQN is -2 + .5 x 5 = .5, and that of Double DQN is
+    # -2 + .5 x 3 = -.5. SGD changes the value by .1 times the target.
     assert step_of(model_of(DQN), rewards=[-2.0]) == pytest.approx(0.05)
     assert step_of(model_of(DoubleDQN), rewards=[-2.0]) == pytest.approx(-0.05)
 

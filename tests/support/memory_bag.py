@@ -15,7 +15,7 @@ SECOND_NS = 10**9
 
 
 class MemoryBag:
-    """Topics given as times in seconds and columns."""
+    """Bag whose topics are given as times in seconds and columns."""
 
     paths: tuple[Path, ...] = (Path("memory.bag"),)
 

@@ -24,7 +24,7 @@ def main(command: str, folder: str, target: str) -> None:
 
 
 def read(folder: Path, target: str) -> None:
-    """Write the items, statistics and facts that LeRobot reads."""
+    """Write what LeRobot reads: items, statistics, frame rate and episode lengths."""
     dataset = _lerobot().LeRobotDataset("any/name", root=folder)
     items = [dataset[row] for row in range(len(dataset))]
     found: dict[str, Any] = {

@@ -52,7 +52,7 @@ def test_a_dueling_network_needs_a_hidden_layer() -> None:
 @pytest.mark.parametrize(
     ("settings", "fraction"),
     [
-        # Two syncs with one reward each give 1 + .5 of the total return of 2.
+        # After two syncs, values contain two rewards, 1 + .5. The total return is 2.
         ({"updates": 20, "target_interval": 10, "gamma": 0.5}, 0.75),
         ({"updates": 20, "target_interval": 10, "gamma": 0.5, "n_steps": 2}, 1 - 0.5**4),
         ({"updates": 20, "target_interval": 10, "gamma": 0.0}, 1.0),

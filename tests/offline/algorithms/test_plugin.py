@@ -14,7 +14,7 @@ from mcaprl.offline.algorithms.registry import ALGORITHMS, all_algorithms, choos
 from mcaprl.offline.training.train import train
 from tests.support.offline_tasks import corridor, inner_observations
 
-# Steps 1 and 2, a config and a loss, are all that the package contains.
+# Steps 1 and 2: define a config and a loss. The package contains nothing else.
 MODULE = '''
 from dataclasses import dataclass
 
@@ -50,7 +50,7 @@ class Smoothed(Learner):
         )
         return {"loss": loss}
 '''
-# Step 3, the registration.
+# Step 3: register the algorithm by an entry point.
 ENTRY_POINT = "smoothed-bc = smoothed_bc_package:Smoothed"
 FEW = ["--updates", "300", "--batch-size", "32", "--hidden", "16", "--learning-rate", "0.01"]
 
@@ -70,7 +70,7 @@ def test_an_installed_algorithm_trains(tmp_path: Path, monkeypatch: pytest.Monke
     log, mostly_right = tmp_path / "log.mcap", {(cell, 1): 9 for cell in (1, 2, 3)}
     data = corridor(mostly_right | {(cell, 0): 1 for cell in (1, 2, 3)})
     data.save(log)
-    # Step 4: from Python, by name and by config, and from the command line.
+    # Step 4: train with the algorithm from Python (by name or config) and from the command line.
     learner_type, defaults = choose_algorithm("smoothed-bc")
     config = replace(defaults, updates=300, hidden=(16,), learning_rate=0.01)
     assert choose_algorithm(config) == (learner_type, config)

@@ -65,8 +65,9 @@ def whole_buffer(weights: list[float]) -> TransitionBuffer:
 def test_a_process_gets_its_rows_padded_with_factors_of_zero() -> None:
     """Draw rows for a process that holds rows 3 to 7 of ten.
 
-    B = 40 rows are drawn for each seed, and M is the larger number of rows that the process holds
-    of a seed. Its mean over M rows, padded with zeros, needs the factor M / B.
+    For each of two seeds, B = 40 rows are drawn, and the process holds some of them. M is the
+    larger of the two numbers of held rows. Both seeds get M rows; missing rows have the factor 0.
+    A mean over M rows replaces a mean over B rows, so the other factors are M / B.
     """
     share = GroupShare(LENGTHS, np.ones(4), 1, 3)
     buffer = whole_buffer([1, 1, 1, 1])

@@ -143,7 +143,7 @@ def test_a_log_of_other_actions_has_no_verdict() -> None:
 
 
 def test_a_mean_weight_far_from_one_has_no_verdict() -> None:
-    """Half of the log never takes the policy's actions, so the mean weight is about 1/2."""
+    """Half of the log never takes one of the policy's actions: the mean weight is about 1/2."""
     always_one = np.array([[1e-6, 1 - 1e-6], [1e-6, 1 - 1e-6]])
     data = Dataset.concatenate([log(60), log(60, seed=1, acting=always_one)])
     found = by_name(OffPolicyEvaluator(data, NO_MODEL).evaluate(Table(task.BEHAVIOR), "half"))

@@ -25,22 +25,23 @@ def resamplings(episodes: int, count: int, seed: int) -> NDArray[np.float64]:
 
 
 def test_a_ratio_by_hand() -> None:
-    # a is 2 and 6, b is 1 and 3: both ratios are 2, so the standard error is 0.
+    # The first arrays are a, the second are b. Both ratios a / b are 2, so the standard error is 0.
     same = RatioEstimate(np.array([0.5]), ((np.array([[2.0], [6.0]]), np.array([[1.0], [3.0]])),))
-    # The second episode is drawn twice: 12 / 6.
+    # If the second episode is drawn twice, the ratio is 12 / 6 = 2, too.
     assert same.values(np.array([[1.0, 1.0], [0.0, 2.0]])) == pytest.approx([1.0, 1.0])
     assert same.errors(np.ones((1, 2))) == pytest.approx([0.0])
     assert same.interval(resamplings(2, 50, 0)) == pytest.approx((1.0, 1.0))
-    # a is 2 and 2: 4 / 4 = 1. The changes are (2 - 1) / 4 and (2 - 3) / 4: sqrt(2 / 16).
+    # The ratio of the sums is 4 / 4 = 1. The episodes contribute (2 - 1) / 4 and (2 - 3) / 4, so
+    # the standard error is sqrt(2 / 16).
     other = RatioEstimate(np.ones(1), ((np.array([[2.0], [2.0]]), np.array([[1.0], [3.0]])),))
     assert other.errors(np.ones((1, 2))) == pytest.approx([np.sqrt(1 / 8)])
-    # Counting each episode twice is like four episodes, so the variance is half.
+    # If each episode is counted twice, there are four episodes. This halves the variance.
     assert other.errors(np.full((1, 2), 2.0)) == pytest.approx([np.sqrt(1 / 16)])
 
 
 def test_weighted_pairs_are_summed() -> None:
     one = (np.array([[1.0, 2.0], [3.0, 2.0]]), np.array([[1.0, 0.0], [1.0, 4.0]]))
-    # (4 / 2 + 4 / 4 of the second) and each twice.
+    # The ratios are 4 / 2 with factor 1 and 4 / 4 with factor 10: 12. Both pairs are equal: 24.
     assert RatioEstimate(np.array([1.0, 10.0]), (one, one)).values(np.ones((1, 2))) == [24.0]
     # Where b is 0 in all episodes, the ratio is 0.
     nothing = RatioEstimate(np.ones(1), ((np.ones((2, 1)), np.zeros((2, 1))),))
@@ -68,7 +69,7 @@ def test_an_interval_shifts_and_scales_with_its_values(
 
 
 def test_the_standard_error_is_the_spread_of_the_estimates() -> None:
-    """Over 150 logs of 200 episodes, both agree within four standard errors."""
+    """Over 150 logs of 200 episodes, error and spread agree within four standard errors."""
     once, logs = np.ones((1, 200)), 150
     tables = [task.play(None, episodes=200, seed=seed) for seed in range(logs)]
     for name in ("WPDIS", "DR", "WDR"):
@@ -79,7 +80,7 @@ def test_the_standard_error_is_the_spread_of_the_estimates() -> None:
 
 
 def test_intervals_have_their_nominal_coverage() -> None:
-    """Over 200 logs of 50 episodes, 95 % intervals have this coverage within the tolerance.
+    """Over 200 logs of 50 episodes, the coverage of 95 % intervals is 95 % within a tolerance.
 
     The tolerance is two percentage points plus two standard errors.
     """
@@ -97,13 +98,14 @@ def test_intervals_have_their_nominal_coverage() -> None:
 
 
 def test_degrees_of_freedom_by_hand() -> None:
-    # 0 and 2 have equal deviations from 1: one degree. 0 0 0 4 have deviations 1 1 1 3:
-    # (1 + 1 + 1 + 9)^2 / (1 + 1 + 1 + 81) - 1 = 144 / 84 - 1 is below the minimum of one.
+    # For deviations d from the mean, the result is (sum of d^2)^2 / (sum of d^4) - 1, at least 1.
+    # The deviations of 0 and 2 are equal: 4 / 2 - 1 = 1. The deviations of 0, 0, 0 and 4 are 1, 1,
+    # 1 and 3: 144 / 84 - 1 is below the minimum of 1.
     assert RatioEstimate.mean(np.array([0.0, 2.0])).degrees_of_freedom() == 1.0
     assert RatioEstimate.mean(np.array([0.0, 0.0, 0.0, 4.0])).degrees_of_freedom() == 1.0
     alike = RatioEstimate.mean(np.array([-1.0, 1.0] * 10))
     assert alike.degrees_of_freedom() == pytest.approx(19.0)
-    # 0 0 0 2 2 4 4 4 have deviations 2 2 2 0 0 2 2 2: six are not 0, so five degrees.
+    # Six deviations are 2, and the other two are 0: 6 - 1 degrees of freedom.
     some = RatioEstimate.mean(np.array([0.0, 0, 0, 2, 2, 4, 4, 4]))
     assert some.degrees_of_freedom() == pytest.approx(5.0)
 

@@ -17,7 +17,7 @@ from tests.support.offline_tasks import corridor, crossing
 
 
 def test_held_out_episodes_are_evaluated_but_not_trained_on(tmp_path: Path) -> None:
-    # Rewards are 1 in the held-out episodes only: 12 of 24.
+    # Rewards are 1 in the 12 held-out episodes, and 0 in the other 12 episodes.
     held_out = choose_held_out(24, 0.5)
     data = crossing((10,) * 24)
     paid = np.isin(np.arange(24), held_out).repeat(10)
@@ -51,8 +51,8 @@ def test_returns_of_short_truncated_episodes_are_unknown() -> None:
         next_observations=observations,
     )
     returns = monte_carlo_returns(data, np.array([0]), 0.5)
-    # Five steps before the truncation, the first missing reward has the discount 1/32. Four steps
-    # before the truncation, it has the discount 1/16.
+    # The first missing reward has the discount 1/32 in the return of step 1, which is valid, and
+    # the discount 1/16 in the return of step 2, which is NaN.
     assert np.isnan(returns).tolist() == [False, False, True, True, True, True]
 
 

@@ -304,8 +304,8 @@ def test_commands(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     (tmp_path / "out.mcap").unlink()
     assert run(["filter", "length > 2", str(log), str(out), "--json"]) == 0
     (one,) = json.loads(capsys.readouterr().out)["logs"]
-    # There are 9 records and 2 summaries of 2 episodes, and the start and the end of each episode
-    # on 2 topics. In a log as short as this, each episode has 2 chunks.
+    # The 2 episodes have 9 records (7 steps and 2 final observations), 2 summaries, and 8 messages:
+    # the start and the end of each episode on 2 topics. Each short episode has 2 chunks.
     assert one == {
         "out": str(out),
         "episodes": 2,

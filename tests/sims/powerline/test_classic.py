@@ -35,17 +35,18 @@ def beside(leg: int, along_m: float, distance_m: float) -> Vector:
 @pytest.mark.parametrize(
     ("place", "speed_m_s", "hit", "reward", "end"),
     [
+        # At distance d and speed v, the reward is (e^-d - .5) + (v - .5).
         # On the line, at rest: (1 - .5) + (0 - .5) = 0.
         (beside(0, 30.0, 0.0), 0.0, False, 0.0, FLYING),
         # On the line, at the speed after the start.
         (beside(0, 30.0, 0.0), 1.445, False, 1.445, FLYING),
-        # 1 m beside the line, at 2 m/s: e^-1 - .5 + 1.5 = 1.36788.
+        # 1 m beside the line, at 2 m/s: (e^-1 - .5) + 1.5.
         (beside(1, 60.0, 1.0), 2.0, False, 1.367879, FLYING),
-        # 1 m beside the line, at rest: e^-1 - 1.
+        # 1 m beside the line, at rest: (e^-1 - .5) - .5.
         (beside(1, 60.0, 1.0), 0.0, False, -0.632121, FLYING),
-        # 3 m beside the line, at 0.5 m/s: e^-3 - .5.
+        # 3 m beside the line, at 0.5 m/s: (e^-3 - .5) + 0.
         (beside(2, 100.0, -3.0), 0.5, False, -0.450213, FLYING),
-        # 6.99 m beside the line, at 10 m/s in any direction: e^-6.99 - .5 + 9.5.
+        # 6.99 m beside the line, at 10 m/s in any direction: (e^-6.99 - .5) + 9.5.
         (beside(3, 100.0, 6.99), 10.0, False, 9.000921, FLYING),
         # Beyond 7 m, the reward is -10 and the episode ends, at any speed.
         (beside(3, 100.0, 7.01), 10.0, False, -10.0, OFF_LINE),
@@ -53,11 +54,11 @@ def beside(leg: int, along_m: float, distance_m: float) -> Vector:
         # A collision has priority.
         (beside(1, 60.0, 0.0), 3.0, True, -100.0, COLLISION),
         (beside(1, 60.0, 9.0), 3.0, True, -100.0, COLLISION),
-        # 50 m before the start, on the first leg's extension: the line is infinite.
+        # The first leg is part of an infinite line. 50 m before the start, the distance is 0.
         (beside(0, -50.0, 0.0), 1.0, False, 1.0, FLYING),
-        # 100 m past the first tower on the same extension.
+        # On the same infinite line, 100 m past the first tower, the distance is also 0.
         (beside(0, LEG_LENGTHS_M[0] + 100.0, 0.0), 1.0, False, 1.0, FLYING),
-        # 300 m beyond the last tower, 2 m beside: e^-2 - .5 + .5.
+        # 300 m beyond the last tower, 2 m beside the last leg's line: (e^-2 - .5) + .5.
         (beside(3, LEG_LENGTHS_M[3] + 300.0, 2.0), 1.0, False, 0.135335, FLYING),
     ],
 )
@@ -88,7 +89,10 @@ def classic() -> PowerlineEnv:
 
 
 def test_an_action_changes_the_measured_velocity() -> None:
-    """The command is 1 + .25 m/s. After 5 s, which are ten lags, the error is e^-10 of the step."""
+    """The command is .25 m/s above the measured 1 m/s.
+
+    The 5 s of a decision are ten lags, after which e^-10 of the .25 m/s is missing.
+    """
     flight = begin(point_on_line(150.0), Vector(1.0, 0.0, 0.0), ZERO)
     flight = flight._replace(command_m_s=Vector(4.0, 4.0, 4.0))
     after, hit = classic_decide(POINT, flight, NORTH)

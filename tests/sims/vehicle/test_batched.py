@@ -197,7 +197,10 @@ def test_each_drone_has_gusts_of_its_own() -> None:
 
 
 def test_the_racers_time_limit_precedes_the_registered_one() -> None:
-    """The limits are 1,000 and 10,000 steps; car 0 repeats the pilot's actions in a single sim."""
+    """The racer's time limit is 1,000 steps; the limit registered with Gymnasium is 10,000 steps.
+
+    Car 0 repeats the actions of the pilot, which drives in a single sim.
+    """
     single = make_sim("racer", start="line")
     pilot = make_pilot(single)
     observation, _ = single.reset(seed=3)
