@@ -13,7 +13,7 @@ has the command and the scores of four seeds. Important settings are:
 - A learning rate that decays to 4 % of its initial value. With a constant learning rate, the policy
   oscillates until the end.
 - `n_steps` is 3 for powerline and racer, whose rewards are sparse or late. Their target networks
-  are updated only every 2,000 steps (powerline, `gamma` 0.95) or 4,000 steps (racer, 0.98).
+  are updated only every 2,000 steps (powerline, `gamma` 0.95) or 4,000 steps (racer, `gamma` 0.98).
 - Checkpoints are compared on separate episodes and the best one is stored, because scores can still
   drop during training.
 """

@@ -64,7 +64,7 @@ class Task:
     def of_preset(
         cls, name: str, sim_options: Mapping[str, Any] | None = None, **settings: Any
     ) -> Task:
-        """Return a task with the published settings of a preset, some of them replaced.
+        """Return a task with the published settings of a preset, except those that are given.
 
         Raises:
             UnknownNameError: There is no such preset.

@@ -72,7 +72,7 @@ def ray_cluster() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def small_chunks() -> Iterator[None]:
-    """Keep the small chunks of a module's logs, as if their writers had been killed."""
+    """Prevent writers from merging small chunks on close, as if they had been killed."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mcaprl.recorder.columns.compact._MIN_CHUNKS_SAVED", 10**9)
         yield

@@ -32,8 +32,8 @@ class LogEstimates:
         epsilon: Probability with which the evaluated policies take a random action.
         behavior_return: Mean discounted return of the logged episodes.
         behavior_interval: 95 % confidence interval of that mean.
-        behavior_calibration: Mean of 1 / `behavior_prob`, which estimates the number of actions,
-            and the number of actions in the action space; None if unknown.
+        behavior_calibration: Two numbers that should be about equal: the mean of
+            1 / `behavior_prob`, and the number of actions in the action space. None if unknown.
         behavior_estimate: Quality of the estimated `behavior_prob`; None if it was not estimated
             for this evaluation.
         coverage: Mean probability of the logged actions under each policy.

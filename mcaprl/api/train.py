@@ -84,8 +84,8 @@ def train(
             number of GPUs.
         address: Address of a Ray cluster, `HOST:PORT` or `auto`; default: RAY_ADDRESS, else a
             local cluster for this call.
-        on_data: Function called with the algorithm and the dataset before the first update; not
-            with `ray`, since no process holds the dataset.
+        on_data: Function called with the algorithm and the dataset before the first update;
+            not called with `ray`, because no single process holds the dataset.
         progress: Function called with each row of metrics.
         **settings: Settings of the algorithm. Missing settings have the algorithm's defaults; with
             `resume`, they have the values of the run.
@@ -201,7 +201,7 @@ def _check_choice(
     follow: bool,
     other_data: bool,
 ) -> None:
-    """Check that arguments which only `auto` has, or has not, are not given otherwise."""
+    """Check the arguments that only `auto` accepts, and those that `auto` does not accept."""
     is_auto = algo == "auto"
     if budget_minutes is not None:
         check_positive(budget_minutes=budget_minutes)

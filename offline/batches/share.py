@@ -1,4 +1,4 @@
-"""The part of the training data that one process holds, and sums over all processes.
+"""The part of the training data that one process holds, and averages over all processes.
 
 Several processes train together if each of them holds some of the episodes. In each update all of
 them draw the same transitions from all data, and each computes the losses of those that it holds.
@@ -64,17 +64,17 @@ class Share:
             Rows (R,) of the buffer, and a factor (R,) for each row. The mean over the batch is
             computed in two steps: each process averages factor times value over its rows, and
             these averages are averaged over the processes. If all factors are 1, None is returned
-            instead of them.
+            instead of the factors.
         """
         return torch.cat([buffer.sample_rows(count, one) for one in generators]), None
 
     def part(
         self, chosen: Tensor, total: int, device: torch.device
     ) -> tuple[Tensor, Tensor | None]:
-        """Return rows and factors like `draw`, for rows (K, n) that this process has chosen.
+        """Return rows and factors as `draw` does, but for rows that this process has chosen.
 
         Args:
-            chosen: Rows of the buffer.
+            chosen: Rows (K, n) of the buffer, n for each of K seeds.
             total: Number of rows that all processes have chosen for each seed.
             device: Device of the results.
         """
@@ -95,7 +95,7 @@ class Share:
         return np.max(self.gather(values), axis=0)
 
     def position(self, count: int) -> tuple[int, int]:
-        """Return the number of items of the processes before this one, and of all processes."""
+        """Return how many items the processes before this one have, and how many all have."""
         return 0, count
 
 
@@ -109,7 +109,7 @@ class GroupShare(Share):
             lengths: (E,) number of transitions of each episode of all data.
             weights: (E,) relative weight of a transition of each episode.
             first: Number of the first episode of this process.
-            stop: Number after the last one.
+            stop: Number of the last episode of this process, plus 1.
 
         Raises:
             TrainingError: All weights are 0.
@@ -131,7 +131,7 @@ class GroupShare(Share):
         self._cumulative = torch.from_numpy(np.cumsum(above * lengths[drawable]))
 
     def gather(self, value: T) -> list[T]:
-        """Return the value of each process, in the order of their episodes."""
+        """Return the values of all processes; their order is that of the processes' episodes."""
         found: list[Any] = [None] * self.processes
         distributed.all_gather_object(found, value)
         return found
@@ -167,7 +167,7 @@ class GroupShare(Share):
         return rows.flatten().to(buffer.device), factors.flatten().to(buffer.device)
 
     def part(self, chosen: Tensor, total: int, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Return rows and factors for rows (K, n) that this process has chosen."""
+        """Return rows and factors as `draw` does, but for rows that this process has chosen."""
         count = chosen.shape[1]
         if not count:
             chosen = torch.zeros(len(chosen), 1, dtype=torch.int64)
@@ -192,7 +192,7 @@ class GroupShare(Share):
         return self._starts[episodes] + steps
 
     def position(self, count: int) -> tuple[int, int]:
-        """Return the number of items of the processes before this one, and of all processes."""
+        """Return how many items the processes before this one have, and how many all have."""
         counts = self.gather(count)
         return sum(counts[: self.rank]), sum(counts)
 

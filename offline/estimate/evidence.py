@@ -92,7 +92,7 @@ class Evidence:
     bellman_error: float | None
 
     def to_json(self) -> dict[str, Any]:
-        """Return the numbers as plain JSON types, without those of single episodes and states."""
+        """Return the attributes as plain JSON types, without the arrays over episodes or states."""
         arrays = ("first_values", "agrees")
         return {name: value for name, value in asdict(self).items() if name not in arrays}
 
@@ -124,7 +124,7 @@ class EvidenceCollector:
             clone: Policy that imitates the behavior of the log, such as one trained by BC.
             config: Settings of FQE; its `gamma` is the discount of all values.
             pessimistic: Whether an episode ends at a policy's first rare action.
-            seed: Seed of the models and of the halves of the log.
+            seed: Seed of the models, and of the division of the log into halves.
 
         Raises:
             UsageError: There are too few episodes.
@@ -154,7 +154,7 @@ class EvidenceCollector:
 
         Args:
             policies: Policies to evaluate.
-            on_update: Function called after each update of the models: FOLDS * updates times.
+            on_update: Function called after each update of a model; FOLDS * updates calls in total.
 
         Raises:
             PolicyError: The observations do not fit a policy.
@@ -255,6 +255,6 @@ def weighted_value(
 
 
 def likely(probabilities: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
-    """Return whether each action (N, A) has at least `LIKELY` times the largest probability."""
+    """Return whether each action's probability (N, A) is at least `LIKELY` times the largest."""
     above: NDArray[np.bool_] = probabilities >= LIKELY * probabilities.max(1, keepdims=True)
     return above

@@ -89,7 +89,7 @@ def per_decision(episodes: EpisodeTable) -> RatioEstimate:
 
 
 def weighted_per_decision(episodes: EpisodeTable) -> RatioEstimate:
-    """Return WPDIS: the sum over t of gamma^t times the mean reward at t, weighted by rho_t."""
+    """Return WPDIS: sum_t gamma^t (mean rho_t r_t) / (mean rho_t), with means over episodes."""
     rho = episodes.rho
     return RatioEstimate(episodes.discounts, ((rho * episodes.rewards, rho),))
 
@@ -144,9 +144,8 @@ def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
 
     For TIS and WIS, this is the size at the last step. For the others, it is the harmonic mean over
     steps, weighted with the discounts, because the variances of the steps add up. PDIS and DR are
-    not normalized, so one huge weight, even in a late step, determines the estimate. For PDIS and
-    DR, each episode's weights are also summed with their discounts. The result is at most the
-    effective sample size of these sums.
+    not normalized, so one huge weight, even in a late step, determines the estimate. Their result
+    is therefore at most the effective sample size of the sums sum_t gamma^t rho_t of the episodes.
     """
     sizes = effective_sample_sizes(episodes)
     if estimator in WHOLE_EPISODE:

@@ -65,9 +65,9 @@ class RatioEstimate:
     def errors(self, counts: Floats) -> Floats:
         """Return the standard errors (B,) of `values(counts)`, by the delta method.
 
-        The weights w and the pairs a, b are those of the class. An episode with the values a_k and
-        b_k changes the estimate by sum_k w_k (a_k - q_k b_k) / (E mean b_k). E is the number of
-        episodes, and q_k is the ratio mean a_k / mean b_k.
+        An episode with the values a_k and b_k changes the estimate by
+        sum_k w_k (a_k - q_k b_k) / (E * mean b_k). E is the number of episodes, and q_k is the
+        ratio mean a_k / mean b_k. For w, a and b, see the attributes of the class.
         """
         parts = [
             self._errors(counts[start : start + _RESAMPLES_AT_ONCE])

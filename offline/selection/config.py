@@ -42,8 +42,8 @@ class AutoConfig(BootstrapConfig):
     def candidate_interval(self) -> int:
         """Number of updates between checkpoints of a candidate.
 
-        The number is at most a quarter of the short training, so that a candidate has a policy when
-        its time is up.
+        The number is at most a quarter of the updates of the short training, so that a candidate
+        has a policy when its time is up.
         """
         quarter = round(self.updates * self.short_fraction / 4)
         return max(1, min(self.checkpoint_interval, quarter))

@@ -1,7 +1,7 @@
 """Training of several candidates, of which only the best are trained to the end.
 
     RUN/config.json       settings of `auto` and the data
-    RUN/clone             clone of the behavior policy, which tells likely actions from rare ones
+    RUN/clone             clone of the behavior policy, which distinguishes likely from rare actions
     RUN/candidates/NAME   run of a candidate
     RUN/stages.json       evaluations of the candidates after the short and the full training
     RUN/choice.json       what was chosen, and why
@@ -96,7 +96,7 @@ class Stage:
 
     @property
     def ratings(self) -> dict[str, Rating]:
-        """Estimate of each candidate."""
+        """Rating of each candidate that has one."""
         return {name: one.rating for name, one in self.tried.items() if one.rating}
 
     def to_json(self) -> dict[str, Any]:
@@ -128,9 +128,9 @@ def select(
         dataset: Dataset with discrete actions.
         config: Settings.
         out: Folder of the run; it must be empty or not exist.
-        seeds: Number of networks of each candidate, over which estimates are averaged.
+        seeds: Number of networks of each candidate; its estimates are averages over them.
         seed: Seed of the first network.
-        weights: (E,) relative sampling weight of each transition of an episode; default: all equal.
+        weights: (E,) relative sampling weight of a transition of each episode; default: all equal.
         resume: Whether to resume the run in `out`.
         device: `cpu` or `cuda`.
         budget_minutes: Wall time after which no update is started; None for no bound.
@@ -318,7 +318,7 @@ class _Race:
             )
 
     def _agreements(self, evidence: Evidence) -> NDArray[np.float64]:
-        """Return the fraction of agreement in each episode (E,).
+        """Return the fraction (E,) of each episode's states where the policy agrees.
 
         A policy agrees in a state if it takes the logged action.
         """
@@ -376,7 +376,7 @@ class _Race:
         ends: float,
         ticks: list[float] | None = None,
     ) -> list[Evidence]:
-        """Return the evidence for each policy by one model. Raise `_Pause` if the time is up."""
+        """Return one model's evidence for each policy. Raise `_Pause` if the time is up."""
 
         def check() -> None:
             now = time.perf_counter()

@@ -112,9 +112,10 @@ class _McapTopic:
 
 
 def _is_column(kind: str) -> bool:
-    """Return whether a field is read as a column: a number, string, time or array of numbers.
+    """Return whether a field is read as a column.
 
-    Messages with other fields, such as bytes and lists of strings, are decoded one by one.
+    Columns are numbers, strings, times and arrays of numbers. Messages with other fields, such as
+    bytes and lists of strings, are decoded one by one.
     """
     element, bracket, _ = kind.partition("[")
     if bracket:

@@ -68,7 +68,7 @@ class LogReader:
     def description(self) -> LogMetadata:
         """Metadata of the log.
 
-        If another program wrote the log, it is inferred from the first episode.
+        If another program wrote the log, the metadata is inferred from the first episode.
 
         Raises:
             LogError: The metadata must be inferred, and the first episode cannot be read.
@@ -92,7 +92,7 @@ class LogReader:
 
     @property
     def checksum(self) -> str:
-        """SHA-256 of the chunk offsets and CRCs, and of the file's mtime if it lacks CRCs."""
+        """SHA-256 of the chunk offsets and CRCs; if CRCs are missing, also of the file's mtime."""
         return fingerprint(self._reader)
 
     def record_times(self) -> NDArray[np.int64]:

@@ -108,7 +108,7 @@ class _Screens:
             if not views:
                 return beside
             return panels.split(panels.stack(views, "column"), beside, "row", 50)
-        # The view from above gets more of the width than an image, because images are square.
+        # The view from above is wider than each image, because images are square.
         below = [(view, 0.4) for view in views] + [(self._above(), 0.6)]
         if _TRACKS not in self.topics and "/tf" in self.topics and "y_m" in self.telemetry:
             below.append((self._track_so_far(), 0.4))
@@ -177,8 +177,8 @@ class _Screens:
     def _above(self) -> Node:
         """Add the view from above.
 
-        It shows the whole world if the log contains its size, otherwise the surroundings of the
-        vehicle.
+        The view shows the whole world if the log contains the size of the world, otherwise the
+        surroundings of the vehicle.
         """
         view = self.metadata.view
         height_m = view.get("world_m", _AROUND_M)
@@ -272,7 +272,7 @@ class _Screens:
         return [self._put("Indicator!state", panel)]
 
     def _actions(self) -> tuple[Node, float]:
-        """Add a panel of recent logged and policy actions; return its node and share of height."""
+        """Add a panel of recent logged and policy actions; return its node and relative height."""
         title = f"actions of the last {_LAST_S} s"
         if not self.metadata.action_names():
             paths = series.action_series(self.metadata)

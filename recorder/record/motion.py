@@ -29,8 +29,8 @@ def motion_transforms(moments: Sequence[Moment], *, thins: bool = True) -> bytes
 
     Args:
         moments: Moments in order of time; all contain the same frames.
-        thins: Whether to omit intermediate poses that linear interpolation between the remaining
-            poses reproduces with errors of at most 0.04 m and 0.02 rad.
+        thins: Whether to omit an intermediate pose if linear interpolation between the remaining
+            poses differs from it by at most 0.04 m and 0.02 rad.
     """
     times = np.array([time_ns for time_ns, _ in moments], np.float64) - moments[0][0]
     kept = []
@@ -45,7 +45,7 @@ def motion_transforms(moments: Sequence[Moment], *, thins: bool = True) -> bytes
 
 
 def knots(times: NDArray[np.float64], values: NDArray[np.float64]) -> list[int]:
-    """Select rows such that linear interpolation gives all other rows with errors of at most 1.
+    """Select rows from which linear interpolation reproduces the others with errors up to 1.
 
     Args:
         times: (N,) increasing times; N is at least 2.

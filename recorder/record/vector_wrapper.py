@@ -170,13 +170,14 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         """Step all environments and log the transitions.
 
         The action of an environment that resets itself in this step is neither taken nor logged.
+        An error in an environment or in its results ends all episodes, which are recorded up to the
+        previous transition.
 
         Raises:
             ResetNeeded: An environment has no open episode.
             UsageError: One of `behavior_probs` is not in (0, 1]; the environments are not stepped.
             SpaceError: The actions do not fit their space (the environments are not stepped), or an
-                observation does not fit its space. An error in an environment or in its results
-                ends all episodes, which are recorded up to the previous transition.
+                observation does not fit its space.
         """
         if not (self._running | self._due).all():
             idle = np.flatnonzero(~(self._running | self._due)).tolist()
@@ -224,7 +225,8 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         probs = np.asarray(self.behavior_probs, np.float32)
         if probs.shape not in ((), steps.shape):
             raise SpaceError(f"behavior_probs has shape {probs.shape}, expected {steps.shape}")
-        # An environment that is reset in this step ignores its action, so its entry is not checked.
+        # An environment that is reset in this step ignores its action, so its probability is not
+        # checked.
         for number in np.flatnonzero(is_impossible(probs) & self._running):
             prob = float(np.broadcast_to(self.behavior_probs, steps.shape)[number])
             check_probability(prob, f"behavior_probs[{number}]")

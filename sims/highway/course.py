@@ -1,7 +1,7 @@
 """Courses along a highway-env road: chains of consecutive lanes, in ROS axes.
 
-In highway-env's images, y points down. Here y and all angles have the opposite sign, so that z is
-up, angles are counter-clockwise, and left is positive.
+In highway-env's images, y points down. In this module, y and all angles have the opposite sign, so
+that z is up, angles are counter-clockwise, and left is positive.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def wanted_velocity(position_m: Vector) -> Vector:
 
 @compiled
 def choose(flight: Flight, step_m_s: float, from_measured: bool) -> int:
-    """Choose the action that most reduces the error of the command, or no change if it is small.
+    """Choose the action that most reduces the command's error, or none if the error is small.
 
     Args:
         flight: State of the drone.

@@ -112,7 +112,8 @@ def test_probabilities_of_huge_logits_are_finite(tmp_path: Path) -> None:
 
 
 def test_bcq_filters_actions_that_are_rare_in_the_log(tmp_path: Path) -> None:
-    # The second action has a higher value than the first, and a tenth of its probability.
+    # The second action has a higher value than the first, but only a tenth of the probability of
+    # the first, so BCQ excludes it.
     learner = learner_with_outputs(BCQ, [1.0, 2.0], np.log([10.0, 1.0]).tolist())
     policy = saved_and_loaded(tmp_path, learner)
     assert policy.act(inner_observations()).tolist() == [5, 5, 5]

@@ -1,4 +1,4 @@
-"""Tests of SB3's model files: the parts that are read, and that no code in them is executed."""
+"""Tests of reading SB3's model files without executing code in them."""
 
 from __future__ import annotations
 
@@ -276,7 +276,7 @@ def test_sizes_are_refused_before_memory_is_taken(tmp_path: Path, changes: Any) 
     try:
         with pytest.raises(PolicyError) as error:
             read_policy(edited(path, tmp_path / "large.zip", OWN_NAME, **changes))
-        # Even the bounds of the largest accepted space need less memory.
+        # 400 MB is more than the bounds of the largest accepted space need.
         assert tracemalloc.get_traced_memory()[1] < 400e6
     finally:
         tracemalloc.stop()

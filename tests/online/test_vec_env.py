@@ -1,4 +1,4 @@
-"""Tests of the adapter from batched environments to SB3 against SB3's `DummyVecEnv`."""
+"""Tests that the adapter from batched environments to SB3 acts like SB3's `DummyVecEnv`."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ def test_the_cluster_listens_on_the_loopback_interface_alone() -> None:
 
 
 def _sockets() -> set[str]:
-    """Return the inodes of the sockets of all child processes, also indirect ones."""
+    """Return the inodes of the sockets of all descendants of this process."""
     found, parents = set(), [os.getpid()]
     while parents:
         parent = parents.pop()

@@ -110,7 +110,7 @@ def worker_processes() -> list[int]:
 
 
 class Killer(threading.Thread):
-    """Callback that kills the oldest worker at random times after progress, a few times."""
+    """Callback that kills the oldest worker a few times, each at a random time after progress."""
 
     def __init__(self, kills: int) -> None:
         super().__init__(daemon=True)

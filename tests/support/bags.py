@@ -107,7 +107,7 @@ def messages(store: Any) -> Iterator[tuple[str, int, Any]]:
 def write_rosbag2(
     folder: Path, storage: str = "mcap", compression: str = "", parts: int = 1
 ) -> Path:
-    """Write a rosbag2 folder; several parts are separate folders below it."""
+    """Write a rosbag2 folder; if there are several parts, write one such folder for each."""
     paths = [folder] if parts == 1 else [folder / f"part_{k}" for k in range(parts)]
     every = list(messages(STORE2))
     share = math.ceil(len(every) / parts)

@@ -60,7 +60,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
         One sentence for each thing that was left out or differs from D4RL's form.
 
     Raises:
-        SpaceError: The observations are a Dict or HDF5 cannot hold an info, and `lossy` is not set.
+        SpaceError: `lossy` is not set, and observations are a Dict or HDF5 cannot store an info.
         MissingExtraError: h5py is not installed.
     """
     h5py = import_extra("h5py", nodes.EXTRA)
@@ -179,7 +179,7 @@ def _own(file: Any, path: Path) -> Dataset | None:
 def _own_infos(
     file: Any, lengths: Sequence[int], described: Mapping[str, tuple[str, np.dtype[Any]]]
 ) -> dict[str, Any]:
-    """Return the infos (F, *shape), including the rows of the final observations."""
+    """Return the infos (F, *shape) of all F observations, including the final ones."""
     finals = np.cumsum(np.array(lengths) + 1) - 1
     found = {}
     for name, (array, dtype) in described.items():

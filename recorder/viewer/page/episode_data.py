@@ -211,7 +211,7 @@ class LogPage:
         """Return the numeric fields of a topic at these log_times; NaN where there is no message.
 
         Returns:
-            (len(times_ns),) or (len(times_ns), N) float32 by field.
+            Arrays (len(times_ns),) or (len(times_ns), N) of float32, by field.
         """
         topic = Topic(self._reader, topic_name)
         found, steps = _rows_at(topic, times_ns)
@@ -248,9 +248,9 @@ def _plot(title: str, names: Sequence[str], values: NDArray[Any]) -> dict[str, A
 
 
 def _rows_at(topic: Topic, times_ns: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[np.int32]]:
-    """Return the rows of a topic whose log_times are in `times_ns`, and their indexes there.
+    """Return the rows of a topic whose log_times are in `times_ns`.
 
-    `times_ns` is increasing.
+    Also return the index of each of these log_times in `times_ns`, which is increasing.
     """
     rows = np.flatnonzero(np.isin(topic.times, times_ns))
     return rows, np.searchsorted(times_ns, topic.times[rows]).astype(np.int32)
@@ -286,5 +286,5 @@ def _finite(value: float | None, default: float) -> float:
 
 
 def _thinning(size: int) -> int:
-    """Return k, so that every k-th image is shown."""
+    """Return k such that every k-th image is shown, to limit the total size."""
     return max(1, math.ceil(size / _MOST_IMAGE_BYTES))

@@ -133,9 +133,9 @@ def test_quantile_regression_by_hand() -> None:
 
 
 def test_quantile_regression_converges_to_sample_quantiles() -> None:
-    # A third is 0, the rest 10: the quantile at 1/8 is 0, those from 3/8 up are 10, but for the
-    # Huber loss, whose pull weakens within 1 of a sample. At 3/8, u below 10:
-    # 2/3 * 3/8 * u = 1/3 * 5/8.
+    # A third of the samples is 0, and the rest is 10. The quantiles are 0 at tau 1/8, and 10 at 3/8
+    # and above. The Huber loss shifts them, because its gradient is smaller within 1 of a sample.
+    # At 3/8, for example, the result is 10 - u, where 2/3 * 3/8 * u = 1/3 * 5/8.
     z_tm1 = torch.full((3, 1, 4), 5.0)
     target = torch.tensor([[0.0] * 4, [10.0] * 4, [10.0] * 4])
     first = torch.zeros(3, dtype=torch.int64)
@@ -148,7 +148,7 @@ def test_quantile_regression_converges_to_sample_quantiles() -> None:
 
 def test_conservative_penalty_by_hand() -> None:
     q_tm1 = torch.tensor([[0.0, 0.0], [math.log(3.0), 0.0]])
-    # Row 0: log(1 + 1) - 0. Row 1: log(3 + 1) - log 3.
+    # The penalty is log sum exp(q) - q(a): log(1 + 1) - 0 in row 0, log(3 + 1) - log 3 in row 1.
     expected = torch.tensor([math.log(2.0), math.log(4.0 / 3.0)])
     torch.testing.assert_close(cross_entropy(q_tm1, torch.tensor([1, 0])), expected)
 

@@ -32,17 +32,19 @@ ONCE = np.ones((1, 2))
 @pytest.mark.parametrize(
     ("estimator", "value"),
     [
-        # The returns are 1 + 4/2 = 3 and 2. The values of rho_T are 2 x .5 = 1 and 3.
+        # The returns of the two episodes are 1 + 4 / 2 = 3 and 2; rho_T is 2 x 0.5 = 1 and 3.
         ("TIS", (1 * 3 + 3 * 2) / 2),
         ("WIS", (1 * 3 + 3 * 2) / 4),
         # The sums of gamma^t rho_t r_t are 2 x 1 + 1/2 x 1 x 4 = 4, and 3 x 2 = 6.
         ("PDIS", (4 + 6) / 2),
-        # Step 0: (2 + 6) / (2 + 3). Step 1: (4 + 0) / (1 + 3), discounted by 1/2.
+        # Weighted mean rewards: (2 x 1 + 3 x 2) / (2 + 3) at step 0, and at step 1
+        # (1 x 4 + 3 x 0) / (1 + 3), which is discounted by 1/2.
         ("WPDIS", 8 / 5 + 0.5 * 4 / 4),
+        # The terms are gamma^t (rho_{t-1} V + rho_t (r - Q)).
         # First episode: 3 + 2 (1 - 1) + 1/2 (2 x 2 + 1 (4 - 2)) = 6. Second: 3 + 3 (2 - 1) = 6.
         ("DR", (6 + 6) / 2),
-        # Step 0: V is 3, plus (0 + 3) / 5. Step 1: V is (2 x 2 + 3 x 0) / 5, plus (2 + 0) / 4.
-        # The sum of step 1 is discounted by 1/2.
+        # Step 0: the mean V is 3, and the weighted mean of r - Q is (2 x 0 + 3 x 1) / 5. Step 1:
+        # they are (2 x 2 + 3 x 0) / 5 and (1 x 2 + 3 x 0) / 4, and are discounted by 1/2.
         ("WDR", 3 + 3 / 5 + 0.5 * (4 / 5 + 2 / 4)),
     ],
 )
@@ -62,7 +64,8 @@ def test_a_resampling_counts_an_episode_as_often_as_it_was_drawn() -> None:
 
 
 def test_effective_sample_sizes_by_hand() -> None:
-    # The weights are 2 and 3 at step 0, and 1 and 3 at step 1: 25 / 13 and 16 / 10.
+    # Step 0 has the weights 2 and 3, and the size (2 + 3)^2 / (4 + 9) = 25 / 13.
+    # Step 1 has the weights 1 and 3, and the size (1 + 3)^2 / (1 + 9) = 16 / 10.
     assert effective_sample_sizes(BY_HAND) == pytest.approx([25 / 13, 1.6, 1.6])
     assert effective_sample_size("WIS", BY_HAND) == pytest.approx(1.6)
     mean = 1.75 / (13 / 25 + 0.5 / 1.6 + 0.25 / 1.6)
@@ -80,7 +83,7 @@ def test_mean_weights_by_hand() -> None:
 
 
 def test_one_huge_late_weight_leaves_one_effective_episode_without_normalization() -> None:
-    """At gamma 1/2, the last of 21 steps has a discount of 1e-6."""
+    """The weight of 1e30 is in the last of 21 steps, whose discount is 2^-20, about 1e-6."""
     shape = (50, 21)
     ratios = np.ones(shape)
     ratios[0, -1] = 1e30

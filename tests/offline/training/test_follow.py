@@ -56,7 +56,7 @@ def test_each_finished_episode_is_read_once(tmp_path: Path) -> None:
     assert logs.grow()
     assert not logs.grow()
     recorder.env.close()
-    # The first reset of `record` interrupted an episode after one transition.
+    # Closing adds no episode: the first reset of `record` had ended the episode of seed 99.
     assert not logs.grow()
     whole = mcaprl.open(tmp_path / "log.mcap")
     assert [len(e.rewards) for e in logs.dataset.episodes] == [

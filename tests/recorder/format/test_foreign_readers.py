@@ -185,7 +185,7 @@ def test_markers_and_frames_pass_through(scene_log: Path, read: Callable[[Path],
                 assert points == shapes[name].points.tolist(), name
                 assert _field(_field(marker, "header"), "frame_id") == shapes[name].frame
     for (_, tree), moment in zip(found["/tf"], moments, strict=True):
-        # The other transforms are the poses until the next step.
+        # Only the first transform is compared; the others are the later poses until the next step.
         transform = _field(tree, "transforms")[0]
         translation = _field(_field(transform, "transform"), "translation")
         assert tuple(_field(translation, axis) for axis in "xyz") == moment.frames[0].position

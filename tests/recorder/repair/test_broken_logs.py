@@ -145,7 +145,7 @@ def test_index_outside_its_chunk(offset: int) -> None:
 @settings(max_examples=50)
 @given(st.permutations(range(12)), st.integers(0, 5))
 def test_gather_of_any_order(order: list[int], gap: int) -> None:
-    """Gather interleaved messages in any order: indexed and contiguous access agree."""
+    """Gather messages in any order, with and without other bytes between them."""
     dtype = message_dtype("uint32 x\n")
     assert dtype is not None
     rows = message_rows(12, dtype, 1)

@@ -41,15 +41,15 @@ def lane(rules: str = "classic", **kwargs: Any) -> LaneKeepingEnv:
 @pytest.mark.parametrize(
     ("x_m", "y_m", "speed_m_s", "action", "hit", "reward", "text", "code"),
     [
-        # In the middle at 10 m/s, the reward is (1 - .5) + (0 - .5) = 0. At rest, it is 10 / 290
-        # less.
+        # At distance d and speed v, the reward is (e^-3d - .5) + ((v - 10) / 290 - .5). In the
+        # middle, it is 0 at 10 m/s, and -10 / 290 at rest.
         (60.0, 1.0, 10.0, STRAIGHT, False, 0.0, DRIVING, DRIVING),
         (60.0, 1.0, 0.0, BRAKE, False, -0.034483, DRIVING, DRIVING),
-        # The next action is not the brake. By the published text, 5 m/s or less is too slow.
+        # By the published text, 5 m/s or less is too slow, unless the action is the brake.
         (60.0, 1.0, 0.0, STRAIGHT, False, -0.034483, SLOW, DRIVING),
         (60.0, 1.0, 5.0, LEFT, False, -0.017241, SLOW, DRIVING),
         (60.0, 1.0, 5.1, LEFT, False, -0.016897, DRIVING, DRIVING),
-        # At the maximum speed, the reward is 20 / 290 more.
+        # In the middle at the maximum speed of 30 m/s, the reward is 20 / 290.
         (60.0, 1.0, 30.0, STRAIGHT, False, 0.068966, DRIVING, DRIVING),
         # 0.5 m beside the line, at 10 m/s: e^-1.5 - 1.
         (60.0, 1.5, 10.0, STRAIGHT, False, -0.776870, DRIVING, DRIVING),
@@ -65,7 +65,7 @@ def lane(rules: str = "classic", **kwargs: Any) -> LaneKeepingEnv:
         # Beyond 3.5 m, the reward is -3 and the episode ends, at any speed.
         (60.0, 4.51, 20.0, STRAIGHT, False, -3.0, OFF_LANE, OFF_LANE),
         (60.0, -60.0, 30.0, BRAKE, True, -3.0, OFF_LANE, OFF_LANE),
-        # By the code, a collision ends the episode, but only during the action straight.
+        # By the published code, a collision ends the episode only if the action is straight.
         (60.0, 1.5, 10.0, STRAIGHT, True, -0.776870, DRIVING, COLLISION),
         (60.0, 1.5, 10.0, LEFT, True, -0.776870, DRIVING, DRIVING),
         (60.0, 1.0, 4.0, BRAKE, True, -0.020690, DRIVING, DRIVING),
@@ -113,7 +113,7 @@ def test_the_distance_is_to_the_nearest_infinite_line(
 
 
 def test_a_decision_takes_one_second() -> None:
-    """At full throttle from 10 m/s, v(t) = 30 - 20 e^(-4 t / 30), in steps of 0.05 s."""
+    """At full throttle, v(t) = 30 - 20 e^(-4 t / 30) from 10 m/s; Euler steps last 0.05 s."""
     car = located(moving(20.0, 1.0, 0.0, 10.0), 0.0, 20.0, 0.0)
     after, hit = classic_decide(car, STRAIGHT)
     assert not hit
@@ -144,8 +144,8 @@ def test_ends_are_named(rules: str) -> None:
 def test_the_two_published_ends_differ() -> None:
     """Compare the ends of episodes in the published text and in the published code.
 
-    By the text, an episode that starts from rest ends because the car is too slow. By the code, an
-    episode ends when the car hits a rail.
+    An episode that starts from rest ends only by the text, because the car is too slow. An episode
+    in which the car hits a rail ends only by the code.
     """
     slow, through_a_rail = {"pose": (60.0, 1.0, 0.0, 0.0)}, {"pose": (120.0, 1.0, 0.0, 20.0)}
     reasons = {}
@@ -184,7 +184,7 @@ def test_fault_a_whole_lap_scores_far_below_leaving_at_once() -> None:
 
 
 def test_fault_speed_is_hardly_rewarded() -> None:
-    """30 instead of 10 m/s adds 0.069 per second, as much as an offset of 2.4 cm costs."""
+    """A speed of 30 instead of 10 m/s adds 0.069 per second; an offset of 2.4 cm costs more."""
     gain = classic_reward(0.0, 30.0) - classic_reward(0.0, 10.0)
     assert gain == pytest.approx(20.0 / 290.0)
     assert classic_reward(0.0, 10.0) - classic_reward(0.024, 10.0) > gain
@@ -208,7 +208,7 @@ def test_fault_a_hidden_lane_at_low_speed() -> None:
 
 
 def test_fault_leaving_along_the_extension_is_rewarded() -> None:
-    """Driving straight on at the first corner, through a rail and houses, has the same reward."""
+    """A car that drives straight on at the first corner, through a rail, is still rewarded."""
     sim = lane()
     sim.reset(options={"pose": (100.0, 1.0, 0.0, 20.0)})
     for _ in range(60):
@@ -229,7 +229,7 @@ def test_fault_an_episode_at_rest_never_ends() -> None:
 
 
 def test_fault_by_the_code_walls_count_only_straight_ahead() -> None:
-    """Driving through the same rail while braking does not end the episode."""
+    """Driving through a rail ends the episode, but not if the car brakes."""
     sim = lane("classic-code")
     reasons = []
     for action in (STRAIGHT, BRAKE):

@@ -58,7 +58,7 @@ def cast(eye: Floats, ray: Floats) -> float:
 def test_the_world_matches_ray_casting(view: str) -> None:
     """Compare 100 pixels at each of 30 random poses of a tilted drone.
 
-    At most 3 of the 3,000 encoded depths differ, because a ray passes an edge there.
+    At most 3 of the 3,000 encoded depths may differ, where a ray passes close to an edge.
     """
     random = np.random.default_rng(5)
     camera = DroneCamera(view)
@@ -83,7 +83,7 @@ def test_the_world_matches_ray_casting(view: str) -> None:
 
 
 def test_the_ground_is_straight_below() -> None:
-    """Half a grid cell beside the wires, the pixel in the middle is the height above ground."""
+    """Beside the wires, the depth in the middle of the image is the height above ground."""
     x, y = 250.0, 60.0
     drone = level_at(x, y, -ground_height(x, y) - 20.0)
     image = DroneCamera("down").image_m(drone)
@@ -91,7 +91,11 @@ def test_the_ground_is_straight_below() -> None:
 
 
 def test_forward_is_up_in_the_lower_camera_and_right_is_right() -> None:
-    """From 6 m north of a mast and east of it, the arm is to the south, in the lower half."""
+    """Look down from the north and from the east of a tower.
+
+    From the north, the tower's arm is in the lower half of the image; from the east, in the left
+    half.
+    """
     tower = towers()[2]
     camera = DroneCamera("down")
     north = camera.image_m(level_at(tower.x_m + 4.0, tower.y_m, tower.arm_z_m - 5.0))
@@ -111,10 +115,7 @@ def test_a_level_front_camera_has_its_horizon_in_the_middle() -> None:
 
 @pytest.mark.parametrize("view", ["down", "front"])
 def test_conductors_are_seen_all_along_the_line(view: str) -> None:
-    """Wires are visible above the middle of each span.
-
-    Without wires, only the ground is visible.
-    """
+    """In the middle of each leg, the wires hide parts of the rest of the world."""
     camera = DroneCamera(view)
     no_wires = DepthCamera(world_mesh(), LENS, IMAGE_SHAPE)
     for leg in range(4):
@@ -132,7 +133,11 @@ def test_the_conductor_below_has_its_distance() -> None:
 
 
 def test_a_wire_takes_one_pixel_of_each_column() -> None:
-    """A wire 1 m below the axis at 10 m is at row 6 + 8 x .1 = 6.8, so row 6 in all 16 columns."""
+    """Draw a wire 1 m below the camera's axis, at a distance of 10 m.
+
+    The focal length is 8 pixels, and the axis is at 6 pixels. The wire is at 6 + 8 x 1 / 10 = 6.8
+    pixels, which is row 6 in all 16 columns.
+    """
     wire = np.array([[[-99.0, 1.0, 10.0], [99.0, 1.0, 10.0]]])
     image = np.zeros((12, 16))
     draw_wires(wire, np.zeros(3), np.eye(3), 8.0, 8.0, image)
@@ -156,7 +161,10 @@ def test_a_wire_is_hidden_by_nearer_surfaces_and_clipped() -> None:
 
 
 def test_a_wire_that_passes_the_lens_is_cut_and_linear_in_1_over_z() -> None:
-    """For a wire parallel to the axis, 1 m to the right, u is 8 + 8/z, so 1/z is (u - 8) / 8."""
+    """Draw a wire that is parallel to the camera's axis, 1 m to its right.
+
+    A point at depth z has the horizontal pixel coordinate u = 8 + 8 / z, so 1 / z is (u - 8) / 8.
+    """
     wire = np.array([[[1.0, 0.1, -5.0], [1.0, 0.1, 1000.0]]])
     image = np.zeros((12, 16))
     draw_wires(wire, np.zeros(3), np.eye(3), 8.0, 8.0, image)

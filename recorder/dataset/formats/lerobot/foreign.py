@@ -116,7 +116,7 @@ def _observed(files: Files) -> dict[str, Feature]:
 
 
 def _infos(files: Files) -> dict[str, NDArray[Any]]:
-    """Return the values (N, *shape) of the features that become infos, by the infos' names."""
+    """Return the infos: the values (N, *shape) of each feature that becomes one, by name."""
     taken = {*features.STEPS, *features.DEFAULTS}
     found = {}
     for name, feature in files.features.items():

@@ -55,7 +55,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
         One sentence for each thing that was left out or changed.
 
     Raises:
-        SpaceError: Minari cannot hold a key of a space or an option, and `lossy` is not set.
+        SpaceError: `lossy` is not set, and Minari cannot store an option or a key of a space.
         MissingExtraError: h5py is not installed.
     """
     h5py = import_extra("h5py", EXTRA)

@@ -145,8 +145,8 @@ def test_the_layout_of_the_file(tmp_path: Path) -> None:
             b"rewards",
             b"terminated",
         ]
-        # The terminated episode has one step per transition. The truncated episode has one more
-        # step.
+        # The terminated episode has one step per transition. The truncated episode also has a step
+        # for its final observation.
         assert file["observations_0"][:, 0].tolist() == [0, 1, 2]
         assert file["observations_1"][:, 0].tolist() == [10, 11, 12]
         assert file["actions_1"][()].tolist() == [[0], [1], [0]]
@@ -310,7 +310,7 @@ def test_d3rlpys_own_files_are_read(tmp_path: Path) -> None:
         assert found.rewards.tolist() == [0, 0.5, 1, 0, 0.5]
         assert found.terminated.tolist() == [False, False, True, False, False]
     assert mcaprl.open(tmp_path / "back.mcap").action_space == spaces.Discrete(4)
-    # The third step before the timeout has no next observation, so it is not a transition.
+    # The third step of the truncated episode has no next observation, so it is not a transition.
     found = mcaprl.open(tmp_path / "collected.h5")
     assert found.observations[:, 0].tolist() == [0, 1, 2, 10, 11]
     assert found.next_observations[:, 0].tolist() == [1, 2, 2, 11, 12]
