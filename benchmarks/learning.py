@@ -7,10 +7,11 @@ All libraries take turns in one process, on the same random transitions (19 numb
 with layer widths 256x256. The measure is CPU time on one thread, the best of several turns. The
 last row covers all steps from a log to a policy: a log of LOG_ROWS steps on disk is read and
 packed, and CQL makes LOG_UPDATES updates with batch size 256. It is compared with reading by mcap
-and mcap-ros2-support, and training by d3rlpy. These read a tenth of the log, and their time is
-scaled up. The time of LOG_UPDATES updates is calculated from the rates in the turns. The ratios are
-printed and written to benchmarks/learning.json. The table is written to docs/results.md. With
---only 256, 32 or whole, the other rows keep the values of an earlier run.
+and mcap-ros2-support, and training by d3rlpy. These libraries load only a tenth of the log, and
+the time to load it is multiplied by ten. The time of LOG_UPDATES updates is calculated from the
+rates in the turns. The ratios are printed and written to benchmarks/learning.json. The table is
+written to docs/results.md. With --only 256, 32 or whole, the other rows keep the values of an
+earlier run.
 
 --only gradients compares updates with autograd to the same updates with closed-form gradients,
 which this file implements. It prints the ratios of the speeds, and runs neither d3rlpy nor SB3.
@@ -133,14 +134,14 @@ def sb3s(data: mcaprl.Dataset, batch_size: int) -> Update:
 
 
 def closed_form(learner: Learner, alpha: float) -> Update:
-    """Return a function that makes the update of a learner's only seed without autograd.
+    """Return a function that updates a learner with one seed, without autograd.
 
     The gradient of the loss with respect to Q(s, a) is clip(Q - target, -1, 1) for the action
     taken, plus alpha (softmax(Q) - onehot) for the penalty of CQL. The rest is the chain rule for
     linear layers and ReLU.
 
     Args:
-        learner: Double DQN with an alpha of 0, or CQL; its network is an MLP on vectors.
+        learner: Double DQN, for which `alpha` is 0, or CQL; with an MLP on vectors.
         alpha: Weight of the penalty.
     """
     assert isinstance(learner, DoubleDQN)
@@ -222,7 +223,7 @@ class Turns:
 
 
 def best_rates(sides: dict[str, tuple[Update, int]], turns: Turns) -> dict[str, float]:
-    """Return updates per CPU second of each side in its best turn."""
+    """Return, for each side, the number of updates per CPU second in its best turn."""
     best = dict.fromkeys(sides, 0.0)
     for _ in range(turns.rounds):
         for name, (update, count) in sides.items():
@@ -235,7 +236,7 @@ def best_rates(sides: dict[str, tuple[Update, int]], turns: Turns) -> dict[str, 
 
 
 def whole_way(folder: Path, turns: Turns) -> float:
-    """Return the CPU time from a log to a policy with mcap and d3rlpy, relative to ours."""
+    """Return the ratio of the CPU times from a log to a policy: mcap and d3rlpy to mcaprl."""
     log, part = folder / "log.mcap", folder / "part.mcap"
     vectors(LOG_ROWS).save(log)
     rivals.write_mcap(rivals.messages(vectors(int(LOG_ROWS * LOG_SHARE))), part)
@@ -252,7 +253,7 @@ def whole_way(folder: Path, turns: Turns) -> float:
 
 
 def logged(columns: dict[str, Any]) -> Any:
-    """Return an object with a dataset's attributes, made from columns of equally long episodes."""
+    """Return columns of episodes of equal length as an object with a dataset's attributes."""
     rows = len(columns["action"])
     return SimpleNamespace(
         observations=columns["observation"],

@@ -4,7 +4,8 @@
 
 This process runs the tasks that Ray's workers would run, and measures the CPU time. The tasks of
 `read_mcap` return the bytes of messages. The benchmark then decodes the bytes in the fastest
-correct way, as one array of all messages, and compares the values with ours.
+correct way, as one array of all messages, and compares the values with those of
+`mcaprl.ray.read`.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def main() -> None:
         path, few = Path(folder) / "log.mcap", Path(folder) / "few.mcap"
         vectors(TRANSITIONS).save(path)
         vectors(FEW).save(few)
-        # This connects to a local cluster, which the data sources of Ray need.
+        # `_tasks` connects to a local cluster, which the data sources of Ray need.
         ours, whole = _tasks(path, COLUMNS), _tasks(path, None)
         _check(_decoded(few, include_metadata=False), few)
         compare(

@@ -77,8 +77,9 @@ def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
 def _widths(columns: Iterable[Sequence[str]], available: int) -> Sequence[int | None]:
     """Return the width of each column of texts, such that no word is broken.
 
-    The columns that need the least space beyond their longest word receive it first. If the words
-    do not fit, the widths are None, and rich breaks words.
+    Each column is at least as wide as its longest word. The remaining space is first given to the
+    columns that need the least of it. If the longest words do not fit, the widths are None, and
+    rich breaks words.
     """
     from rich.cells import cell_len
 

@@ -3,7 +3,8 @@
 Two encoders of images are available, which `ENCODERS` describes. `nature` has the convolutions of
 "Human-level control through deep reinforcement learning" (https://doi.org/10.1038/nature14236).
 `compact` first averages squares of pixels, so that the image's shorter edge has about 42 pixels; it
-has two small convolutions. A gradient step takes a fraction of the time of a step with `nature`.
+has two small convolutions. A gradient step with `compact` takes a fraction of the time of a step
+with `nature`.
 """
 
 from __future__ import annotations

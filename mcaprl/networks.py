@@ -62,9 +62,10 @@ class ImageInput:
 
         Args:
             images: All images, or those of this process.
-            position: Function of the number of images here; returns how many images the processes
-                before this one have, and how many all have.
-            gather: Function that returns the value of each process.
+            position: Function that accepts the number of `images`. It returns two numbers of
+                images: of the processes before this one, and of all processes.
+            gather: Function that accepts the value of this process, and returns the values of
+                all processes.
         """
         first, number = position(len(images))
         used = np.linspace(0, number - 1, min(number, _MAX_IMAGES)).astype(np.int64) - first
@@ -166,7 +167,7 @@ class Network(Trunk):
 class Convolutions(nn.Module):
     """Convolutions of an encoder: images (B, height, width, channels) to features (B, n_features).
 
-    Images are first averaged over squares of pixels, except images that already have this size.
+    Images are first averaged over squares of pixels, unless they already have the averaged size.
 
     Attributes:
         shift: Tensor (channels, height, width) that is subtracted from the averaged pixels.
@@ -193,7 +194,7 @@ class Convolutions(nn.Module):
         self.n_features = architecture.features(image.shape)
 
     def normalize(self, image: ImageInput) -> None:
-        """Set shift and scale to those of an image input of the same shape."""
+        """Copy shift and scale from an image input of the same shape."""
         self.shift.copy_(self._shift_of(image))
         self.scale.fill_(image.scale)
 
@@ -278,7 +279,7 @@ def make_head(
 
 
 def last_layers(head: nn.Module) -> list[nn.Linear]:
-    """Return the last layers of a head: one, or those of the two streams."""
+    """Return the last layer of a head, or the last layers of the two streams of a dueling head."""
     if isinstance(head, DuelingHead):
         return [cast(nn.Linear, stream[-1]) for stream in (head.advantages, head.value)]
     return [cast(nn.Linear, head)]

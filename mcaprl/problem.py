@@ -11,7 +11,7 @@ from typing import Literal, Protocol, TypeVar
 Severity = Literal["problem", "note"]
 LISTED = 10
 """Maximum number of listed findings of one kind; further findings are only counted."""
-# Descriptions contain texts from the file, so the number of kinds must be limited, too.
+# Descriptions contain texts from the file. Without a limit, a file could have any number of kinds.
 _MAX_KINDS = 100
 _OTHERS = "other findings"
 _NUMBER = re.compile(r"-?\d[\d.,]*")
@@ -89,7 +89,7 @@ class Shortlist(list[F]):
         return self._counts.total()
 
     def rest(self) -> list[Problem]:
-        """Return, for each kind with unlisted findings, a problem that states their number."""
+        """Return a problem for each kind with unlisted findings. It states the number of them."""
         return [
             Problem(f"{count - LISTED} more findings of the kind: {kind}", "not listed")
             for kind, count in self._counts.items()

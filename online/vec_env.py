@@ -33,7 +33,7 @@ class BatchedVecEnv(VecEnv):
     """
 
     def __init__(self, env: Any) -> None:
-        """Adapt `env`, which must reset an environment in the step that ends its episode.
+        """Adapt `env`. In the step that ends an episode, it must also reset that environment.
 
         Args:
             env: `VectorEnv` with `metadata["autoreset_mode"]` SAME_STEP, whose `reset` accepts a

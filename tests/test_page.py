@@ -210,7 +210,7 @@ def test_tracks_are_the_positions_in_telemetry(tmp_path: Path) -> None:
     tracks = tracks_of(mcaprl.open(tmp_path / "lane.mcap"))
     for track, places in zip(tracks, reported, strict=True):
         expected = [(place["x_m"], place["y_m"]) for place in places]
-        # Telemetry has 16 significant bits.
+        # Telemetry is rounded to 16 significant bits.
         np.testing.assert_allclose(track, np.array(expected), rtol=2**-16)
 
 

@@ -46,8 +46,8 @@ def local_settings() -> dict[str, str]:
 def cluster(address: str | None = None, *, workers: int | None = None) -> Iterator[Any]:
     """Connect to a cluster, yield the module `ray`, and disconnect at the end.
 
-    If this process is already connected, the connection is used and kept. A local cluster that this
-    function started ends with the context.
+    If this process is already connected, the connection is used and kept. At the end of the
+    context, a local cluster that this function started is stopped.
 
     Args:
         address: `HOST:PORT` of a cluster, `auto` for this machine's cluster, or `local` for a new
@@ -79,7 +79,7 @@ def connect(
         store_bytes: Size of the object store of a local cluster; default: Ray's choice.
 
     Returns:
-        Whether this call connected.
+        Whether this call created the connection.
 
     Raises:
         ClusterError, MissingExtraError, UsageError: As for `cluster`.

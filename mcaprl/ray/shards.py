@@ -1,6 +1,6 @@
-"""Log that one worker records, or several in turn if workers are killed.
+"""Log that a worker records. If the worker is killed, another worker continues the log.
 
-The log gets its name when it is complete.
+The log is moved to its final path when it is complete.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _UNFINISHED = ".unfinished"
 
 
 class Shard:
-    """A log in a folder, and its unfinished content in a hidden folder beside it.
+    """A log in a folder. Until the log is complete, its content is stored in a hidden folder.
 
     Attributes:
         path: Path of the complete log.

@@ -85,13 +85,13 @@ class IQL(Learner):
         }
 
     def validate(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the values Q of the logged actions, and their absolute TD errors."""
+        """Return the Q-values of the logged actions, and the absolute TD errors of these values."""
         q_a_tm1 = chosen(self.outputs("q", batch.observations), batch.actions)
         terms = {"q": q_a_tm1, "td_error": (self.targets(batch) - q_a_tm1).abs()}
         return {name: self.in_reward_units(term) for name, term in terms.items()}
 
     def normalized(self, advantages: Tensor, factors: Tensor | None = None) -> Tensor:
-        """Return advantages (R,), divided by the root mean square of each seed's batch."""
+        """Divide the advantages (R,) of each seed by their root mean square in the seed's batch."""
         of_seeds = advantages.view(len(self.seeds), -1)
         squares = advantages.square()
         squares = self.batch_means(squares if factors is None else squares * factors)

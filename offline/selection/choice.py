@@ -43,13 +43,13 @@ class Tried:
     """Results of one candidate.
 
     Attributes:
-        updates: Number of its updates at its last evaluation. If it was never evaluated, the
-            current number.
+        updates: Number of updates at the last evaluation of the candidate. If there was no
+            evaluation, the current number of updates.
         rating: Its estimate; None if it was not evaluated.
         support: Fraction of the states in which its action is likely under the behavior policy.
         bellman_error: Its relative Bellman error; None if it has no Q-values.
-        weighted: Estimate by WPDIS, and the effective number of its episodes; None if the log
-            has no action probabilities.
+        weighted: Estimate by WPDIS, and the effective number of episodes of this estimate; None
+            if the log has no action probabilities.
         outcome: `chosen`, `runner-up`, `stopped early`, or why it was not trained.
     """
 
@@ -102,7 +102,7 @@ class Choice:
 
     @property
     def rows(self) -> list[tuple[str, ...]]:
-        """Rows of the table with `COLUMNS`."""
+        """Rows of the table of candidates, with the columns `COLUMNS`."""
         return [_row(name, one) for name, one in self.tried.items()]
 
     def write(self, run: Path) -> None:

@@ -3,10 +3,10 @@
 Each candidate has an estimated value of the first state of each episode: pessimistic FQE by a model
 that was trained on other episodes (`mcaprl.offline.estimate.evidence`). The rule:
 
-1. The score of a candidate is the mean value of the episodes' first states, over its networks and
-   the models that evaluate them. If the behavior policy is almost deterministic, the log has no
-   evidence on other actions. In this case, the score is the fraction of the states in which the
-   candidate takes the logged action.
+1. The score of a candidate is the mean of the estimated values. The mean is over the episodes, the
+   networks of the candidate, and the models that evaluate these networks. If the behavior policy is
+   almost deterministic, the log has no evidence on other actions. In this case, the score is the
+   fraction of the states in which the candidate takes the logged action.
 2. The candidate with the largest score is chosen.
 3. Episodes are resampled, together with the networks and models. The chance that a candidate is the
    best is the fraction of the resamplings in which its score is the largest.
@@ -91,5 +91,5 @@ def ranked(ratings: Mapping[str, Rating]) -> list[str]:
 
 
 def _counts(random: np.random.Generator, size: int) -> Floats:
-    """Return the fraction (B, size) of each of B resamplings that each element makes up."""
+    """Return the fraction (B, size) of each element in each of B resamplings."""
     return random.multinomial(size, np.full(size, 1 / size), RESAMPLES) / size

@@ -72,8 +72,8 @@ def train(
         seeds: Number of networks to train in parallel; they are independent of each other.
         seed: Seed of the first network; network k uses seed + k.
         weights: (E,) relative sampling weight of each transition of an episode; default: all equal.
-        resume: Whether to resume from the checkpoints in `out`. Seeds without one start from
-            update 0.
+        resume: Whether to resume from the checkpoints in `out`. Seeds without a checkpoint
+            start from update 0.
         other_data: Whether to accept checkpoints trained on other data when resuming.
         follow: Growing logs from which `dataset` was read; episodes finished during training
             are added.
@@ -139,7 +139,7 @@ def train_share(
         config: Settings.
         out: Folder of the run, which exists and is locked; checkpoints in it are continued.
         identity: Identity of the run.
-        share: The part of all data that the dataset is.
+        share: Share of this process in all data; its episodes are in `dataset`.
         held_out: Numbers of the held-out episodes in the dataset.
         seeds: Seeds of the networks.
         device: Device of the data, the networks and the updates.
@@ -167,7 +167,7 @@ def identity_parts(config: TrainingConfig, data: str) -> dict[str, Any]:
 
 
 def without(weights: NDArray[np.float64], held_out: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the weights (E,) of episodes, with 0 for the held-out ones."""
+    """Return the weights (E,) of episodes. The weights of held-out episodes are 0."""
     return np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights)
 
 
@@ -317,7 +317,7 @@ class _Run:
             save_checkpoint(folder, learner, seed, self.identity)
 
     def _update(self, learner: Learner) -> dict[str, Tensor]:
-        """Run one update. If the loss is not finite, raise an error with the last checkpoints."""
+        """Run one update. If the loss is not finite, raise an error that lists the checkpoints."""
         try:
             return learner.update()
         except NotFiniteError as error:

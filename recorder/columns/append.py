@@ -40,7 +40,7 @@ class WrittenState:
 
 
 def written_state(path: Path) -> WrittenState:
-    """Read the state that a writer needs to append to a finished file.
+    """Open a finished file, and return the state that a writer needs to append to it.
 
     Raises:
         LogError: The file is damaged or not finished, or has messages outside of chunks.

@@ -77,7 +77,7 @@ class Decoder:
         }
 
     def fill(self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows) -> None:
-        """Decode the messages that `index` lists, and store them in these rows of the columns."""
+        """Decode the messages that `index` lists, and store them in `rows` of the columns."""
         if self._put_alike(columns, records, index, rows):
             return
         if isinstance(rows, slice):
@@ -98,7 +98,7 @@ class Decoder:
     def _put_by_length(
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: NDArray[np.int64]
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
-        """Copy messages of equal length at once; return index entries and rows of the rest."""
+        """Copy messages of equal length at once; return `index` and `rows` of other messages."""
         if int(index["offset"].max()) > len(records) - MESSAGE_HEADER.itemsize:
             return index, rows
         lengths = gather(records, index, MESSAGE_HEADER)["length"]
@@ -212,7 +212,7 @@ class Decoder:
         }
 
     def _lists_of_texts(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Convert structured values that have one item per string to lists of strings."""
+        """Convert structured values, which have one field for each string, to lists of strings."""
         texts = [self._texts(values[part]) for part in values.dtype.names or ()]
         lists = np.empty(len(values), object)
         lists[:] = [[text[row] for text in texts] for row in range(len(values))]

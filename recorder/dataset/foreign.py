@@ -65,7 +65,7 @@ def inferred_metadata(reader: McapReader, columns: Columns) -> LogMetadata:
     }
     parts |= {topic.removeprefix(_IMAGE_TOPIC): _image_space(reader, topic) for topic in images}
     metadata = LogMetadata(spaces.Dict(parts), action_space_of(action))
-    # A leaf is read from the field or topic with the same name, so this field or topic must exist.
+    # Leaves are later read by name, so there must be a field or topic with the name of each leaf.
     for leaf in observation_leaves(metadata.observation_space):
         if not (reader.channels_of(leaf.topic) if leaf.encoding else leaf.name in columns):
             raise LogError(

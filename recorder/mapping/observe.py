@@ -88,7 +88,7 @@ def values_of(
         stream: Messages of the topic.
         run: Messages of the topic between two resets of the clock.
         steps_ns: (N,) times of the steps.
-        transforms: Tree of frames, for a transform.
+        transforms: Tree of coordinate frames; required if the quantity is a transform.
         ends_ns: (N,) ends of the steps. If given, each step uses the last message before its end;
             if None, `quantity.align` applies.
 

@@ -18,7 +18,7 @@ NEUTRAL, GOOD, BAD = "#4e98e2", "#31b57b", "#d64545"
 _COLORS = ("#4e98e2", "#f5774d", "#31b57b", "#a395e2", "#e8c547", "#d65f8a", "#7fd1d8", "#9c755f")
 # Width in pixels of a legend with labels, and of a legend with labels and current values.
 _LEGEND_PX, _LEGEND_WITH_VALUES_PX = 160, 220
-# Height in pixels of each row of state transitions, and of their title and time axis.
+# Height in pixels of each row of state transitions, and of the title and time axis together.
 _TRANSITIONS_ROW_PX, _TRANSITIONS_REST_PX = 64, 60
 # Height of a screen in the smallest window, 1280 x 720 pixels.
 _SCREEN_PX = 570
@@ -80,8 +80,8 @@ def state_transitions(title: str, paths: Mapping[str, str], last_s: float | None
     Args:
         title: Title of the panel.
         paths: Message path of each row, by label.
-        last_s: Number of seconds before the current time to show; None for all. A limited time axis
-            is not synchronized with other panels, because their range would also be limited.
+        last_s: Number of seconds before the current time to show; None for all. If limited, the
+            panel is not synchronized, because that would also limit the range of other panels.
     """
     rows = [_series(label, path) for label, path in paths.items()]
     if last_s is None:
@@ -90,7 +90,7 @@ def state_transitions(title: str, paths: Mapping[str, str], last_s: float | None
 
 
 def share_of_transitions(rows: int) -> float:
-    """Return the share of a screen's height that this number of rows needs, at most 0.45."""
+    """Return the fraction of a screen's height that `rows` rows need, at most 0.45."""
     return min(0.45, (rows * _TRANSITIONS_ROW_PX + _TRANSITIONS_REST_PX) / _SCREEN_PX)
 
 
@@ -167,7 +167,7 @@ def three_d(
     axes_m: float = 0.0,
     without_axes: Sequence[str] = (),
 ) -> Panel:
-    """Return a 3D view without outlines, and without names and connections of frames.
+    """Return a 3D view that hides outlines, and the names and connections of frames.
 
     Args:
         title: Title of the panel.

@@ -312,7 +312,7 @@ def _rounded_points(points: NDArray[np.float64] | Sequence[Vector]) -> Any:
 
 
 def _rounded(numbers: Iterable[float], per_one: int) -> list[float]:
-    """Round numbers to multiples of 1 / per_one."""
+    """Round numbers to multiples of 1 / `per_one`."""
     return [round(number * per_one) / per_one for number in numbers]
 
 

@@ -127,7 +127,9 @@ def recover_log(
 def _keep_whole_episodes(
     copied: Path, result: Path, recovery: Recovery, keep_unfinished: bool
 ) -> None:
-    """Write `result`: the file `copied`, or only its whole episodes if some are incomplete.
+    """Write the file `copied` to `result`, without its incomplete episodes.
+
+    If `keep_unfinished` is set, episodes without an end are kept up to their last whole transition.
 
     Raises:
         LogError: There is nothing to keep, or the new log has a problem.

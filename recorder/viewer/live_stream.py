@@ -182,7 +182,7 @@ class LiveStream(ViewerServer):
         self._log = log = LogTopics(metadata, self._sink)
         self._training = dict(training)
         self._shown = ShownTopics(log, source)
-        # This call adds the channels of the log lines; the returned messages are not sent.
+        # `begin_messages` adds the channels of the log lines. Its messages are not sent.
         self._line_channel = log.begin_messages(0, "", 0)[0][0]
         self._topics = dict(self._shown.channels)
         type_name, text = telemetry_schema(tuple(training))
@@ -203,8 +203,8 @@ class LiveStream(ViewerServer):
         }
         self._static_shapes: Sequence[Any] | None = None
         self._tracks = Tracks()
-        # Coordinate frames of the latest step. They are sent at the next step, because one message
-        # contains all poses from a step until the next.
+        # Coordinate frames of the latest step. They are sent at the next step, in one message with
+        # all poses between the two steps.
         self._moment: Moment | None = None
         self._start_ns = self._time_ns = self._next_ns = self._frame_ns = 0
         self._steps_shown = 0
@@ -233,7 +233,8 @@ class LiveStream(ViewerServer):
         """Start the timer of the frame; send telemetry, scene and depth image before a step.
 
         Returns:
-            Whether shapes and depth images were sent. If so, set `values` of the next `LiveStep`.
+            Whether shapes and depth images were sent. If so, the caller should set `values` of the
+            next `LiveStep`.
         """
         self._pace.begin()
         self._time_ns = time_ns = max(time.time_ns(), self._next_ns)
@@ -272,7 +273,7 @@ class LiveStream(ViewerServer):
         return goes_on
 
     def end_episode(self, summary: EpisodeSummary) -> None:
-        """Send the end of the shown episode. Stream times replace the times in `summary`."""
+        """Send the end of the shown episode, with the stream's times in place of the summary's."""
         self._pace.begin()
         summary = summary._replace(start_time_ns=self._start_ns, end_time_ns=self._next_ns)
         self._send_motion([])

@@ -82,7 +82,7 @@ def _surprises(columns: Columns) -> Iterator[_Ranked]:
 
 
 def _disagreements(columns: Columns) -> Iterator[_Ranked]:
-    """Yield the disagreements with the lowest advantage, or entropy if Q-values are missing."""
+    """Yield the disagreements with the lowest advantage; without Q-values, the lowest entropy."""
     differs = ~columns["agrees"].astype(bool)
     has_values = bool(np.isfinite(columns["advantage"]).any())
     numbers = columns["advantage"] if has_values else columns["entropy"]

@@ -51,7 +51,7 @@ def observe_rays(car: Car, observation: NDArray[np.float32], has_barriers: bool)
 def observe_all_rays(
     cars: NDArray[np.float64], observations: NDArray[np.float32], has_barriers: bool
 ) -> None:
-    """Write (N, 20) observations; each of the (N, 10) rows of `cars` begins with a `Car`."""
+    """Write observations (N, 20). Each row of `cars` (N, 10) begins with the values of a `Car`."""
     for i in range(len(cars)):
         observe_rays(car_at(cars[i]), observations[i], has_barriers)
 

@@ -6,7 +6,7 @@ comments in the page describe the next block:
 
     <!-- file: NAME -->                      content of a file
     <!-- skip: next "REASON" -->             not run
-    <!-- skip: next if(quick, "REASON") -->  run only as it is written
+    <!-- skip: next if(quick, "REASON") -->  not run in a quick run
 
 Commands that a reader does not need to see are also in a comment:
 
@@ -214,7 +214,7 @@ def _environment() -> dict[str, str]:
 
 
 def _sh(script: list[str]) -> None:
-    """Run commands in one shell, which stops at the first failure. Then empty the list."""
+    """Run the commands of a list in one shell, up to the first failure. Then clear the list."""
     if script:
         command = ["sh", "-e", "-c", "\n".join(script)]
         done = subprocess.run(command, env=_environment(), stdout=-1, text=True, check=False)

@@ -48,7 +48,7 @@ def appended(path: Path) -> None:
 
 
 def recovered(path: Path, *, keep_unfinished: bool) -> None:
-    """Record a log that was cut off in its second episode, after 8191 steps."""
+    """Record a log, cut it off in the second episode after 8191 steps, and recover it."""
     whole = path.with_suffix(".whole")
     space = spaces.Box(-1, 1, (2,), np.float32)
     rows = [(np.full(2, step % 2, np.float32), 0.5, False, step == 8200) for step in range(8201)]

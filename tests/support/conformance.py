@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 MAGIC = b"\x89MCAP0\r\n"
-# The padding is longer than an index entry, so that a reader that mistakes it for one fails.
+# A reader that mistakes the padding for an index entry fails, because the padding is longer.
 PADDING = b"\x01" + b"\xff" * 37
 FEATURES = ("ch", "mx", "st", "rsh", "rch", "ax", "mdx", "chx", "sum", "pad")
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)

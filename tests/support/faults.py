@@ -19,7 +19,7 @@ FIGURES = os.environ.get("MCAPRL_FAULT_FIGURES")
 
 
 def count(small: int, large: int) -> int:
-    """Return the number of trials of a fault; `make faults` selects the large number."""
+    """Return the number of trials of a fault: `large` in `make faults`, otherwise `small`."""
     return large if LARGE else small
 
 

@@ -52,7 +52,7 @@ def spliced(data: bytes, chance: random.Random) -> bytes:
 
 
 def wrong_length(data: bytes, chance: random.Random) -> bytes:
-    """Change the length of a record, or any eight or four bytes of the record's content."""
+    """Write a wrong length over the length of a record, or over a part of its content."""
     start, _, length = chance.choice(list(records_of(data)))
     spoilt, claimed = bytearray(data), chance.choice(LENGTHS)
     place = start + chance.choice([1, 1, chance.randrange(1, max(2, min(length - 8, 60)))])

@@ -215,7 +215,7 @@ class _Table:
         return [name.removeprefix("info.") for name in names if name.startswith("info.")]
 
     def info(self, prefix: str, name: str) -> Masked:
-        """Return an info (N, *shape) by the prefix and the name of its column.
+        """Return the info (N, *shape) in the column `<prefix>.<name>`.
 
         Raises:
             LogError: There is no such column, or the metadata of its field is damaged.
@@ -316,7 +316,10 @@ def _episodes_with_ends(arrow: Any, columns: Transitions, leaves: Sequence[Leaf]
 
 
 def _info(steps: Masked, resets: Masked, lengths: NDArray[np.int64]) -> Masked:
-    """Return an info (F, *shape): for each episode, the row of the reset, then the steps' rows."""
+    """Return all rows (F, *shape) of an info.
+
+    For each episode, the row of the reset is followed by the rows of the steps.
+    """
     frames: Masked = np.ma.concatenate([steps, resets])  # type: ignore[no-untyped-call]
     firsts = np.cumsum(lengths + 1) - lengths - 1
     order = np.empty(len(frames), np.int64)

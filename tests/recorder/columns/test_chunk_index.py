@@ -90,7 +90,7 @@ def test_a_channel_that_is_listed_twice_is_refused() -> None:
 
 @pytest.mark.parametrize("field", ["chunk_start_offset", "chunk_length", "message_index_length"])
 def test_chunks_beyond_the_end_are_refused(log_path: Path, field: str) -> None:
-    """Refuse such chunks even if the sum of lengths would overflow to an offset in the file."""
+    """Refuse huge offsets and lengths, even if their 64-bit sum would wrap to a valid offset."""
     record(log_path, MIXED_SPACE, spaces.Discrete(2), [5])
     reader = McapReader(log_path)
     data = log_path.read_bytes()[: reader.summary_start]
@@ -105,7 +105,7 @@ def test_chunks_beyond_the_end_are_refused(log_path: Path, field: str) -> None:
 
 @pytest.mark.parametrize("field", [32, 44])
 def test_invalid_lengths_are_refused(field: int) -> None:
-    """Change the length of the empty map, at byte 32, or the length of the name, at byte 44."""
+    """Refuse a wrong length of the empty map, at byte 32, or of the name `zstd`, at byte 44."""
     content = bytearray(content_of(ChunkIndex(1, 2, "zstd", 3, 4, 5, {}, 6, 7)))
     for wrong in (61, 2**31, 2**32 - 1):
         struct.pack_into("<I", content, field, wrong)

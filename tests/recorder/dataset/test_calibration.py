@@ -16,8 +16,9 @@ from mcaprl.recorder.dataset.lint import lint
 def test_by_hand() -> None:
     found = calibration(np.array([0.5, 0.5, 0.25, 1.0]), spaces.Discrete(3))
     assert found is not None
-    # The mean of 1 / p is (2 + 2 + 4 + 1) / 4. The deviations are -0.25, -0.25, 1.75 and -1.25, so
-    # the variance is 4.75 / 3. The squared standard error is this variance divided by 4.
+    # The values of 1 / p are 2, 2, 4 and 1, and their mean is 2.25. The deviations are -0.25,
+    # -0.25, 1.75 and -1.25, so the variance is 4.75 / 3. The squared standard error of the mean is
+    # the variance divided by the number of values, 4.
     assert (found.available, found.actions) == (3, 2.25)
     assert found.error == pytest.approx(math.sqrt(4.75 / 3 / 4))
     assert found.ranges == (
@@ -67,7 +68,7 @@ def test_probabilities_that_are_too_small_are_a_problem() -> None:
 
 @pytest.mark.parametrize("tiny", [1, 12, 400])
 def test_a_probability_too_small_to_be_drawn_is_a_problem(tiny: int) -> None:
-    """Report this even if 12 huge values of 1 / p make the standard error as large as the mean."""
+    """Report tiny probabilities, although huge values of 1 / p have a large standard error."""
     probs = np.full(400, 0.5)
     probs[:tiny] = 1e-38
     found = calibration(probs, spaces.Discrete(2))

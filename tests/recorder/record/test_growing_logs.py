@@ -137,7 +137,7 @@ def test_a_damaged_file_is_not_appended_to(log_path: Path) -> None:
 
 
 def test_killed_while_appending(log_path: Path) -> None:
-    """After the first appended byte, the file is read as one that is being written."""
+    """If appending is interrupted, read the file like a file that is being written."""
     cartpole_log(log_path, 2)
     env = mcaprl.RecordMcap(gym.make("CartPole-v1"), log_path, append=True)
     env.reset(seed=5)

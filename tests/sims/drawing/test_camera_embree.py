@@ -71,7 +71,7 @@ class RayTracer:
 
 
 def check(drawn: Floats, expected: Codes, at_edge: NDArray[np.bool_]) -> int:
-    """Check that an image of 1/m is exact except at edges; return the number of wrong pixels."""
+    """Check that inverse depths are exact except at edges; return the number of wrong pixels."""
     with np.errstate(divide="ignore"):
         differs = encode_depth(1.0 / drawn) != expected
     assert not np.any(differs & ~at_edge)
