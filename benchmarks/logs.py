@@ -215,7 +215,10 @@ def _threads(log: Path) -> Table:
 
 
 def _checking(folder: Path, log: Path) -> Table:
-    """Measure the time to check a log, which reads it, and to recover it, which also writes."""
+    """Measure the time to check a log, to read it, and to recover it.
+
+    A check reads the log. A recovery also writes a new log.
+    """
     out = folder / "recovered.mcap"
     return compare(
         "Checking and recovering the log of vectors",

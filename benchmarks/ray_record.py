@@ -4,7 +4,7 @@
 
 Both record the same episodes. CPU time counts all processes: ours, the workers and, for Ray, those
 of the cluster. Wall time is meaningful only on an idle machine. The start of the Ray cluster is not
-included; the start of the workers is, as is that of the plain processes.
+included, but the start of the workers and of the plain processes is.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ GOAL = "at most 1.18 times the time of plain processes, an efficiency of .85"
 
 
 def main() -> None:
-    """Print the ratios of the best of several turns."""
+    """Print the ratios between the best times of both sides in several turns."""
     best: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -35,7 +35,7 @@ GOALS = {
 
 
 def ours() -> list[Side]:
-    """Return a side for each of our sims.
+    """Return a benchmark side for each of our sims.
 
     A turn takes only hundredths of a second, so that disturbances affect few turns. An episode that
     is not finished at the end of a turn continues in the next turn.
@@ -112,7 +112,7 @@ def _single(name: str, env: gym.Env[Any, Any], steps: int) -> Side:
 
 
 def _frames_of(name: str, env: gym.Env[Any, Any], frames: int) -> Side:
-    """Return a side that renders a frame for each step, and none for a reset."""
+    """Return a benchmark side that renders a frame after each step, but not after a reset."""
     sim: Any = env.unwrapped
     sim.action_space.seed(0)
     actions = [sim.action_space.sample() for _ in range(frames)]

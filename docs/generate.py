@@ -182,7 +182,7 @@ class _Text(str):
 
 
 def _plain(parameter: inspect.Parameter) -> inspect.Parameter:
-    """Remove the quotes of an annotation, and replace a function as default by `...`."""
+    """Remove the quotes of an annotation; replace a default value that is a function by `...`."""
     if inspect.isfunction(parameter.default):
         parameter = parameter.replace(default=_Text("..."))
     if parameter.annotation is parameter.empty:
@@ -191,7 +191,7 @@ def _plain(parameter: inspect.Parameter) -> inspect.Parameter:
 
 
 def contact_sheet(sheet: Sheet, policy: str) -> Figure:
-    """Draw frames of an episode from above, and depth images in the rows below.
+    """Draw an episode: top views in the first row, and depth images in the rows below.
 
     Args:
         sheet: Contact sheet to draw.

@@ -83,7 +83,8 @@ def _bars(*columns: ProgressColumn, transient: bool = False) -> Progress:
     from rich.console import Console
     from rich.progress import Progress
 
-    # While bars are shown, rich prints stdout above them, to stderr: only if both are the terminal.
+    # While bars are shown, rich redirects stdout to stderr, above the bars. Do this only if stdout
+    # is a terminal.
     redirects = sys.stdout is not None and sys.stdout.isatty()
     console = Console(stderr=True)
     return Progress(*columns, console=console, transient=transient, redirect_stdout=redirects)

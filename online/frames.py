@@ -30,7 +30,7 @@ def parts_of(observations: Any) -> dict[str, NDArray[Any]]:
 
 
 def whole_of(parts: dict[str, Any]) -> Any:
-    """Invert `parts_of`."""
+    """Return the observations that `parts_of` split into these parts."""
     return parts.get(WHOLE, parts)
 
 
@@ -127,7 +127,7 @@ class StackedVecEnv(VecEnvWrapper):
     """Wrapper whose observations are stacks of the last k observations."""
 
     def __init__(self, venv: VecEnv, count: int) -> None:
-        """Stack `count` observations; `venv` must reset in the step that ends an episode."""
+        """Stack `count` observations; `venv` must reset an environment when its episode ends."""
         self._memory = FrameMemory(venv.observation_space, count)
         super().__init__(venv, stacked_space(venv.observation_space, count))
 
@@ -136,7 +136,7 @@ class StackedVecEnv(VecEnvWrapper):
         return cast(VecEnvObs, self._memory.begin(self.venv.reset()))
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all environments, and stack all observations, also each `terminal_observation`."""
+        """Step all environments; stack the observations, and also each `terminal_observation`."""
         observations, rewards, dones, infos = self.venv.step_wait()
         self._memory.see(observations)
         for row in np.flatnonzero(dones).tolist():

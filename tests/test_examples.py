@@ -58,7 +58,7 @@ def test_an_example_runs_and_prints_what_its_notebook_shows(script: Path, tmp_pa
 
 
 def shape(text: str) -> list[str]:
-    """Return the words of a text without its numbers and the words that depend on them."""
+    """Return the lines of a text without numbers, and without words that depend on numbers."""
     lines = re.sub(r"refused.*|ok$|no interval.*", "verdict", text, flags=re.MULTILINE).splitlines()
     return [" ".join(re.sub(r"[-\d.]+( to [-\d.]+)?|\[.*\]", "", line).split()) for line in lines]
 

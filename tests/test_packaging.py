@@ -94,7 +94,7 @@ def test_public_names_are_documented(name: str) -> None:
 
 
 def test_layers_are_kept_by_the_imports_themselves() -> None:
-    """Check two of import-linter's rules without import-linter."""
+    """Check two rules for imports directly; import-linter also checks them."""
     for path in (ROOT / "recorder").rglob("*.py"):
         assert not _imports(path) & {"torch", "mcaprl.sims", "mcaprl.offline", "numba"}, path
     for path in (ROOT / "sims").rglob("*.py"):

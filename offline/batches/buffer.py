@@ -80,7 +80,7 @@ class TransitionBuffer:
         drawable: (M,) int64, rows with a weight above 0; None if all weights are above 0.
         cumulative: (M,) float64, cumulative weights of the drawable rows; None if the weights are
             equal.
-        share: Part of all data that the transitions are.
+        share: Share of all data that these transitions make up.
     """
 
     encoder: ObservationEncoder
@@ -116,7 +116,7 @@ class TransitionBuffer:
             reward_scale: Divisor of the rewards; default: see `packing.scale_rewards`.
             weights: (E,) relative sampling weight of each transition of an episode; default: all
                 equal.
-            share: Part of all data that the dataset is; normalization is over all data.
+            share: Share of all data that the dataset makes up; normalization uses all data.
 
         Raises:
             SpaceError: The actions are not discrete or are outside their space, or no network

@@ -127,7 +127,7 @@ PORTFOLIO: Final = (
 
 
 def candidates_for(traits: LogTraits) -> dict[str, str]:
-    """Return the reason for each candidate that is not tried on a log, by name."""
+    """Return a dict from the name of each candidate that is not tried on a log to the reason."""
     skipped = {}
     if traits.coverage <= LEAST_COVERAGE:
         skipped["double-dqn"] = (

@@ -43,7 +43,7 @@ def open_files(path: Path, opened: ExitStack) -> list[McapFile | RosbagFile]:
         opened: Stack that closes the files, and removes decompressed copies.
 
     Raises:
-        LogError: The path is not a bag, or damaged.
+        LogError: The path is not a bag, or the bag is damaged.
     """
     if not path.is_dir():
         return [_open(path, "", opened)]

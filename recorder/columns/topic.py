@@ -95,7 +95,7 @@ class Topic:
 
     @cached_property
     def chunks_rise(self) -> bool:
-        """Whether one channel has all messages, in chunks that follow each other in time."""
+        """Whether all messages are in one channel, and in chunks that do not overlap in time."""
         chunks = [part.chunk for _, part in self.parts if part.chunk is not None]
         return (
             self.channels == 1

@@ -83,7 +83,7 @@ class Transitions:
         return {name: getattr(self, name)[steps] for name in STEP_COLUMNS}
 
     def take(self, chosen: Sequence[int]) -> Transitions:
-        """Copy the chosen episodes, in the given order."""
+        """Return a copy of the chosen episodes, in the order of `chosen`."""
         rows = np.array(chosen, np.int64)
         steps = ranges(self.first_steps[rows], self.lengths[rows])
         frames = ranges(self.first_frames[rows], self.lengths[rows] + 1)

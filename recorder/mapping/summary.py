@@ -85,7 +85,7 @@ class MappingReport:
     action_counts: dict[str, int]
 
     def to_json(self) -> dict[str, Any]:
-        """Return the report as JSON types; unknown ages are None."""
+        """Return the report as JSON types; ages that are not finite become None."""
         found = asdict(self)
         for field in found["fields"].values():
             for name in ("median_age_s", "max_age_s"):

@@ -243,7 +243,7 @@ class ImageColumn:
     def append(self, image: NDArray[Any]) -> None:
         """Store the image of the next step.
 
-        Its dtype must have as many bytes as that of the space.
+        The dtypes of the image and of the space must have the same number of bytes.
         """
         self._images.append(image)
 

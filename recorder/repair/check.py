@@ -114,7 +114,7 @@ def _decompressed(
     chunks = iter(reader.chunks)
     with ThreadPoolExecutor(threads) as pool:
         ahead = deque[tuple[ChunkIndex, Future[memoryview]]]()
-        # There is one buffer for each thread and one for the caller, which limits memory use.
+        # Memory use is limited: there is one buffer for each thread, and one for the caller.
         scratches = cycle([Scratch() for _ in range(threads + 1)])
         while True:
             for chunk in islice(chunks, threads + 1 - len(ahead)):

@@ -84,9 +84,9 @@ class Track:
             yield place.time_ns, place.channel, self._message(place)
 
     def latest(self, time_ns: int) -> _Messages:
-        """Yield the latest message of each topic up to a time: what a viewer shows at that time.
+        """Yield the latest message of each topic up to a time.
 
-        Messages before `start_ns` are included.
+        A viewer shows these messages at that time. Messages before `start_ns` are included.
         """
         for topic in self._topics:
             place = topic.latest(min(time_ns, self.end_ns))

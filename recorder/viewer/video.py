@@ -134,7 +134,7 @@ def shown_steps(length: int, steps_per_s: float) -> tuple[range, float]:
 
 
 def parts_of_step(images_per_s: float) -> int:
-    """Return how many images to render per shown step, for at least 20 images per second.
+    """Return the number of images per shown step that yields at least 20 images per second.
 
     `images_per_s` is the number of shown steps per second.
 

@@ -111,7 +111,7 @@ def _step_blocks(
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
 ) -> int:
-    """Advance all cars that fill whole blocks; return the number of these cars."""
+    """Advance as many cars as fill whole blocks, and return their number."""
     block = np.empty(_BLOCK_NUMBERS * LANES)
     count = len(cars) // LANES * LANES
     for first in range(0, count, LANES):

@@ -180,7 +180,7 @@ def _at(values: Floats, along: Floats, places: Floats) -> Floats:
 
 
 def _wall(line: Floats) -> Floats:
-    """Approximate a closed line by `WALLS_PER_SIDE` walls (W, 4); walls in bends are shorter."""
+    """Approximate a closed line by `WALLS_PER_SIDE` walls (W, 4), which are shorter in bends."""
     tangents = _tangents(line)
     yaw = np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
     bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(yaw)))])
@@ -240,7 +240,7 @@ def _drivable(controls: Floats) -> bool:
 
 
 def _apart(center: Floats) -> bool:
-    """Return whether the track nowhere comes too close to another part of itself in the image."""
+    """Return whether all parts of the track are far enough from each other in the image."""
     along = _along(center)
     places = np.arange(0.0, along[-1], HALF_WIDTH_PX / 2)
     points = _at(center, along, places)

@@ -32,9 +32,8 @@ def spread(share: float, most: float) -> float:
 class Draws:
     """Random numbers from 0 to 1, drawn in advance from N generators.
 
-    A generator call takes a microsecond even for a few numbers. Therefore one call draws the
-    numbers for many starts. The numbers of each generator are used in the order in which it
-    draws them.
+    Because a generator call takes a microsecond even for a few numbers, one call draws the numbers
+    for many starts. The numbers of each generator are used in the order in which they were drawn.
 
     Attributes:
         numbers: (N, starts, size) numbers drawn in advance.
@@ -63,7 +62,7 @@ class Draws:
             numbers[:] = take(self.numbers, self.used, i)
 
     def draw_ahead(self, chosen: NDArray[np.int64]) -> None:
-        """Draw numbers for `take` from each of the `chosen` generators (K,) that has none left."""
+        """Draw numbers for `take` from each `chosen` generator (K,) whose numbers are all used."""
         for i in chosen[self.used[chosen] == _AHEAD].tolist():
             self._generators[i].random(out=self.numbers[i])
             self.used[i] = 0

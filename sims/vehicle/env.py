@@ -131,7 +131,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         except TypeError:
             number = -1
         if not 0 <= number < self._n_actions:
-            # This call raises the error. It is too slow to be made for valid actions.
+            # `check_action` raises the error. It is called only here because it is slow.
             number = check_action(action, self._n_actions)
         if self._noise_size:
             self.fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
@@ -212,7 +212,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
 
 
 def before_end(moments: Sequence[Frames], duration_s: float) -> list[tuple[float, Frames]]:
-    """Return the coordinate frames within a step, and the time to the end of the step for each.
+    """Return the coordinate frames at moments within a step, with the time left in the step.
 
     The coordinate frames at the end of the step are omitted.
 

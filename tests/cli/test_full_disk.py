@@ -14,7 +14,7 @@ from mcaprl.cli import run
 
 resource = pytest.importorskip("resource", reason="needs limits on the size of files")
 
-# As on a full disk, files cannot grow beyond a limit. Python ignores the signal of the limit.
+# The limit on the size of files simulates a full disk. Python ignores SIGXFSZ, so a write raises.
 SCRIPT = """
 import resource, sys
 from mcaprl.cli import main

@@ -12,7 +12,7 @@ from mcaprl.sims.racer.course import Track
 
 
 def corridor(top_px: float = 100.0, bottom_px: float = 200.0) -> Track:
-    """Return a box 1000 pixels long, driven to the right, with gates at 300 and 600 pixels."""
+    """Return a box of 1000 pixels in length with gates at 300 and 600; cars drive to the right."""
     right_px = 1000.0
     corners = [(0.0, top_px), (right_px, top_px), (right_px, bottom_px), (0.0, bottom_px)]
     walls = np.array([(*corners[i], *corners[(i + 1) % 4]) for i in range(4)])

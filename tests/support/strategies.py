@@ -14,7 +14,7 @@ DTYPES = ("float32", "float64", "float16", "int64", "int32", "int16", "int8", "u
 
 @st.composite
 def boxes(draw: st.DrawFn) -> spaces.Box:
-    """Draw unbounded Boxes of any dtype, from scalars to small stacks and images."""
+    """Draw unbounded Boxes of any dtype; their shapes range from scalars to small images."""
     dtype = np.dtype(draw(st.sampled_from(DTYPES)))
     shape = draw(st.sampled_from([(), (1,), (3,), (7,), (2, 2), (2, 3, 2), (8, 9, 3), (9, 8)]))
     if dtype.kind == "f":

@@ -258,7 +258,7 @@ def _converted(
 ) -> spaces.Space[Any]:
     """Permute the axes of each Box in a space by `order_of(box)`.
 
-    If that is None, keep the axes.
+    If `order_of` returns None for a Box, the Box keeps its axes.
     """
     if isinstance(space, spaces.Dict):
         return spaces.Dict([(key, _converted(part, order_of)) for key, part in space.items()])
@@ -295,7 +295,7 @@ def _is_image(space: spaces.Space[Any]) -> bool:
 def _reordered(values: NDArray[Any], order: Order | None) -> NDArray[Any]:
     """Permute the axes of each row of `values` (N, *shape) by `order`.
 
-    If it is None, do nothing.
+    If `order` is None, return `values` unchanged.
     """
     return values if order is None else values.transpose(0, *(axis + 1 for axis in order))
 
@@ -330,7 +330,7 @@ def _rounded(name: str, values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[A
 
 
 def _unscaled(space: spaces.Space[Any], actions: NDArray[Any]) -> NDArray[Any]:
-    """Convert actions from the form that SB3 stores back to the environment's form.
+    """Scale the actions of a bounded Box from [-1, 1], as SB3 stores them, to the bounds.
 
     Raises:
         SpaceError: An action is not in [-1, 1].

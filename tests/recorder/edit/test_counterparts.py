@@ -167,8 +167,8 @@ def test_commands_of_the_page(
     assert [part[0].split(": ")[1] for part in parts] == ["10 episodes", "1 episode", "1 episode"]
     assert long == ["long.mcap: 2 episodes", "203 steps"]
     assert start == ["start.mcap: 11 episodes", "1000 steps"]
-    # The part has the records from 60 s to 119 s. They are 30 transitions of the first episode and
-    # 28 transitions of the second.
+    # The part has the records from 60 s to 119 s: 30 transitions of the first episode and 28 of the
+    # second, 58 steps in total.
     assert minute == ["minute.mcap: 2 episodes", "58 steps"]
 
 
@@ -221,6 +221,6 @@ def test_killed_command_leaves_nothing_under_the_name(tmp_path: Path, command: s
             process.kill()
     assert not out.exists()
     assert (tmp_path / "a.mcap").read_bytes() == before
-    # The next command can write to the same path, and removes the files of the killed command.
+    # The next command can write to `out`, and removes the temporary files of the killed command.
     mcaprl.filter("length > 1", tmp_path / "a.mcap", out)
     assert sorted(one.name for one in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "out"]

@@ -82,7 +82,7 @@ def test_part_within_one_episode(log: Path, tmp_path: Path) -> None:
     counts: dict[str, int] = {}
     for topic, *_ in messages_of(tmp_path / "out.mcap").elements():
         counts[topic] = counts.get(topic, 0) + 1
-    # The part keeps one phase message: the phase `running` from the start of the episode.
+    # The only phase message in the part is `running`, from the start of the episode.
     assert counts.pop("/rl/phase") == 1
     assert counts == {"/rl/step": 3, "/rl/observation/image": 3, "/rl/episode": 1}
 
@@ -105,7 +105,7 @@ def test_part_of_whole_episodes_changes_no_message(log: Path, tmp_path: Path) ->
         # The final record of the first episode is left out, because it is not a transition.
         ((0.2, None), [(1, 0, 1), (2, 0, 3)]),
         ((None, 0.25), [(0, 0, 4)]),
-        # The first record of the last episode alone is not a transition, either.
+        # The part ends after the first record of the last episode, which alone is not a transition.
         ((0.25, 0.4), [(1, 0, 1)]),
         ((None, None), [(0, 0, 4), (1, 0, 1), (2, 0, 3)]),
     ],

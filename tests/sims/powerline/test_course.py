@@ -67,7 +67,11 @@ def test_beyond_the_end_the_infinite_line_is_nearer() -> None:
 
 
 def test_a_level_catenary_by_its_formula() -> None:
-    """If both ends have the same height, the middle is lowest: a (cosh(w / 2a) - 1) = sag."""
+    """Check a wire of 100 m with a sag of 2 m, whose ends have the same height.
+
+    The middle is 2 m lower than the ends. At a quarter of the width, the wire is within 0.01 m of
+    the parabola through these three points, which is 1.5 m lower than the ends.
+    """
     heights = catenary(100.0, 0.0, 2.0, np.array([0.0, 50.0, 100.0]))
     assert heights.tolist() == pytest.approx([0.0, -2.0, 0.0], abs=1e-9)
     parabola = catenary(100.0, 0.0, 2.0, np.array([25.0]))
@@ -125,7 +129,7 @@ def test_arms_lie_across_the_line() -> None:
     units = legs / np.hypot(*legs.T)[:, None]
     assert np.dot(first.right, units[0]) == pytest.approx(0.0, abs=1e-12)
     assert np.dot(second.right, units[0]) == pytest.approx(-np.dot(second.right, units[1]))
-    # The first leg leads to the north-west, so right is north-east, where y is larger.
+    # The first leg leads to the north-west, so its right side is in the north-east: y is positive.
     assert first.right[1] > 0
 
 
@@ -138,7 +142,7 @@ def test_no_conductor_touches_the_ground_or_a_tree() -> None:
 
 
 def test_the_mesh_of_the_ground_is_near_the_ground() -> None:
-    """Near the line, the middle of each triangle is within 1.5 m; all triangles face up."""
+    """All triangles face up; near the line, their middles are less than 1.5 m from the ground."""
     triangles = ground_triangles()
     up = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     assert np.all(up[:, 2] > 0)

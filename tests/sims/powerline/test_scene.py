@@ -78,7 +78,7 @@ def test_the_scene_has_z_up() -> None:
 
 
 def test_the_drones_frame_has_its_position_and_tilt() -> None:
-    """If the drone accelerates east (to the right), the upward axis of its body tilts to -y."""
+    """If the drone accelerates to the east, which is -y, its upward axis tilts to -y."""
     sim = flying()
     sim.step(EAST)
     level, body = sim.frames()

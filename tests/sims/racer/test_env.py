@@ -115,7 +115,7 @@ def test_a_car_at_rest_is_truncated_after_100_steps() -> None:
 
 
 def test_gates_are_counted_and_rewarded() -> None:
-    """Straight ahead of the start, gates are 6.6 m apart; the first is half that distance away."""
+    """On the straight after the start, gates are 6.6 m apart; the first one is 3.3 m away."""
     sim = racer()
     sim.reset(options={"pose": (5.0, 30.0, -math.pi / 2, 10.0)})
     rewards, counts = [], []
