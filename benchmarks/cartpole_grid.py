@@ -162,7 +162,7 @@ def verdict(gate: str, result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Run the missing trainings; print the table and the conditions, and write them to the docs."""
+    """Run the missing trainings; print the results, and write them to the docs."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seeds", type=int, default=4)
@@ -188,7 +188,7 @@ def main() -> None:
 def cells(algos: list[str]) -> list[tuple[str, str, str]]:
     """Return the library, algorithm and log of each training.
 
-    mcaprl's trainings come first. They are the only ones if d3rlpy is not installed.
+    mcaprl's trainings come first. Without d3rlpy, only mcaprl's trainings are returned.
     """
     wanted = sorted(algos, key=ALGOS.index)
     mine = [("mcaprl", algo, name) for algo in wanted for name in NAMES]

@@ -33,7 +33,7 @@ print(json.dumps({**best, "kept": kept, "peak": peak}))
 
 
 def tables(folder: Path, sizes: tuple[int, ...]) -> list[Table]:
-    """Measure the time and memory for reading, checking and recovering logs of `sizes`."""
+    """Measure the time and memory to read, check and recover logs with these numbers of steps."""
     found = {}
     for size in sizes:
         path = folder / "growth.mcap"

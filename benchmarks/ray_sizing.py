@@ -22,7 +22,7 @@ from mcaprl.recorder import LogReader
 
 EPISODES = 60
 FILE_BYTES = 1e9
-# Bytes in each worker for each episode of all data: the seven arrays of `GroupShare`.
+# Each worker stores the seven arrays of `GroupShare` for all episodes: 56 bytes per episode.
 _EPISODE_BYTES = 56
 
 
@@ -62,7 +62,8 @@ def measure(sim: str) -> Rates:
         read_s = min(_cpu_s(lambda: mcaprl.open(path)) for _ in range(5))
         index_s = min(_cpu_s(lambda: LogReader(path).lengths) for _ in range(5))
         content = path.read_bytes()
-    # Footer of MCAP: magic (8 bytes), CRC (4), summary offset start (8), summary start (8).
+    # The fields from the end of an MCAP file backward: magic (8 bytes), CRC (4), summary offset
+    # start (8), summary start (8).
     (summary,) = struct.unpack("<Q", content[-28:-20])
     buffer, count = TransitionBuffer.from_dataset(data), len(data)
     frames = buffer.frames.parts()

@@ -11,8 +11,9 @@ interrupted run resumes.
 A rule chooses one candidate by the scores from the log. The regret of a rule is the true score of
 the best candidate minus that of the chosen candidate; both scores are means over seeds. The table
 has the mean regret of each rule over the finished logs, with a 95 % bootstrap interval over logs,
-and the largest. Its last row is fair to the choice of the rule: on the logs of each sim, it uses
-the rule with the smallest mean regret on the logs of the other sims.
+and the largest regret. In the last row, a rule is never chosen by the logs on which its regret is
+computed: on the logs of each sim, the row uses the rule with the smallest mean regret on the logs
+of the other sims.
 """
 
 from __future__ import annotations
@@ -89,7 +90,7 @@ def _references(sim: str) -> tuple[PolicyScore, PolicyScore]:
 
 
 def collect(sim: str, log: Path, out: Path, names: list[str]) -> list[Row]:
-    """Return a row of evidence for each seed of trained candidates, short and full."""
+    """Return one row of evidence per candidate, seed, and length of training (short or full)."""
     data = mcaprl.open(log)
     rows: list[Row] = []
     policies: list[Any] = []
@@ -124,7 +125,7 @@ class Log:
     Attributes:
         sim: Name of its sim.
         name: Name of the log.
-        entropy: Entropy of the behavior by the logged probabilities, from 0 to 1.
+        entropy: Entropy of the behavior, from 0 to 1, computed from the logged probabilities.
         scores: Mean true score of each candidate.
         rows: Evidence for each candidate and seed.
     """
@@ -157,7 +158,11 @@ def largest(values: dict[str, float]) -> str:
 
 
 def auto(log: Log, threshold: float = DETERMINISTIC, survivors: int | None = None) -> str:
-    """Return the choice of `auto`: pessimistic FQE, or agreement below an entropy."""
+    """Return the candidate that `auto` chooses.
+
+    Below the entropy `threshold`, this is the candidate with the largest agreement, otherwise the
+    candidate with the largest value by pessimistic FQE.
+    """
     field = "agreement" if log.entropy < threshold else "first_value"
     values = log.means("pessimistic", field)
     if survivors is not None:
@@ -194,7 +199,7 @@ def rules(candidates: Iterable[str]) -> dict[str, Rule]:
 
 
 def read_logs(folder: Path) -> list[Log]:
-    """Return all logs with evidence. Candidates without evidence on each log are left out."""
+    """Return all finished logs, with only the candidates that have evidence on every log."""
     found = []
     for path in sorted(folder.glob("*/evidence-*.json")):
         name, sim = path.stem.removeprefix("evidence-"), path.parent.name

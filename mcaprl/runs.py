@@ -70,7 +70,7 @@ class RunIdentity:
     other_data: bool = False
 
     def check_same(self, found: Mapping[str, Any], where: Path) -> None:
-        """Check that the identity in a file is equal to this one.
+        """Check that the identity in a file is equal to this identity.
 
         Args:
             found: Identity in the file; it may have further parts.
@@ -104,7 +104,7 @@ def locked_run(folder: Path, resume: bool) -> Iterator[None]:
 
     Raises:
         OutputExistsError: `folder` is a file.
-        TrainingError: Another training is using the folder, the folder cannot be created, or
+        TrainingError: Another training is using the folder, or the folder cannot be created, or it
             contains no run to resume.
     """
     if resume:
@@ -238,7 +238,10 @@ def read_curves(run: Path, name: str) -> list[Curve]:
 
 
 def _leftovers(folder: Path) -> list[Path] | None:
-    """Return the files of a run without a checkpoint, or None if there are other files."""
+    """Return the files in the folder of a run that has no checkpoint.
+
+    Return None if the folder contains any other file.
+    """
     if not folder.exists():
         return []
     if not folder.is_dir():
@@ -252,6 +255,6 @@ def _leftovers(folder: Path) -> list[Path] | None:
 
 def _is_leftover(path: Path) -> bool:
     if path.is_dir():
-        # This is the work folder of a file that a killed run was writing.
+        # Some files are first written in such a temporary folder. A killed run leaves it.
         return path.name.startswith(".") and path.name.endswith(".part")
     return path.name in (CONFIG_NAME, METRICS_NAME) or path.name.startswith("events.out.tfevents")

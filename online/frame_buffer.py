@@ -73,7 +73,7 @@ class FrameReplayBuffer(BaseBuffer):
             optimize_memory_usage: Ignored argument of SB3.
             n_steps: Number of rewards in a return.
             gamma: Discount per step.
-            frame_stack: k, the number of successive frames in an observation.
+            frame_stack: Number of successive frames in an observation.
             pools: Factor by which the images of each key are averaged when they are stored.
             image_shift: Largest shift of the images in a batch, in pixels of the stored size.
         """

@@ -43,8 +43,8 @@ class LogInfo:
         observations: Observation space.
         actions: Action space.
         action_counts: Number of times each action was taken, by its name.
-        behavior_prob: Mean of 1 / `behavior_prob`, which estimates the number of actions, and the
-            number of actions in the action space; None if unknown.
+        behavior_prob: Two numbers: the mean of 1 / `behavior_prob`, which estimates the number of
+            actions, and the number of actions in the action space. None if unknown.
         behavior_estimated: Whether `behavior_prob` was estimated, not logged by the policy.
         policies: Names of the policies that acted.
         ends: Number of episodes by the reason of their end.
@@ -234,9 +234,9 @@ def check(
 ) -> CheckResult:
     """Read logs completely; validate structure, CRCs, indexes, episodes and metadata.
 
-    With a mapping, the bag is read by the mapping. The function then also reports missing or
-    outdated values, commands that are far from every named action, and episodes that are too short,
-    if they affect many steps.
+    With a mapping, the bag is read by the mapping. The function then also reports defects that
+    affect many steps: missing or outdated values, commands that are far from every named action,
+    and episodes that are too short.
 
     Args:
         data: File, folder or glob of logs, or several of them. A path without logs is

@@ -63,7 +63,7 @@ def _divided(whole: FileRequest, parts: int) -> list[FileRequest]:
             out=whole.out / f"shard-{number:0{digits}d}.mcap",
             episodes=None if whole.episodes is None else end - start,
             steps=None if whole.steps is None else end - start,
-            # With `steps`, the number of episodes is unknown, so reserve 2**20 numbers per shard.
+            # With `steps`, the number of episodes is unknown: each shard gets 2**20 indexes.
             first_episode=start if whole.episodes is not None else number << 20,
         )
         for number, (start, end) in shares

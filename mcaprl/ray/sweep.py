@@ -1,6 +1,6 @@
-"""Training with many settings by Ray Tune, which stops those with low off-policy scores early.
+"""Training with many settings by Ray Tune. Trials with low off-policy scores are stopped early.
 
-OUT/sweep.json             trials and data; a sweep can only be resumed with the same
+OUT/sweep.json             trials and data, which must be equal when the sweep is resumed
 OUT/NAME/                  run folder of a trial
 OUT/NAME.scores.json       scores so far, or the error that ended the trial
 """
@@ -105,7 +105,8 @@ def sweep_on_ray(
     """Run the trials on the cluster that this process is connected to.
 
     Args:
-        data: Logs and weights, as for `open_weighted`; all workers must see local ones.
+        data: Logs and weights, as for `open_weighted`; all workers must see the local files among
+            them.
         plan: What to try.
         out: Folder to create; an absolute path that all workers see.
         workers: Largest number of trials at a time; default: CPUs of the cluster.
@@ -117,7 +118,7 @@ def sweep_on_ray(
 
     Raises:
         OutputExistsError: `out` exists.
-        TrainingError: All trials failed, or `out` has another sweep or none.
+        TrainingError: All trials failed, or `out` contains a different sweep or no sweep.
         McaprlError: The logs cannot be read.
     """
     tune = import_extra("ray.tune", "ray")
@@ -177,7 +178,7 @@ def _run(tune: Any, job: _Job, folder: Path, workers: int | None, advance: Advan
         def on_trial_complete(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
             advance(1)
 
-    # Otherwise, Ray prints a box with its settings at any verbosity.
+    # Without this variable, Ray prints a box with its settings at any verbosity.
     os.environ.setdefault("RAY_AIR_NEW_OUTPUT", "0")
     for name in ("ray.tune", "ray.train"):
         logging.getLogger(name).setLevel(logging.ERROR)
@@ -209,7 +210,7 @@ def _try(job: _Job, chosen: dict[str, int]) -> None:
         check_machine(job.versions, [job.out])
         _train(job, trial, folder)
     except McaprlError as error:
-        # Other settings may do better, so the sweep goes on.
+        # A failed trial does not end the sweep: other settings may work.
         _save(folder, _result(trial, job.out).scores, str(error))
 
 
@@ -265,7 +266,7 @@ def _score(folder: Path, plan: SweepPlan, evaluator: OffPolicyEvaluator, updates
 
 
 def _divided(episodes: int, fraction: float) -> tuple[list[int], list[int]]:
-    """Divide episodes at random into those to learn from and those for scores."""
+    """Split the episodes at random into a part for training and a part for scores."""
     order = np.random.default_rng(_SPLIT_SEED).permutation(episodes)
     count = max(round(fraction * episodes), 2)
     if count >= episodes:

@@ -138,8 +138,8 @@ class _State:
 
     Attributes:
         done: Amount of work that was reported to the caller.
-        at_death: Amount when a worker last died in the task.
-        deaths: Number of workers that died since the amount last changed.
+        at_death: Value of `done` when a worker last died in the task.
+        deaths: Number of workers that died since `done` last changed.
     """
 
     done: int = 0
@@ -218,7 +218,7 @@ class _Pool:
 
     def replace(self, index: int | None, error: Exception) -> None:
         """Start another worker in place of a dead worker, whose task is the next to run."""
-        # Ray's explanation has several sentences. The first ones name the cause of the death.
+        # Ray's explanation has several sentences. The first sentences name the cause of the death.
         cause = str(error).strip().splitlines()[-1].partition(" Some common causes")[0]
         if index is None:
             self.failed_starts += 1
@@ -253,7 +253,10 @@ class _Pool:
             self.count(index, amount)
 
     def count(self, index: int, amount: int) -> None:
-        """Report new work of a task. A repeated task reports nothing until it has passed `done`."""
+        """Report new work of a task.
+
+        A repeated task reports nothing until its amount of work exceeds `done`.
+        """
         state = self.states[index]
         if amount > state.done:
             self.advance(amount - state.done)

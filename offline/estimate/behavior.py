@@ -47,8 +47,8 @@ class FoldScore:
     Attributes:
         episodes: Number of episodes that were predicted.
         log_likelihood: Mean log probability of the actions taken.
-        marginal: `log_likelihood` of a prediction that is always the action frequencies of the
-            training episodes.
+        marginal: Value of `log_likelihood` if every prediction is equal to the action frequencies
+            of the training episodes.
         uniform: `log_likelihood` of equal probabilities for all allowed actions.
         temperature: Divisor of the network's logits.
         uniform_share: Share of the uniform distribution in the prediction.

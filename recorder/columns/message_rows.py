@@ -65,7 +65,7 @@ def message_record(channel_id: int, sequence: int, time_ns: int, data: bytes) ->
 
 
 def are_messages(rows: NDArray[Any], channel_id: int) -> bool:
-    """Return whether all rows are messages of this channel with the length that the dtype has."""
+    """Return whether all rows are messages of this channel and have the length of the dtype."""
     size = rows.dtype.itemsize
     head = _HEAD.pack(Opcode.MESSAGE, size - RECORD_HEADER_BYTES, channel_id)
     words, expected = rows.view(_words(size)), np.frombuffer(head, _words(_HEAD.size))[0]

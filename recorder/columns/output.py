@@ -68,7 +68,7 @@ class OutputFile:
         header = ChunkHeader(
             *times, len(records), crc32(records), compression, data=slice(0, len(data))
         )
-        # `data` is not copied: a copy would take as long as everything else here.
+        # `data` is not copied: a copy would take as long as the rest of this function.
         head = header.to_record()
         offset, chunk_bytes = self.position, len(head) + len(data)
         index_offsets, index_bytes = {}, 0

@@ -88,7 +88,7 @@ def episode_lengths(columns: Columns, where: object) -> NDArray[np.int64]:
 
 
 def _breaks(column: NDArray[Any], by: int) -> NDArray[np.int64]:
-    """Return each row k for which `column[k + 1] - column[k]` is not `by`."""
+    """Return the rows k where `column[k + 1] - column[k]` differs from `by`."""
     found = []
     for start in range(0, len(column) - 1, _BLOCK_ROWS):
         block = column[start : start + _BLOCK_ROWS + 1]

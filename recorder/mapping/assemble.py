@@ -187,7 +187,7 @@ def _names(name: str, quantity: Quantity, count: int) -> list[str]:
 
 
 def _stacked(lengths: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Return the indexes of the `count` frames that are stacked at each frame.
+    """Return the indexes of the `count` frames in the stack of each frame.
 
     The shape is (frames, count), with the oldest frame first. At the beginning of an episode, its
     first frame is repeated.
@@ -208,6 +208,6 @@ def _repeated(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
 def _common_space(found: list[spaces.Space[Any]]) -> spaces.Space[Any]:
     """Return a space for all runs.
 
-    This is the largest Discrete space, or the Box space, which is the same in all runs.
+    If the runs have Discrete spaces, this is the largest one. All Box spaces are equal.
     """
     return max(found, key=lambda space: int(getattr(space, "n", 0)))

@@ -101,7 +101,7 @@ class Expression:
 
         Args:
             columns: (N,) or (N, K) column of each name.
-            following: (N,) row that follows each row, for `next`.
+            following: (N,) index of the row after each row, which `next` reads.
 
         Raises:
             UsageError: A name is unknown, or a value has the wrong type or shape.

@@ -154,8 +154,8 @@ def evaluation_page(
         world: Static shapes of the map.
         behavior: Mean return of the logged episodes, and the lower and upper limit of its interval;
             None without a log.
-        recorded: Log with the episodes of the first N policies in `scores`, and the number N; None
-            without a log.
+        recorded: Pair of a log and a number N: the log contains the episodes of the first N
+            policies in `scores`. None without a log.
         curves: Learning curves of the policies.
 
     Raises:

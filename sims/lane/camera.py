@@ -32,7 +32,7 @@ IMAGE_SHAPE = (84, 84)
 def lane_mesh(closed: tuple[Box, ...] = ()) -> NDArray[np.float64]:
     """Return (T, 3, 3) triangles of all surfaces, meters. Callers must not modify the array.
 
-    `closed` contains the barriers; without barriers, the mesh is that of the classic rules.
+    `closed` contains the barriers. The classic rules have no barriers.
     """
     solids = [
         box_mesh((box.x_m, box.y_m, box.height_m / 2), (box.length_m, box.width_m, box.height_m))

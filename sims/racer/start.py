@@ -59,7 +59,8 @@ def start_car(
         classic: Whether the classic rules apply.
         shares: Random numbers from 0 to 1: four for a start anywhere, two for a start near the
             start line, none for a start exactly on the start line.
-        cars: (N, 13) rows of a `Car`, followed by its distance along the path at the start.
+        cars: (N, 13) output. A row contains the fields of a `Car`, then the distance along the path
+            at which the car starts.
         observations: (N, 19) output.
         i: Index of the car.
     """

@@ -92,7 +92,7 @@ def test_each_option_is_an_argument() -> None:
 
 def test_defaults_of_options_are_those_of_the_arguments() -> None:
     for command, option, is_setting in _options():
-        # Click has a marker for a missing default. The marker has none of these types.
+        # A missing default is a marker of Click, which is not a str, an int or a float.
         if is_setting or option.is_flag or not isinstance(option.default, str | int | float):
             continue
         name = max(option.opts, key=len).lstrip("-").replace("-", "_")

@@ -15,7 +15,7 @@ from tests.docs.pages import ROOT
 from tests.test_page import browse, colors_at
 
 PAGES = sorted(str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md"))
-# A browser loads these when it shows the page. The reader follows all other links.
+# A browser loads these addresses when it shows the page. All other links need a click.
 LOADED = {("script", "src"), ("img", "src"), ("link", "href"), ("iframe", "src")}
 
 

@@ -62,14 +62,14 @@ def test_frames_stay_within_their_time_budget() -> None:
             pace.begin()
             clock.now_s += 0.003
             pace.pause()
-            # This time is that of the environment's step, and not part of the frame.
+            # The environment's step takes this time, which is not part of the frame.
             clock.now_s += 0.05
             pace.begin()
             clock.now_s += 0.001
             pace.end()
         clock.now_s += 0.001
-    # A frame takes 4 ms, so the next one may be shown after 200 ms. The environment's step of 50 ms
-    # is not counted.
+    # A frame takes 4 ms, which may be 2 % of the time. The next frame is therefore due after 200
+    # ms, not counting the environment's step of 50 ms.
     assert shown * 0.004 <= 0.02 * clock.now_s
     assert shown == pytest.approx(clock.now_s / 0.25, rel=0.02)
 

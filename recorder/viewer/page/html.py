@@ -13,8 +13,8 @@ _SCRIPTS = ("data.js", "scene.js", "plots.js", "images.js", "main.js")
 def page_html(log: bytes, episode: bytes = b"") -> str:
     """Return the page.
 
-    Texts from the log are contained in base64 only, and the page's policy allows no script but
-    those of this package, so no text can become HTML or code.
+    Texts from the log are encoded as base64, and the page's Content Security Policy permits only
+    the scripts of this package. Therefore, no text can become HTML or code.
 
     Args:
         log: Packed description of the log.
@@ -27,7 +27,7 @@ def page_html(log: bytes, episode: bytes = b"") -> str:
     policy = [
         "default-src 'none'",
         f"script-src {' '.join(map(_hash, scripts))}",
-        # uPlot and OrbitControls set the styles of elements by scripts, which this policy allows.
+        # uPlot and OrbitControls set styles from scripts. `style-src` does not prevent this.
         f"style-src {_hash(style)}",
         "img-src data:",
         "base-uri 'none'; form-action 'none'",

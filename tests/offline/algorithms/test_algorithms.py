@@ -72,7 +72,7 @@ def outputs(learner: Learner, observations: NDArray[np.float32], name: str = "q"
 
 
 def best(learner: Learner, observations: NDArray[np.float32]) -> list[int]:
-    """Return the actions of the first seed's policy, counted from 0."""
+    """Return the action of the first seed's policy for each observation."""
     networks = {name: learner.network(name, learner.seeds[0]) for name in learner.policy_models}
     scores = Scores(networks, learner.acts_by, getattr(learner.config, "threshold", 0.0))
     found: list[int] = scores(Observations(torch.from_numpy(observations))).argmax(1).tolist()
@@ -141,8 +141,8 @@ def test_quantiles_stop_at_termination() -> None:
 
 
 def test_n_step_returns_propagate_a_reward_over_the_corridor() -> None:
-    # The data are one episode from cell 1 to the far exit. With one sync, 1-step targets do not
-    # propagate the reward to cell 1, but n-step returns do.
+    # The data are one episode from cell 1 to the far exit. If the target network is synced only
+    # once, 1-step targets do not propagate the reward to cell 1, but n-step returns do.
     walk = corridor_walk()
     config = DQNConfig(**{**SMALL_Q, "n_steps": 3, "target_interval": 600})
     values = outputs(trained(learner_of(config, walk)), inner_observations())[:, 1]
@@ -255,12 +255,14 @@ def test_more_alpha_means_lower_values_of_unseen_actions() -> None:
     [
         CQLConfig(**SMALL_Q, alpha=0.01),
         BCQConfig(**SMALL_Q),
-        # The log goes left twice as often. The weight exp(10 * .3) makes going right preferable.
+        # The log goes left twice as often as right. With this large `beta`, the weight of the
+        # better action, right, makes up for this.
         IQLConfig(**SMALL_Q, expectile=0.9, beta=20.0),
     ],
 )
 def test_the_better_action_is_found_if_the_data_has_both(config: Any) -> None:
-    # One of three visits goes right. Cloning alone would go left, but the reward favors right.
+    # In one third of the steps, the log goes right. Cloning alone would go left, but right has the
+    # larger reward.
     mostly_left = corridor({(cell, action): 2 - action for cell in (1, 2, 3) for action in (0, 1)})
     assert best(trained(learner_of(config, mostly_left)), inner_observations()) == [1, 1, 1]
     clone = trained(learner_of(BCConfig(**SMALL), mostly_left))
@@ -273,9 +275,10 @@ def test_iql_values_are_between_mean_and_maximum() -> None:
         config = IQLConfig(**{**SMALL_Q, "updates": 1500}, expectile=expectile)
         learner = trained(learner_of(config, corridor()))
         values.append(outputs(learner, inner_observations()[1:2], "v").item())
-    # Both actions are logged equally often, so the mean value is that of a random walk:
-    # v1 = (.3 + .9 v2) / 2, v2 = .9 (v1 + v3) / 2, v3 = (.9 v2 + 1) / 2. The solution is
-    # v2 = .585 / .595 / 2 = .492. The value of the best action is .9.
+    # Both actions are logged equally often. The mean values v1, v2 and v3 of the three cells are
+    # therefore those of a random walk: v1 = (.3 + .9 v2) / 2, v2 = .9 (v1 + v3) / 2 and
+    # v3 = (.9 v2 + 1) / 2. The solution is v2 = .585 / .595 / 2 = .492. The value of the best
+    # action in the middle cell is .9.
     assert values[0] == pytest.approx(0.45 * 1.3 / 2 / (1 - 0.45 * 0.9), abs=0.02)
     assert values[0] < values[1] < values[2]
     assert values[2] == pytest.approx(0.9, abs=0.05)
@@ -285,7 +288,7 @@ def test_normalized_advantages_do_not_depend_on_the_unit_of_the_reward() -> None
     settings = {**SMALL_Q, "updates": 1, "normalize_advantages": True, "beta": 1.0}
     learner = cast(IQL, learner_of(IQLConfig(**settings), corridor(), 0, 1))
     advantages = torch.tensor([3.0, -4.0, 0.0, 0.0, 30.0, -40.0, 0.0, 0.0])
-    # The root mean squares of the two seeds are 2.5 and 25.
+    # The advantages of the two seeds have the root mean squares 2.5 and 25.
     found = learner.normalized(advantages).tolist()
     assert found == pytest.approx([1.2, -1.6, 0, 0] * 2)
     assert learner.normalized(torch.zeros(8)).tolist() == [0] * 8

@@ -271,7 +271,7 @@ def test_a_killed_recording_has_the_infos_of_its_episodes(tmp_path: Path) -> Non
     env.step(0)
     content = path.read_bytes()
     env.close()
-    # With the last length, the file ends after the infos of the third episode and before its steps.
+    # At the last length, the file contains the infos of the third episode, but not its steps.
     for episodes, length in ((3, sizes[2]), (2, sizes[1]), (2, sizes[2] - 100)):
         killed.write_bytes(content[:length])
         with pytest.warns(UserWarning, match=f"finished episodes read: {episodes}"):

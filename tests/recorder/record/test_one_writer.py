@@ -252,7 +252,7 @@ def test_appending_keeps_what_readers_have_mapped(log_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore:.*is still being written")
 def test_readers_beside_a_recorder_that_appends(log_path: Path) -> None:
-    """A reader that opens the log reads whole episodes, without an error or a signal."""
+    """A reader that opens the log reads whole episodes; no error or signal interrupts it."""
     write_log(log_path, 1)
     stop, errors, seen = threading.Event(), [], []
 

@@ -379,7 +379,7 @@ def test_a_log_without_the_step_topic(log_path: Path, tmp_path: Path, other: byt
 
 
 def test_scanning_for_records_does_not_copy_the_file(log_path: Path) -> None:
-    """Scan without copying the rest of the file at each record, which takes quadratic time."""
+    """Scan without a copy of the rest of the file at each record; copies take quadratic time."""
     steps = 20_000
     frames = np.random.default_rng(0).standard_normal((steps + 1, 20))
     mcaprl.Dataset.from_arrays(

@@ -84,7 +84,10 @@ def plain(tmp_path: Path) -> Path:
 
 
 def test_values_by_hand(episode: Any) -> None:
-    """The TD errors at gamma 0.5 are 1 + 0.5*2 - 1, -1 + 0.5*4 - 2, and at the end 2 + 0 - 4."""
+    """A TD error is the reward, plus gamma times the next value, minus the Q of the action.
+
+    With gamma 0.5, the errors are 1 + 0.5*2 - 1, -1 + 0.5*4 - 2 and, at the end, 2 + 0 - 4.
+    """
     found = value_columns(Table(), episode, spaces.Discrete(2), 0.5)
     assert found["q"].tolist() == VALUES[:3].tolist()
     assert found["value"].tolist() == [3.0, 2.0, 4.0]

@@ -324,7 +324,8 @@ def test_the_browser_shows_an_episode(browser: Browser, log: Path) -> None:
             "observation/",
         ):
             assert expected.lower() in text.lower(), expected
-        # Step 2 takes action 7, whose reward is 1.5, after rewards of 0.5 and 1.
+        # Step 2 takes action 7 and has the reward 1.5. The return so far is the sum of the earlier
+        # rewards, 0.5 and 1.
         browser.run("seek(1.1)")
         assert browser.run("get('facts').innerText").split() == (
             ["action", "right", "word", "reward", "1.5", "return", "so", "far", "1.5"]

@@ -152,7 +152,7 @@ def test_buildings_are_beside_the_streets_and_apart() -> None:
 
 
 def test_rails_follow_the_road_but_never_cross_it() -> None:
-    """Each path point has 4 m of free road in the directions of the axes."""
+    """No rail is nearer than 4 m to a point of the path."""
     for along_m in np.arange(0.0, COURSE.length_m, 1.7):
         x, y = point_at(COURSE, along_m)
         for box in rails():

@@ -137,8 +137,8 @@ def test_the_camera_image_is_observed() -> None:
     [(10.0, -1), (129.9, -1), (130.1, -1), (511.0, -1), (513.0, 1), (1025.9, 1)],
 )
 def test_a_dashboard_has_speed_steering_and_the_next_turn(along_m: float, turn: int) -> None:
-    # The shared street comes before the fifth corner: its first passage ends in a right turn, the
-    # second, 512 m later, in a left one.
+    # The course passes the shared street twice. The first passage ends with a right turn. The
+    # second passage, 512 m later, ends with a left turn.
     sim = lane(observation="dashboard")
     sim.reset(seed=4)
     sim.fleet._cars[0, 5] = along_m + 3 * COURSE.length_m
@@ -157,7 +157,7 @@ def test_the_last_commands_are_observed_beside_the_image() -> None:
     assert seen["depth"].tobytes() == encode_depth(sim.depth_image_m()).tobytes()
     assert seen["commands"].shape == (64,)
     assert not seen["commands"].any(), "no decision yet"
-    # Left, brake (which keeps the steering), slightly right, straight.
+    # Commands of four actions: left, brake (which keeps the steering), slightly right, straight.
     expected = [1.0, 1.0], [-1.0, 1.0], [1.0, -0.5], [1.0, 0.0]
     for step, action in enumerate((3, 0, 4, 1), start=1):
         before = seen["commands"].copy()

@@ -123,7 +123,7 @@ def test_the_path_point_distinguishes_the_streets_of_a_crossing() -> None:
         (134.0 - 2.199, 1.0, 0.0, True),
         (134.0 - 2.101, 1.0, math.pi, False),
         (134.0 - 2.099, 1.0, math.pi, True),
-        # Across the street, the car needs 4.3 m; turned by 45 degrees, it needs 3.05 m to one side.
+        # Turned across the street, 2 m from the middle, the nose is at 2 m + 2.2 m: in the rail.
         (60.0, 1.0, math.pi / 2, False),
         (60.0, 3.0, math.pi / 2, True),
         # The car is beside the road, between the rails and the houses.

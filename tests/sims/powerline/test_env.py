@@ -33,7 +33,7 @@ def last_step(sim: PowerlineEnv, action: int) -> tuple[float, str]:
 
 
 def test_starts_on_the_line_are_near_the_published_one() -> None:
-    """The drone flies from the first point for 5 s minus the lag, and starts differ."""
+    """The drone has flown from the first point for 5 s, less about 0.4 s of lag; starts differ."""
     sim = powerline(start="line")
     places = set()
     for seed in range(20):
@@ -73,7 +73,8 @@ def test_a_pose_is_kept_and_reported_in_ros_axes() -> None:
     assert sim.flight.drone.position_m == pose[:3]
     assert (telemetry["x_m"], telemetry["y_m"], telemetry["z_m"]) == (pose[0], -pose[1], -pose[2])
     assert telemetry["speed_m_s"] == info["speed_m_s"] == 3.0
-    # East of a line that leads north is to the right. A higher position is positive.
+    # The drone is 2 m east of a line that leads north. This is to the right, which is negative. A
+    # higher position is positive.
     assert telemetry["lateral_offset_m"] < -1.9
     assert telemetry["vertical_offset_m"] == pytest.approx(1.0, abs=0.15)
     assert telemetry["line_distance_m"] == pytest.approx(math.sqrt(5.0), abs=0.1)

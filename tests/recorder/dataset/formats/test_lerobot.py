@@ -253,7 +253,8 @@ def test_statistics_of_vectors_images_and_all_episodes() -> None:
     }
     second = describe(vector, np.array([[4, 3]] * 2, np.float32))
     both = pooled([first, second])
-    # The values 0, 2, 4 and 4 have the mean 2.5 and the variance (6.25 + 0.25 + 2.25 + 2.25) / 4.
+    # The first elements of the vectors are 0, 2, 4 and 4. Their mean is 2.5, and their variance is
+    # (6.25 + 0.25 + 2.25 + 2.25) / 4.
     assert (both["mean"][0], both["std"][0]) == (2.5, pytest.approx(np.sqrt(2.75)))
     assert (both["min"][0], both["max"][0], both["count"][0]) == (0, 4, 4)
     assert both["q50"][0] == 2.5
