@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib.util
 import logging
 import os
+import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -67,7 +69,13 @@ def ray_cluster() -> Iterator[None]:
         assert connect(LOCAL, workers=2, store_bytes=200 << 20)
     logging.getLogger("ray.data").setLevel(logging.ERROR)
     yield
+    # Ray's thread for errors sometimes waits for the server forever: end the server after a minute.
+    command = ["pkill", "-P", str(os.getpid()), "gcs_server"]
+    timer = threading.Timer(60, subprocess.run, [command])
+    timer.daemon = True
+    timer.start()
     ray.shutdown()
+    timer.cancel()
 
 
 @pytest.fixture(scope="module")
