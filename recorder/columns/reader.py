@@ -227,8 +227,8 @@ class McapReader:
         """
         if channel.id not in self._ranges:
             if self._remote is not None:
-                # Of chunks with several channels, fetch all indexes together. Otherwise, each
-                # chunk would need a request.
+                # Fetch the indexes of all chunks with several channels in one call, not with
+                # one request for each chunk.
                 places = [one for one in self.chunks if len(one.message_index_offsets) > 1]
                 starts = [one.chunk_start_offset + one.chunk_length for one in places]
                 self.fetch(zip(starts, map(end_of, places), strict=True))

@@ -149,7 +149,7 @@ def write_with_mcap(
     channels: Callable[[int], int] = lambda row: 0,
     **options: Any,
 ) -> None:
-    """Write with mcap's Writer, mixed with a topic whose messages have various lengths."""
+    """Write a log with mcap's Writer, with a second topic whose messages vary in length."""
     writer = Writer(str(path), **{"chunk_size": 2000, **options})
     writer.start("ros2")
     schema = writer.register_schema(TYPE, "ros2msg", text.encode())
