@@ -173,7 +173,7 @@ def test_videos_of_a_scene_and_of_a_sim(
         for kind in ("gif", "webp"):
             assert run(["replay", f"{name}.mcap", "--video", f"{name}.{kind}"]) == 0
         for kind, plugin in (("mp4", "pyav"), ("gif", "pillow"), ("webp", "pillow")):
-            video = imageio.imread(f"{name}.{kind}", plugin=plugin, index=...)
+            video = np.stack(list(imageio.imiter(f"{name}.{kind}", plugin=plugin)))
             # If an image equals the previous image, a GIF or WebP stores only a longer duration of
             # the previous image.
             count = 26 if name == "lane" else 6
