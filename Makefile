@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BENCH ?= .venv-bench
 BIN := $(VENV)/bin
+# Without the cache of compiled modules, every process that is started compiles what it imports.
+unexport PYTHONDONTWRITEBYTECODE
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 # A change of these files reinstalls the environments.
 SETTINGS := pyproject.toml constraints.txt
