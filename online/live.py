@@ -21,6 +21,7 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 
+from mcaprl.online.algorithms import check_spaces
 from mcaprl.online.recording import behavior_probabilities, exploration
 from mcaprl.online.task import Task
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
@@ -72,12 +73,14 @@ class LiveTraining:
 
         Raises:
             MissingExtraError: foxglove-sdk is not installed.
+            SpaceError: The algorithm does not support the environment's spaces.
             UsageError: The port is in use, or the environment cannot be created.
         """
         self._task = task
-        self._shown = make_sim(task.sim, **task.sim_options)
-        self._shown.reset(seed=0)
+        self._shown = env = make_sim(task.sim, **task.sim_options)
         try:
+            check_spaces(task.algo, env.observation_space, env.action_space)
+            env.reset(seed=0)
             self.stream = LiveStream(
                 LogMetadata.of_env(self._shown, policy=task.algo),
                 self._shown.unwrapped,

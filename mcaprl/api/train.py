@@ -105,6 +105,7 @@ def train(
         MissingExtraError: The packages of the `offline` extra, or Ray, are not installed.
     """
     from mcaprl.offline.algorithms.registry import choose_algorithm
+    from mcaprl.offline.batches.buffer import discrete_actions
     from mcaprl.offline.batches.sources import open_weighted
     from mcaprl.offline.selection.config import AUTO, AutoConfig
     from mcaprl.offline.selection.race import select
@@ -168,6 +169,7 @@ def train(
             dataset = growing.dataset
         else:
             dataset, weights = open_weighted(as_names(data), threads=threads)
+        discrete_actions(dataset.action_space)
         on_data(algo, dataset)
         request: dict[str, Any] = {
             "seeds": seeds,

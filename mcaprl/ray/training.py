@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import ClusterError, McaprlError, SpaceError, UsageError, import_extra
 from mcaprl.files import work_folder
 from mcaprl.offline.algorithms.config import TrainingConfig
+from mcaprl.offline.batches.buffer import discrete_actions
 from mcaprl.offline.batches.share import GroupShare, divided
 from mcaprl.offline.batches.sources import weighted_logs
 from mcaprl.offline.training.metrics import OfflineSummary
@@ -157,6 +158,7 @@ def train_on_ray(
     import ray
 
     logs = _read_summaries(data)
+    discrete_actions(logs.description.action_space)
     check_weights(logs.all_weights, len(logs.all_weights))
     count = _workers(workers, request.device, sum(map(len, logs.lengths)))
     identity = RunIdentity(identity_parts(request.config, logs.fingerprint), request.other_data)

@@ -16,6 +16,7 @@ import pytest
 
 import mcaprl
 from mcaprl.cli import run
+from mcaprl.errors import SpaceError
 from mcaprl.recorder.columns.reader import McapReader
 from tests.support.paths import GOLDEN
 
@@ -385,6 +386,29 @@ def test_spaces_that_differ(cartpole: Path, capsys: pytest.CaptureFixture[str]) 
     line = fails_after(capsys, 1, "evaluate", "run", "--sim", "lane")
     assert "was trained on observation_space" in line
     assert not Path("r").exists()
+
+
+def test_training_refuses_continuous_actions_before_it_prints_anything(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    log = str(GOLDEN / "multi-binary.mcap")
+    for command in (
+        ["train-offline", log, "--out", "run"],
+        ["train-offline", log, "--algo", "auto", "--out", "run"],
+        ["train-online", "Pendulum-v1", "--out", "run"],
+        ["train-online", "Pendulum-v1", "--out", "run", "--live", "--port", "0"],
+    ):
+        assert run(command) == 1
+        out, err = capsys.readouterr()
+        assert (out, err.count("\n")) == ("", 1), f"{command}: {out!r}, {err!r}"
+        assert "needs discrete actions, got Box" in err
+    with pytest.raises(SpaceError, match="needs discrete actions, got Box"):
+        mcaprl.train(log, "run", on_data=lambda algo, dataset: pytest.fail("training began"))
+    with pytest.raises(SpaceError, match="needs discrete actions, got Box"):
+        mcaprl.train_online(
+            "Pendulum-v1", "run", live=True, port=0, on_live=lambda _: pytest.fail("it listens")
+        )
+    assert not Path("run").exists()
 
 
 def test_missing_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,11 +14,12 @@ import pytest
 
 import mcaprl
 from mcaprl.cli import run
-from mcaprl.errors import ClusterError, UsageError
+from mcaprl.errors import ClusterError, SpaceError, UsageError
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.format.metadata import installed_versions
 from mcaprl.runs import read_curve
 from tests.ray.seeded import SEEDED
+from tests.support.paths import GOLDEN
 
 pytest.importorskip("torch")
 from safetensors.torch import load_file
@@ -131,6 +132,8 @@ def test_options_that_cannot_be_used_with_ray(logs: Path, tmp_path: Path) -> Non
         train(ray=True, workers=3)
     with pytest.raises(ClusterError, match="the cluster has 0 GPUs for 1 workers"):
         train(ray=True, device="cuda")
+    with pytest.raises(SpaceError, match="needs discrete actions, got Box"):
+        train(GOLDEN / "multi-binary.mcap", ray=True)
     assert not (tmp_path / "run").exists()
 
 
