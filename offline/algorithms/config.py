@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from importlib.metadata import entry_points
@@ -11,6 +12,8 @@ from mcaprl.architecture import Architecture, NetworkSettings
 from mcaprl.offline.batches.packing import Packing
 
 ENTRY_POINT_GROUP: Final = "mcaprl.algorithms"
+ALPHA_RANGE: Final = (1e-4, 100.0)
+"""Range of CQL's alpha if it is learned."""
 
 
 @dataclass(frozen=True)
@@ -145,15 +148,21 @@ class BCQConfig(DQNConfig):
 
 @dataclass(frozen=True)
 class CQLConfig(DoubleDQNConfig):
-    """Settings of CQL: those of Double DQN, plus alpha."""
+    """Settings of CQL: those of Double DQN, plus alpha and its target."""
 
     alpha: float = 1.0
     """weight of the penalty on actions that are not in the data; 0 is Double DQN"""
+    target_gap: float = 0.0
+    """mean penalty to which alpha is tuned, starting at its setting; 0 leaves alpha fixed"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
         super().__post_init__()
         self._require("alpha", self.alpha >= 0, "at least 0")
+        self._require("target_gap", 0 <= self.target_gap < math.inf, "at least 0 and finite")
+        low, high = ALPHA_RANGE
+        startable = not self.target_gap or low <= self.alpha <= high
+        self._require("alpha", startable, f"within [{low:g}, {high:g}] with a target gap")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from mcaprl.networks import Network
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.losses import allowed_only
-from mcaprl.offline.algorithms.models import Model, TargetNetwork, build_model
+from mcaprl.offline.algorithms.models import ALIGNMENT, Model, TargetNetwork, build_model
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
 
@@ -51,6 +51,7 @@ class Learner(ABC):
         seeds: K seeds.
         models: Models by name; each contains K networks.
         target_networks: Target networks by the name of the model that they copy.
+        scalars: Learned numbers by name, one per seed; see `add_scalar`.
         step: Number of finished updates.
     """
 
@@ -82,12 +83,10 @@ class Learner(ABC):
         self._sync_interval = 0
         self._losses: nn.Module | None = None
         weights = [model.weights for model in self.models.values()]
-        self.optimizer = torch.optim.AdamW(weights, weight_decay=config.weight_decay, fused=True)
-        # Create the optimizer state now, so that a checkpoint can be loaded before the first step.
-        for tensor in weights:
-            moments = {name: torch.zeros_like(tensor) for name in _MOMENTS}
-            step = torch.tensor(0.0, device=tensor.device)
-            self.optimizer.state[tensor] = {"step": step, **moments}
+        self.scalars: dict[str, nn.Parameter] = {}
+        groups = [{"params": weights, "rate_factor": 1.0, "weight_decay": config.weight_decay}]
+        self.optimizer = torch.optim.AdamW(groups, fused=True)
+        self._reset_moments(weights)
 
     @abstractmethod
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -133,7 +132,8 @@ class Learner(ABC):
             raise self._not_finite(self.seed_means(terms))
         self.optimizer.zero_grad()
         torch.autograd.backward(loss / (len(rows) // len(self.seeds)))
-        self.optimizer.param_groups[0]["lr"] = self.config.learning_rate_at(self.step)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.config.learning_rate_at(self.step) * group["rate_factor"]
         self.optimizer.step()
         self.step += 1
         if self.target_networks and self.step % self._sync_interval == 0:
@@ -157,6 +157,34 @@ class Learner(ABC):
             self.models[name], self.buffer, rows, next_states=next_states
         )
         return self.target_networks[name]
+
+    def add_scalar(self, name: str, start: float, rate_factor: float) -> nn.Parameter:
+        """Add a number that each seed learns by its own Adam, such as a Lagrange multiplier.
+
+        The number is saved in checkpoints. Weight decay does not apply to it. A loss reads it with
+        `scalar_rows`.
+
+        Args:
+            name: Name in `scalars` and in checkpoints.
+            start: Value before the first update.
+            rate_factor: Learning rate, as a multiple of the learning rate of the networks.
+
+        Returns:
+            The numbers as (K, P); only the first column is used, see `models`.
+        """
+        scalar = nn.Parameter(
+            torch.full((len(self.seeds), ALIGNMENT), start, device=self.buffer.device)
+        )
+        group = {"params": [scalar], "rate_factor": rate_factor, "weight_decay": 0.0}
+        self.optimizer.add_param_group(group)
+        self._reset_moments([scalar])
+        self.scalars[name] = scalar
+        return scalar
+
+    def scalar_rows(self, name: str, batch: Batch) -> Tensor:
+        """Return a learned number of `add_scalar` for each row (R,) of a batch."""
+        rows = len(batch.actions) // len(self.seeds)
+        return self.scalars[name][:, :1].expand(-1, rows).flatten()
 
     def seed_means(self, terms: Mapping[str, Tensor]) -> list[dict[str, float]]:
         """Return the mean of each term for each seed.
@@ -193,14 +221,15 @@ class Learner(ABC):
     def state(self, seed: int) -> dict[str, Tensor]:
         """Return the state of the training of one seed, without `step`.
 
-        The state consists of the weights, the moments of the optimizer, and the state of the random
-        generator.
+        The state consists of the weights and learned numbers, the moments of the optimizer, and the
+        state of the random generator.
         """
         k = self.seeds.index(seed)
-        models = self.all_models()
-        tensors = {f"{name}.weights": models[name].weights.detach()[k] for name in models}
-        for name, model in self.models.items():
-            moments = self.optimizer.state[model.weights]
+        tensors = {
+            f"{name}.weights": weights.detach()[k] for name, weights in self._weights().items()
+        }
+        for name, weights in self._learned().items():
+            moments = self.optimizer.state[weights]
             tensors |= {f"{name}.{moment}": moments[moment][k] for moment in _MOMENTS}
         tensors["generator.sampler"] = self.samplers[k].get_state()
         return tensors
@@ -216,10 +245,10 @@ class Learner(ABC):
             RuntimeError: A tensor has another shape.
         """
         k = self.seeds.index(seed)
-        for name, model in self.all_models().items():
-            _copy(model.weights[k], tensors[f"{name}.weights"])
-        for name, model in self.models.items():
-            state = self.optimizer.state[model.weights]
+        for name, weights in self._weights().items():
+            _copy(weights[k], tensors[f"{name}.weights"])
+        for name, weights in self._learned().items():
+            state = self.optimizer.state[weights]
             state["step"].fill_(step)
             for moment in _MOMENTS:
                 _copy(state[moment][k], tensors[f"{name}.{moment}"])
@@ -227,6 +256,21 @@ class Learner(ABC):
             target.reset()
         self.samplers[k].set_state(tensors["generator.sampler"])
         self.step = step
+
+    def _learned(self) -> dict[str, nn.Parameter]:
+        """Return everything that the optimizer changes, (K, P) by name."""
+        return {name: model.weights for name, model in self.models.items()} | self.scalars
+
+    def _weights(self) -> dict[str, nn.Parameter]:
+        """Return the weights (K, P) of all models, and the learned numbers, by name."""
+        return {name: model.weights for name, model in self.all_models().items()} | self.scalars
+
+    def _reset_moments(self, parameters: Sequence[nn.Parameter]) -> None:
+        """Create the optimizer state, so that a checkpoint can be loaded before the first step."""
+        for tensor in parameters:
+            moments = {name: torch.zeros_like(tensor) for name in _MOMENTS}
+            step = torch.tensor(0.0, device=tensor.device)
+            self.optimizer.state[tensor] = {"step": step, **moments}
 
     def _random_networks(self, seed: int) -> dict[str, Network]:
         buffer, architecture = self.buffer, self.architecture
@@ -253,8 +297,8 @@ class _Losses(nn.Module):
 
     def __init__(self, learner: Learner) -> None:
         super().__init__()
-        for name, model in learner.models.items():
-            self.register_parameter(name, model.weights)
+        for name, weights in learner._learned().items():
+            self.register_parameter(name, weights)
         self._function = learner.losses
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:

@@ -20,7 +20,7 @@ from mcaprl.networks import Network
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
 
-_ALIGNMENT = 16
+ALIGNMENT = 16
 """Number of floats in a vector register.
 
 Rows of weights are padded to a multiple of this number, so that the results of a seed do not depend
@@ -47,7 +47,7 @@ class Model(ABC):
         parameters = dict(networks[0].named_parameters())
         self._names, self._shapes = list(parameters), [p.shape for p in parameters.values()]
         length = sum(parameter.numel() for parameter in parameters.values())
-        self._sizes = [*(shape.numel() for shape in self._shapes), -length % _ALIGNMENT]
+        self._sizes = [*(shape.numel() for shape in self._shapes), -length % ALIGNMENT]
         device = next(iter(parameters.values())).device
         weights = torch.zeros(len(networks), sum(self._sizes), device=device)
         for row, network in zip(weights, networks, strict=True):

@@ -94,6 +94,9 @@ def test_configs_cannot_be_changed() -> None:
         (DQNConfig, "gamma", 1.01),
         (DQNConfig, "target_interval", 0),
         (CQLConfig, "alpha", -1.0),
+        (CQLConfig, "target_gap", -0.1),
+        (CQLConfig, "target_gap", float("inf")),
+        (CQLConfig, "target_gap", float("nan")),
     ],
 )
 def test_a_setting_out_of_range_is_refused_by_name(

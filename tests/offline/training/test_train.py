@@ -52,6 +52,7 @@ LATE = {**SHORT, "gamma": 0.5, "target_interval": 30}
 RESUMABLE = [
     SHORT_CQL,
     replace(SHORT_CQL, n_steps=2, frame_stack=2, normalize=True, n_quantiles=3, weight_decay=0.1),
+    replace(SHORT_CQL, target_gap=0.7, alpha=0.5, scale_rewards=True),
     DQNConfig(**LATE, dueling=True, layer_norm=True),
     BCQConfig(**LATE),
     IQLConfig(**LATE),
