@@ -16,6 +16,7 @@ from mcaprl.texts import printable, shortened
 
 INK: Final = "#1d2733"
 PALE: Final = "#b9c2cc"
+BACKGROUND: Final = "#fefefe"
 COLORS: Final = ("#2f6fb7", "#d9622b", "#2a9d6f", "#8a63c9", "#b08d1e", "#c04a7c")
 _STYLE: Final = {
     "text.color": INK,
@@ -35,6 +36,7 @@ _STYLE: Final = {
 _LITERAL: Final = {"text.parse_math": False}
 _MAX_LABEL: Final = 200
 _MAX_TICK_LABEL: Final = 40
+_PAGE_COLORS: Final = {INK: "currentColor", PALE: "var(--pale)", BACKGROUND: "var(--card)"}
 _NO_METADATA: Final = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 _SVG_STYLE: Final = {"svg.fonttype": "none", "svg.hashsalt": "mcaprl"}
 
@@ -73,9 +75,10 @@ def save_png(figure: Any, path: Path) -> None:
 
 
 def to_svg(figure: Any) -> str:
-    """Convert a figure to SVG, and replace two colors by those of the HTML page.
+    """Convert a figure to SVG, and replace three colors by those of the HTML page.
 
-    `INK` becomes the page's text color, and `PALE` becomes the CSS variable `--pale`.
+    `INK` becomes the page's text color. `PALE` and `BACKGROUND` become the CSS variables `--pale`
+    and `--card`, which is the color behind a figure.
     """
     matplotlib = import_extra("matplotlib", "report")
     text = io.StringIO()
@@ -84,7 +87,9 @@ def to_svg(figure: Any) -> str:
         figure.savefig(text, format="svg", transparent=True, metadata=_NO_METADATA)
     element = text.getvalue()
     element = element[element.index("<svg") :]
-    return element.replace(INK, "currentColor").replace(PALE, "var(--pale)")
+    for color, replacement in _PAGE_COLORS.items():
+        element = element.replace(color, replacement)
+    return element
 
 
 def tick_labels(names: Iterable[str]) -> list[str]:

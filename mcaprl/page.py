@@ -19,7 +19,8 @@ from mcaprl.texts import encodable
 
 PAGE_NAME = "index.html"
 """Name of the page in the folder of a report."""
-_NUMBER = re.compile(r"[-+]?\d[\d.,]*( to [-+]?\d[\d.,]*)?( [%a-zA-Z]{1,3})?")
+_NUMBER = re.compile(r"[-+]?\d[\d.,]*( to [-+]?\d[\d.,]*)?(%| [%a-zA-Z]{1,3})?")
+_MAX_SHORT = 30
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,9 @@ class Table:
 
     @property
     def kinds(self) -> list[str]:
-        """Kind of each column: `number` (right-aligned) or `text`."""
+        """Kind of each column: `number` (right-aligned), `short` (one line) or `text`."""
         cells = [[row[k] for row in self.rows if row[k]] for k in range(len(self.columns))]
-        return [
-            "number" if column and all(map(_NUMBER.fullmatch, column)) else "text"
-            for column in cells
-        ]
+        return list(map(_kind, cells))
 
 
 @dataclass(frozen=True)
@@ -88,6 +86,12 @@ class Section:
     figures: Sequence[Figure] = ()
     table: Table | None = None
     cards: Sequence[Card] = ()
+
+
+def _kind(cells: Sequence[str]) -> str:
+    if cells and all(map(_NUMBER.fullmatch, cells)):
+        return "number"
+    return "short" if max(map(len, cells), default=0) <= _MAX_SHORT else "text"
 
 
 def write_page(path: Path, title: str, lead: str, sections: Sequence[Section]) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import TrainingError
-from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png
+from mcaprl.figures import BACKGROUND, COLORS, INK, PALE, new_figure, save_png
 from mcaprl.files import write_atomically
 from mcaprl.runs import CURVE_NAME, Curve, read_curves
 
@@ -146,11 +146,12 @@ def _draw_run(axes: Any, run: RunCurve, color: str, value: str) -> None:
     steps, values = _on_common_steps(run, value)
     axes.plot(steps, values.T, color=color, lw=0.6, alpha=0.35)
     axes.fill_between(steps, values.min(0), values.max(0), color=color, alpha=0.15, lw=0)
-    label = f"{run.name}: median and range of {len(values)} seeds"
+    seeds = "1 seed" if len(values) == 1 else f"median and range of {len(values)} seeds"
+    label = f"{run.name}: {seeds}"
     axes.plot(steps, np.median(values, axis=0), color=color, lw=2, label=label)
     if _has_finals([run], value):
         beyond = np.full(len(run.finals), steps[-1] * 1.04)
-        axes.plot(beyond, run.finals, "o", color=color, mec="white", ms=6, clip_on=False)
+        axes.plot(beyond, run.finals, "o", color=color, mec=BACKGROUND, ms=6, clip_on=False)
 
 
 def _on_common_steps(run: RunCurve, value: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

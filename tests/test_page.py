@@ -14,7 +14,7 @@ import pytest
 
 import mcaprl
 from mcaprl.api.evaluate import learning_curves
-from mcaprl.figures import new_figure, to_svg
+from mcaprl.figures import COLORS, new_figure, to_svg
 from mcaprl.online.curves import CurvePoint, write_curve
 from mcaprl.page import Card, Figure, Section, Table, write_page
 from mcaprl.recorder.dataset.lint import lint
@@ -22,7 +22,7 @@ from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.recorder.viewer.report import dataset_page, tracks_of
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.evaluate import PolicyScore
-from mcaprl.sims.evaluation.report import evaluation_page
+from mcaprl.sims.evaluation.report import comparison_figure, evaluation_page
 from mcaprl.sims.evaluation.rollout import EpisodeResult
 from tests.conftest import need
 
@@ -168,6 +168,18 @@ def test_an_evaluation_shows_the_learning_curves(tmp_path: Path) -> None:
     assert document.count("<svg") == 1 + 1 + 2 + 3, "comparison, ways, thumbnails, curves"
 
 
+def test_the_colors_of_an_evaluation_figure_fit_both_color_schemes() -> None:
+    scores = []
+    for name, total in (("cql", 3.5), ("pilot", 9.0)):
+        episodes = tuple(
+            (EpisodeResult(seed, total + seed, 1, "crash", np.empty((0, 2))),) for seed in range(3)
+        )
+        scores.append(PolicyScore(name, episodes, total, (total, total + 2)))
+    drawn = to_svg(comparison_figure(scores, "", (5.0, 4.0, 6.0)))
+    of_page = {"currentColor", "var(--pale)", "var(--card)"}
+    assert set(re.findall(r'(?:fill|stroke): ([^;"]+)', drawn)) == {"none", *COLORS[:2], *of_page}
+
+
 def test_text_is_escaped(tmp_path: Path) -> None:
     evil = "<script>alert(1)</script>"
     figure, axes = new_figure((2, 1))
@@ -183,9 +195,10 @@ def test_text_is_escaped(tmp_path: Path) -> None:
     assert "<script" not in (tmp_path / "evil.html").read_text()
 
 
-def test_numbers_are_right_aligned() -> None:
-    rows = [["lane", "1.5", "3", ""], ["12", "-2 to 3.25", "x", "4.5 s"]]
-    assert Table(["a", "b", "c", "d"], rows).kinds == ["text", "number", "text", "number"]
+def test_numbers_are_right_aligned_and_short_texts_are_not_wrapped() -> None:
+    rows = [["lane", "1.5", "3", "", "x" * 31], ["12", "-2 to 3.25", "x", "4.5 s", "1"]]
+    assert Table("abcde", rows).kinds == ["short", "number", "short", "number", "text"]
+    assert Table("a", [["7.5%"], ["100%"]]).kinds == ["number"]
 
 
 def test_equal_figures_are_equal_bytes() -> None:

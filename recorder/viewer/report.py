@@ -18,10 +18,12 @@ from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.open import open_logs
 from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.record.display import TELEMETRY
+from mcaprl.texts import counted
 
 Positions = NDArray[np.float64]
 _POSITION = ("x_m", "y_m")
 _BINS = 30
+_LAST: Final = "A cross in a map is the last position of the episode."
 _SHOWN_EPISODES: Final = 3
 """Maximum number of best episodes, and of worst episodes, on the page."""
 _MAP_CELLS = 80
@@ -74,7 +76,7 @@ def dataset_page(
     tracks = tracks_of(dataset)
     statistics = dataset.statistics
     lead = (
-        f"{statistics.episodes} episodes, {statistics.steps} steps of"
+        f"{counted(statistics.episodes, 'episode')}, {counted(statistics.steps, 'step')} of"
         f" {dataset.env_id or 'an unknown environment'}"
     )
     sections = [
@@ -82,7 +84,11 @@ def dataset_page(
         _findings_section(findings),
         Section("Episodes", figures=_figures(dataset, tracks)),
         *_calibration_section(dataset),
-        Section("Best and worst episodes", cards=_cards(dataset, tracks)),
+        Section(
+            "Best and worst episodes",
+            _LAST if any(map(len, tracks)) else "",
+            cards=_cards(dataset, tracks),
+        ),
         Section("Observations", table=_columns(dataset)),
     ]
     write_page(path, title, lead, sections)
@@ -134,7 +140,7 @@ def _figures(dataset: Dataset, tracks: Sequence[Positions]) -> list[Figure]:
         found.append(Figure.of(caption, figure))
     coverage = _coverage(tracks)
     if coverage is not None:
-        found.append(Figure.of("Positions in meters; darker cells have more steps", coverage))
+        found.append(Figure.of("Positions in meters; a stronger color means more steps", coverage))
     return found
 
 
@@ -176,7 +182,8 @@ def _commands(dataset: Dataset) -> list[str]:
 
 
 def _card(kind: str, episode: Episode, track: Positions, places: Positions, command: str) -> Card:
-    text = f"return {episode.total_reward:.4g}, {len(episode)} steps, {episode.reason or 'unknown'}"
+    steps, reason = counted(len(episode), "step"), episode.reason or "unknown"
+    text = f"return {episode.total_reward:.4g}, {steps}, {reason}"
     if episode.policy:
         text += f", by {episode.policy}"
     return Card(
@@ -198,7 +205,9 @@ def _thumbnail(episode: Episode, track: Positions, places: Positions) -> str:
         axes.set_aspect("equal")
         axes.set_axis_off()
     else:
-        axes.plot(np.cumsum(episode.rewards), color=COLORS[1])
+        # The first point makes an episode of one step visible.
+        axes.plot(np.cumsum([0.0, *episode.rewards]), color=COLORS[1])
+        axes.xaxis.get_major_locator().set_params(integer=True)
         axes.set_xlabel("step")
         axes.set_title("cumulative reward")
     return to_svg(figure)

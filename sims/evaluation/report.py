@@ -11,18 +11,23 @@ from typing import Any
 
 import numpy as np
 
-from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, tick_labels, to_svg
+from mcaprl.figures import BACKGROUND, COLORS, INK, PALE, new_figure, save_png, tick_labels, to_svg
 from mcaprl.page import PAGE_NAME, Card, Figure, Section, Table, write_page
 from mcaprl.sims.drawing.scene import Shape
 from mcaprl.sims.drawing.top_view import patches
 from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore
 from mcaprl.sims.evaluation.rollout import EpisodeResult
 from mcaprl.sims.evaluation.statistics import interquartile_mean, median
+from mcaprl.texts import counted
 
 _MAX_PATHS = 30
 _PAIRS = (
     "Probability that an episode of the first policy has a higher return than an episode of"
     " the second; ties count half."
+)
+_CARDS = (
+    "env.reset(seed=...) starts the same episode. Episodes that --record writes to a log have the"
+    " command that replays them instead. A cross marks an end before the time limit."
 )
 _FLAT_M = 1.0
 """Boxes up to this height are ground and are not drawn."""
@@ -58,7 +63,7 @@ def comparison_figure(
         axes.plot([low, high], [row, row], color=INK, lw=2, solid_capstyle="butt")
         means = score.returns.mean(axis=1)
         if len(means) > 1:
-            axes.plot(means, np.full(len(means), row), "o", color="white", mec=INK, ms=4.5)
+            axes.plot(means, np.full(len(means), row), "o", color=BACKGROUND, mec=INK, ms=4.5)
         label = f"{score.mean_return:.1f}"
         if score.normalized_score is not None:
             label += f"   score {score.normalized_score:.2f}"
@@ -66,7 +71,7 @@ def comparison_figure(
         end = max(high, 0.0, float(means.max()))
         text = axes.annotate(label, (end, row), (8, 0), textcoords="offset points", va="center")
         # The background keeps the label readable where the line of the logged behavior crosses it.
-        text.set_bbox({"facecolor": axes.get_facecolor(), "alpha": 0.85, "lw": 0, "pad": 1})
+        text.set_bbox({"facecolor": BACKGROUND, "alpha": 0.85, "lw": 0, "pad": 1})
     axes.set_yticks(range(len(scores)), tick_labels(score.policy for score in scores))
     axes.invert_yaxis()
     axes.set_xlim(right=axes.get_xlim()[1] * 1.28)
@@ -173,14 +178,15 @@ def evaluation_page(
         Section("Probability of improvement", _PAIRS, table=_improvement_table(compared)),
     ]
     if trajectories is not None:
-        text = "A cross marks an episode that ended before the time limit."
+        text = "A cross marks the end of an episode before the time limit."
         sections.append(Section("Trajectories", text, figures=_trajectories(scores, world)))
     cards = _cards(scores, world, recorded)
-    sections.append(Section("Best and worst episodes", cards=cards))
+    sections.append(Section("Best and worst episodes", _CARDS, cards=cards))
     if curves:
         sections.append(Section("Learning curves", figures=curves))
     episodes = sum(score.returns.size for score in scores)
-    write_page(folder / PAGE_NAME, title, f"{episodes} episodes, greedy actions", sections)
+    lead = f"{counted(episodes, 'episode')}, greedy actions"
+    write_page(folder / PAGE_NAME, title, lead, sections)
 
 
 def _score_table(scores: Sequence[PolicyScore]) -> Table:
@@ -188,16 +194,17 @@ def _score_table(scores: Sequence[PolicyScore]) -> Table:
         (
             score.policy,
             f"{score.mean_return:.2f}",
+            "" if score.normalized_score is None else f"{score.normalized_score:.3f}",
+            "" if score.success_rate is None else f"{score.success_rate:.0%}",
             f"{score.interval[0]:.2f} to {score.interval[1]:.2f}",
             f"{float(interquartile_mean(score.returns)):.2f}",
             f"{float(median(score.returns)):.2f}",
-            "" if score.normalized_score is None else f"{score.normalized_score:.3f}",
-            "" if score.success_rate is None else f"{score.success_rate:.0%}",
             _ends(score),
         )
         for score in scores
     ]
-    names = ("policy", "mean return", "95 % interval", "IQM", "median", "score", "success", "ends")
+    # A phone shows the first columns only.
+    names = ("policy", "mean return", "score", "success", "95 % interval", "IQM", "median", "ends")
     return Table(names, rows)
 
 
@@ -219,23 +226,29 @@ def _cards(
         totals = [episode.total_reward for episode in episodes]
         for kind, index in (("best", int(np.argmax(totals))), ("worst", int(np.argmin(totals)))):
             episode = episodes[index]
-            command = f"reset(seed={episode.seed})"
+            command = f"env.reset(seed={episode.seed})"
             if recorded is not None and row < recorded[1]:
                 command = f"mcaprl replay {recorded[0]} --episode {first + index}"
-            text = f"return {episode.total_reward:.4g}, {episode.length} steps, {episode.reason}"
-            cards.append(Card(f"{score.policy}: {kind}", text, _thumbnail(episode, world), command))
+            steps = counted(episode.length, "step")
+            text = f"return {episode.total_reward:.4g}, {steps}, {episode.reason}"
+            thumbnail = _thumbnail(episode, world, COLORS[row % len(COLORS)])
+            cards.append(Card(f"{score.policy}: {kind}", text, thumbnail, command))
         first += len(episodes)
     return cards
 
 
-def _thumbnail(episode: EpisodeResult, world: Sequence[Shape]) -> str:
-    """Return an episode's trajectory as a small SVG; empty if the episode has no positions."""
+def _thumbnail(episode: EpisodeResult, world: Sequence[Shape], color: str) -> str:
+    """Return an episode's trajectory as a small SVG; empty if the episode has no positions.
+
+    The last position is a cross if the episode ended before the time limit, otherwise a dot.
+    """
     if not episode.positions.size:
         return ""
     figure, axes = new_figure((3.2, 2.2))
     _draw_world(axes, world)
-    axes.plot(*episode.positions.T, color=COLORS[1], lw=1.6)
-    axes.plot(*episode.positions[-1], "x", color=INK, ms=6)
+    axes.plot(*episode.positions.T, color=color, lw=1.6)
+    marker = "o" if episode.reason == "time_limit" else "x"
+    axes.plot(*episode.positions[-1], marker, color=INK, ms=6)
     axes.set_aspect("equal")
     axes.set_axis_off()
     return to_svg(figure)
