@@ -1,8 +1,8 @@
 """Command-line interface; `mcaprl --help` lists the commands.
 
-Every command exits 0 on success, 1 on failure, 2 on invalid usage. User errors are printed as one
-line on stderr. Each command calls the public API function of the same name. Torch and numba are
-imported only by the commands that need them.
+Every command exits 0 on success, 1 on failure, 2 on invalid usage, 130 if it is interrupted. User
+errors are printed as one line on stderr. Each command calls the public API function of the same
+name. Torch and numba are imported only by the commands that need them.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 
 import click
 
+from mcaprl._interrupt import INTERRUPTED
 from mcaprl._version import __version__
 from mcaprl.cli.completion import completion
 from mcaprl.cli.convert import convert
@@ -69,11 +70,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: Command-line arguments; default: `sys.argv[1:]`.
     """
-    # SIGTERM and SIGHUP act like Ctrl-C, so that a recording closes its file. Under nohup, SIGHUP
-    # stays ignored.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
-        signal.signal(signal.SIGHUP, signal.default_int_handler)
+    # SIGTERM and SIGHUP act like Ctrl-C, so that a recording closes its file. A signal that is
+    # ignored, such as SIGHUP under nohup, stays ignored.
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler)
     warnings.showwarning = _print_warning
     threading.excepthook = _on_thread_error
     sys.exit(run(arguments))
@@ -95,8 +97,10 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(error), error.exit_code)
     except OSError as error:
         return _fail(f"{error.filename or 'output'}: {error.strerror}", 1)
-    except (click.Abort, KeyboardInterrupt):
-        return _fail("interrupted; finished work is kept", 1)
+    except (click.Abort, KeyboardInterrupt) as error:
+        # Click converts a KeyboardInterrupt to an Abort. The notes say what is kept.
+        notes = getattr(error.__cause__ or error, "__notes__", [])
+        return _fail("; ".join(["interrupted", *notes]), INTERRUPTED)
     return code if isinstance(code, int) else 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from mcaprl.cli.options import (
     ray_options,
     sim_options,
 )
-from mcaprl.cli.progress import working
+from mcaprl.cli.progress import keeping, working
 from mcaprl.cli.show import echo, print_json, print_table
 from mcaprl.errors import UsageError
 from mcaprl.page import PAGE_NAME
@@ -108,7 +109,8 @@ def evaluate(
         print_json(estimates.to_json()) if as_json else _print_estimates(estimates)
     elif sim is not None and data is None:
         _refuse_unused(given, _OF_DATA, "data")
-        with working("loading the sim and the policies") as bar:
+        kept = nullcontext() if others["record"] is None else keeping("finished episodes are kept")
+        with kept, working("loading the sim and the policies") as bar:
             found = mcaprl.evaluate(
                 policies, sim, episodes=episodes, seed=seed, progress=bar, **given
             )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
 from typing import Final
 
 import click
@@ -48,6 +50,29 @@ def working(text: str) -> AbstractContextManager[ProgressBar]:
 def training_progress(unit: str, term: str) -> AbstractContextManager[ProgressCallback]:
     """Show progress bars of training; see `mcaprl.progress.terminal_progress`."""
     return nullcontext(lambda _: None) if _is_quiet() else terminal_progress(unit, term)
+
+
+@contextmanager
+def keeping(text: str, proof: Path | None = None) -> Iterator[None]:
+    """Context manager that adds what is kept to the message of an interruption.
+
+    Args:
+        text: What is kept, such as `finished episodes are kept`.
+        proof: File that must exist for the text to be true; None if it is always true.
+    """
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        if proof is None or proof.exists():
+            error.add_note(text)
+        raise
+
+
+def checkpoints_kept(run: Path) -> AbstractContextManager[None]:
+    """Return a context manager that names `--resume` if a training is interrupted."""
+    from mcaprl.runs import CONFIG_NAME
+
+    return keeping("continue with --resume", run / CONFIG_NAME)
 
 
 def _is_quiet() -> bool:

@@ -12,7 +12,7 @@ import mcaprl
 from mcaprl.cli.completion import Name, policies, sims
 from mcaprl.cli.help import Command
 from mcaprl.cli.options import integer_option, ray_options, sim_options
-from mcaprl.cli.progress import working
+from mcaprl.cli.progress import keeping, working
 from mcaprl.cli.show import echo
 from mcaprl.texts import counted, size
 
@@ -85,7 +85,8 @@ def record(no_scene: bool, **request: Any) -> None:
     SIM is lane, powerline, racer, highway-lane, or any Gymnasium id. Each episode is
     written when it ends.
     """
-    with working("loading the sim and the policy") as bar:
+    kept = f"finished {'logs' if request['ray'] else 'episodes'} are kept"
+    with keeping(kept), working("loading the sim and the policy") as bar:
         found = mcaprl.record(**request, scene=not no_scene, progress=bar)
     echo(
         f"{found.out}: {counted(found.episodes, 'episode')}, {counted(found.steps, 'step')},"

@@ -12,7 +12,7 @@ import mcaprl
 from mcaprl.cli.completion import Name
 from mcaprl.cli.help import Command
 from mcaprl.cli.options import PATH, integer_option, mapping_options, ray_options
-from mcaprl.cli.progress import hint, training_progress, working
+from mcaprl.cli.progress import checkpoints_kept, hint, training_progress, working
 from mcaprl.cli.settings import SettingsCommand
 from mcaprl.cli.show import echo, print_table
 from mcaprl.errors import UsageError
@@ -82,7 +82,7 @@ def train_offline(data: tuple[str, ...], out: Path, sweep: Path | None, **reques
     if sweep is not None:
         _sweep(data, out, sweep, request)
         return
-    with training_progress("updates", "loss") as progress:
+    with checkpoints_kept(out), training_progress("updates", "loss") as progress:
         summaries = mcaprl.train(data, out, on_data=_print_data, progress=progress, **given)
     from mcaprl.offline.selection.choice import CHOICE_NAME, read_choice
     from mcaprl.offline.training.curves import CURVES_NAME

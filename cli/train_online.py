@@ -12,7 +12,7 @@ import click
 import mcaprl
 from mcaprl.cli.completion import Name, sims
 from mcaprl.cli.options import integer_option, origin_option, sim_options
-from mcaprl.cli.progress import hint, training_progress
+from mcaprl.cli.progress import checkpoints_kept, hint, training_progress
 from mcaprl.cli.settings import SettingsCommand
 from mcaprl.cli.show import print_address, print_table
 from mcaprl.settings import Settings
@@ -94,7 +94,7 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
     selected on one set of episodes and scored on another set.
     """
     given = {name: value for name, value in request.items() if value is not None}
-    with training_progress("steps", "score") as progress:
+    with checkpoints_kept(out), training_progress("steps", "score") as progress:
         found = mcaprl.train_online(sim, out, on_live=print_address, progress=progress, **given)
     rows = [
         [

@@ -12,6 +12,7 @@ is `train`, `evaluate --data` is `estimate`, and `replay` is split into `replay`
 
 from typing import TYPE_CHECKING
 
+import mcaprl._interrupt  # first, because the other imports take up to a second
 import mcaprl.sims  # noqa: F401  (registers the environments)
 from mcaprl._version import __version__
 from mcaprl.errors import McaprlError

@@ -460,10 +460,38 @@ def test_stopped_recording_is_readable(number: signal.Signals) -> None:
         time.sleep(0.05)
     process.send_signal(number)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == 1
-    assert err.splitlines()[-1] == "mcaprl: interrupted; finished work is kept"
+    assert process.returncode == 130
+    assert err.splitlines()[-1] == "mcaprl: interrupted; finished episodes are kept"
     assert run(["check", "stopped.mcap"]) == 0
     assert len(mcaprl.open(path).episodes) >= 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "function", "kept"),
+    [
+        (["record", "lane", "--steps", "5", "--out", "x.mcap"], "record", "; finished episodes ar"),
+        (["evaluate", "pilot", "--sim", "lane"], "evaluate", "\n"),
+        (["evaluate", "run", "--data", "x"], "estimate", "\n"),
+        (["train-offline", "x", "--out", "new"], "train", "\n"),
+        (["train-offline", "x", "--out", "run"], "train", "; continue with --resume\n"),
+        (["train-online", "lane", "--out", "run"], "train_online", "; continue with --resume\n"),
+    ],
+)
+def test_an_interruption_says_what_is_kept(
+    arguments: list[str],
+    function: str,
+    kept: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    Path("run").mkdir()
+    Path("run/config.json").touch()
+    monkeypatch.setattr(mcaprl, function, stopped)
+    assert run(arguments) == 130
+    assert f"mcaprl: interrupted{kept}" in capsys.readouterr().err
 
 
 def test_help_has_the_defaults_of_each_sim(capsys: pytest.CaptureFixture[str]) -> None:
