@@ -101,10 +101,18 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
 
 @click.command(cls=Command)
 @click.argument("source", metavar="SIM|LOG", type=Name(sims, is_path=True))
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="JSON file to write.")
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="JSON file to write; - for the standard output.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def layout(source: str, out: Path, overwrite: bool) -> None:
     """Write the Foxglove layout of a log, or of the logs of a sim."""
+    if str(out) == "-":
+        print_json(mcaprl.layout(source))
+        return
     mcaprl.layout(source, out, overwrite=overwrite)
     echo(f"{out}: written")
     hint("in Foxglove, open the layout menu and import this file")

@@ -88,8 +88,12 @@ def record(no_scene: bool, **request: Any) -> None:
     kept = f"finished {'logs' if request['ray'] else 'episodes'} are kept"
     with keeping(kept), working("loading the sim and the policy") as bar:
         found = mcaprl.record(**request, scene=not no_scene, progress=bar)
+    written = str(found.out)
+    if not found.out.exists():
+        parts = [str(path) for path in found.files]
+        written = parts[0] if len(parts) == 1 else f"{parts[0]} to {parts[-1]}"
     echo(
-        f"{found.out}: {counted(found.episodes, 'episode')}, {counted(found.steps, 'step')},"
+        f"{written}: {counted(found.episodes, 'episode')}, {counted(found.steps, 'step')},"
         f" mean return {found.mean_return:.2f} (standard deviation {found.return_std:.2f}),"
         f" {size(found.size_bytes)}"
     )

@@ -21,7 +21,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
-from mcaprl.errors import LogError, McaprlError, OutputExistsError
+from mcaprl.errors import LogError, McaprlError, OutputExistsError, UsageError
 
 if sys.platform != "win32":
     import fcntl
@@ -62,7 +62,7 @@ def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Ite
         if sys.platform != "win32":
             descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
-        raise error_type(f"cannot write {folder}: {error.strerror or error}") from error
+        raise error_type(f"cannot write {folder}: {_reason(folder, error)}") from error
     try:
         if descriptor >= 0 and not try_lock(descriptor):
             raise error_type(
@@ -104,6 +104,18 @@ def check_target(path: Path, *, overwrite: bool) -> None:
         )
     with locked_file(path):
         pass
+
+
+def check_log_name(path: str | Path) -> Path:
+    """Check that the name of a log to write ends in `.mcap`; return the path.
+
+    Raises:
+        UsageError: It has another suffix, so that folders and globs of logs would not include it.
+    """
+    path = Path(path)
+    if path.suffix != ".mcap":
+        raise UsageError(f"{path}: the name of a log must end in .mcap")
+    return path
 
 
 @contextmanager
@@ -246,7 +258,7 @@ def replacing(
     except OSError as error:
         if error_type is None:
             raise
-        raise error_type(f"cannot write {path}: {error.strerror or error}") from error
+        raise error_type(f"cannot write {path}: {_reason(path, error)}") from error
     except LogError as error:
         # The message names the target, because the user does not know the work folder.
         cause = error.__cause__
@@ -289,7 +301,16 @@ def replacing_folder(
                 os.rename(path, work / f"{path.name}.old")
             os.rename(unfinished, path)
     except OSError as error:
-        raise error_type(f"cannot write {path}: {error.strerror or error}") from error
+        raise error_type(f"cannot write {path}: {_reason(path, error)}") from error
+
+
+def _reason(path: Path, error: OSError) -> str:
+    """Return why a file or folder cannot be created."""
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        for folder in (path, *path.parents):
+            if folder.exists() and not folder.is_dir():
+                return f"{folder} is not a folder"
+    return error.strerror or str(error)
 
 
 def _check_folder(path: Path, *, overwrite: bool) -> None:

@@ -10,6 +10,7 @@ Importing this package does not import numba or pygame; making or rendering a si
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
@@ -106,6 +107,9 @@ def _clear_errors(name: str, spec: SimSpec | None, kwargs: dict[str, Any]) -> It
     except (TypeError, ValueError, gym.error.Error, ModuleNotFoundError) as error:
         given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
         reason = str(error).split(" was raised from the environment creator")[0]
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", reason)
+        if unknown and unknown[1] in kwargs:
+            raise UsageError(f"sim '{name}' has no argument {unknown[1]}: omit it") from error
         raise UsageError(f"cannot make sim '{name}' with {given}: {reason}") from error
 
 

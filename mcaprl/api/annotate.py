@@ -13,7 +13,7 @@ from mcaprl.api.environments import sim_of
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
 from mcaprl.api.ranges import check_fraction
 from mcaprl.errors import UsageError
-from mcaprl.files import check_target
+from mcaprl.files import check_log_name, check_target
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import open_logs
@@ -84,6 +84,7 @@ def annotate(
     """
     check_fraction(gamma=gamma)
     path, names, added = as_path(file, whole=True), as_names(policy), None
+    check_log_name(out)
     if not names and not scene:
         raise UsageError("annotate needs --policy POLICY, --scene, or both")
     if mapping is not None:

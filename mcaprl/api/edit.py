@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mcaprl.api.data import Paths
+from mcaprl.files import check_log_name
 from mcaprl.recorder.edit.cut import filter_log, split_log
 from mcaprl.recorder.edit.join import merge_logs
 from mcaprl.recorder.edit.piece import Bounds, slice_log
@@ -35,7 +36,7 @@ def merge(logs: Paths, out: str | Path, *, shift: bool = False, overwrite: bool 
         LogError: A log cannot be read. Or the environment, names or step duration differ. Or
             episodes of two logs overlap in time, and `shift` is not set.
     """
-    return merge_logs(logs, out, shift=shift, overwrite=overwrite)
+    return merge_logs(logs, check_log_name(out), shift=shift, overwrite=overwrite)
 
 
 def split(
@@ -90,7 +91,7 @@ def filter(expression: str, log: str | Path, out: str | Path, *, overwrite: bool
         NoEpisodesError: The expression is true for no episode.
         LogError: The log cannot be read, or is not finished.
     """
-    return filter_log(expression, log, out, overwrite=overwrite)
+    return filter_log(expression, log, check_log_name(out), overwrite=overwrite)
 
 
 def slice(
@@ -122,4 +123,4 @@ def slice(
         NoEpisodesError: The range has no complete transition.
         LogError: The log cannot be read, or is not finished.
     """
-    return slice_log(log, out, steps=steps, time=time, overwrite=overwrite)
+    return slice_log(log, check_log_name(out), steps=steps, time=time, overwrite=overwrite)

@@ -18,7 +18,7 @@ from mcaprl.api.evaluate_parts import Part, results_on_ray
 from mcaprl.api.policies import SCRIPTED, Names, as_names, policies_of, policy_names
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import ReportError, UsageError, import_extra
-from mcaprl.files import write_json
+from mcaprl.files import check_log_name, write_json
 from mcaprl.page import Figure
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.open import find_logs, open_logs
@@ -149,6 +149,8 @@ def evaluate(
         raise UsageError("--record needs one process: omit --ray")
     names, options = as_names(policies), all_options(observation, rules, sim_options)
     log, folder = (None if path is None else Path(path) for path in (record, report))
+    if log is not None:
+        check_log_name(log)
     env = make_sim(sim, **options)
     with closing(env):
         # Arguments are checked first, because the episodes may take minutes.

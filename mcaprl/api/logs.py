@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from mcaprl.api.data import MappingFile, Paths, mapped, open_data
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import LogError, ReportError, UsageError, import_extra
-from mcaprl.files import size_of, write_json
+from mcaprl.files import check_log_name, size_of, write_json
 from mcaprl.page import PAGE_NAME
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import Calibration, calibration
@@ -297,4 +297,6 @@ def recover(
     """
     from mcaprl.recorder.repair.recover import recover_log
 
-    return recover_log(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)
+    return recover_log(
+        file, check_log_name(out), keep_unfinished=keep_unfinished, overwrite=overwrite
+    )

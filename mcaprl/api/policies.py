@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -134,7 +135,7 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
 
     Raises:
         UnknownNameError: There is no such policy.
-        UsageError: The sim has no pilot.
+        UsageError: The sim has no pilot, or there is no such path.
         PolicyError: The path contains no policy, or the policy's spaces differ from those of `env`.
     """
     if name == "random":
@@ -159,13 +160,13 @@ def trained_policies(name: str, dataset: Dataset) -> list[TrainedPolicy]:
     """Load the policies of all seeds of a run, and check that they fit a log.
 
     Raises:
-        UsageError: The policy is scripted.
-        UnknownNameError: There is no such path.
+        UsageError: The policy is scripted, or there is no such path.
+        UnknownNameError: There is no such policy.
         PolicyError: The path contains no policy, or the policy's spaces differ from the log's.
     """
     if name in SCRIPTED:
         raise UsageError(
-            f"{name} has no network to evaluate on a log: pass the path of a trained run, or --sim"
+            f"{name} has no network to evaluate on a log: pass the path of a trained run"
         )
     policies = load_policies(_existing(name, ["the path of a trained run"]))
     for policy in policies:
@@ -201,10 +202,16 @@ def _existing(name: str, others: Sequence[str]) -> Path:
         return path
     folders = sorted(path.parent.iterdir()) if path.parent.is_dir() else []
     runs = [str(folder) for folder in folders if (folder / CONFIG_NAME).exists()]
+    if path.parent != Path():
+        near = difflib.get_close_matches(name, runs, n=1, cutoff=0.5)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise UsageError(f"{name}: no such file or folder{hint}")
     raise UnknownNameError("policy", name, [*others, *runs])
 
 
 def _found_files(path: Path) -> list[Path]:
+    if path.suffix == ".mcap":
+        raise PolicyError(f"{path} is a log: pass the path of a trained run, or a .zip file of SB3")
     files = policy_files(path)
     if not files:
         raise PolicyError(

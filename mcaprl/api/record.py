@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ from mcaprl.api.ranges import check_fraction, check_least
 from mcaprl.api.record_file import FileRequest, record_file
 from mcaprl.api.shards import record_on_ray, record_shards
 from mcaprl.errors import UsageError
+from mcaprl.files import check_log_name
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.manifest import MANIFEST_NAME
 from mcaprl.remote import check_upload, upload_all
@@ -27,12 +29,14 @@ class Recording:
     """Result of `record`.
 
     Attributes:
-        out: Written file or folder.
+        out: File or folder to write, as in the call.
         episodes: Number of episodes.
         steps: Number of steps.
         mean_return: Mean of the episodes' returns.
         return_std: Standard deviation of the episodes' returns.
-        size_bytes: Size of all files of `out`, including earlier episodes.
+        size_bytes: Size of all files, including earlier episodes.
+        files: Paths of the logs: `out`, the logs in this folder, or with `rotate_mb` the numbered
+            files.
         results: Result of each episode.
     """
 
@@ -42,6 +46,7 @@ class Recording:
     mean_return: float
     return_std: float
     size_bytes: int
+    files: tuple[Path, ...]
     results: tuple[EpisodeResult, ...] = field(repr=False)
 
 
@@ -132,6 +137,8 @@ def record(
         rotate_mb=rotate_mb,
     )
     _check_request(request, envs)
+    if envs == 1 and not ray:
+        check_log_name(request.out)
     on_cluster = ClusterOptions(ray, workers, address)
     on_cluster.check(shards=shards)
     if ray:
@@ -149,8 +156,8 @@ def record(
             results = record_file(request, on_episode)
         else:
             results = record_shards(request, envs, on_episode)
+    files = _files(request.out)
     if upload is not None:
-        files = _files(request.out)
         upload_all([*files, request.out / MANIFEST_NAME] if ray else files, upload)
     returns = np.array([result.total_reward for result in results])
     return Recording(
@@ -159,7 +166,8 @@ def record(
         sum(result.length for result in results),
         float(returns.mean()),
         float(returns.std()),
-        sum(path.stat().st_size for path in _files(request.out)),
+        sum(path.stat().st_size for path in files),
+        tuple(files),
         tuple(results),
     )
 
@@ -195,4 +203,7 @@ def _files(out: Path) -> list[Path]:
     """Return the written files: one file, its rotated parts, or the shards in a folder."""
     if out.is_file():
         return [out]
-    return sorted(out.glob("*.mcap") if out.is_dir() else out.parent.glob(f"{out.stem}-*.mcap"))
+    if out.is_dir():
+        return sorted(out.glob("*.mcap"))
+    pattern = re.escape(out.stem) + r"-\d{5}\.mcap"
+    return sorted(path for path in out.parent.iterdir() if re.fullmatch(pattern, path.name))

@@ -315,25 +315,45 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["layout", "lane", "--out", "b.json"]) == 0
     assert "3D!scene" in json.loads(Path("b.json").read_text())["configById"]
     assert run(["layout", "CartPole-v1", "--out", "c.json"]) == 0
+    capsys.readouterr()
+    assert run(["layout", "lane", "--out", "-"]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads(Path("b.json").read_text())
+    assert not Path("-").exists()
     assert "exists" in fails_after(capsys, 2, "layout", "lane", "--out", "c.json")
 
 
 @pytest.mark.parametrize(
     ("arguments", "code", "reported"),
     [
-        (["record", "lan", "--steps", "5", "--out", "x"], 2, "did you mean lane?"),
-        (["record", "CartPol-v1", "--steps", "5", "--out", "x"], 2, "CartPole-v1"),
-        (["record", "a:b:c", "--steps", "5", "--out", "x"], 2, "a:b:c"),
-        (["record", "lane", "--policy", "pilt", "--steps", "5", "--out", "x"], 2, "mean pilot?"),
-        (["record", "CartPole-v1", "--steps", "5", "--out", "x"], 2, "CartPole-v1"),
-        (["record", "lane", "--out", "x"], 2, "--episodes N or --steps N"),
+        (["record", "lan", "--steps", "5", "--out=x.mcap"], 2, "did you mean lane?"),
+        (["record", "CartPol-v1", "--steps", "5", "--out=x.mcap"], 2, "CartPole-v1"),
+        (["record", "a:b:c", "--steps", "5", "--out=x.mcap"], 2, "a:b:c"),
+        (["record", "lane", "--policy", "pilt", "--steps", "5", "--out=x.mcap"], 2, "mean pilot?"),
+        (["record", "CartPole-v1", "--steps", "5", "--out=x.mcap"], 2, "CartPole-v1"),
+        (["record", "lane", "--out=x.mcap"], 2, "--episodes N or --steps N"),
         (["record", "lane", "--steps", "5"], 2, "Missing option '--out'"),
-        (["record", "lane", "--steps", "-1", "--out", "x"], 2, "--steps"),
-        (["record", "lane", "--steps", "5", "--out", "x", "--epsilon", "2"], 2, "--epsilon"),
-        (["record", "lane", "--steps", "5", "--out", "x", "--rules", "odd"], 2, "classic-code"),
-        (["record", "lane", "--steps", "5", "--out", "x", "--observation", "sound"], 2, "depth, "),
+        (["record", "lane", "--steps", "-1", "--out=x.mcap"], 2, "--steps"),
+        (["record", "lane", "--steps", "5", "--out=x.mcap", "--epsilon", "2"], 2, "--epsilon"),
+        (["record", "lane", "--steps", "5", "--out=x.mcap", "--rules", "odd"], 2, "classic-code"),
+        (["record", "lane", "--steps=5", "--out=x.mcap", "--observation", "sound"], 2, "depth, "),
         (["record", "lane", "--steps", "5", "--out", "taken/x.mcap"], 1, "cannot write taken/"),
-        (["record", "lane", "--steps", "5", "--out", "taken"], 2, "taken exists"),
+        (["record", "lane", "--steps", "5", "--out", "empty.mcap"], 2, "empty.mcap exists"),
+        (["record", "lane", "--steps", "5", "--out", "x.csv"], 2, "x.csv: the name of a log must"),
+        (["record", "lane", "--steps", "5", "--out", "-"], 2, "a log must end in .mcap"),
+        (["recover", str(LANE_LOG), "x"], 2, "a log must end in .mcap"),
+        (["annotate", str(LANE_LOG), "--scene", "--out", "x"], 2, "a log must end in .mcap"),
+        (["slice", str(LANE_LOG), "x", "--steps", "0:9"], 2, "a log must end in .mcap"),
+        (["evaluate", "pilot", "--sim", "lane", "--record", "x"], 2, "a log must end in .mcap"),
+        (
+            ["record", "lane", "--policy", str(LANE_LOG), "--steps", "5", "--out=x.mcap"],
+            1,
+            "lane-1.mcap is a log: pass the path of a trained run",
+        ),
+        (
+            ["record", "FrozenLake-v1", "--observation", "depth", "--steps", "5", "--out=x.mcap"],
+            2,
+            "sim 'FrozenLake-v1' has no argument observation: omit it",
+        ),
         (["info", "nothing.mcap"], 1, "no such file"),
         (["info", "taken"], 1, "not an MCAP file"),
         (["info", "empty.mcap"], 1, "it is empty"),
@@ -342,7 +362,7 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         (["train-offline", str(LANE_LOG), "--out", "taken"], 2, "taken exists"),
         (["train-offline", str(LANE_LOG), "--out", "taken/r"], 1, "cannot write taken/r"),
         (["evaluate", "pilot", "--sim", "lane", "--episodes=1", "--report", "taken"], 1, "cann"),
-        (["info", str(LANE_LOG), "--report", "taken"], 1, "cannot write taken/"),
+        (["info", str(LANE_LOG), "--report", "taken"], 1, "dataset.json: taken is not a folder"),
         (["train-offline", str(LANE_LOG), "--out", "r", "--algo", "cqk"], 2, "did you mean cql"),
         (
             ["train-offline", str(LANE_LOG), "--out", "r", "--algo", "bc", "--alpha", "1"],
@@ -353,14 +373,15 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         (["evaluate", "pilot", "--sim", "line"], 2, "did you mean lane"),
         (["evaluate", "taken", "--sim", "lane"], 1, "taken"),
         (["evaluate", "nowhere", "--sim", "lane"], 2, "unknown policy 'nowhere'"),
+        (["evaluate", "runs/no", "--sim", "lane"], 2, "runs/no: no such file or folder"),
         (["evaluate", "pilot"], 2, "either --sim SIM or --data DATA"),
         (["evaluate", "pilot", "--sim", "lane", "--data", "taken"], 2, "either --sim SIM"),
         (["evaluate", "pilot", "--sim", "lane", "--gamma", ".9"], 2, "--gamma requires --data"),
         (["evaluate", "pilot", "--data", "lane.mcap", "--record", "x"], 2, "--record requires"),
         (["evaluate", "random", "--data", "nothing"], 1, "no such file"),
         (["layout", "lane"], 2, "--out"),
-        (["record", "lane", "--steps", "5", "--out", "x", "--epsilon", "nan"], 2, "0 to 1"),
-        (["record", "lane", "--steps", "5", "--out", "x.mcap", "--envs", "2"], 2, "into a folder"),
+        (["record", "lane", "--steps", "5", "--out=x.mcap", "--epsilon", "nan"], 2, "0 to 1"),
+        (["record", "lane", "--steps", "5", "--out=x.mcap", "--envs", "2"], 2, "into a folder"),
         (["layout", "nothing.mcap", "--out", "x.json"], 1, "cannot read nothing.mcap"),
         (["info", "x" * 300], 1, "name too long"),
         (["evaluate", "pilot", "--sim", "lane", "--behavior", "nothing"], 1, "no such file"),
@@ -409,6 +430,18 @@ def test_training_refuses_continuous_actions_before_it_prints_anything(
             "Pendulum-v1", "run", live=True, port=0, on_live=lambda _: pytest.fail("it listens")
         )
     assert not Path("run").exists()
+
+
+def test_a_rotated_recording_reports_its_files(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("r-notes.mcap").touch()
+    record = ["record", "CartPole-v1", "--policy", "random", "--out", "r.mcap"]
+    assert run([*record, "--episodes", "9", "--rotate-mb", "0.0001"]) == 0
+    assert capsys.readouterr().out.startswith("r-00000.mcap to r-00008.mcap: 9 episodes")
+    found = mcaprl.record(
+        "CartPole-v1", "one.mcap", policy="random", episodes=1, rotate_mb=1000, scene=False
+    )
+    assert found.files == (Path("one-00000.mcap"),)
+    assert found.size_bytes == found.files[0].stat().st_size
 
 
 def test_missing_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
