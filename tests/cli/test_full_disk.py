@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import warnings
@@ -28,17 +29,19 @@ CARTPOLE = ["record", "CartPole-v1", "--steps", "9999", "--policy", "random"]
 ONLINE = ["train-online", "CartPole-v1", "--algo", "dqn", "--steps", "300", "--out", "run", *SMALL]
 
 
-@pytest.fixture
-def _inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    record = ["record", "CartPole-v1", "--policy", "random", "--episodes", "100", "--out", LOG]
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a log and a policy."""
+    folder = tmp_path_factory.mktemp("inputs")
+    log = str(folder / LOG)
+    record = ["record", "CartPole-v1", "--policy", "random", "--episodes", "100", "--out", log]
     assert run(record) == 0
-    train = ["train-offline", LOG, "--algo", "bc", "--updates", "5", "--out", POLICY, *SMALL]
+    policy = str(folder / POLICY)
+    train = ["train-offline", log, "--algo", "bc", "--updates", "5", "--out", policy, *SMALL]
     assert run(train) == 0
+    return folder
 
 
-@pytest.mark.usefixtures("_inputs")
 @pytest.mark.parametrize(
     ("limit", "command", "path"),
     [
@@ -57,14 +60,23 @@ def _inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
     ids=lambda value: value[0] if isinstance(value, list) else None,
 )
-def test_a_full_disk_is_one_line(limit: int, command: list[str], path: str) -> None:
+def test_a_full_disk_is_one_line(
+    limit: int,
+    command: list[str],
+    path: str,
+    inputs: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(shutil.copytree(inputs, tmp_path / "folder"))
     out = path.split("/")[0]
     if command[0] in ("recover", "info"):
         command = [*command, out]
     elif "run" not in command:
         command = [*command, "--out", out]
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(limit), *command],
+        # On a busy machine, lines of progress would be printed too.
+        [sys.executable, "-c", SCRIPT, str(limit), *command, "--quiet"],
         capture_output=True,
         text=True,
         check=False,
