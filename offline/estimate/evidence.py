@@ -19,7 +19,7 @@ the most likely action.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
@@ -74,6 +74,8 @@ class Evidence:
         first_value: FQE's mean value of the first states of the episodes.
         mean_value: FQE's mean value of all states of the log.
         first_values: (E,) FQE's value of the first state of each episode.
+        logged_values: (N,) FQE's value of each logged action.
+        next_values: (N,) FQE's largest value in each next state.
         agrees: (N,) whether the policy's action is the logged one, in each state.
         support: Fraction of the states in which the policy's action is likely under the clone.
         agreement: Fraction of the states in which the policy's action is the logged one.
@@ -85,6 +87,8 @@ class Evidence:
     first_value: float
     mean_value: float
     first_values: Floats = field(repr=False)
+    logged_values: Floats = field(repr=False)
+    next_values: Floats = field(repr=False)
     agrees: NDArray[np.bool_] = field(repr=False)
     support: float
     agreement: float
@@ -93,8 +97,7 @@ class Evidence:
 
     def to_json(self) -> dict[str, Any]:
         """Return the attributes as plain JSON types, without the arrays over episodes or states."""
-        arrays = ("first_values", "agrees")
-        return {name: value for name, value in asdict(self).items() if name not in arrays}
+        return {name: one for name, one in vars(self).items() if not isinstance(one, np.ndarray)}
 
 
 def fqe_config(gamma: float, updates: int, hidden: tuple[int, ...] = (64, 64)) -> FQEConfig:
@@ -165,8 +168,8 @@ class EvidenceCollector:
         )
         values = self._values(actions, next_actions, on_update)
         return [
-            self._evidence(policy, mine, value)
-            for policy, mine, value in zip(policies, actions, values, strict=True)
+            self._evidence(policy, mine, *found)
+            for policy, mine, found in zip(policies, actions, values.swapaxes(0, 1), strict=True)
         ]
 
     def _actions(self, policy: Actor, observations: Any) -> NDArray[np.int64]:
@@ -180,14 +183,18 @@ class EvidenceCollector:
         next_actions: NDArray[np.int64],
         on_update: Callable[[], None],
     ) -> Floats:
-        """Return FQE's values (P, N) of the states for P policies."""
+        """Return three values (3, P, N) by FQE for P policies.
+
+        The values are those of the policy's action, of the logged action, and of the best action in
+        the next state.
+        """
         pi_t = np.eye(int(self._buffer.action_space.n), dtype=np.float32)[next_actions]
         rows = np.arange(actions.shape[1])
         fixed_v_t = None
         if self._pessimistic:
             ends = ~self._next_likely[rows, next_actions]
             fixed_v_t = torch.from_numpy(np.where(ends, self.low_value, np.nan).astype(np.float32))
-        values = np.zeros(actions.shape)
+        values = np.zeros((3, *actions.shape))
         for held_out in range(FOLDS):
             evaluated = self._fold == held_out
             training = self._buffer.with_weights((~evaluated).astype(np.float64))
@@ -198,12 +205,21 @@ class EvidenceCollector:
                 on_update()
             q = learner.values(next_states=False).numpy()
             v = np.take_along_axis(q, actions[:, :, None], 2)[:, :, 0]
-            values[:, evaluated] = v[:, evaluated]
+            logged = q[:, rows, self._buffer.actions.numpy()]
+            best_t = learner.values(next_states=True).numpy().max(2)
+            values[:, :, evaluated] = np.stack([v, logged, best_t])[:, :, evaluated]
         if self._pessimistic:
-            values[~self._likely[rows, actions]] = self.low_value
+            values[0, ~self._likely[rows, actions]] = self.low_value
         return values
 
-    def _evidence(self, policy: Actor, actions: NDArray[np.int64], values: Floats) -> Evidence:
+    def _evidence(
+        self,
+        policy: Actor,
+        actions: NDArray[np.int64],
+        values: Floats,
+        logged_values: Floats,
+        next_values: Floats,
+    ) -> Evidence:
         rows = np.arange(len(actions))
         own_value, bellman_error = self._own_values(policy)
         agrees = actions == self._buffer.actions.numpy()
@@ -211,6 +227,8 @@ class EvidenceCollector:
             first_value=float(values[self._first].mean()),
             mean_value=float(values.mean()),
             first_values=values[self._first],
+            logged_values=logged_values,
+            next_values=next_values,
             support=float(self._likely[rows, actions].mean()),
             agrees=agrees,
             agreement=float(agrees.mean()),

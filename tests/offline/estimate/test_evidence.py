@@ -57,6 +57,15 @@ def test_values_of_policies_side_by_side_are_the_true_ones() -> None:
         taken = np.array(actions)[data.observations.argmax(1)]
         assert evidence.agreement == (taken == data.actions).mean()
         assert (evidence.own_value, evidence.bellman_error) == (None, None)
+        to_one = task.TO_ONE
+        q = task.PAYS + task.GAMMA * (1 - task.ENDS) * (
+            (1 - to_one) * values[0] + to_one * values[1]
+        )
+        logged = q[data.observations.argmax(1), data.actions]
+        np.testing.assert_allclose(evidence.logged_values, logged, rtol=0.15, atol=0.15)
+        best = q.max(1)[data.next_observations.argmax(1)]
+        np.testing.assert_allclose(evidence.next_values, best, rtol=0.15, atol=0.15)
+        assert evidence.to_json().keys().isdisjoint({"agrees", "first_values", "next_values"})
     best = max(range(4), key=lambda k: found[k].first_value)
     assert policies[best] == max(policies, key=lambda actions: true_values(actions)[0])
 
