@@ -4,16 +4,31 @@
 
 The candidates are algorithms of offline learning. On each log of `sim_data`, each candidate is
 trained with the settings of `sim_grid`. Its true score is measured in the sim. Other scores are
-computed from the log: FQE with and without pessimism, the policy's own values, its Bellman error
-and its support in the log. FOLDER/SIM has the policies and two JSON files for each log, so an
-interrupted run resumes.
+computed from the log: FQE with and without pessimism, the policy's own values, its Bellman error,
+its support in the log, and the losses of BVFT and SBV (`q_scores`). FOLDER/SIM has the policies and
+three JSON files for each log, so an interrupted run resumes.
+
+BVFT and SBV rate Q-functions. BC has none, so both are computed in two ways: with the Q-function of
+the candidate, in which case BC is not chosen, and with the one by which FQE evaluates the
+candidate's policy. The target of the candidate's Q-function has the value of the action that the
+candidate takes; for candidates that are greedy this is the largest value, as in the papers. The
+target of FQE's Q-function has its largest value: the error is then small if FQE sees no action that
+is better than the policy's.
 
 A rule chooses one candidate by the scores from the log. The regret of a rule is the true score of
-the best candidate minus that of the chosen candidate; both scores are means over seeds. The table
-has the mean regret of each rule over the finished logs, with a 95 % bootstrap interval over logs,
-and the largest regret. In the last row, a rule is never chosen by the logs on which its regret is
-computed: on the logs of each sim, the row uses the rule with the smallest mean regret on the logs
-of the other sims.
+the best candidate minus that of the chosen candidate; both scores are means over seeds. The first
+table has the mean regret of each rule over the finished logs, with a 95 % bootstrap interval over
+logs, and the largest regret. In the last row, a rule is never chosen by the logs on which its
+regret is computed: on the logs of each sim, the row uses the rule with the smallest mean regret on
+the logs of the other sims.
+
+All candidates of the first table are the last checkpoints of their trainings, so "always cql" is
+the choice of a user who trains with the default algorithm and uses its last checkpoint. The second
+table is about the checkpoints of one training, the last one and the one after `SHORT` updates. A
+rule chooses one of the two; its regret is the score of the better one minus that of the chosen one,
+as a mean over the candidates. This is what "last checkpoint" means in the literature: papers on
+offline learning report the policy after the last update, because nothing in the log says which
+checkpoint is better.
 """
 
 from __future__ import annotations
@@ -32,15 +47,25 @@ from typing import Any, Final
 import numpy as np
 import torch
 from gymnasium.spaces import Discrete
+from numpy.typing import NDArray
 
 import mcaprl
-from benchmarks.sim_data import make_logs
+from benchmarks.q_scores import bvft, sbv
+from benchmarks.sim_data import log_names, make_logs, pilot_of
 from benchmarks.sim_grid import SETTINGS, normalize_mean, run, settings_of
 from mcaprl.api import load_policies
+from mcaprl.errors import PolicyError
 from mcaprl.files import write_json
-from mcaprl.offline import DETERMINISTIC, EvidenceCollector, fqe_config, train
+from mcaprl.offline import (
+    DETERMINISTIC,
+    CQLConfig,
+    EvidenceCollector,
+    TransitionBuffer,
+    fqe_config,
+    train,
+)
 from mcaprl.progress import TrainingProgress
-from mcaprl.sims import PolicyScore, make_pilot, make_sim
+from mcaprl.sims import PolicyScore, make_sim
 
 CANDIDATES: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "cql": ("cql", {}),
@@ -55,6 +80,9 @@ SMALL: Final = {"batch_size": 64, "hidden": (128, 128)}
 """Settings that differ from those of `sim_grid`, so that a log takes minutes."""
 SHORT, MODEL_UPDATES, SHORT_MODEL_UPDATES = 1_000, 1_000, 500
 """Updates of the short training, of FQE, and of FQE after the short training."""
+AT_SHORT: Final = f" after {SHORT}"
+"""Suffix of a candidate in the file of scores, for its policies after the short training."""
+FQE_NAME: Final = "fqe.npz"
 ORDER: Final = ("expert", "weak", "mixed", "replay", "medium", "random")
 Row = dict[str, Any]
 
@@ -75,18 +103,18 @@ def learn(sim: str, data: mcaprl.Dataset, name: str, out: Path, seeds: int) -> N
     part.rename(out)
 
 
-def score(sim: str, policies: list[Any]) -> list[float]:
-    """Return the score of each policy in the sim."""
-    random, pilot = _references(sim)
+def score(sim: str, folder: Path, policies: list[Any]) -> list[float]:
+    """Return the score of each policy in the sim; `folder` has the sim's logs."""
+    random, pilot = _references(sim, folder)
     returns = run(sim, policies).returns.mean(axis=1)
     return [normalize_mean(float(mean), random, pilot) for mean in returns]
 
 
 @functools.cache
-def _references(sim: str) -> tuple[PolicyScore, PolicyScore]:
+def _references(sim: str, folder: Path) -> tuple[PolicyScore, PolicyScore]:
     """Evaluate the random policy and the pilot, whose normalized scores are 0 and 1."""
     with closing(make_sim(sim)) as env:
-        return run(sim, [None]), run(sim, [make_pilot(env)], env)
+        return run(sim, [None]), run(sim, [pilot_of(sim, folder, env)], env)
 
 
 def collect(sim: str, log: Path, out: Path, names: list[str]) -> list[Row]:
@@ -115,6 +143,54 @@ def collect(sim: str, log: Path, out: Path, names: list[str]) -> list[Row]:
         found = collector.collect([policies[k] for k in which])
         for k, evidence in zip(which, found, strict=True):
             rows[k][label] = evidence.to_json()
+            if label == "plain":
+                path = out / rows[k]["candidate"] / FQE_NAME
+                np.savez(path, logged=evidence.logged_values, after=evidence.next_values)
+    return rows
+
+
+def tournament(sim: str, log: Path, out: Path, names: list[str]) -> list[Row]:
+    """Return rows with the losses of BVFT and SBV, in units of the spread of the log's returns."""
+    data = mcaprl.open(log)
+    packing = CQLConfig(gamma=SETTINGS[sim]["gamma"], scale_rewards=True).packing
+    buffer = TransitionBuffer.from_dataset(data, packing)
+    (rewards, discounts), scale = buffer.returns.double().numpy(), buffer.reward_scale
+    actions, half = buffer.actions.numpy(), np.arange(len(data.episodes)) % 2 == 0
+    steps, first_half = np.arange(len(data)), np.repeat(half, data.episode_lengths)
+    first_action = int(buffer.action_space.start)
+    rows: list[Row] = []
+    for name in names:
+        policies = load_policies(out / name)
+        rows += [
+            {"candidate": name, "seed": k, "kind": "full", "tournament": {}}
+            for k in range(len(policies))
+        ]
+
+    def add(kind: str, which: list[Row], values: list[Any], next_values: list[Any]) -> None:
+        """Add the losses of Q-functions with values (N,) each in units of the reward."""
+        q = np.array(values, np.float64) / scale
+        targets = rewards + discounts * np.array(next_values) / scale
+        losses = {
+            f"bvft_{kind}": bvft(q, targets, 1.0),
+            f"sbv_{kind}": sbv(q, targets, data.observations, actions, first_half),
+        }
+        for field, each in losses.items():
+            for row, loss in zip(which, each.tolist(), strict=True):
+                row["tournament"][field] = loss
+
+    found = []
+    for row in rows:
+        policy = load_policies(out / row["candidate"])[row["seed"]]
+        try:
+            q, q_t = (policy.q_values(seen) for seen in (data.observations, data.next_observations))
+        except PolicyError:
+            continue
+        next_actions = policy.act(data.next_observations) - first_action
+        found.append((row, q[steps, actions], q_t[steps, next_actions]))
+    add("own", *map(list, zip(*found, strict=True)))
+    firsts = [row for row in rows if row["seed"] == 0]
+    fitted = [np.load(out / row["candidate"] / FQE_NAME) for row in firsts]
+    add("fqe", firsts, [one["logged"] for one in fitted], [one["after"] for one in fitted])
     return rows
 
 
@@ -127,6 +203,7 @@ class Log:
         name: Name of the log.
         entropy: Entropy of the behavior, from 0 to 1, computed from the logged probabilities.
         scores: Mean true score of each candidate.
+        short_scores: The same after the short training.
         rows: Evidence for each candidate and seed.
     """
 
@@ -134,6 +211,7 @@ class Log:
     name: str
     entropy: float
     scores: dict[str, float]
+    short_scores: dict[str, float]
     rows: list[Row]
 
     def means(self, label: str, field: str, kind: str = "full") -> dict[str, float]:
@@ -148,8 +226,48 @@ class Log:
         """Return the regret of a rule."""
         return max(self.scores.values()) - self.scores[rule(self)]
 
+    @property
+    def agrees(self) -> bool:
+        """Whether `auto` rates candidates by their agreement with the behavior."""
+        return self.entropy < DETERMINISTIC
+
+    def checkpoint_regret(self, rule: CheckpointRule) -> float:
+        """Return the mean regret of a rule that chooses between the two checkpoints."""
+        regrets = []
+        for name, short in self.short_scores.items():
+            full = self.scores[name]
+            regrets.append(max(short, full) - (full if rule(self, name) else short))
+        return float(np.mean(regrets))
+
 
 Rule = Callable[[Log], str]
+CheckpointRule = Callable[[Log, str], bool]
+"""Function that returns whether it chooses the last checkpoint of a candidate on a log."""
+
+
+def later_if_larger(field: str) -> CheckpointRule:
+    """Return the rule that chooses the checkpoint with the larger number.
+
+    Without this number, it chooses the last checkpoint.
+    """
+
+    def rule(log: Log, name: str) -> bool:
+        short, full = (log.means("pessimistic", field, kind) for kind in ("short", "full"))
+        return name not in full or full[name] >= short[name]
+
+    return rule
+
+
+CHECKPOINT_RULES: Final[dict[str, CheckpointRule]] = {
+    "last checkpoint": lambda log, name: True,
+    "first checkpoint": lambda log, name: False,
+    "largest own Q": later_if_larger("own_value"),
+    "pessimistic FQE, first states": later_if_larger("first_value"),
+    "agreement with the behavior": later_if_larger("agreement"),
+    "auto": lambda log, name: later_if_larger("agreement" if log.agrees else "first_value")(
+        log, name
+    ),
+}
 
 
 def largest(values: dict[str, float]) -> str:
@@ -178,15 +296,20 @@ def rules(candidates: Iterable[str]) -> dict[str, Rule]:
     def highest(label: str, field: str) -> Rule:
         return lambda log: largest(log.means(label, field))
 
+    def smallest(label: str, field: str) -> Rule:
+        return lambda log: largest({name: -loss for name, loss in log.means(label, field).items()})
+
     def always(name: str) -> Rule:
         return lambda log: name
 
     return {
         **{f"always {name}": always(name) for name in candidates},
         "largest own Q": highest("pessimistic", "own_value"),
-        "smallest Bellman error": lambda log: largest(
-            {name: -error for name, error in log.means("pessimistic", "bellman_error").items()}
-        ),
+        "smallest Bellman error": smallest("pessimistic", "bellman_error"),
+        "BVFT, own Q": smallest("tournament", "bvft_own"),
+        "BVFT, FQE's Q": smallest("tournament", "bvft_fqe"),
+        "SBV, own Q": smallest("tournament", "sbv_own"),
+        "SBV, FQE's Q": smallest("tournament", "sbv_fqe"),
         "FQE, first states": highest("plain", "first_value"),
         "FQE, all states": highest("plain", "mean_value"),
         "pessimistic FQE, first states": highest("pessimistic", "first_value"),
@@ -201,20 +324,24 @@ def rules(candidates: Iterable[str]) -> dict[str, Rule]:
 def read_logs(folder: Path) -> list[Log]:
     """Return all finished logs, with only the candidates that have evidence on every log."""
     found = []
-    for path in sorted(folder.glob("*/evidence-*.json")):
-        name, sim = path.stem.removeprefix("evidence-"), path.parent.name
+    for path in sorted(folder.glob("*/tournament-*.json")):
+        name, sim = path.stem.removeprefix("tournament-"), path.parent.name
         data = mcaprl.open(path.with_name(f"{name}.mcap"))
         assert isinstance(data.action_space, Discrete)
         nats = -np.log(data.behavior_probs.astype(np.float64)).mean()
         scores = json.loads(path.with_name(f"scores-{name}.json").read_text())
         means = {candidate: float(np.mean(values)) for candidate, values in scores.items()}
-        rows = json.loads(path.read_text())
-        found.append(Log(sim, name, float(nats / np.log(data.action_space.n)), means, rows))
+        short = {one: means.pop(f"{one}{AT_SHORT}") for one in list(means) if AT_SHORT not in one}
+        rows = json.loads(path.with_name(f"evidence-{name}.json").read_text())
+        rows += json.loads(path.read_text())
+        entropy = float(nats / np.log(data.action_space.n))
+        found.append(Log(sim, name, entropy, means, short, rows))
     common = set.intersection(*({row["candidate"] for row in log.rows} for log in found))
     return [
         replace(
             log,
             scores={name: log.scores[name] for name in CANDIDATES if name in common},
+            short_scores={name: log.short_scores[name] for name in CANDIDATES if name in common},
             rows=[row for row in log.rows if row["candidate"] in common],
         )
         for log in found
@@ -222,7 +349,7 @@ def read_logs(folder: Path) -> list[Log]:
 
 
 def show(folder: Path) -> None:
-    """Print the regret of each rule over all finished logs."""
+    """Print the regret of each rule over all finished logs, in two tables."""
     logs = read_logs(folder)
     names = [f"{log.sim} {log.name}" for log in logs]
     print(f"{len(logs)} logs: {', '.join(names)}; candidates: {', '.join(logs[0].scores)}")
@@ -235,8 +362,20 @@ def show(folder: Path) -> None:
             best = min(regrets, key=lambda name: regrets[name][~mine].mean())
             fair[mine] = regrets[best][mine]
             print(f"the best rule on the other sims than {sim}: {best}")
+    _print({**regrets, "the best rule on other sims": fair})
+    print(f"checkpoints of one training, after {SHORT} updates and the last:")
+    _print(
+        {
+            name: np.array([log.checkpoint_regret(rule) for log in logs])
+            for name, rule in CHECKPOINT_RULES.items()
+        }
+    )
+
+
+def _print(regrets: dict[str, NDArray[np.float64]]) -> None:
+    """Print a row for each rule: mean regret with interval, largest regret, and single regrets."""
     random = np.random.default_rng(0)
-    for name, each in {**regrets, "the best rule on other sims": fair}.items():
+    for name, each in regrets.items():
         draws = random.choice(each, (1_000, len(each))).mean(1)
         low, high = np.percentile(draws, [2.5, 97.5])
         single = " ".join(f"{regret:.2f}" for regret in each)
@@ -257,7 +396,8 @@ def main() -> None:
     torch.set_num_threads(1)
     for name in given.data.split(","):
         for sim in given.sims.split(","):
-            _fill(given.folder / sim, sim, name, given.algos.split(";"), given.seeds)
+            if name in log_names(sim):
+                _fill(given.folder / sim, sim, name, given.algos.split(";"), given.seeds)
     show(given.folder)
 
 
@@ -273,14 +413,27 @@ def _fill(folder: Path, sim: str, name: str, candidates: list[str], seeds: int) 
         if not out.exists():
             out.parent.mkdir(exist_ok=True)
             learn(sim, data, candidate, out, seeds)
-        if candidate not in scores:
-            scores[candidate] = score(sim, load_policies(out))
-            write_json(path, scores)
-            print(sim, name, candidate, scores[candidate], flush=True)
+        for key, policies in ((candidate, out), (f"{candidate}{AT_SHORT}", out / "short")):
+            if key not in scores:
+                scores[key] = score(sim, folder, load_policies(policies))
+                write_json(path, scores)
+                print(sim, name, key, scores[key], flush=True)
     known = {row["candidate"] for row in rows}
     if missing := [candidate for candidate in candidates if candidate not in known]:
         write_json(result, rows + collect(sim, log, folder / name, missing))
         print(sim, name, "evidence", flush=True)
+    _compare(folder, sim, name, log)
+
+
+def _compare(folder: Path, sim: str, name: str, log: Path) -> None:
+    """Run BVFT and SBV again if candidates were added."""
+    path = folder / f"tournament-{name}.json"
+    evidence = json.loads((folder / f"evidence-{name}.json").read_text())
+    names = list(dict.fromkeys(row["candidate"] for row in evidence))
+    earlier = json.loads(path.read_text()) if path.exists() else []
+    if names != list(dict.fromkeys(row["candidate"] for row in earlier)):
+        write_json(path, tournament(sim, log, folder / name, names))
+        print(sim, name, "BVFT and SBV", flush=True)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,10 @@ weak     a pilot that mostly does the wrong thing: drone and racer do nothing, t
 In most states, most actions of the weak pilot are bad, so a policy that imitates it is also bad.
 The better actions are in the log, and its rewards identify them. A car that does nothing would
 leave its lane within eight seconds, and its log would show little of the course.
+
+CartPole and Acrobot have the same logs except the weak one. Their pilot is the best policy of an
+online training with Double DQN, and the medium policy is one of an earlier stage of that training.
+All logs have the probabilities of their actions.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ import shutil
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Final, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
@@ -28,7 +32,8 @@ import numpy as np
 import mcaprl
 from mcaprl.api import load_policies
 from mcaprl.progress import TrainingProgress
-from mcaprl.sims import EpsilonGreedy, LaneKeepingEnv, make_pilot, make_sim, rollout
+from mcaprl.runs import read_curve
+from mcaprl.sims import EpsilonGreedy, LaneKeepingEnv, Policy, make_pilot, make_sim, rollout
 
 STEPS = 20_000
 NAMES = ("random", "medium", "expert", "replay", "mixed", "weak")
@@ -42,6 +47,35 @@ WEAK, CLUMSY = 0.6, 0.1
 """Probability of the wrong action, and probability of a random action in the other cases."""
 MIXED_EPSILONS = (0.1, 0.3, 0.6, 1.0)
 MakeBehavior = Callable[[gym.Env[Any, Any]], EpsilonGreedy]
+
+
+class GymTask(NamedTuple):
+    """Environment of Gymnasium without a scripted pilot.
+
+    Attributes:
+        medium_return: Mean return of an evaluation at which the policy is medium.
+        settings: Settings of the online training.
+    """
+
+    medium_return: float
+    settings: dict[str, Any]
+
+
+_STEADY: Final[dict[str, Any]] = {
+    "hidden": (128, 128),
+    "learning_rate": 1e-3,
+    "final_learning_rate_fraction": 0.04,
+    "batch_size": 64,
+    "learning_starts": 1_000,
+    "target_update_interval": 500,
+    "exploration_fraction": 0.2,
+    "buffer_size": 50_000,
+}
+GYM: Final = {
+    "CartPole-v1": GymTask(200.0, {**_STEADY, "steps": 40_000}),
+    "Acrobot-v1": GymTask(-200.0, {**_STEADY, "steps": 40_000}),
+}
+"""Environments by Gymnasium id."""
 
 
 class WeakPilot(EpsilonGreedy):
@@ -70,31 +104,53 @@ class WeakPilot(EpsilonGreedy):
         return cast(LaneKeepingEnv, self._sim).car.speed_m_s > self._timid_above_m_s
 
 
+def log_names(sim: str) -> list[str]:
+    """Return the names of the logs of a sim."""
+    return [name for name in NAMES if name != "weak" or sim in WRONG]
+
+
 def make_logs(folder: Path, sim: str) -> dict[str, Path]:
-    """Create the missing logs of a sim, and return the paths of all six."""
+    """Create the missing logs of a sim, and return the paths of all."""
     folder.mkdir(parents=True, exist_ok=True)
-    paths = {name: folder / f"{name}.mcap" for name in NAMES}
-    online = folder / "online"
+    paths = {name: folder / f"{name}.mcap" for name in log_names(sim)}
+    if sim in GYM and not (folder / "pilot").exists():
+        shutil.rmtree(part := folder / "pilot.part", ignore_errors=True)
+        mcaprl.train_online(sim, part, **GYM[sim].settings, eval_interval=2_000)
+        part.rename(folder / "pilot")
     if not paths["replay"].exists():
-        _learn_online(sim, online, paths["replay"])
-    for name, make_behaviors in _behaviors(sim, online).items():
+        _learn_online(sim, folder / "online", paths["replay"])
+    for name, make_behaviors in _behaviors(sim, folder).items():
         if not paths[name].exists():
             _record(paths[name], sim, make_behaviors)
     return paths
 
 
+def pilot_of(sim: str, folder: Path, env: gym.Env[Any, Any]) -> Policy:
+    """Return the scripted pilot of a sim, or the policy that `make_logs` trained for GYM."""
+    return load_policies(folder / "pilot")[0] if sim in GYM else make_pilot(env)
+
+
 def _learn_online(sim: str, out: Path, log: Path) -> None:
-    """Train with default settings until MEDIUM_SCORE is reached; save the best policy in `out`."""
+    """Train until the policy is medium; save the best policy in `out`."""
 
     def stop_halfway(now: TrainingProgress) -> None:
-        if now.terms["score"] >= MEDIUM_SCORE:
+        if sim not in GYM:
+            is_medium = now.terms["score"] >= MEDIUM_SCORE
+        else:
+            curve = out / "seed-0" / "curve.csv"
+            returns = read_curve(curve)["mean_return"] if curve.exists() else np.array([])
+            is_medium = bool((returns >= GYM[sim].medium_return).any())
+        if is_medium:
             raise _HalfwayError
 
     shutil.rmtree(out, ignore_errors=True)
     part = log.with_suffix(".part.mcap")
     part.unlink(missing_ok=True)
     with contextlib.suppress(_HalfwayError):
-        mcaprl.train_online(sim, out, record=part, progress=stop_halfway, eval_interval=2_000)
+        settings = GYM[sim].settings if sim in GYM else {}
+        mcaprl.train_online(
+            sim, out, record=part, progress=stop_halfway, eval_interval=2_000, **settings
+        )
     part.rename(log)
 
 
@@ -102,14 +158,14 @@ class _HalfwayError(Exception):
     """Exception that stops an online training."""
 
 
-def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
+def _behaviors(sim: str, folder: Path) -> dict[str, list[MakeBehavior]]:
     """Return the behavior policies of each log, in the order in which they are recorded."""
 
     def pilot(epsilon: float) -> MakeBehavior:
-        return lambda env: EpsilonGreedy(make_pilot(env), epsilon, env.action_space)
+        return lambda env: EpsilonGreedy(pilot_of(sim, folder, env), epsilon, env.action_space)
 
     def medium(env: gym.Env[Any, Any]) -> EpsilonGreedy:
-        return EpsilonGreedy(load_policies(online)[0], 0.1, env.action_space)
+        return EpsilonGreedy(load_policies(folder / "online")[0], 0.1, env.action_space)
 
     def weak(env: gym.Env[Any, Any]) -> EpsilonGreedy:
         return WeakPilot(env, sim)
@@ -119,7 +175,7 @@ def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
         "medium": [medium],
         "expert": [pilot(0.0)],
         "mixed": [pilot(epsilon) for epsilon in MIXED_EPSILONS],
-        "weak": [weak],
+        **({"weak": [weak]} if sim in WRONG else {}),
     }
 
 

@@ -6,8 +6,14 @@ The logs are those of `sim_data`. The settings below are the same for all logs o
 networks after the last update are scored, without selection by scores in the sim. A score is the
 mean return over 30 episodes of each seed, normalized so that random is 0 and the pilot is 1, with a
 95 % bootstrap interval over seeds and episodes. FOLDER/SIM/scores.json has each finished cell, so
-an interrupted run resumes. At the end, the tables are written to docs/results.md, with a dash for
-each missing cell.
+an interrupted run resumes. After each sim, the tables are written to docs/results.md, with a dash
+for each missing cell.
+
+    python -m benchmarks.sim_grid FOLDER --study [--sims lane,racer] [--data weak]
+
+compares settings instead of algorithms, on the same logs and with the same seeds: the columns of
+STUDY. The last rows are the mean over the logs, and the mean difference from the default of the
+same algorithm, with a 95 % bootstrap interval over the logs on which both have been run.
 """
 
 from __future__ import annotations
@@ -15,23 +21,25 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 import mcaprl
 from benchmarks.page import write_section
-from benchmarks.sim_data import NAMES, make_logs
+from benchmarks.sim_data import NAMES, WRONG, log_names, make_logs, pilot_of
 from mcaprl.api import load_policies
 from mcaprl.files import write_json
 from mcaprl.offline import ALGORITHMS, BootstrapConfig, DQNConfig, TrainingConfig, train
-from mcaprl.sims import Policy, PolicyScore, evaluate, make_pilot, make_sim, make_sims, normalize
+from mcaprl.sims import Policy, PolicyScore, evaluate, make_sim, make_sims, normalize
 
+Special = dict[str, Any] | Callable[[mcaprl.Dataset], dict[str, Any]]
 SEEDS, EPISODES, EPISODE_SEED = 4, 30, 1_000_000
-ALGOS: dict[str, tuple[str, dict[str, Any]]] = {
+ALGOS: dict[str, tuple[str, Special]] = {
     "cql": ("cql", {}),
     "cql, alpha .1": ("cql", {"alpha": 0.1}),
     "bc": ("bc", {}),
@@ -40,6 +48,27 @@ ALGOS: dict[str, tuple[str, dict[str, Any]]] = {
     "iql": ("iql", {}),
 }
 """Algorithm and settings, by column; CQL has a penalty weight of 1, its default, or of 0.1."""
+
+
+def above_entropy(data: mcaprl.Dataset) -> dict[str, Any]:
+    """Return settings of CQL with a target gap of 0.2 nats above that of a perfect clone.
+
+    The gap of a clone is the entropy of the behavior, so the target bounds the divergence of the
+    softmax of Q from the behavior.
+    """
+    entropy = -float(np.log(data.behavior_probs.astype(np.float64)).mean())
+    return {"target_gap": entropy + 0.2, "scale_rewards": True}
+
+
+STUDY: dict[str, tuple[str, Special]] = {
+    "cql": ALGOS["cql"],
+    "cql, scaled": ("cql", {"scale_rewards": True}),
+    "cql, gap 1, scaled": ("cql", {"target_gap": 1.0, "scale_rewards": True}),
+    "cql, gap of a clone + .2, scaled": ("cql", above_entropy),
+    "iql": ALGOS["iql"],
+    "iql, normalized, beta .5": ("iql", {"normalize_advantages": True, "beta": 0.5}),
+}
+"""Columns of the comparison of settings; the first column of an algorithm is its default."""
 SHARED: dict[str, Any] = {"updates": 4_000, "batch_size": 128}
 TARGET_INTERVAL = 150
 """Updates between two target syncs; the default has too few syncs for the effective horizon."""
@@ -47,8 +76,12 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "lane": {"gamma": 0.97},
     "powerline": {"gamma": 0.95, "n_steps": 3, "learning_rate": 3e-4},
     "racer": {"gamma": 0.98, "n_steps": 3},
+    "CartPole-v1": {"gamma": 0.99},
+    "Acrobot-v1": {"gamma": 0.99},
 }
 """Settings of each sim; behavior cloning uses only the learning rate."""
+SIMS = tuple(WRONG)
+"""Sims of the tables."""
 Cell = dict[str, Any]
 
 
@@ -56,22 +89,29 @@ def main() -> None:
     """Compute the requested missing cells, and write the tables."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--sims", default=",".join(SETTINGS))
+    parser.add_argument("--sims", default=",".join(SIMS))
     parser.add_argument("--data", default=",".join(NAMES))
-    parser.add_argument("--algos", default=";".join(ALGOS))
+    parser.add_argument("--study", action="store_true")
+    parser.add_argument("--algos", help="columns, separated by semicolons; default: all")
     arguments = parser.parse_args()
+    columns = STUDY if arguments.study else ALGOS
     torch.set_num_threads(1)
     for sim in arguments.sims.split(","):
         folder = arguments.folder / sim
         paths = make_logs(folder, sim)
         wanted = [
             (name, algo)
-            for algo in arguments.algos.split(";")
+            for algo in (arguments.algos.split(";") if arguments.algos else columns)
             for name in arguments.data.split(",")
+            if name in log_names(sim)
         ]
         _fill(folder, sim, paths, wanted)
-        found = {sim: _read(arguments.folder / sim) for sim in SETTINGS}
-        write_section("sim-grid", "\n".join(table(sim, found[sim]) for sim in SETTINGS))
+        found = {sim: _read(arguments.folder / sim) for sim in SIMS}
+        if arguments.study:
+            print(text := study_table(found))
+            write_section("sim-settings", text)
+        else:
+            write_section("sim-grid", "\n".join(table(sim, found[sim]) for sim in SIMS))
 
 
 def _fill(
@@ -80,7 +120,7 @@ def _fill(
     """Compute the missing cells."""
     with closing(make_sim(sim)) as env:
         random = run(sim, [None])
-        pilot = run(sim, [make_pilot(env)], env)
+        pilot = run(sim, [pilot_of(sim, folder, env)], env)
     for name, algo in wanted:
         cells = _read(folder)
         row = cells.setdefault(name, {})
@@ -99,7 +139,9 @@ def learn(
 ) -> Cell:
     """Train all seeds on a log and score them."""
     shutil.rmtree(out, ignore_errors=True)
-    train(data, settings_of(sim, *ALGOS[algo]), out, seeds=SEEDS, progress=lambda _: None)
+    name, special = {**ALGOS, **STUDY}[algo]
+    special = special(data) if callable(special) else special
+    train(data, settings_of(sim, name, special), out, seeds=SEEDS, progress=lambda _: None)
     score = normalize(run(sim, list(load_policies(out))), random, pilot)
     assert score.normalized_score is not None
     assert score.normalized_interval is not None
@@ -155,6 +197,40 @@ def table(sim: str, cells: dict[str, dict[str, Cell]]) -> str:
         texts = [_text(row.get(algo)) for algo in ALGOS]
         lines.append(f"| {name}{behavior} | {' | '.join(texts)} |")
     return "\n".join([*lines, ""])
+
+
+def study_table(cells: dict[str, dict[str, dict[str, Cell]]]) -> str:
+    """Return the comparison of settings as Markdown: one row for each log, and two summaries."""
+    lines = [f"| log (behavior) | {' | '.join(STUDY)} |", "|---|" + "---|" * len(STUDY)]
+    scores: dict[str, list[float]] = {column: [] for column in STUDY}
+    for sim, of_sim in cells.items():
+        for name in log_names(sim):
+            row = of_sim.get(name, {})
+            behavior = f" ({row['behavior']['score']:.2f})" if row else ""
+            texts = [_text(row.get(column)) for column in STUDY]
+            lines.append(f"| {sim} {name}{behavior} | {' | '.join(texts)} |")
+            for column, found in scores.items():
+                found.append(row[column]["score"] if column in row else np.nan)
+    means, differences = [], []
+    for column, (algo, _) in STUDY.items():
+        default = next(name for name, (other, _) in STUDY.items() if other == algo)
+        mine = np.array(scores[column])
+        change = mine - np.array(scores[default])
+        means.append(_interval_text(mine[~np.isnan(mine)]))
+        kept = change[~np.isnan(change)]
+        differences.append("" if column == default else _interval_text(kept))
+    lines.append(f"| mean | {' | '.join(means)} |")
+    lines.append(f"| minus the default | {' | '.join(differences)} |")
+    return "\n".join(lines)
+
+
+def _interval_text(values: Any) -> str:
+    """Return a mean with its 95 % bootstrap interval and the number of values."""
+    if not len(values):
+        return "-"
+    draws = np.random.default_rng(0).choice(values, (1_000, len(values))).mean(1)
+    low, high = np.percentile(draws, [2.5, 97.5])
+    return f"{values.mean():.2f} ({low:.2f} to {high:.2f}; n = {len(values)})"
 
 
 def _text(cell: Cell | None) -> str:
