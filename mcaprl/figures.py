@@ -78,7 +78,7 @@ def to_svg(figure: Any) -> str:
     """Convert a figure to SVG, and replace three colors by those of the HTML page.
 
     `INK` becomes the page's text color. `PALE` and `BACKGROUND` become the CSS variables `--pale`
-    and `--card`, which is the color behind a figure.
+    and `--card`, which is the color of a figure's card.
     """
     matplotlib = import_extra("matplotlib", "report")
     text = io.StringIO()

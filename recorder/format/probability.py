@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
+from mcaprl.texts import shortened
 
 SMALLEST: Final = float(np.finfo(np.float32).smallest_subnormal)
 """Smallest positive float32; a log stores probabilities as float32."""
 LARGEST: Final = 1 + 1e-6
 """Largest accepted probability, which allows for the rounding errors of a softmax."""
+_MAX_SHOWN: Final = 40
 
 
 def is_impossible(probs: NDArray[Any]) -> NDArray[np.bool_]:
@@ -21,7 +24,7 @@ def is_impossible(probs: NDArray[Any]) -> NDArray[np.bool_]:
     return found
 
 
-def check_probability(prob: float, name: str) -> None:
+def check_probability(prob: Any, name: str) -> None:
     """Check one probability.
 
     Args:
@@ -29,10 +32,15 @@ def check_probability(prob: float, name: str) -> None:
         name: Name of the probability in the error message.
 
     Raises:
-        UsageError: The number is not within (0, 1].
+        UsageError: It is not a number within (0, 1].
     """
-    if not (SMALLEST <= prob <= LARGEST or prob != prob):
-        raise UsageError(
-            f"{name} {prob:g} is not the probability of an action that was taken: give a number"
-            " above 0 and up to 1, or NaN if it is unknown"
-        )
+    try:
+        if SMALLEST <= prob <= LARGEST or math.isnan(prob):
+            return
+        shown = f"{prob:g}"
+    except (TypeError, ValueError):
+        shown = shortened(repr(prob), _MAX_SHOWN)
+    raise UsageError(
+        f"{name} {shown} is not the probability of an action that was taken: give a number"
+        " above 0 and up to 1, or NaN if it is unknown"
+    )

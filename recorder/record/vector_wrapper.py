@@ -31,16 +31,18 @@ from mcaprl.recorder.record.display import Display
 from mcaprl.recorder.record.infos import EpisodeInfos, info_of
 from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
 from mcaprl.recorder.record.step_rows import as_declared, converters
+from mcaprl.recorder.record.unclosed import FinishesAtExit
 from mcaprl.recorder.record.vector_rows import OpenRows, OpenSteps
 
 
-class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
+class RecordVecMcap(FinishesAtExit, gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
     """A wrapper that records every transition of a vector environment to an MCAP file.
 
     An episode is on disk when the `step` that ends it returns, in every autoreset mode. An episode
     interrupted by `reset`, `close` or an error is recorded as truncated, with the reason
     `interrupted`. Make this wrapper the outermost one: the effects of wrappers around it are not
-    recorded.
+    recorded. Without a call of `close`, the log is finished when the wrapper is deleted or Python
+    exits.
 
     Attributes:
         behavior_probs: (N,) probabilities of the next actions under the behavior policy. Set them
@@ -131,6 +133,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         # For each environment: whether it resets itself in the next step.
         self._due = np.zeros(count, np.bool_)
         self._full_at = 0
+        self._watch()
 
     @property
     def episodes(self) -> int:
@@ -212,12 +215,15 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
     def close(self, **kwargs: Any) -> None:
         """Finish the log and close the environments; a second call has no effect."""
         try:
-            with HoldSignals():
-                if not self._recording.closed:
-                    self._interrupt(self._every)
-                    self._recording.close()
+            self._finish()
         finally:
             super().close(**kwargs)
+
+    def _finish(self) -> None:
+        with HoldSignals():
+            if not self._recording.closed:
+                self._interrupt(self._every)
+                self._recording.close()
 
     def _act(self, actions: Any) -> None:
         """Store the actions before the environments can change them."""

@@ -30,16 +30,18 @@ from mcaprl.recorder.record.step_rows import (
     observation_store,
     reward_number,
 )
+from mcaprl.recorder.record.unclosed import FinishesAtExit
 
 _UNKNOWN = math.nan
 
 
-class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
+class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
     """A wrapper that records every transition of an environment to an MCAP file.
 
     An episode is on disk when the `step` that ends it returns. An episode interrupted by `reset`,
     `close` or an error is recorded as truncated, with the reason `interrupted`. Make this wrapper
     the outermost one: the effects of wrappers around it, such as a TimeLimit, are not recorded.
+    Without a call of `close`, the log is finished when the wrapper is deleted or Python exits.
 
     Attributes:
         behavior_prob: Probability of the next action under the behavior policy. Set it before each
@@ -134,6 +136,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._store_observation = observation_store(env.observation_space, self._columns, images)
         self._full_at = 0
         self._open: OpenEpisode | None = None
+        self._watch()
 
     @property
     def episodes(self) -> int:
@@ -175,8 +178,13 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         probability = self.behavior_prob
         # Call `check_probability` only for invalid values, because a comparison is faster than a
         # call.
-        if probability is not _UNKNOWN and not SMALLEST <= probability <= 1.0:
-            check_probability(probability, "behavior_prob")
+        if probability is not _UNKNOWN:
+            try:
+                is_possible = SMALLEST <= probability <= 1.0
+            except (TypeError, ValueError):
+                is_possible = False
+            if not is_possible:
+                check_probability(probability, "behavior_prob")
         try:
             # Copy the action before the environment can change it.
             try:
@@ -223,12 +231,15 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
     def close(self) -> None:
         """Finish the log and close the environment; a second call has no effect."""
         try:
-            with HoldSignals():
-                if not self._recording.closed:
-                    self._interrupt()
-                    self._recording.close()
+            self._finish()
         finally:
             super().close()
+
+    def _finish(self) -> None:
+        with HoldSignals():
+            if not self._recording.closed:
+                self._interrupt()
+                self._recording.close()
 
     def _begin(self, episode: OpenEpisode, observation: Any) -> None:
         recording = self._recording

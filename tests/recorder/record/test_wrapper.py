@@ -48,6 +48,20 @@ ONE = [
 ]
 
 
+def test_a_probability_that_is_not_a_number_is_refused(log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(scripted(ONE), log_path)) as env:
+        env.reset()
+        for wrong in (None, "0.5", [0.5, 0.5]):
+            env.behavior_prob = wrong  # type: ignore[assignment]
+            with pytest.raises(
+                UsageError, match=r"is not the prob.*or NaN if it is unknown"
+            ) as one:
+                env.step(2)
+            assert str(one.value).startswith(f"behavior_prob {wrong!r} ")
+        env.behavior_prob = math.nan
+        env.step(1)
+
+
 @pytest.mark.parametrize("prob", [-0.5, 0.0, 1e-60, 1.5, math.inf])
 def test_impossible_probabilities_are_refused_before_the_step(prob: float, log_path: Path) -> None:
     with closing(mcaprl.RecordMcap(scripted(ONE), log_path)) as env:
