@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -24,11 +24,13 @@ def native(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make(native: Path, form: str) -> Path:
-    """Make a bag of the drives in a separate process, as a user does."""
+    """Make a bag of the drives; start the example's script in the same way as Python does."""
     out = native.with_name(form if form == "ros2" else f"{form}.mcap")
-    command = [sys.executable, str(EXAMPLE / "make_bag.py"), str(native), str(out)]
-    done = subprocess.run([*command, "--format", form], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    script = EXAMPLE / "make_bag.py"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [str(script), str(native), str(out), "--format", form])
+        patch.syspath_prepend(EXAMPLE)
+        runpy.run_path(str(script), run_name="__main__")
     return out
 
 

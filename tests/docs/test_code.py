@@ -32,6 +32,8 @@ def run_page(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch, *, quick:
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.syspath_prepend(folder)
     link_examples(folder)
+    if quick:
+        monkeypatch.setattr("mcaprl.online.agent.CENTERING_STEPS", 100)
     run = Run(quick=quick)
     run.page(ROOT / page)
     return run

@@ -164,7 +164,10 @@ def agent(folder: Path, observation: str, **settings: Any) -> Agent:
     return Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0))
 
 
-def test_an_agent_centers_the_images_of_random_steps(tmp_path: Path) -> None:
+def test_an_agent_centers_the_images_of_random_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mcaprl.online.agent.CENTERING_STEPS", CENTERING_STEPS)
     with closing(agent(tmp_path, "depth", frame_stack=2)) as begun:
         model: Any = begun.model
         (convolutions,) = model.q_net.features_extractor.convolutions

@@ -96,6 +96,14 @@ def watched(task: Task, out: Path, **options: Any) -> Any:
     return watcher.seen()
 
 
+@pytest.fixture(scope="module")
+def viewed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Path]:
+    """Return the messages of a recorded training in the lane sim, and the folder of its files."""
+    folder = tmp_path_factory.mktemp("viewed")
+    task = Task.for_sim("lane", **SHORT)
+    return watched(task, folder / "run", record=folder / "log.mcap"), folder
+
+
 def decoded(seen: Any, topic: str) -> np.ndarray[Any, Any]:
     """Return the messages of a topic as an array; all of them must have the same length."""
     dtype = message_dtype(seen["topics"][topic]["schema"])
@@ -104,10 +112,9 @@ def decoded(seen: Any, topic: str) -> np.ndarray[Any, Any]:
     return np.frombuffer(b"".join(found), dtype)
 
 
-def test_a_viewer_receives_what_is_recorded(tmp_path: Path) -> None:
+def test_a_viewer_receives_what_is_recorded(viewed: tuple[Any, Path]) -> None:
     """If no frame is skipped, viewers receive the logged transitions of the first environment."""
-    task = Task.for_sim("lane", **SHORT)
-    seen = watched(task, tmp_path / "run", record=tmp_path / "log.mcap")
+    seen, folder = viewed
     counts = Counter(message["topic"] for message in seen["messages"])
     each_step = {"/rl/step", "/rl/learner", "/rl/values", "/rl/training"}
     shown = {"/scene", "/telemetry", "/camera/depth"}
@@ -116,7 +123,7 @@ def test_a_viewer_receives_what_is_recorded(tmp_path: Path) -> None:
     assert counts["/tf"] in (99, 100)
     assert counts["/scene/static"] >= 1
     steps, learner = decoded(seen, "/rl/step"), decoded(seen, "/rl/learner")
-    log, reported = mcaprl.open(tmp_path / "log.mcap"), read_learner(tmp_path / "log.mcap")
+    log, reported = mcaprl.open(folder / "log.mcap"), read_learner(folder / "log.mcap")
     # The log contains the episodes of all environments, in the order in which they ended. Find the
     # steps of the first environment by their observations.
     places = {row.tobytes(): i for i, row in enumerate(log.observations)}
@@ -135,8 +142,8 @@ def test_a_viewer_receives_what_is_recorded(tmp_path: Path) -> None:
     assert first.total_reward == pytest.approx(steps["reward"][:length].sum())
 
 
-def test_a_shown_episode_has_its_trail(tmp_path: Path) -> None:
-    seen = watched(Task.for_sim("lane", **SHORT), tmp_path / "run")
+def test_a_shown_episode_has_its_trail(viewed: tuple[Any, Path]) -> None:
+    seen, _ = viewed
     steps = decoded(seen, "/rl/step")["step"].tolist()
     scenes = [base64.b64decode(m["bytes"]) for m in seen["messages"] if m["topic"] == "/scene"]
     lengths = []
@@ -148,9 +155,8 @@ def test_a_shown_episode_has_its_trail(tmp_path: Path) -> None:
     assert lengths == [max(2, min(step + 1, 40)) for step in steps]
 
 
-def test_values_and_metrics_are_those_of_the_learner(tmp_path: Path) -> None:
-    task = Task.for_sim("lane", **SHORT)
-    seen = watched(task, tmp_path / "run")
+def test_values_and_metrics_are_those_of_the_learner(viewed: tuple[Any, Path]) -> None:
+    seen, _ = viewed
     values, steps = decoded(seen, "/rl/values"), decoded(seen, "/rl/step")
     assert values["q"].shape == (100, 6)
     np.testing.assert_array_equal(values["policy_action"], values["q"].argmax(1))
@@ -168,16 +174,16 @@ def test_values_and_metrics_are_those_of_the_learner(tmp_path: Path) -> None:
     assert np.isfinite(training["score"][-1])
 
 
-def test_viewing_changes_nothing(tmp_path: Path) -> None:
+def test_viewing_changes_nothing(viewed: tuple[Any, Path], tmp_path: Path) -> None:
+    _, folder = viewed
     task = Task.for_sim("lane", **SHORT)
-    watched(task, tmp_path / "seen", record=tmp_path / "seen.mcap")
-    train(task, tmp_path / "alone", record=tmp_path / "alone.mcap", progress=silent)
-    curves = [tmp_path / name / "seed-0" / "curve.csv" for name in ("seen", "alone")]
+    train(task, tmp_path / "run", record=tmp_path / "log.mcap", progress=silent)
+    curves = [one / "run" / "seed-0" / "curve.csv" for one in (folder, tmp_path)]
     assert curves[0].read_text() == curves[1].read_text()
-    logs = [mcaprl.open(tmp_path / f"{name}.mcap") for name in ("seen", "alone")]
+    logs = [mcaprl.open(one / "log.mcap") for one in (folder, tmp_path)]
     np.testing.assert_array_equal(logs[0].observations, logs[1].observations)
     np.testing.assert_array_equal(logs[0].behavior_probs, logs[1].behavior_probs)
-    layout = json.loads((tmp_path / "seen" / "foxglove-layout.json").read_text())
+    layout = json.loads((folder / "run" / "foxglove-layout.json").read_text())
     paths = layout["configById"]["Plot!loss"]["paths"]
     assert [path["value"] for path in paths] == ["/rl/training.loss"]
     assert "3D!scene" in layout["configById"]

@@ -62,6 +62,13 @@ def trained(
     return agent, mcaprl.open(path)
 
 
+@pytest.fixture(scope="module")
+def usual(tmp_path_factory: pytest.TempPathFactory) -> tuple[Agent, Dataset, Path]:
+    """Return an agent that was trained with `SHORT`, its log and its folder; tests change none."""
+    folder = tmp_path_factory.mktemp("usual") / "run"
+    return *trained(folder), folder
+
+
 def buffered_episodes(buffer: ReplayBuffer) -> list[dict[str, NDArray[Any]]]:
     """Split the rows of SB3's buffer into episodes, in the order of their ends."""
     episodes = []
@@ -88,8 +95,10 @@ def buffered_episodes(buffer: ReplayBuffer) -> list[dict[str, NDArray[Any]]]:
 
 
 @pytest.mark.parametrize("envs", [1, 4])
-def test_the_log_is_sb3s_replay_buffer_row_for_row(tmp_path: Path, envs: int) -> None:
-    agent, log = trained(tmp_path / "run", envs=envs)
+def test_the_log_is_sb3s_replay_buffer_row_for_row(
+    usual: tuple[Agent, Dataset, Path], tmp_path: Path, envs: int
+) -> None:
+    agent, log = usual[:2] if envs == SHORT["envs"] else trained(tmp_path / "run", envs=envs)
     assert isinstance(agent.model, DQN)
     assert agent.model.replay_buffer is not None
     episodes = buffered_episodes(agent.model.replay_buffer)
@@ -173,16 +182,20 @@ def test_a_file_that_is_no_log_is_not_replaced(tmp_path: Path) -> None:
     assert path.read_text() == "thesis"
 
 
-def test_the_log_can_be_trained_on_offline(tmp_path: Path) -> None:
-    _, log = trained(tmp_path / "run")
+def test_the_log_can_be_trained_on_offline(
+    usual: tuple[Agent, Dataset, Path], tmp_path: Path
+) -> None:
+    _, log, _ = usual
     config = CQLConfig(updates=20, hidden=(8,), log_interval=10, gamma=0.5, target_interval=2)
     (summary,) = train_offline(log, config, tmp_path / "offline", progress=silent)
     assert summary.steps == 20
 
 
-def test_probabilities_are_those_of_the_behavior_policy(tmp_path: Path) -> None:
-    _, log = trained(tmp_path / "run")
-    learner = read_learner(tmp_path / "run" / "log.mcap")
+def test_probabilities_are_those_of_the_behavior_policy(
+    usual: tuple[Agent, Dataset, Path],
+) -> None:
+    _, log, folder = usual
+    learner = read_learner(folder / "log.mcap")
     epsilon, probs = learner.epsilon, log.behavior_probs
     warm_up = learner.policy_version == 0
     # There are 160 random steps, and then four steps of the first policy decision.
@@ -243,17 +256,17 @@ def test_an_actors_probabilities_sum_to_one() -> None:
     env.close()
 
 
-def test_recording_changes_nothing(tmp_path: Path) -> None:
-    agent, _ = trained(tmp_path / "recorded")
+def test_recording_changes_nothing(usual: tuple[Agent, Dataset, Path], tmp_path: Path) -> None:
+    agent, _, _ = usual
     train(Task.for_sim("lane", "dqn", **SHORT), tmp_path / "plain", progress=silent)
     plain = read_curve(tmp_path / "plain" / "seed-0" / "curve.csv")
     for name in set(plain) - {"score"}:
         assert plain[name].tolist() == [getattr(point, name) for point in agent.points]
 
 
-def test_each_evaluation_has_a_separate_log(tmp_path: Path) -> None:
-    agent, _ = trained(tmp_path / "run")
-    paths = sorted((tmp_path / "run" / "evaluations").iterdir())
+def test_each_evaluation_has_a_separate_log(usual: tuple[Agent, Dataset, Path]) -> None:
+    agent, _, folder = usual
+    paths = sorted((folder / "evaluations").iterdir())
     assert [path.name for path in paths] == ["step-000000400.mcap", "step-000000800.mcap"]
     for path, point in zip(paths, agent.points, strict=True):
         log = mcaprl.open(path)
@@ -263,7 +276,7 @@ def test_each_evaluation_has_a_separate_log(tmp_path: Path) -> None:
         assert min(returns) == pytest.approx(point.lowest_return, rel=1e-5)
         np.testing.assert_array_equal(log.behavior_probs, 1)
         assert log.env_id == "mcaprl/LaneKeeping-v0"
-    assert len(mcaprl.open(tmp_path / "run" / "evaluations").episodes) == 6
+    assert len(mcaprl.open(folder / "evaluations").episodes) == 6
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"observation": "depth"}])

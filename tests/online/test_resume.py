@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -24,7 +25,7 @@ from mcaprl.offline.training.follow import GrowingLogs
 from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import Scale
 from mcaprl.online.task import Task
-from mcaprl.online.train import train
+from mcaprl.online.train import OnlineSummary, train
 from mcaprl.progress import TrainingProgress
 from mcaprl.runs import read_curve
 
@@ -38,6 +39,7 @@ SHORT: dict[str, Any] = {
     "target_update_interval": 200,
     "checkpoint_interval": 400,
 }
+SHORTER: dict[str, Any] = {**SHORT, "steps": 200, "eval_interval": 200}
 
 
 class Stopped(Exception):
@@ -101,15 +103,36 @@ def test_a_checkpoint_restores_everything(tmp_path: Path, settings: dict[str, An
     assert state_of(second) == before
 
 
-def test_a_stopped_run_continues_from_its_last_checkpoint(tmp_path: Path) -> None:
-    task = Task.for_sim("lane", "dqn", **SHORT)
+@pytest.fixture(scope="module")
+def resumed(tmp_path_factory: pytest.TempPathFactory) -> OnlineSummary:
+    """Train, stop after 1,000 steps and resume; return the summary of a run for reading only."""
+    out = tmp_path_factory.mktemp("resumed") / "run"
+    settings = {**SHORT, "exploration_fraction": 1.0, "final_learning_rate_fraction": 0.1}
+    task = Task.for_sim("lane", "dqn", **settings)
     with pytest.raises(Stopped):
-        train(task, tmp_path / "run", progress=stop_at(1_000))
-    (summary,) = train(task, tmp_path / "run", resume=True, progress=silent)
-    assert (summary.resumed_at, summary.steps) == (800, 2_000)
-    curve = read_curve(summary.folder / "curve.csv")
+        train(task, out, progress=stop_at(1_000))
+    (summary,) = train(task, out, resume=True, progress=silent)
+    return summary
+
+
+@pytest.fixture
+def finished(_finished: Path, tmp_path: Path) -> Path:
+    """Return a copy of the folder of a finished run of 200 steps."""
+    return shutil.copytree(_finished, tmp_path / "run")
+
+
+@pytest.fixture(scope="module")
+def _finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("finished") / "run"
+    train(Task.for_sim("lane", "dqn", **SHORTER), out, progress=silent)
+    return out
+
+
+def test_a_stopped_run_continues_from_its_last_checkpoint(resumed: OnlineSummary) -> None:
+    assert (resumed.resumed_at, resumed.steps) == (800, 2_000)
+    curve = read_curve(resumed.folder / "curve.csv")
     assert curve["step"].tolist() == [400, 800, 1_200, 1_600, 2_000]
-    names = sorted(path.name for path in summary.folder.glob("progress*"))
+    names = sorted(path.name for path in resumed.folder.glob("progress*"))
     assert names == ["progress-from-800.csv", "progress.csv"]
 
 
@@ -122,13 +145,11 @@ def test_a_run_stopped_before_its_first_evaluation_continues(tmp_path: Path) -> 
     assert (summary.resumed_at, summary.best_step) == (800, 2_000)
 
 
-def test_the_best_policy_is_that_of_the_checkpoint(tmp_path: Path) -> None:
-    task = Task.for_sim("lane", "dqn", **SHORT)
-    (first,) = train(task, tmp_path / "run", progress=silent)
-    best = first.folder / "best_model.zip"
+def test_the_best_policy_is_that_of_the_checkpoint(finished: Path) -> None:
+    best = finished / "seed-0" / "best_model.zip"
     content = best.read_bytes()
     best.write_bytes(b"of an evaluation after the checkpoint")
-    train(task, tmp_path / "run", resume=True, progress=silent)
+    train(Task.for_sim("lane", "dqn", **SHORTER), finished, resume=True, progress=silent)
     assert best.read_bytes() == content
 
 
@@ -141,41 +162,40 @@ def test_resuming_a_missing_run_is_refused(
 
 
 def test_a_second_training_in_the_folder_is_refused(tmp_path: Path) -> None:
-    task = Task.for_sim("lane", "dqn", **SHORT)
+    task = Task.for_sim("lane", "dqn", **SHORTER)
+    begun = []
 
     def begin_another(now: TrainingProgress) -> None:
+        begun.append(now.done)
         with pytest.raises(TrainingError, match="run is in use by another"):
             train(task, tmp_path / "run", resume=True, progress=silent)
 
     (summary,) = train(task, tmp_path / "run", progress=begin_another)
-    assert summary.steps == 2_000
+    assert begun
+    assert summary.steps == 200
 
 
-def test_epsilon_and_learning_rate_continue_to_decay(tmp_path: Path) -> None:
-    settings = {**SHORT, "exploration_fraction": 1.0, "final_learning_rate_fraction": 0.1}
-    task = Task.for_sim("lane", "dqn", **settings)
-    with pytest.raises(Stopped):
-        train(task, tmp_path / "run", progress=stop_at(1_000))
-    (summary,) = train(task, tmp_path / "run", resume=True, progress=silent)
-    text = (summary.folder / "progress-from-800.csv").read_text().splitlines()
+def test_epsilon_and_learning_rate_continue_to_decay(resumed: OnlineSummary) -> None:
+    text = (resumed.folder / "progress-from-800.csv").read_text().splitlines()
     header, *rows = [line.split(",") for line in text]
     rates = [
         (float(row[header.index("time/total_timesteps")]), float(value))
         for row in rows
         if (value := row[header.index("rollout/exploration_rate")])
     ]
+    assert rates
     for step, epsilon in rates:
         assert epsilon == pytest.approx(1 - 0.95 * step / 2_000, abs=0.01)
 
 
-def test_a_finished_run_is_not_repeated(tmp_path: Path) -> None:
-    task = Task.for_sim("lane", "dqn", **SHORT)
-    (first,) = train(task, tmp_path / "run", progress=silent)
-    curve = (first.folder / "curve.csv").read_bytes()
-    again, more = train(task, tmp_path / "run", seeds=2, resume=True, progress=silent)
-    assert (again.resumed_at, again.steps, again.score) == (2_000, 2_000, first.score)
-    assert (first.folder / "curve.csv").read_bytes() == curve
-    assert (more.resumed_at, more.steps) == (0, 2_000)
+def test_a_finished_run_is_not_repeated(finished: Path) -> None:
+    task = Task.for_sim("lane", "dqn", **SHORTER)
+    before = {name: (finished / name).read_text() for name in ("scores.json", "seed-0/curve.csv")}
+    again, more = train(task, finished, seeds=2, resume=True, progress=silent)
+    score = json.loads(before["scores.json"])["seeds"]["seed-0"]["score"]
+    assert (again.resumed_at, again.steps, again.score) == (200, 200, score)
+    assert (finished / "seed-0" / "curve.csv").read_text() == before["seed-0/curve.csv"]
+    assert (more.resumed_at, more.steps) == (0, 200)
 
 
 def test_a_killed_run_continues(tmp_path: Path) -> None:
@@ -233,34 +253,27 @@ def test_ppo_continues(tmp_path: Path) -> None:
     assert summary.steps >= 2_000
 
 
-def test_another_task_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    short = {**SHORT, "steps": 200, "eval_interval": 200}
-    train(Task.for_sim("lane", "dqn", **short), tmp_path / "run", progress=silent)
-    other = Task.for_sim("lane", "dqn", **{**short, "gamma": 0.5})
+def test_another_task_is_refused(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = Task.for_sim("lane", "dqn", **{**SHORTER, "gamma": 0.5})
     with pytest.raises(TrainingError, match=r"has gamma 0\.97, not 0\.5"):
-        train(other, tmp_path / "run", resume=True, progress=silent)
-    out = ["--out", str(tmp_path / "run"), "--resume"]
+        train(other, finished, resume=True, progress=silent)
+    out = ["--out", str(finished), "--resume"]
     assert run(["train-online", "racer", *out]) == 1
     assert "has sim 'lane', not 'racer'" in capsys.readouterr().err
 
 
 def test_the_command_resumes_with_the_runs_settings(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    short = {**SHORT, "steps": 200, "eval_interval": 200}
-    train(Task.for_sim("lane", "dqn", **short), tmp_path / "run", progress=silent)
-    assert run(["train-online", "--out", str(tmp_path / "run"), "--resume"]) == 0
+    assert run(["train-online", "--out", str(finished), "--resume"]) == 0
     assert "dqn in lane" in capsys.readouterr().out
 
 
-def test_a_broken_checkpoint_is_reported(tmp_path: Path) -> None:
-    short = {**SHORT, "steps": 200, "eval_interval": 200}
-    task = Task.for_sim("lane", "dqn", **short)
-    train(task, tmp_path / "run", progress=silent)
-    path = tmp_path / "run" / "seed-0" / "checkpoint.safetensors"
+def test_a_broken_checkpoint_is_reported(finished: Path) -> None:
+    path = finished / "seed-0" / "checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:-10])
     with pytest.raises(TrainingError, match=r"is broken .* delete it to restart this seed"):
-        train(task, tmp_path / "run", resume=True, progress=silent)
+        train(Task.for_sim("lane", "dqn", **SHORTER), finished, resume=True, progress=silent)
 
 
 def test_a_folder_without_a_run_is_reported(tmp_path: Path) -> None:
@@ -272,9 +285,5 @@ def test_a_folder_without_a_run_is_reported(tmp_path: Path) -> None:
         Task.of_run(tmp_path)
 
 
-def test_a_resumed_models_file_is_complete(tmp_path: Path) -> None:
-    task = Task.for_sim("lane", "dqn", **SHORT)
-    with pytest.raises(Stopped):
-        train(task, tmp_path / "run", progress=stop_at(1_000))
-    (summary,) = train(task, tmp_path / "run", resume=True, progress=silent)
-    assert DQN.load(summary.folder / "best_model.zip").num_timesteps == summary.best_step
+def test_a_resumed_models_file_is_complete(resumed: OnlineSummary) -> None:
+    assert DQN.load(resumed.folder / "best_model.zip").num_timesteps == resumed.best_step

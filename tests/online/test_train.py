@@ -16,7 +16,7 @@ from mcaprl.api.policies import load_policies
 from mcaprl.cli import run
 from mcaprl.errors import OutputExistsError, SpaceError, TrainingError, UnknownNameError, UsageError
 from mcaprl.online.task import Task
-from mcaprl.online.train import train
+from mcaprl.online.train import OnlineSummary, train
 from mcaprl.progress import TrainingProgress
 from mcaprl.runs import read_curve
 from mcaprl.sims import make_sim
@@ -40,9 +40,16 @@ def silent(_: TrainingProgress) -> None:
     """A progress callback that does nothing."""
 
 
-def test_a_run_writes_these_files(tmp_path: Path) -> None:
-    out = tmp_path / "run"
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> OnlineSummary:
+    """Train with seed 2 and return the summary; tests do not change the folder."""
+    out = tmp_path_factory.mktemp("lane") / "run"
     (summary,) = train(lane(), out, seed=2, progress=silent)
+    return summary
+
+
+def test_a_run_writes_these_files(trained: OnlineSummary) -> None:
+    out = trained.folder.parent
     assert {path.name for path in out.iterdir()} == {
         "config.json",
         "scores.json",
@@ -57,14 +64,13 @@ def test_a_run_writes_these_files(tmp_path: Path) -> None:
         "progress.csv",
         "events.out",
     }
-    assert (summary.folder, summary.seed, summary.steps) == (out / "seed-2", 2, 600)
+    assert (trained.folder.name, trained.seed, trained.steps) == ("seed-2", 2, 600)
     config = json.loads((out / "config.json").read_text())
     assert (config["algo"], config["sim"], config["config"]["steps"]) == ("double-dqn", "lane", 600)
 
 
-def test_the_curve_has_a_row_for_each_evaluation(tmp_path: Path) -> None:
-    train(lane(), tmp_path / "run", progress=silent)
-    curve = read_curve(tmp_path / "run" / "seed-0" / "curve.csv")
+def test_the_curve_has_a_row_for_each_evaluation(trained: OnlineSummary) -> None:
+    curve = read_curve(trained.folder / "curve.csv")
     assert curve["step"].tolist() == [200, 400, 600]
     assert (curve["lowest_return"] <= curve["mean_return"]).all()
     assert (curve["mean_return"] <= curve["highest_return"]).all()
@@ -73,9 +79,8 @@ def test_the_curve_has_a_row_for_each_evaluation(tmp_path: Path) -> None:
     assert ((curve["score"] > -1) & (curve["score"] < 1.5)).all()
 
 
-def test_scalars_have_sb3s_names(tmp_path: Path) -> None:
-    train(lane(), tmp_path / "run", progress=silent)
-    board = EventAccumulator(str(tmp_path / "run" / "seed-0"))
+def test_scalars_have_sb3s_names(trained: OnlineSummary) -> None:
+    board = EventAccumulator(str(trained.folder))
     board.Reload()
     assert set(board.Tags()["scalars"]) >= {
         "eval/mean_reward",
@@ -91,40 +96,37 @@ def test_scalars_have_sb3s_names(tmp_path: Path) -> None:
     assert [event.step for event in board.Scalars("eval/score")] == [200, 400, 600]
 
 
-@pytest.mark.parametrize("envs", [1, 8])
+@pytest.mark.parametrize("envs", [1, 4])
 def test_the_same_seed_gives_the_same_curve(tmp_path: Path, envs: int) -> None:
     curves = []
-    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        train(lane(envs=envs), tmp_path / name, seed=seed, progress=silent)
-        curves.append((tmp_path / name / f"seed-{seed}" / "curve.csv").read_text())
-    assert curves[0] == curves[1] != curves[2]
+    for name in ("a", "b"):
+        train(lane(envs=envs), tmp_path / name, seed=1, progress=silent)
+        curves.append((tmp_path / name / "seed-1" / "curve.csv").read_text())
+    assert curves[0] == curves[1]
 
 
-def test_each_seed_is_independent_of_the_others(tmp_path: Path) -> None:
-    train(lane(), tmp_path / "all", seeds=2, progress=silent)
-    train(lane(), tmp_path / "one", seed=1, progress=silent)
-    curves = [tmp_path / name / "seed-1" / "curve.csv" for name in ("all", "one")]
-    assert curves[0].read_text() == curves[1].read_text()
-    scores = json.loads((tmp_path / "all" / "scores.json").read_text())
-    assert set(scores["seeds"]) == {"seed-0", "seed-1"}
+def test_each_seed_is_independent_of_the_others(trained: OnlineSummary, tmp_path: Path) -> None:
+    train(lane(), tmp_path, seed=1, seeds=2, progress=silent)
+    curves = [(tmp_path / f"seed-{seed}" / "curve.csv").read_text() for seed in (1, 2)]
+    assert curves[1] == (trained.folder / "curve.csv").read_text() != curves[0]
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert set(scores["seeds"]) == {"seed-1", "seed-2"}
 
 
 def test_the_last_score_equals_evaluates(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trained: OnlineSummary, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "run"
-    (summary,) = train(lane(), out, progress=silent)
-    assert run(["evaluate", str(out), "--sim", "lane", "--episodes", "4", "--json"]) == 0
+    out = str(trained.folder.parent)
+    assert run(["evaluate", out, "--sim", "lane", "--episodes", "4", "--json"]) == 0
     (mine, *_) = json.loads(capsys.readouterr().out)["policies"]
-    assert mine["mean_return"] == summary.mean_return
-    assert mine["normalized_score"] == pytest.approx(summary.score, abs=1e-12)
+    assert mine["mean_return"] == trained.mean_return
+    assert mine["normalized_score"] == pytest.approx(trained.score, abs=1e-12)
 
 
-def test_the_saved_model_is_the_best_and_loads_in_sb3(tmp_path: Path) -> None:
-    (summary,) = train(lane(), tmp_path / "run", progress=silent)
-    model = DQN.load(summary.folder / "best_model.zip")
-    assert model.num_timesteps == summary.best_step
-    (policy,) = load_policies(tmp_path / "run")
+def test_the_saved_model_is_the_best_and_loads_in_sb3(trained: OnlineSummary) -> None:
+    model = DQN.load(trained.folder / "best_model.zip")
+    assert model.num_timesteps == trained.best_step
+    (policy,) = load_policies(trained.folder.parent)
     observations = np.random.default_rng(0).uniform(-1, 1, (30, 12)).astype(np.float32)
     np.testing.assert_array_equal(
         policy.act(observations), model.predict(observations, deterministic=True)[0]

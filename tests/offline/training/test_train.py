@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,7 +31,7 @@ from mcaprl.offline.algorithms.config import (
 )
 from mcaprl.offline.policy import read_policy
 from mcaprl.offline.training.curves import draw_curves
-from mcaprl.offline.training.metrics import describe_seeds
+from mcaprl.offline.training.metrics import OfflineSummary, describe_seeds
 from mcaprl.offline.training.train import train
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -94,15 +95,29 @@ def assert_same_result(run: Path, expected: Path, seed: int = 0) -> None:
     assert curves[0] == curves[1]
 
 
-def test_a_run_folder_has_settings_policy_checkpoint_and_curve(tmp_path: Path) -> None:
-    (summary,) = train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
-    assert summary.folder == tmp_path / "run" / "seed-0"
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> OfflineSummary:
+    """Train with SHORT_CQL and return the summary; tests do not change the folder."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    (summary,) = train(corridor(), SHORT_CQL, out, progress=silent)
+    return summary
+
+
+@pytest.fixture
+def copied(whole: OfflineSummary, tmp_path: Path) -> Path:
+    """Return the folder of a copy of this run."""
+    return shutil.copytree(whole.folder.parent, tmp_path / "run")
+
+
+def test_a_run_folder_has_settings_policy_checkpoint_and_curve(whole: OfflineSummary) -> None:
+    summary, run = whole, whole.folder.parent
+    assert summary.folder.name == "seed-0"
     assert (summary.algo, summary.seed, summary.steps, summary.resumed_at) == ("cql", 0, 100, 0)
     assert summary.seconds > 0
     names = {path.name for path in summary.folder.iterdir()}
     assert names > {"policy.json", "policy.safetensors", "checkpoint.safetensors", "metrics.csv"}
     assert not any(name.endswith(".tmp") for name in names)
-    settings = json.loads((tmp_path / "run" / "config.json").read_text())
+    settings = json.loads((run / "config.json").read_text())
     assert settings["algo"] == "cql"
     assert settings["config"]["alpha"] == 1.0
     assert settings["config"]["hidden"] == [16]
@@ -110,24 +125,22 @@ def test_a_run_folder_has_settings_policy_checkpoint_and_curve(tmp_path: Path) -
     assert settings["env_id"] == "Corridor-v0"
 
 
-def test_the_curve_names_the_terms_of_the_loss(tmp_path: Path) -> None:
-    (summary,) = train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
-    curve = rows(tmp_path / "run")
+def test_the_curve_names_the_terms_of_the_loss(whole: OfflineSummary) -> None:
+    curve = rows(whole.folder.parent)
     assert [int(row["update"]) for row in curve] == list(range(10, 101, 10))
     assert {"learning_rate", "loss", "td_loss", "conservative_penalty", "mean_q"} < curve[0].keys()
     for row in curve:
         total = float(row["td_loss"]) + float(row["conservative_penalty"])
         assert float(row["loss"]) == pytest.approx(total, abs=1e-5)
     assert float(curve[-1]["learning_rate"]) == pytest.approx(0.02 * 1e-3)
-    assert float(curve[-1]["loss"]) == summary.terms["loss"]
+    assert float(curve[-1]["loss"]) == whole.terms["loss"]
 
 
-def test_tensorboard_shows_the_same_curve(tmp_path: Path) -> None:
-    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
-    events = EventAccumulator(str(tmp_path / "run" / "seed-0"))
+def test_tensorboard_shows_the_same_curve(whole: OfflineSummary) -> None:
+    events = EventAccumulator(str(whole.folder))
     events.Reload()
     shown = {event.step: event.value for event in events.Scalars("train/loss")}
-    written = {int(row["update"]): float(row["loss"]) for row in rows(tmp_path / "run")}
+    written = {int(row["update"]): float(row["loss"]) for row in rows(whole.folder.parent)}
     assert shown == pytest.approx(written)
 
 
@@ -168,17 +181,22 @@ def test_each_seed_gets_a_folder_and_does_not_depend_on_the_others(tmp_path: Pat
     ("config", "stop"),
     [*((SHORT_CQL, stop) for stop in (20, 40, 100)), *((config, 70) for config in RESUMABLE)],
 )
-def test_a_stopped_run_resumes_bit_for_bit(tmp_path: Path, stop: int, config: Any) -> None:
-    train(corridor(), config, tmp_path / "whole", progress=silent)
+def test_a_stopped_run_resumes_bit_for_bit(
+    whole: OfflineSummary, tmp_path: Path, stop: int, config: Any
+) -> None:
+    expected = whole.folder.parent
+    if config is not SHORT_CQL:
+        expected = tmp_path / "whole"
+        train(corridor(), config, expected, progress=silent)
     with pytest.raises(Stopped):
         train(corridor(), config, tmp_path / "cut", progress=StopAt(stop))
     (summary,) = train(corridor(), config, tmp_path / "cut", resume=True, progress=silent)
     assert summary.resumed_at == {20: 0, 40: 40, 70: 40, 100: 100}[stop]
     assert summary.steps == 100
-    assert_same_result(tmp_path / "cut", tmp_path / "whole")
+    assert_same_result(tmp_path / "cut", expected)
 
 
-def test_a_killed_run_resumes_bit_for_bit(tmp_path: Path) -> None:
+def test_a_killed_run_resumes_bit_for_bit(whole: OfflineSummary, tmp_path: Path) -> None:
     script = """
         import sys, time
         from pathlib import Path
@@ -202,8 +220,7 @@ def test_a_killed_run_resumes_bit_for_bit(tmp_path: Path) -> None:
     assert len(rows(tmp_path / "cut")) == 7
     (summary,) = train(corridor(), SHORT_CQL, tmp_path / "cut", resume=True, progress=silent)
     assert summary.resumed_at == 40
-    train(corridor(), SHORT_CQL, tmp_path / "whole", progress=silent)
-    assert_same_result(tmp_path / "cut", tmp_path / "whole")
+    assert_same_result(tmp_path / "cut", whole.folder.parent)
 
 
 LONG_CQL = replace(SHORT_CQL, updates=1500, checkpoint_interval=20)
@@ -226,7 +243,8 @@ def test_a_run_killed_at_random_moments_resumes_bit_for_bit(tmp_path: Path) -> N
     for moment in np.random.default_rng().uniform(0, 0.4, 2):
         with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=root) as child:
             assert child.stdout is not None
-            assert child.stdout.readline()
+            # On a busy machine, a new run would otherwise be killed before its first checkpoint.
+            assert any(int(line) >= LONG_CQL.checkpoint_interval for line in child.stdout)
             time.sleep(moment)
             child.kill()
     resumed = train(corridor(), LONG_CQL, tmp_path / "cut", seeds=2, resume=True, progress=silent)
@@ -236,39 +254,33 @@ def test_a_run_killed_at_random_moments_resumes_bit_for_bit(tmp_path: Path) -> N
         assert_same_result(tmp_path / "cut", tmp_path / "whole", seed)
 
 
-def test_an_incomplete_row_after_a_kill_is_dropped(tmp_path: Path) -> None:
-    train(corridor(), SHORT_CQL, tmp_path / "whole", progress=silent)
+def test_an_incomplete_row_after_a_kill_is_dropped(whole: OfflineSummary, tmp_path: Path) -> None:
     with pytest.raises(Stopped):
         train(corridor(), SHORT_CQL, tmp_path / "cut", progress=StopAt(50))
     with (tmp_path / "cut" / "seed-0" / "metrics.csv").open("a") as file:
         file.write("60,0.00")
     train(corridor(), SHORT_CQL, tmp_path / "cut", resume=True, progress=silent)
-    assert_same_result(tmp_path / "cut", tmp_path / "whole")
+    assert_same_result(tmp_path / "cut", whole.folder.parent)
 
 
-def test_the_checkpoint_is_written_after_the_policy(tmp_path: Path) -> None:
+def test_the_checkpoint_is_written_after_the_policy(whole: OfflineSummary) -> None:
     # If the last checkpoint were written first, a kill before the policy is written would leave an
     # old policy beside the checkpoint of a finished run.
-    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
-    folder = tmp_path / "run" / "seed-0"
+    folder = whole.folder
     names = ("policy.safetensors", "policy.json", "checkpoint.safetensors")
     times_ns = [(folder / name).stat().st_mtime_ns for name in names]
     assert max(times_ns) == times_ns[-1]
 
 
-def test_resuming_adds_missing_seeds(tmp_path: Path) -> None:
-    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
-    summaries = train(
-        corridor(), SHORT_CQL, tmp_path / "run", seeds=2, resume=True, progress=silent
-    )
+def test_resuming_adds_missing_seeds(copied: Path) -> None:
+    summaries = train(corridor(), SHORT_CQL, copied, seeds=2, resume=True, progress=silent)
     assert [(summary.seed, summary.resumed_at) for summary in summaries] == [(0, 100), (1, 0)]
     assert summaries[0].terms == {}
 
 
-def test_a_run_resumes_only_with_its_own_data(tmp_path: Path) -> None:
-    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+def test_a_run_resumes_only_with_its_own_data(copied: Path) -> None:
     with pytest.raises(TrainingError, match=r"config\.json was trained on other data"):
-        train(corridor(repeat=21), SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
+        train(corridor(repeat=21), SHORT_CQL, copied, resume=True, progress=silent)
 
 
 @pytest.mark.parametrize(
@@ -279,36 +291,32 @@ def test_a_run_resumes_only_with_its_own_data(tmp_path: Path) -> None:
         (BCConfig(**SHORT), "has algo 'cql', not 'bc'"),
     ],
 )
-def test_a_run_resumes_only_with_its_own_settings(tmp_path: Path, other: Any, says: str) -> None:
-    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+def test_a_run_resumes_only_with_its_own_settings(copied: Path, other: Any, says: str) -> None:
     with pytest.raises(TrainingError, match=says):
-        train(corridor(), other, tmp_path / "run", resume=True, progress=silent)
+        train(corridor(), other, copied, resume=True, progress=silent)
 
 
 @pytest.mark.parametrize("content", [b"", b"nonsense", b"\xff" * 64])
-def test_a_broken_checkpoint_is_named(tmp_path: Path, content: bytes) -> None:
-    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
-    path = tmp_path / "run" / "seed-0" / "checkpoint.safetensors"
+def test_a_broken_checkpoint_is_named(copied: Path, content: bytes) -> None:
+    path = copied / "seed-0" / "checkpoint.safetensors"
     path.write_bytes(content)
     with pytest.raises(TrainingError, match=f"{path} is broken"):
-        train(corridor(), SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
+        train(corridor(), SHORT_CQL, copied, resume=True, progress=silent)
 
 
-def test_a_checkpoint_of_other_data_is_refused(tmp_path: Path) -> None:
-    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+def test_a_checkpoint_of_other_data_is_refused(copied: Path, tmp_path: Path) -> None:
     train(corridor(repeat=21), SHORT_CQL, tmp_path / "other", progress=silent)
     name = Path("seed-0", "checkpoint.safetensors")
-    (tmp_path / "run" / name).write_bytes((tmp_path / "other" / name).read_bytes())
+    (copied / name).write_bytes((tmp_path / "other" / name).read_bytes())
     with pytest.raises(TrainingError, match=r"checkpoint\.safetensors was trained on other data"):
-        train(corridor(), SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
+        train(corridor(), SHORT_CQL, copied, resume=True, progress=silent)
 
 
-def test_an_existing_run_is_not_replaced(tmp_path: Path) -> None:
-    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
-    before = (tmp_path / "run" / "config.json").read_bytes()
-    with pytest.raises(OutputExistsError, match=f"{tmp_path / 'run'} exists"):
-        train(corridor(), BCConfig(**SHORT), tmp_path / "run", progress=silent)
-    assert (tmp_path / "run" / "config.json").read_bytes() == before
+def test_an_existing_run_is_not_replaced(copied: Path) -> None:
+    before = (copied / "config.json").read_bytes()
+    with pytest.raises(OutputExistsError, match=f"{copied} exists"):
+        train(corridor(), BCConfig(**SHORT), copied, progress=silent)
+    assert (copied / "config.json").read_bytes() == before
 
 
 @pytest.mark.parametrize("resume", [False, True])
@@ -337,7 +345,7 @@ def test_a_run_killed_before_its_first_write_starts_again(tmp_path: Path, resume
 
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_second_training_in_the_folder_is_refused_before_the_first_checkpoint(
-    tmp_path: Path, resume: bool
+    whole: OfflineSummary, tmp_path: Path, resume: bool
 ) -> None:
     run = tmp_path / "run"
     refused = []
@@ -352,8 +360,7 @@ def test_a_second_training_in_the_folder_is_refused_before_the_first_checkpoint(
 
     train(corridor(), SHORT_CQL, run, progress=begin_another)
     assert refused
-    train(corridor(), SHORT_CQL, tmp_path / "alone", progress=silent)
-    assert_same_result(run, tmp_path / "alone")
+    assert_same_result(run, whole.folder.parent)
 
 
 def test_a_file_is_no_run_folder(tmp_path: Path) -> None:
