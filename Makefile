@@ -35,7 +35,7 @@ demo: $(VENV)/.demo
 	  "Next: docs/tutorial.md, and docs/howto/environment.md for your environment."
 
 test: $(VENV)/.dev $(VENV)/.lerobot $(VENV)/.s3 $(VENV)/.rivals tests/node/node_modules
-	OMP_NUM_THREADS=1 $(BIN)/pytest
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 faults: $(VENV)/.dev
 	rm -f $(VENV)/fault-figures

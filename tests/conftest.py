@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -48,6 +49,22 @@ def _same_weights() -> None:
 def log_path(tmp_path: Path) -> Path:
     """Return the path of a test's log."""
     return tmp_path / "log.mcap"
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Run the tests of a file in one worker, and all tests with the Ray cluster in one worker."""
+    from xdist.scheduler import LoadFileScheduling
+
+    scheduling = LoadFileScheduling(config, log)
+    file_of = scheduling._split_scope
+
+    def group_of(test: str) -> str:
+        needs_ray = test.startswith("tests/ray/") or test.endswith("[docs/ray.md]")
+        return "ray" if needs_ray else file_of(test)
+
+    scheduling._split_scope = group_of
+    return scheduling
 
 
 def need(available: bool, reason: str) -> None:
