@@ -33,7 +33,7 @@ from mcaprl.recorder.viewer.log_layout import attached_layout
 from mcaprl.recorder.viewer.playback import Player, Track
 from mcaprl.recorder.viewer.player_server import LiveServer
 from mcaprl.recorder.viewer.prefix import prefixes_of, side_by_side
-from mcaprl.recorder.viewer.scene_reader import moments_of_episode
+from mcaprl.recorder.viewer.scene_reader import SeenStep, moments_of_episode
 from mcaprl.recorder.viewer.verify import Verification
 from mcaprl.recorder.viewer.verify import verify as verify_dataset
 from mcaprl.recorder.viewer.video import (
@@ -258,16 +258,20 @@ def _of_scene(
     from mcaprl.sims.drawing.chase_view import ChaseView
     from mcaprl.sims.drawing.scene import Frame, Shape
 
-    static, last = [], None
+    static, moving, last = [], [], SeenStep(0, 0)
     with closing(ChaseView()) as view:
         for moment in moments_of_episode(reader, episode, parts):
             if moment.step not in steps:
                 continue
-            if moment.static is not last:
-                static, last = [Shape(**vars(seen)) for seen in moment.static], moment.static
+            # The view prepares a list of shapes once, so an unchanged list stays the same object.
+            if moment.static is not last.static:
+                static = [Shape(**vars(seen)) for seen in moment.static]
+            if moment.moving is not last.moving:
+                moving = [Shape(**vars(seen)) for seen in moment.moving]
+            last = moment
             yield view.draw(
                 static,
-                [Shape(**vars(seen)) for seen in moment.moving],
+                moving,
                 [Frame(**vars(seen)) for seen in moment.frames],
                 moment.follow,
                 _caption(dataset, episode, moment.step, moment.time_ns),

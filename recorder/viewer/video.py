@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from fractions import Fraction
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +24,9 @@ SMOOTH_FPS: Final = 20.0
 """Frame rate from which motion looks continuous."""
 # WebP with Pillow's default quality of 80 is nearly twice as large.
 _LOOP_OPTIONS: Final[dict[str, dict[str, int]]] = {".gif": {}, ".webp": {"quality": 50}}
+# x264's defaults, "medium" and 23, take 3 to 4 times the CPU time for a PSNR that is at most 0.3 dB
+# higher. Their files of our scenes are half to two thirds as large.
+_H264_OPTIONS: Final = {"preset": "superfast", "crf": "25"}
 _COLUMNS = 3
 _GAP_PX = 6
 
@@ -80,16 +84,29 @@ def _write(path: Path, kind: str, images: Iterable[Image], fps: float) -> int:
             options = {"extension": kind, "plugin": "pillow", **times, **_LOOP_OPTIONS[kind]}
             imageio.imwrite(path, stills, **options)
         return len(stills)
-    count = 0
-    # The format is given because the name of the temporary file has no suffix.
-    options = {"extension": kind, "plugin": "pyav", "container": kind.removeprefix(".")}
+    return _encode(path, images, fps)
+
+
+def _encode(path: Path, images: Iterable[Image], fps: float) -> int:
+    """Write an H.264 encoded `.mp4`; see `write_video`."""
+    av = import_extra("av", "video")
+    # imageio offers neither the encoder's options nor the choice of the interpolation.
+    count, stream = 0, None
     # The encoder cannot be closed after a failed write, so it writes to memory.
     content = BytesIO()
-    with imageio.imopen(content, "w", **options) as video:
-        video.init_video_stream("libx264", fps=float(fps))
-        for image in images:
-            video.write_frame(image)
-            count += 1
+    with av.open(content, "w", format="mp4") as container:
+        for count, image in enumerate(images, 1):  # noqa: B007
+            if stream is None:
+                rate = Fraction(fps).limit_denominator(10_000)
+                stream = container.add_stream("libx264", rate=rate, options=_H264_OPTIONS)
+                stream.height, stream.width = image.shape[:2]
+                stream.pix_fmt = "yuv420p"
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            # A chroma sample is the mean of its 2x2 pixels; the default, bicubic, is slower.
+            frame = frame.reformat(format="yuv420p", interpolation="BILINEAR")
+            container.mux(stream.encode(frame))
+        if stream is not None:
+            container.mux(stream.encode())
     path.write_bytes(content.getvalue())
     return count
 

@@ -45,6 +45,7 @@ class Canvas:
         width_px, height_px = size_px
         self._large = self.pygame.Surface((_SMOOTH * width_px, _SMOOTH * height_px))
         self._image = self.pygame.Surface(size_px)
+        self._pixels: NDArray[np.uint8] | None = None
         self._window: Any = None
         if render_mode == "human":
             self.pygame.display.init()
@@ -58,7 +59,16 @@ class Canvas:
 
     def flatten(self) -> None:
         """Downsample the polygons to the image; later calls draw over them."""
+        self._pixels = None
         self._image = self.pygame.transform.smoothscale(self._large, self._size_px)
+
+    def paste(self, image: NDArray[np.uint8]) -> None:
+        """Use (height, width, 3) pixels as the image; later calls draw over them, in place.
+
+        This replaces the calls of `polygon` and `flatten`.
+        """
+        self._pixels = image
+        self._image = self.pygame.image.frombuffer(image, self._size_px, "RGB")
 
     def rectangle(self, box_px: tuple[int, int, int, int], color: Rgb, edge_px: int = 0) -> None:
         """Draw a rectangle (left, top, width, height); fill it if `edge_px` is 0."""
@@ -94,8 +104,13 @@ class Canvas:
             self.pygame.event.pump()
             self.pygame.display.flip()
             self._clock.tick(self._images_per_s)
-        pixels = self.pygame.surfarray.array3d(self._image)
-        return np.ascontiguousarray(pixels.transpose(1, 0, 2))
+        if self._pixels is not None:
+            return self._pixels
+        # `surfarray` would take much longer, because it returns columns. The copy in a bytearray
+        # makes the image writable.
+        pixels = bytearray(self.pygame.image.tobytes(self._image, "RGB"))
+        width_px, height_px = self._size_px
+        return np.frombuffer(pixels, np.uint8).reshape(height_px, width_px, 3)
 
     def close(self) -> None:
         """Close the window."""

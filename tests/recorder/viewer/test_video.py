@@ -15,10 +15,17 @@ import mcaprl
 from mcaprl.cli import run
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.viewer.scene_reader import moments_of_episode
-from mcaprl.recorder.viewer.video import contact_sheet, evenly_spaced, parts_of_step, shown_steps
+from mcaprl.recorder.viewer.video import (
+    contact_sheet,
+    evenly_spaced,
+    parts_of_step,
+    shown_steps,
+    write_video,
+)
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.chase_view import SIZE_PX, ChaseView, chase_eye, poses_of
 from mcaprl.sims.drawing.scene import Frame, Kind, Shape, yaw_rotation
+from mcaprl.sims.lane.scene import static_shapes
 from tests.conftest import need
 
 RED, GREEN = (1.0, 0.0, 0.0, 1.0), (0.0, 1.0, 0.0, 1.0)
@@ -191,6 +198,28 @@ def test_videos_of_a_scene_and_of_a_sim(
         assert run(["replay", "lane.mcap", *arguments]) == 2
         assert why in capsys.readouterr().err
     assert not Path("new.mp4").exists()
+
+
+def test_an_encoded_video_looks_like_its_images(view: ChaseView, tmp_path: Path) -> None:
+    import imageio.v3 as imageio
+
+    path, static = tmp_path / "lane.mp4", list(static_shapes())
+    images = [view.draw(static, [], car_at(x_m), "car", ["a line"]) for x_m in (20.0, 20.5, 21.0)]
+    assert write_video(path, iter(images), 12.5) == 3
+    assert imageio.immeta(path, plugin="pyav")["fps"] == 12.5
+    for seen, image in zip(imageio.imiter(path, plugin="pyav"), images, strict=True):
+        error = seen.astype(float) - image
+        # A video has one color for 2x2 pixels, so edges between colors differ.
+        assert np.abs(error).mean() < 2.0
+        assert 10 * np.log10(255**2 / (error**2).mean()) > 33, "dB"
+
+
+def test_a_video_needs_frames(tmp_path: Path) -> None:
+    for kind in ("mp4", "gif"):
+        path = tmp_path / f"video.{kind}"
+        with pytest.raises(mcaprl.errors.UsageError, match="no frames"):
+            write_video(path, [], 20.0)
+        assert not path.exists()
 
 
 def test_a_log_without_a_scene_has_no_video(
