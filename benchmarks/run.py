@@ -9,14 +9,14 @@ import tempfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from benchmarks import bags, edits, formats, growth, logs, sims
+from benchmarks import bags, edits, formats, growth, logs, sims, video
 from benchmarks.measure import Table
 from benchmarks.workloads import IMAGE_STEPS
 from mcaprl.files import write_json
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"
-PARTS = ["logs", "bags", "edits", "formats", "growth", "sims"]
+PARTS = ["logs", "bags", "edits", "formats", "growth", "sims", "video"]
 LIBRARIES = (
     "numpy",
     "zstandard",
@@ -30,6 +30,7 @@ LIBRARIES = (
     "h5py",
     "pyarrow",
     "highway-env",
+    "av",
 )
 _PAGE = """\
 # Speed
@@ -81,6 +82,8 @@ def main() -> None:
             found += growth.tables(folder, sizes)
         if "sims" in arguments.only:
             found += sims.tables()
+        if "video" in arguments.only:
+            found += video.tables(folder)
     tables |= {table.title: table for table in found}
     write_results(list(tables.values()), arguments.transitions)
 
