@@ -137,12 +137,12 @@ def record(
         rotate_mb=rotate_mb,
     )
     _check_request(request, envs)
-    if envs == 1 and not ray:
-        check_log_name(request.out)
     on_cluster = ClusterOptions(ray, workers, address)
     on_cluster.check(shards=shards)
     if ray:
         _check_for_ray(request, envs)
+    elif envs == 1:
+        check_log_name(request.out)
     if upload is not None:
         check_upload(upload)
     with progress(f"recording {sim}", episodes or steps) as advance:
