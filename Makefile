@@ -58,12 +58,12 @@ bench: $(BENCH)/.ready
 	OMP_NUM_THREADS=1 $(BENCH)/bin/python -m benchmarks.run
 
 bench-learning: $(VENV)/.rivals
-	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.learning
-	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.off_policy
-	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.cartpole_grid $(VENV)/cartpole
+	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.speed.learning
+	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.studies.off_policy
+	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.studies.cartpole_grid $(VENV)/cartpole
 
 sim-grid: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.sim_grid $(VENV)/sim-grid
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.studies.sim_grid $(VENV)/sim-grid
 
 docs: $(VENV)/.dev
 	$(BIN)/python docs/generate.py

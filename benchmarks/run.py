@@ -9,9 +9,9 @@ import tempfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from benchmarks import bags, edits, formats, growth, logs, sims, video
 from benchmarks.measure import Table
-from benchmarks.workloads import IMAGE_STEPS
+from benchmarks.speed import bags, edits, formats, growth, logs, sims, video
+from benchmarks.speed.workloads import IMAGE_STEPS
 from mcaprl.files import write_json
 
 ROOT = Path(__file__).parent.parent

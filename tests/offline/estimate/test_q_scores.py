@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.q_scores import RESOLUTIONS, bvft, bvft_losses, sbv
+from benchmarks.studies.q_scores import RESOLUTIONS, bvft, bvft_losses, sbv
 
 PAYS = np.array([[1.0, 0.0], [0.5, 0.2]])
 """Mean reward of two actions in two states; each step ends the episode."""

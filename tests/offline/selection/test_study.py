@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import selection, sim_grid
-from benchmarks.selection import CHECKPOINT_RULES, Log, rules
+from benchmarks.studies import selection, sim_grid
+from benchmarks.studies.selection import CHECKPOINT_RULES, Log, rules
 
 
 def row(candidate: str, kind: str = "full", seed: int = 0, **labels: Any) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Compare the read tasks of `mcaprl.ray.read` with those of `ray.data.read_mcap`.
 
-    python -m benchmarks.ray_read
+    python -m benchmarks.speed.ray_read
 
 This process runs the tasks that Ray's workers would run, and measures the CPU time. The tasks of
 `read_mcap` return the bytes of messages. The benchmark then decodes the bytes in the fastest
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 import mcaprl
 import mcaprl.ray
 from benchmarks.measure import OURS, Side, compare
-from benchmarks.workloads import ACTION, EPISODE_STEPS, OBSERVATION, vectors
+from benchmarks.speed.workloads import ACTION, EPISODE_STEPS, OBSERVATION, vectors
 from mcaprl.recorder import STEP_TOPIC, message_dtype, step_schema
 
 # The tasks of read_mcap are timed on a part of the rows, and their time is scaled up.

@@ -8,10 +8,10 @@ from functools import partial
 from pathlib import Path
 
 import mcaprl
-from benchmarks import limits, loading, log_parts, rivals
-from benchmarks.limits import LEAST_WORK, PLAIN
 from benchmarks.measure import OURS, SLOW_SHARE, SLOWEST_SHARE, Side, Table, after, compare
-from benchmarks.workloads import EPISODE_STEPS, Constant, run_env, vectors
+from benchmarks.speed import limits, loading, log_parts, rivals
+from benchmarks.speed.limits import LEAST_WORK, PLAIN
+from benchmarks.speed.workloads import EPISODE_STEPS, Constant, run_env, vectors
 from mcaprl.recorder import STEP_TOPIC
 
 

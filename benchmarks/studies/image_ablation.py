@@ -1,7 +1,7 @@
 """Measure which settings matter for learning online from depth images.
 
-    python -m benchmarks.image_ablation FOLDER --sim powerline --steps 80000
-    python -m benchmarks.image_ablation FOLDER --sim lane --observation dashboard --steps 120000
+    python -m benchmarks.studies.image_ablation FOLDER --sim powerline --steps 80000
+    python -m benchmarks.studies.image_ablation FOLDER --sim lane --observation dashboard
 
 Each variant differs from the sim's default settings in one respect. Every seed of every variant is
 trained and then evaluated on fresh episodes. The table has the mean score over seeds (random 0,

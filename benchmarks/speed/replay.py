@@ -1,6 +1,6 @@
 """Measure the chunks and indexes of long logs, and the memory that our player needs for a seek.
 
-    python benchmarks/replay.py
+    python benchmarks/speed/replay.py
 
 Creates two logs in a temporary folder: one of a million steps without a scene, and one of an hour
 of the lane sim with a scene.

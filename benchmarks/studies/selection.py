@@ -1,6 +1,6 @@
 """Measure how well the best offline policy can be chosen from a log alone.
 
-    python -m benchmarks.selection FOLDER [--sims lane,racer] [--data weak,expert] [--seeds 2]
+    python -m benchmarks.studies.selection FOLDER [--sims lane,racer] [--data weak] [--seeds 2]
 
 The candidates are algorithms of offline learning. On each log of `sim_data`, each candidate is
 trained with the settings of `sim_grid`. Its true score is measured in the sim. Other scores are
@@ -50,9 +50,9 @@ from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
 import mcaprl
-from benchmarks.q_scores import bvft, sbv
-from benchmarks.sim_data import log_names, make_logs, pilot_of
-from benchmarks.sim_grid import SETTINGS, normalize_mean, run, settings_of
+from benchmarks.studies.q_scores import bvft, sbv
+from benchmarks.studies.sim_data import log_names, make_logs, pilot_of
+from benchmarks.studies.sim_grid import SETTINGS, normalize_mean, run, settings_of
 from mcaprl.api import load_policies
 from mcaprl.errors import PolicyError
 from mcaprl.files import write_json

@@ -1,6 +1,6 @@
 """Train five algorithms on five CartPole logs with four seeds, and compare with d3rlpy.
 
-    python benchmarks/cartpole_grid.py FOLDER [--seeds 4] [--only cql,bc]
+    python benchmarks/studies/cartpole_grid.py FOLDER [--seeds 4] [--only cql,bc]
 
 A training has 5000 updates with batch size 64, learning rate 1e-3, gamma .99, a target sync every
 200 updates, and layer widths 256x256. Its result is the mean return of the last three evaluations
@@ -26,8 +26,8 @@ import torch
 from numpy.typing import NDArray
 
 import mcaprl
-from benchmarks.cartpole_data import NAMES, make_logs
 from benchmarks.page import write_section
+from benchmarks.studies.cartpole_data import NAMES, make_logs
 from mcaprl.files import write_json
 from mcaprl.offline import ALGORITHMS, BootstrapConfig, Scores, TransitionBuffer
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import mcaprl
 from benchmarks.measure import Side, Table, compare
-from benchmarks.workloads import vectors
+from benchmarks.speed.workloads import vectors
 
 _TRANSITIONS = 1_750_000
 _COPY = "copy of the files"

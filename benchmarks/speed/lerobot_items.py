@@ -1,6 +1,6 @@
 """Compare the time to load batches of transitions with that of LeRobot's dataset.
 
-    make .venv/.lerobot && python -m benchmarks.lerobot_items
+    make .venv/.lerobot && python -m benchmarks.speed.lerobot_items
 
 LeRobot reads a dataset that mcaprl writes. It runs in a separate Python environment:
 `.venv/lerobot`, or the environment of the interpreter that MCAPRL_LEROBOT_PYTHON names. The program
@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 
 import mcaprl.torch
-from benchmarks.workloads import vectors
+from benchmarks.speed.workloads import vectors
 
 TRANSITIONS, BATCH, LEROBOT_ITEMS = 20_000, 256, 5_120
 _PROGRAM = """

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 import mcaprl
-from benchmarks import rivals
 from benchmarks.measure import OURS, Side, Table, after, compare
-from benchmarks.workloads import vectors
+from benchmarks.speed import rivals
+from benchmarks.speed.workloads import vectors
 
 TRANSITIONS = 100_000
 # Libraries that handle one transition at a time are timed on this fraction of the task.

@@ -1,7 +1,7 @@
 """Measure updates per second of Double DQN and CQL relative to d3rlpy's and SB3's DQN.
 
-    python -m benchmarks.learning [--rounds 7] [--turn-s 1.0] [--only whole]
-    python -m benchmarks.learning --only gradients
+    python -m benchmarks.speed.learning [--rounds 7] [--turn-s 1.0] [--only whole]
+    python -m benchmarks.speed.learning --only gradients
 
 All libraries take turns in one process, on the same random transitions (19 numbers, 9 actions) and
 with layer widths 256x256. The measure is CPU time on one thread, the best of several turns. The
@@ -9,8 +9,8 @@ last row covers all steps from a log to a policy: a log of LOG_ROWS steps on dis
 packed, and CQL makes LOG_UPDATES updates with batch size 256. It is compared with reading by mcap
 and mcap-ros2-support, and training by d3rlpy. These libraries load only a tenth of the log, and
 the time to load it is multiplied by ten. The time of LOG_UPDATES updates is calculated from the
-rates in the turns. The ratios are printed and written to benchmarks/learning.json. The table is
-written to docs/results.md. With --only 256, 32 or whole, the other rows keep the values of an
+rates in the turns. The ratios are printed and written to benchmarks/speed/learning.json. The table
+is written to docs/results.md. With --only 256, 32 or whole, the other rows keep the values of an
 earlier run.
 
 --only gradients compares updates with autograd to the same updates with closed-form gradients,
@@ -40,9 +40,9 @@ from stable_baselines3.common.logger import configure
 from torch.nn import functional
 
 import mcaprl
-from benchmarks import rivals
 from benchmarks.page import write_section
-from benchmarks.workloads import EPISODE_STEPS, vectors
+from benchmarks.speed import rivals
+from benchmarks.speed.workloads import EPISODE_STEPS, vectors
 from mcaprl.files import write_json
 from mcaprl.offline import ALGORITHMS, DoubleDQN, Learner, TransitionBuffer
 

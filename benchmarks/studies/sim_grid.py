@@ -1,6 +1,6 @@
 """Train five algorithms on six logs of each sim, with four seeds.
 
-    python -m benchmarks.sim_grid FOLDER [--sims lane,racer] [--data weak] [--algos 'cql;bc']
+    python -m benchmarks.studies.sim_grid FOLDER [--sims lane,racer] [--data weak] [--algos cql]
 
 The logs are those of `sim_data`. The settings below are the same for all logs of a sim. The
 networks after the last update are scored, without selection by scores in the sim. A score is the
@@ -9,7 +9,7 @@ mean return over 30 episodes of each seed, normalized so that random is 0 and th
 an interrupted run resumes. After each sim, the tables are written to docs/results.md, with a dash
 for each missing cell.
 
-    python -m benchmarks.sim_grid FOLDER --study [--sims lane,racer] [--data weak]
+    python -m benchmarks.studies.sim_grid FOLDER --study [--sims lane,racer] [--data weak]
 
 compares settings instead of algorithms, on the same logs and with the same seeds: the columns of
 STUDY. The last rows are the mean over the logs, and the mean difference from the default of the
@@ -31,7 +31,7 @@ import torch
 
 import mcaprl
 from benchmarks.page import write_section
-from benchmarks.sim_data import NAMES, WRONG, log_names, make_logs, pilot_of
+from benchmarks.studies.sim_data import NAMES, WRONG, log_names, make_logs, pilot_of
 from mcaprl.api import load_policies
 from mcaprl.files import write_json
 from mcaprl.offline import ALGORITHMS, BootstrapConfig, DQNConfig, TrainingConfig, train

@@ -1,4 +1,4 @@
-"""Measure what recording and the live view add to a training: `python -m benchmarks.online`.
+"""Measure what recording and the live view add to a training: `python -m benchmarks.speed.online`.
 
 The same training runs in turns: alone, with a log, and with a viewer (Node, see tests/node). The
 measure is the CPU time of all threads of the training, the best of several turns. By default, the
@@ -24,7 +24,7 @@ from mcaprl.progress import TrainingProgress
 from mcaprl.sims import SIMS
 
 KINDS = ("plain", "recorded", "watched")
-_VIEWER = Path(__file__).parent.parent / "tests" / "node" / "watch.mjs"
+_VIEWER = Path(__file__).parent.parent.parent / "tests" / "node" / "watch.mjs"
 
 
 def training_s(task: Task, folder: Path, kind: str) -> tuple[float, int]:

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 import mcaprl
-from benchmarks import limits, rivals
-from benchmarks.limits import LEAST_WORK, PLAIN
 from benchmarks.measure import OURS, SLOW_SHARE, SLOWEST_SHARE, Side, Table, after, compare
-from benchmarks.workloads import (
+from benchmarks.speed import limits, rivals
+from benchmarks.speed.limits import LEAST_WORK, PLAIN
+from benchmarks.speed.workloads import (
     EPISODE_STEPS,
     IMAGE_STEPS,
     Constant,

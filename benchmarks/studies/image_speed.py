@@ -1,6 +1,6 @@
 """Measure how well the car's speed is predicted from its depth images and its last commands.
 
-    python -m benchmarks.image_speed
+    python -m benchmarks.studies.image_speed
 
 The data are 40,000 decisions of the lane sim's pilot with 5 to 50 % random actions, from random
 starts. A network with the architecture of online training is trained on four fifths of the

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.measure import Table
-from benchmarks.workloads import vectors
+from benchmarks.speed.workloads import vectors
 
 _READ = """
 import json, sys, time, tracemalloc

@@ -1,6 +1,7 @@
 """Measure the sims relative to highway-env's environments, on one core.
 
-`python -m benchmarks.sims` prints steps per second on this machine; `make bench` has the ratios.
+`python -m benchmarks.speed.sims` prints steps per second on this machine; `make bench` has the
+ratios.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Compare off-policy estimates with other libraries, and measure the coverage of their intervals.
 
-    python -m benchmarks.off_policy
+    python -m benchmarks.studies.off_policy
 
 The program makes three comparisons:
 

@@ -1,6 +1,6 @@
 """Compare off-policy estimates with logged and with estimated behavior probabilities.
 
-    python -m benchmarks.estimated_behavior
+    python -m benchmarks.studies.estimated_behavior
 
 The task has a known value, the solution of linear equations (tests/support/two_state_task.py). For
 each estimator, print the mean and the standard deviation of the estimates from several logs, and

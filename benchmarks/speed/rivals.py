@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mcaprl
-from benchmarks.workloads import ACTION, EPISODE_STEPS, OBSERVATION, Constant, run_env
+from benchmarks.speed.workloads import ACTION, EPISODE_STEPS, OBSERVATION, Constant, run_env
 from mcaprl.recorder import message_dtype, step_schema
 
 NAME, TEXT = step_schema(OBSERVATION, ACTION)

@@ -1,7 +1,7 @@
 """Measure how well a log alone ranks the checkpoints of a training run.
 
-    python -m benchmarks.ranking FOLDER --sim lane
-    python -m benchmarks.ranking FOLDER --sim racer
+    python -m benchmarks.studies.ranking FOLDER --sim lane
+    python -m benchmarks.studies.ranking FOLDER --sim racer
 
 Double DQN trains online and records its transitions; its checkpoints are saved. Each checkpoint is
 then evaluated twice: its greedy policy runs fresh episodes in the sim, which gives its true value,

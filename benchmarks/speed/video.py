@@ -1,7 +1,7 @@
 """Measure the CPU time of videos of a scene: reading the log, drawing and encoding.
 
-`python -m benchmarks.video` prints milliseconds per frame on this machine; `make bench` has the
-ratios.
+`python -m benchmarks.speed.video` prints milliseconds per frame on this machine; `make bench` has
+the ratios.
 """
 
 from __future__ import annotations
