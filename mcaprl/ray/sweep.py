@@ -28,7 +28,7 @@ from mcaprl.offline.policy import read_policy
 from mcaprl.offline.training.train import train
 from mcaprl.progress import Advance, TrainingProgress
 from mcaprl.ray.sweep_file import SweepPlan, Trial
-from mcaprl.ray.workers import MOST_DEATHS, check_machine
+from mcaprl.ray.workers import MOST_DEATHS, check_machine, check_machines
 from mcaprl.recorder.dataset.log_reader import LogReader
 from mcaprl.recorder.format.metadata import installed_versions
 
@@ -119,6 +119,7 @@ def sweep_on_ray(
     Raises:
         OutputExistsError: `out` exists.
         TrainingError: All trials failed, or `out` contains a different sweep or no sweep.
+        ClusterError: A machine has other versions, or does not see a path.
         McaprlError: The logs cannot be read.
     """
     tune = import_extra("ray.tune", "ray")
@@ -129,8 +130,8 @@ def sweep_on_ray(
         "score": asdict(plan.score),
         "data": [[path.name, LogReader(path).checksum, weight] for path, weight in logs],
     }
-    out.mkdir(parents=True, exist_ok=True)
     with locked_folder(out, TrainingError):
+        check_machines([out, *(path for path, _ in logs)])
         _open(out, json.loads(json.dumps(identity)), resume)
         names = tuple(f"{path}:{weight:g}" for path, weight in logs)
         job = _Job(names, plan, out, installed_versions())

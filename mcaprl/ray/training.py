@@ -36,8 +36,9 @@ from mcaprl.offline.training.train import (
 )
 from mcaprl.offline.training.watch import choose_held_out, horizon_warning
 from mcaprl.progress import ProgressCallback, TrainingProgress
+from mcaprl.ray.board import Board
 from mcaprl.ray.cluster import cpus
-from mcaprl.ray.workers import MOST_DEATHS, check_machine
+from mcaprl.ray.workers import MOST_DEATHS, check_machine, check_machines
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader
 from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
@@ -99,38 +100,6 @@ class _Job:
     board: Any
 
 
-class Board:
-    """Actor that stores messages of the workers until the calling process reads them."""
-
-    def __init__(self) -> None:
-        """Create a board without messages."""
-        self._news: list[TrainingProgress | str] = []
-        self._summaries: list[OfflineSummary] | None = None
-        self._error: Exception | None = None
-
-    def report(self, news: TrainingProgress | str) -> bool:
-        """Add metrics or a warning. Return False if the training must end."""
-        self._news.append(news)
-        return self._error is None
-
-    def take(self) -> list[TrainingProgress | str]:
-        """Return the metrics and warnings that were added since the last call."""
-        news, self._news = self._news, []
-        return news
-
-    def fail(self, error: Exception) -> None:
-        """Store the error that ends the training."""
-        self._error = self._error or error
-
-    def finish(self, summaries: list[OfflineSummary]) -> None:
-        """Store the result."""
-        self._summaries = summaries
-
-    def outcome(self) -> tuple[list[OfflineSummary] | None, Exception | None]:
-        """Return the result and the error; None for each that does not exist yet."""
-        return self._summaries, self._error
-
-
 def train_on_ray(
     data: Sequence[str],
     request: TrainingRequest,
@@ -151,8 +120,8 @@ def train_on_ray(
         One summary for each seed.
 
     Raises:
-        ClusterError: The cluster has fewer processors, a worker has other versions or does not see
-            a path, or workers died repeatedly.
+        ClusterError: The cluster has fewer processors, a machine has other versions or does not
+            see a path, or workers died repeatedly.
         McaprlError: As for a local training.
     """
     import ray
@@ -163,6 +132,7 @@ def train_on_ray(
     count = _workers(workers, request.device, sum(map(len, logs.lengths)))
     identity = RunIdentity(identity_parts(request.config, logs.fingerprint), request.other_data)
     with locked_run(request.out, request.resume):
+        check_machines([request.out, *logs.paths])
         transitions = int(logs.all_lengths.sum())
         open_run(
             request.out,
@@ -251,9 +221,12 @@ def _train(job: _Job) -> None:
     lengths, weights = logs.all_lengths, logs.all_weights
     first, stop = divided(lengths, count)[rank]
     held_out = choose_held_out(len(lengths), request.config.held_out)
-    check_machine(job.versions, [request.out])
     share = GroupShare(lengths, without(weights, held_out), first, stop)
-    dataset = _read_episodes(job, first, stop)
+    dataset = _read_episodes(job, share, first, stop)
+    if isinstance(dataset, McaprlError):
+        # All workers end without raising the error, because Ray Train would restart them.
+        ray.get(job.board.fail.remote(dataset))
+        return
 
     def report(news: TrainingProgress | str) -> None:
         if not ray.get(job.board.report.remote(news)):
@@ -282,8 +255,22 @@ def _scales(request: TrainingRequest) -> tuple[Any, Any]:
     return earlier_scales(request.out) if reused else (None, None)
 
 
-def _read_episodes(job: _Job, first: int, stop: int) -> Dataset:
-    """Read the episodes from `first` up to, but not including, `stop`, counted over all logs."""
+def _read_episodes(job: _Job, share: GroupShare, first: int, stop: int) -> Dataset | McaprlError:
+    """Read the episodes from `first` up to, but not including, `stop`, counted over all logs.
+
+    If one of the workers fails, return its error on all of them.
+    """
+    found: Dataset | McaprlError
+    try:
+        check_machine(job.versions, [job.request.out])
+        found = _read_logs(job, first, stop)
+    except McaprlError as error:
+        found = error
+    errors = share.gather(found if isinstance(found, McaprlError) else None)
+    return next(filter(None, errors), found)
+
+
+def _read_logs(job: _Job, first: int, stop: int) -> Dataset:
     parts, begin = [], 0
     for path, lengths in zip(job.logs.paths, job.logs.lengths, strict=True):
         mine = np.arange(max(first - begin, 0), min(stop - begin, len(lengths)))

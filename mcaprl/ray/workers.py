@@ -66,6 +66,42 @@ def check_machine(versions: dict[str, str], paths: Sequence[Path]) -> None:
             )
 
 
+def check_machines(paths: Sequence[Path]) -> None:
+    """Check all machines of the cluster that this process is connected to.
+
+    Raises:
+        ClusterError: A machine has other versions, does not see a path, or cannot import mcaprl.
+    """
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    check = ray.remote(check_machine)
+    nodes = [one["NodeID"] for one in ray.nodes() if one["Alive"] and one["Resources"].get("CPU")]
+    calls = [
+        check.options(
+            num_cpus=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)
+        ).remote(installed_versions(), list(paths))
+        for node in nodes
+    ]
+    try:
+        ray.get(calls)
+    except ray.exceptions.RayError as error:
+        cause = getattr(error, "cause", None)
+        raise cause if isinstance(cause, McaprlError) else _cannot_start(error) from None
+
+
+def _cannot_start(error: Exception) -> ClusterError:
+    return ClusterError(
+        "the workers of the cluster cannot start: install mcaprl with the same extras on all"
+        f" machines ({_cause(error)})"
+    )
+
+
+def _cause(error: Exception) -> str:
+    """Return the first sentences of Ray's explanation, which name the cause of a death."""
+    return str(error).strip().splitlines()[-1].partition(" Some common causes")[0]
+
+
 def _here() -> str:
     """Return the address of this machine."""
     import ray
@@ -218,21 +254,16 @@ class _Pool:
 
     def replace(self, index: int | None, error: Exception) -> None:
         """Start another worker in place of a dead worker, whose task is the next to run."""
-        # Ray's explanation has several sentences. The first sentences name the cause of the death.
-        cause = str(error).strip().splitlines()[-1].partition(" Some common causes")[0]
         if index is None:
             self.failed_starts += 1
             if self.failed_starts >= MOST_DEATHS:
-                raise ClusterError(
-                    "the workers of the cluster cannot start: install mcaprl with the same extras"
-                    f" on all machines ({cause})"
-                )
+                raise _cannot_start(error)
         else:
             state = self.states[index]
             state.deaths = state.deaths + 1 if state.at_death == state.done else 1
             state.at_death = state.done
             if state.deaths >= MOST_DEATHS:
-                raise WorkerDiedError(index, cause)
+                raise WorkerDiedError(index, _cause(error))
             self.waiting.appendleft(index)
         self.start()
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from torch.utils.tensorboard import SummaryWriter
 
 from mcaprl.errors import TrainingError
 from mcaprl.files import write_atomically
@@ -34,6 +33,9 @@ class MetricsWriter:
         Raises:
             TrainingError: A file cannot be written.
         """
+        # Imported here because a process that only handles summaries does not need torch.
+        from torch.utils.tensorboard import SummaryWriter
+
         self._path = path = folder / METRICS_NAME
         kept = _rows_before(path, first_update)
         write_atomically(path, "".join(kept).encode(), TrainingError)

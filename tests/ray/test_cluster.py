@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ from mcaprl.errors import ClusterError, MissingExtraError, UsageError
 from mcaprl.ray import cluster, workers
 from mcaprl.recorder.format.metadata import installed_versions
 from tests.ray.seeded import SEEDED
+from tests.support.processes import open_files
 
 
 def record_elsewhere(folder: Path, address: str, before: str = "") -> str:
@@ -38,11 +37,47 @@ def free_port() -> int:
         return int(server.getsockname()[1])
 
 
-def test_an_unreachable_cluster_is_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["record", SEEDED, "--policy", "random", "--episodes", "2", "--ray", "--out", "a"],
+        ["evaluate", "random", "--sim", SEEDED, "--episodes", "2", "--ray"],
+        ["train-offline", "none.mcap", "--ray", "--out", "a"],
+        ["train-offline", "none.mcap", "--ray", "--out", "a", "--sweep", "sweep.json"],
+    ],
+)
+def test_an_unreachable_cluster_is_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: list[str],
+) -> None:
+    ray = pytest.importorskip("ray")
+    # This process may be connected to the cluster of the tests.
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sweep.json").write_text('{"algos": ["bc"]}')
     address = f"127.0.0.1:{free_port()}"
-    line = record_elsewhere(tmp_path / "a", address)
-    assert line.startswith(f"mcaprl: no Ray cluster answers at {address} (")
-    assert not (tmp_path / "a").exists()
+    assert run([*command, "--address", address]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"mcaprl: no Ray cluster answers at {address} (")
+    assert error.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep.json"]
+    with pytest.raises(ClusterError, match="no Ray cluster answers"):
+        mcaprl.ray.read(tmp_path, address=address)
+
+
+def test_a_local_cluster_that_starts_too_slowly_is_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ray = pytest.importorskip("ray")
+
+    def init(**options: Any) -> None:
+        raise Exception("The current node timed out during startup.\nSee the logs.")  # as Ray does
+
+    monkeypatch.setattr(ray, "init", init)
+    with pytest.raises(ClusterError, match=r"cluster at local: The current .* startup\. See the"):
+        cluster._initialize("local")
 
 
 @pytest.mark.parametrize("address", ["somewhere", "ray://127.0.0.1:10001", ":6379", "host:x"])
@@ -114,24 +149,10 @@ def test_the_cluster_listens_on_the_loopback_interface_alone() -> None:
             if fields[3] == "0A":
                 listening[fields[9]] = fields[1].partition(":")[0]
     loopback = {"0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000"}
-    owned = [listening[inode] for inode in _sockets() if inode in listening]
+    links = {link for _, link in open_files() if link.startswith("socket:[")}
+    owned = [listening[link[8:-1]] for link in links if link[8:-1] in listening]
     assert len(owned) >= 3
     assert set(owned) <= loopback
-
-
-def _sockets() -> set[str]:
-    """Return the inodes of the sockets of all descendants of this process."""
-    found, parents = set(), [os.getpid()]
-    while parents:
-        parent = parents.pop()
-        # A process may have ended, or a file may be closed.
-        with suppress(OSError):
-            children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
-            parents += map(int, children)
-            for path in Path(f"/proc/{parent}/fd").iterdir():
-                with suppress(OSError):
-                    found.add(os.readlink(path))
-    return {link[8:-1] for link in found if link.startswith("socket:[")}
 
 
 def test_without_ray_the_option_names_the_install_command(

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +21,10 @@ from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.recorder.repair.check import check_log
 from tests.ray.seeded import SEEDED
 from tests.support.faults import count, tell
+from tests.support.processes import titled
 
 pytestmark = pytest.mark.usefixtures("ray_cluster")
-EPISODES_PER_KILL = 60
+EPISODES_PER_KILL = count(40, 60)
 
 
 def contents(folder: Path) -> list[str]:
@@ -40,42 +43,87 @@ def recorded_locally(tmp_path: Path, episodes: int) -> mcaprl.Dataset:
     return mcaprl.open(path)
 
 
-def test_episodes_are_those_of_one_process(tmp_path: Path) -> None:
-    expected = recorded_locally(tmp_path, 13)
-    for workers, shards in ((1, 3), (2, 5)):
-        folder, amounts = tmp_path / f"{workers}", list[int]()
-
-        @contextmanager
-        def bar(text: str, total: int | None) -> Iterator[Callable[[int], None]]:
-            assert total == 13
-            yield amounts.append  # noqa: B023 (the bar ends before the next iteration)
-
-        found = record(folder, 13, workers=workers, shards=shards, progress=bar)
-        data = mcaprl.open(folder)
-        assert data.fingerprint == expected.fingerprint
-        assert [e.seed for e in data.episodes] == [e.seed for e in expected.episodes]
-        assert sum(amounts) == 13
-        assert (found.episodes, found.steps) == (13, len(expected))
-        assert [one.seed for one in found.results] == [e.seed for e in expected.episodes]
-        names = [f"shard-{number:02d}.mcap" for number in range(shards)]
-        assert contents(folder) == ["manifest.json", *names]
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory) -> mcaprl.Dataset:
+    return recorded_locally(tmp_path_factory.mktemp("local"), 13)
 
 
-def test_a_manifest_is_read_like_its_folder(tmp_path: Path) -> None:
-    record(tmp_path / "a", 5, shards=2)
-    path = tmp_path / "a" / "manifest.json"
-    assert mcaprl.open(path).fingerprint == mcaprl.open(tmp_path / "a").fingerprint
-    files = json.loads(path.read_text())["files"]
-    assert [file["episodes"] for file in files] == [2, 3]
-    assert sum(file["steps"] for file in files) == len(mcaprl.open(tmp_path / "a"))
+@dataclass
+class Recorded:
+    """Recording of 13 episodes by two workers.
+
+    Attributes:
+        folder: Folder with 5 shards.
+        copy: URL to which they were uploaded.
+        found: Result.
+        totals: Total of each progress bar.
+        amounts: Reported progress.
+    """
+
+    folder: Path
+    copy: str
+    found: Any
+    totals: list[int | None]
+    amounts: list[int]
 
 
-def test_an_upload_has_the_manifest(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     pytest.importorskip("fsspec")
-    url = f"file://{tmp_path}/copy"
-    record(tmp_path / "a", 3, shards=2, upload=url)
-    again = mcaprl.open(f"{url}/manifest.json")
-    assert again.fingerprint == mcaprl.open(tmp_path / "a").fingerprint
+    parent = tmp_path_factory.mktemp("recorded")
+    totals, amounts = list[int | None](), list[int]()
+
+    @contextmanager
+    def bar(text: str, total: int | None) -> Iterator[Callable[[int], None]]:
+        totals.append(total)
+        yield amounts.append
+
+    folder, url = parent / "logs", f"file://{parent}/copy"
+    found = record(folder, 13, workers=2, shards=5, upload=url, progress=bar)
+    return Recorded(folder, url, found, totals, amounts)
+
+
+def assert_same(folder: Path, shards: int, expected: mcaprl.Dataset) -> None:
+    data = mcaprl.open(folder)
+    assert data.fingerprint == expected.fingerprint
+    assert [one.seed for one in data.episodes] == [one.seed for one in expected.episodes]
+    names = [f"shard-{number:02d}.mcap" for number in range(shards)]
+    assert contents(folder) == ["manifest.json", *names]
+
+
+def test_episodes_are_those_of_one_process(recorded: Recorded, expected: mcaprl.Dataset) -> None:
+    assert_same(recorded.folder, 5, expected)
+    assert recorded.totals == [13]
+    assert sum(recorded.amounts) == 13
+    assert (recorded.found.episodes, recorded.found.steps) == (13, len(expected))
+    seeds = [one.seed for one in expected.episodes]
+    assert [one.seed for one in recorded.found.results] == seeds
+
+
+def test_a_manifest_is_read_like_its_folder(recorded: Recorded) -> None:
+    path = recorded.folder / "manifest.json"
+    assert mcaprl.open(path).fingerprint == mcaprl.open(recorded.folder).fingerprint
+    files = json.loads(path.read_text())["files"]
+    assert [file["episodes"] for file in files] == [2, 3, 2, 3, 3]
+    assert sum(file["steps"] for file in files) == len(mcaprl.open(recorded.folder))
+
+
+def test_an_upload_has_the_manifest(recorded: Recorded) -> None:
+    again = mcaprl.open(f"{recorded.copy}/manifest.json")
+    assert again.fingerprint == mcaprl.open(recorded.folder).fingerprint
+
+
+def test_old_shards_are_replaced_only_on_request(
+    recorded: Recorded, expected: mcaprl.Dataset, tmp_path: Path
+) -> None:
+    """Record the same episodes with another number of workers and shards."""
+    folder = tmp_path / "logs"
+    shutil.copytree(recorded.folder, folder)
+    with pytest.raises(OutputExistsError, match="pass --overwrite"):
+        record(folder, 2)
+    found = record(folder, 13, workers=1, shards=3, overwrite=True)
+    assert found.episodes == 13
+    assert_same(folder, 3, expected)
 
 
 def test_steps_do_not_depend_on_the_workers(tmp_path: Path) -> None:
@@ -90,25 +138,6 @@ def test_steps_do_not_depend_on_the_workers(tmp_path: Path) -> None:
     assert prints[0] == prints[1]
 
 
-def worker_processes() -> list[int]:
-    """Return the worker processes of mcaprl among the descendants of this process."""
-    found, parents = list[int](), [os.getpid()]
-    while parents:
-        try:
-            parent = parents.pop()
-            text = Path(f"/proc/{parent}/task/{parent}/children").read_text()
-            children = [int(child) for child in text.split()]
-            for child in children:
-                name = Path(f"/proc/{child}/cmdline").read_bytes()
-                if name.startswith(b"ray::Worker"):
-                    found.append(child)
-            parents += children
-        except OSError:
-            # The process has ended.
-            continue
-    return found
-
-
 class Killer(threading.Thread):
     """Callback that kills the oldest worker a few times, each at a random time after progress."""
 
@@ -121,10 +150,10 @@ class Killer(threading.Thread):
         randoms = random.Random(1)
         while self.killed < self.kills and not self.done.wait(0.2 * randoms.random()):
             if self.progress.wait(0.1):
-                workers = worker_processes()
+                workers = titled("ray::Worker")
                 if workers:
                     self.progress.clear()
-                    os.kill(min(workers), signal.SIGKILL)
+                    os.kill(workers[0], signal.SIGKILL)
                     self.killed += 1
 
 
@@ -149,14 +178,10 @@ def test_killed_workers_lose_and_double_no_episode(tmp_path: Path) -> None:
     killer.done.set()
     killer.join()
     assert killer.killed == kills, "the recording ended before the last kill"
-    data = mcaprl.open(tmp_path / "logs")
-    assert data.fingerprint == expected.fingerprint
-    assert [one.seed for one in data.episodes] == [one.seed for one in expected.episodes]
+    assert_same(tmp_path / "logs", shards, expected)
     assert (found.episodes, sum(amounts)) == (episodes, episodes)
-    names = [f"shard-{number:02d}.mcap" for number in range(shards)]
-    assert contents(tmp_path / "logs") == ["manifest.json", *names]
-    for name in names:
-        assert check_log(tmp_path / "logs" / name) == []
+    for path in (tmp_path / "logs").glob("*.mcap"):
+        assert check_log(path) == []
     tell(
         "Ray workers killed with SIGKILL",
         killed=kills,
@@ -169,7 +194,7 @@ def test_killed_workers_lose_and_double_no_episode(tmp_path: Path) -> None:
 def test_a_sim_that_kills_each_worker_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mcaprl.ray.workers.MOST_DEATHS", 3)
+    monkeypatch.setattr("mcaprl.ray.workers.MOST_DEATHS", 2)
     with pytest.raises(LogError, match=r"shard-00\.mcap: workers died repeatedly without"):
         record(tmp_path / "a", 2, shards=1, sim_options={"dies": True})
     assert "manifest.json" not in contents(tmp_path / "a")
@@ -177,16 +202,7 @@ def test_a_sim_that_kills_each_worker_is_one_line(
 
 def test_an_error_of_the_sim_ends_the_recording(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match="pause"):
-        record(tmp_path / "a", 2, sim_options={"pause_s": "x"})
-
-
-def test_old_shards_are_replaced_only_on_request(tmp_path: Path) -> None:
-    record(tmp_path / "a", 2, shards=2)
-    with pytest.raises(OutputExistsError, match="pass --overwrite"):
-        record(tmp_path / "a", 2)
-    record(tmp_path / "a", 3, shards=1, overwrite=True)
-    assert contents(tmp_path / "a") == ["manifest.json", "shard-00.mcap"]
-    assert len(mcaprl.open(tmp_path / "a").episodes) == 3
+        record(tmp_path / "a", 2, shards=1, sim_options={"pause_s": "x"})
 
 
 @pytest.mark.parametrize(

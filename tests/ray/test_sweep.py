@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +18,17 @@ pytest.importorskip("torch")
 
 import mcaprl
 from mcaprl.cli import run
-from mcaprl.errors import OutputExistsError, TrainingError, UsageError
+from mcaprl.errors import ClusterError, OutputExistsError, TrainingError, UsageError
 from mcaprl.offline.algorithms.config import BCConfig
+from mcaprl.offline.training.train import train
+from mcaprl.ray import sweep, workers
 from mcaprl.ray.sweep import Score, TrialResult
 from mcaprl.ray.sweep_file import SweepPlan, Trial, read_plan
 from mcaprl.ray.sweep_report import table_of, write_sweep
+from mcaprl.ray.workers import check_machine
+from mcaprl.recorder.format.metadata import installed_versions
 from tests.ray.seeded import SEEDED
+from tests.support.processes import open_files
 
 PLAN = """
 algos:
@@ -130,23 +140,50 @@ def test_table_image_and_page_have_all_trials(tmp_path: Path) -> None:
     assert (tmp_path / "sweep.png").read_bytes().startswith(b"\x89PNG")
 
 
+UPDATES, EVERY = 40, 4
+
+
+def kill_once(out: Path, killed: list[int]) -> None:
+    """Kill the worker of the first trial after its first score."""
+    scores = out / "bc-000.scores.json"
+    while not scores.exists():
+        time.sleep(0.01)
+    # The process that trains into a folder has locked it.
+    (process,) = {process for process, link in open_files() if link == str(out / "bc-000")}
+    os.kill(process, signal.SIGKILL)
+    killed.append(len(json.loads(scores.read_text())["scores"]))
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record 20 episodes."""
+    path = tmp_path_factory.mktemp("log") / "log.mcap"
+    mcaprl.record(SEEDED, path, policy="random", episodes=20, sim_options={"pause_s": 0.0})
+    return path
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
 @pytest.mark.usefixtures("ray_cluster")
 def test_a_sweep_ranks_policies_by_the_episodes_that_they_have_not_learned_from(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log, out = tmp_path / "log.mcap", tmp_path / "out"
-    fast = {"pause_s": 0.0}
-    mcaprl.record(SEEDED, log, policy="random", episodes=20, sim_options=fast)
+    """Kill the worker of one trial; the other trial fails."""
+    out = tmp_path / "out"
     plan = tmp_path / "sweep.yaml"
     tree: dict[str, Any] = {
         "algos": ["bc"],
-        "settings": {"updates": 4, "hidden": [8], "learning_rate": [1e-3, 1e30]},
+        "settings": {"updates": UPDATES, "hidden": [8], "learning_rate": [1e-3, 1e30]},
         "seeds": 2,
-        "score": {"every": 2, "updates": 5, "fraction": 0.5},
+        "score": {"every": EVERY, "updates": 5, "fraction": 0.5},
     }
     plan.write_text(json.dumps(tree))
     command = ["train-offline", str(log), "--out", str(out), "--sweep", str(plan)]
+    killed: list[int] = []
+    killer = threading.Thread(target=kill_once, args=(out, killed), daemon=True)
+    killer.start()
     assert run([*command, "--ray", "--workers", "2"]) == 0
+    killer.join()
+    assert 1 <= killed[0] < UPDATES / EVERY
     printed = capsys.readouterr().out
     assert printed.index("bc-000") < printed.index("bc-001")
     rows = list(csv.DictReader((out / "sweep.csv").read_text().splitlines()))
@@ -154,12 +191,21 @@ def test_a_sweep_ranks_policies_by_the_episodes_that_they_have_not_learned_from(
     assert rows[0]["status"] == "finished"
     assert rows[1]["status"].startswith("failed: update 2 of")
     scores = json.loads((out / "bc-000.scores.json").read_text())["scores"]
-    assert [one["updates"] for one in scores] == [2, 4]
+    assert [one["updates"] for one in scores] == list(range(EVERY, UPDATES + 1, EVERY))
     assert all(len(one["values"]) == 2 and one["estimator"] == "WDR" for one in scores)
-    assert float(rows[0]["score"]) == pytest.approx(sum(scores[1]["values"]) / 2, abs=1e-3)
+    assert float(rows[0]["score"]) == pytest.approx(sum(scores[-1]["values"]) / 2, abs=1e-3)
+    # The killed trial has the weights of an undisturbed training.
+    data = mcaprl.open(log)
+    learned, _ = sweep._divided(len(data.episodes), 0.5)
+    train(data._take(learned), read_plan(tree).trials[0].config, tmp_path / "local", seeds=2)
+    for seed in ("seed-0", "seed-1"):
+        mine, theirs = (
+            path / seed / "policy.safetensors" for path in (out / "bc-000", tmp_path / "local")
+        )
+        assert mine.read_bytes() == theirs.read_bytes()
     assert mcaprl.load_policy(out / "bc-000" / "seed-1").act([[0.0, 0.0, 0.0]]).shape == (1,)
     trained = json.loads((out / "bc-000" / "config.json").read_text())
-    assert 0 < trained["transitions"] < len(mcaprl.open(log))
+    assert 0 < trained["transitions"] < len(data)
     with pytest.raises(OutputExistsError, match="or resume its sweep"):
         mcaprl.sweep(log, out, tree)
     with pytest.raises(TrainingError, match="has other seeds; resume with the same sweep file"):
@@ -167,3 +213,29 @@ def test_a_sweep_ranks_policies_by_the_episodes_that_they_have_not_learned_from(
     assert run([*command]) == 2
     assert run([*command, "--ray", "--updates", "3"]) == 2
     assert "--updates and --sweep: write the setting into" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("ray_cluster")
+def test_other_versions_and_unseen_paths_are_found_before_the_trials_start(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start() -> None:
+        mcaprl.sweep(log, tmp_path / "out", {"algos": ["bc"]})
+
+    monkeypatch.setattr(sweep, "_run", None)
+    with monkeypatch.context() as patch:
+        patch.setattr(workers, "check_machine", check_elsewhere)
+        with pytest.raises(
+            ClusterError, match=r"127\.0\.0\.1 cannot see /elsewhere/.*: choose a path"
+        ):
+            start()
+    versions = {**installed_versions(), "numpy": "1.2.3"}
+    monkeypatch.setattr(workers, "installed_versions", lambda: versions)
+    with pytest.raises(ClusterError, match=r"the worker at 127\.0\.0\.1 has numpy .* 1\.2\.3: in"):
+        start()
+    assert list(tmp_path.iterdir()) == []
+
+
+def check_elsewhere(versions: dict[str, str], paths: Sequence[Path]) -> None:
+    """Check the machine of a worker as if it had another file system."""
+    check_machine(versions, [Path("/elsewhere", *path.parts[1:]) for path in paths])
