@@ -146,7 +146,7 @@ def _initialize(address: str, **options: Any) -> None:
 
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
-    except (OSError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+    except Exception as error:  # Ray raises a plain Exception if a local cluster starts too slowly.
         text = " ".join(str(error).split())
         if text.startswith("Version mismatch"):
             text += "; install the versions of the cluster here"
