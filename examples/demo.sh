@@ -5,9 +5,7 @@
 set -eu
 out=${1:-demo}
 mkdir -p "$out"
-for made in data runs report cql.log double-dqn.log replay.mcap foxglove-layout.json; do
-  rm -rf "${out:?}/$made"
-done
+(cd "$out" && rm -rf data runs report cql.log double-dqn.log replay.mcap foxglove-layout.json)
 # One thread for each training; two trainings run side by side.
 export OMP_NUM_THREADS=1
 
@@ -34,8 +32,7 @@ shown=$!
 trap 'kill "$first" "$second" "$shown" 2>/dev/null || true' EXIT
 trap 'exit 130' INT TERM
 wait "$first"
-sleep 1
-kill "$shown"
+sleep 1 && kill "$shown"
 wait "$second" || { cat "$out/double-dqn.log"; exit 1; }
 echo "behavior cloning:"
 mcaprl train-offline "$out/data" --algo bc --seeds 4 --out "$out/runs/bc"

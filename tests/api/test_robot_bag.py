@@ -12,7 +12,7 @@ import pytest
 import mcaprl
 from mcaprl.cli import run
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "robot_bag"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "05_robot_bag"
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 # From a depth camera to a policy: train online from images alone, record an episode, make its video.
 # About twenty minutes on one core.
 #
-#   sh examples/camera.sh FOLDER [SIM] [OBSERVATION]     creates FOLDER, which must not exist
+#   sh examples/experiments/camera.sh FOLDER [SIM] [OBSERVATION]     creates FOLDER, which must not exist
 #
 # SIM is powerline (OBSERVATION depth) or lane (OBSERVATION dashboard or depth).
 set -eu

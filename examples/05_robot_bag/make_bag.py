@@ -1,9 +1,8 @@
 """Make a robot's bag from the drives in a log of the lane sim.
 
     mcaprl record lane --policy pilot --epsilon 0.1 --episodes 40 --out native.mcap
-    python examples/robot_bag/make_bag.py native.mcap bag                     # ROS 2, by rosbags
-    python examples/robot_bag/make_bag.py native.mcap drive.mcap --format protobuf   # foxglove-sdk
-    python examples/robot_bag/make_bag.py native.mcap drive.mcap --format json
+    python examples/05_robot_bag/make_bag.py native.mcap bag                  # ROS 2, by rosbags
+    python examples/05_robot_bag/make_bag.py native.mcap drive.mcap --format protobuf
 
 Only the seeds and actions are read from the log; `robot.py` lists the topics of the bag.
 """
@@ -32,11 +31,8 @@ def make_bag(log: str | Path, out: str | Path, form: str = "ros2") -> int:
         form: `ros2`, `protobuf` or `json`.
     """
     with WRITERS[form](Path(out)) as write:
-        count = 0
-        for time_ns, message in _recorded(log):
-            write(message.topic, time_ns, message.content)
-            count += 1
-    return count
+        messages = [write(one.topic, at_ns, one.content) for at_ns, one in _recorded(log)]
+    return len(messages)
 
 
 def _recorded(log: str | Path) -> Iterator[tuple[int, Message]]:
@@ -55,9 +51,8 @@ def main() -> None:
     parser.add_argument("log", type=Path, help="log of the lane sim")
     parser.add_argument("out", type=Path, help="folder of a ROS 2 bag, or MCAP file")
     parser.add_argument("--format", choices=list(WRITERS), default="ros2")
-    arguments = parser.parse_args()
-    count = make_bag(arguments.log, arguments.out, arguments.format)
-    print(f"{arguments.out}: {count} messages")
+    given = parser.parse_args()
+    print(f"{given.out}: {make_bag(given.log, given.out, given.format)} messages")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Plot the learning curves of online runs in one image.
 
-python examples/compare_curves.py RUN... --out curves.png [--value mean_progress_m]
+python examples/experiments/compare_curves.py RUN... --out curves.png [--value mean_progress_m]
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 #!/usr/bin/env sh
 # Train a policy that drives by a depth camera, from a log of a pilot.
 #
-#   sh examples/depth.sh FOLDER       writes into FOLDER, and replaces the output of an earlier run
+#   sh examples/experiments/depth.sh FOLDER       writes into FOLDER, and replaces the output of an earlier run
 set -eu
 out=${1:-depth}
 mkdir -p "$out"

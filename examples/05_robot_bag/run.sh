@@ -2,7 +2,7 @@
 # Learn to drive from the bag of a robot that does not know mcaprl, and from the lane sim's own log
 # of the same drives: CQL, four seeds each, scored in the lane sim over the same 30 episodes.
 #
-#   sh examples/robot_bag/run.sh FOLDER       writes into FOLDER
+#   sh examples/05_robot_bag/run.sh FOLDER       writes into FOLDER
 set -eu
 here=$(dirname "$0")
 out=${1:-robot_bag}

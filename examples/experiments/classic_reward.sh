@@ -2,7 +2,7 @@
 # Compare the published rewards with the default ones: the same learner and settings, four seeds each,
 # measured by the distance along the path. About ten minutes on one core.
 #
-#   sh examples/classic_reward.sh FOLDER       creates FOLDER, which must not exist
+#   sh examples/experiments/classic_reward.sh FOLDER       creates FOLDER, which must not exist
 set -eu
 out=${1:-classic-reward}
 mkdir "$out"

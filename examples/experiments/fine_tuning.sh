@@ -2,7 +2,7 @@
 # Train offline on a poor pilot's logs, then continue online; for comparison, train online without data.
 # A few minutes on one core.
 #
-#   sh examples/fine_tuning.sh FOLDER       creates FOLDER, which must not exist
+#   sh examples/experiments/fine_tuning.sh FOLDER       creates FOLDER, which must not exist
 set -eu
 out=${1:-fine-tuning}
 mkdir "$out"
