@@ -134,7 +134,7 @@ def annotate(file: Path, out: Path, **request: Any) -> None:
     with working("reading the log") as bar:
         found = mcaprl.annotate(file, out, progress=bar, **request)
     for name, topic in found.topics.items():
-        echo(f"{out}: {topic} has the values of {name} for {found.steps} steps")
+        echo(f"{out}: {topic} has the values of {name} for {counted(found.steps, 'step')}")
     if found.scene is not None:
         episodes, steps = found.scene.episodes, found.scene.steps
         echo(f"{out}: the scene of {counted(episodes, 'episode')}, {counted(steps, 'step')}")

@@ -13,6 +13,7 @@ from mcaprl.errors import TrainingError
 from mcaprl.files import write_atomically
 from mcaprl.runs import METRICS_NAME, RunSummary, writing
 from mcaprl.sims.evaluation.statistics import mean_interval
+from mcaprl.texts import counted
 
 
 class MetricsWriter:
@@ -91,11 +92,13 @@ def describe_seeds(summaries: Sequence[OfflineSummary]) -> list[str]:
     for summary in summaries:
         done = summary.steps - summary.resumed_at
         if not done:
-            lines.append(f"{summary.folder}: finished before, with {summary.steps} updates")
+            lines.append(
+                f"{summary.folder}: finished before, with {counted(summary.steps, 'update')}"
+            )
             continue
         rate = done / summary.seconds if summary.seconds else 0.0
         terms = ", ".join(f"{name} {value:.4g}" for name, value in summary.terms.items())
-        lines.append(f"{summary.folder}: {done} updates, {rate:.0f} per second; {terms}")
+        lines.append(f"{summary.folder}: {counted(done, 'update')}, {rate:.0f} per second; {terms}")
     finished = [summary.terms for summary in summaries if summary.terms]
     if len(finished) > 1:
         means = []

@@ -22,6 +22,7 @@ from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import contents_of, map_file, only, parse_record
 from mcaprl.recorder.columns.salvage import Damage, ValidRecord, intact_summary, valid_records
 from mcaprl.recorder.columns.writer import COMPRESSIONS, McapWriter
+from mcaprl.texts import counted
 
 # Messages outside of chunks are written in chunks of this number of bytes.
 _UNCHUNKED_BYTES = 2**20
@@ -230,7 +231,8 @@ class _Copy:
             if self._topics.announce(channel_id, self._writer):
                 known[channel_id] = index
             else:
-                what = f"{len(index)} messages of channel {channel_id}, which has no definition"
+                messages = counted(len(index), "message")
+                what = f"{messages} of channel {channel_id}, which has no definition"
                 self._damages.append(Damage(offset, 0, what))
         if len(known) < len(contents.indexes):
             records, known = only(records, known)

@@ -34,6 +34,7 @@ from mcaprl.recorder.repair.whole_episodes import (
     write_planned,
 )
 from mcaprl.remote import as_path
+from mcaprl.texts import counted
 
 _LISTS = ("damages", "dropped")
 
@@ -83,7 +84,9 @@ class Recovery:
             for one in self.dropped
         ]
         if self.strays:
-            found.append((f"{self.strays} messages", "/rl/ topics", "part of dropped episodes"))
+            found.append(
+                (counted(self.strays, "message"), "/rl/ topics", "part of dropped episodes")
+            )
         problems = [
             Problem(f"lost: {what}", where, effect, file=self.source)
             for what, where, effect in found

@@ -24,6 +24,7 @@ from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 from mcaprl.recorder.record.step_rows import as_declared
+from mcaprl.texts import counted
 
 _MOST_FIELDS = 8
 _MOST_EPISODES = 10
@@ -95,7 +96,7 @@ class Verification:
         if self.unseeded:
             more = ", ..." if len(self.unseeded) > _MOST_EPISODES else ""
             where = f"episodes {', '.join(map(str, self.unseeded[:_MOST_EPISODES]))}{more}"
-            what = f"{len(self.unseeded)} episodes without a seed were not compared"
+            what = f"{counted(len(self.unseeded), 'episode')} without a seed: not compared"
             found.insert(0, Problem(what, where, file=file, severity="note"))
         return found
 

@@ -79,10 +79,12 @@ class _Announcer(event.Listener):  # type: ignore[misc]
 
     def on_start(self, event: Any) -> None:
         """Print one line to stderr at the first compilation."""
-        ours = event.data["dispatcher"].py_func.__module__.startswith("mcaprl.")
-        if ours and not _Announcer.is_silent:
+        module = event.data["dispatcher"].py_func.__module__
+        if module.startswith("mcaprl.") and not _Announcer.is_silent:
             _Announcer.is_silent = True
-            print(f"compiling the sim for this machine, {self.lasts}", file=sys.stderr)
+            # Commands compile what they need, so a later one may compile another part.
+            part = module.removeprefix("mcaprl.sims.")
+            print(f"compiling the sim ({part}) for this machine, {self.lasts}", file=sys.stderr)
 
     def on_end(self, event: Any) -> None:
         """Do nothing."""
