@@ -12,9 +12,30 @@ Raises:
 """
 
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 from mcaprl.errors import MissingExtraError
 from mcaprl.lazy import lazy_attributes
+
+if TYPE_CHECKING:
+    from mcaprl.offline.algorithms.config import (
+        BootstrapConfig,
+        CQLConfig,
+        DQNConfig,
+        TrainingConfig,
+    )
+    from mcaprl.offline.algorithms.cql import CQL
+    from mcaprl.offline.algorithms.dqn import DoubleDQN
+    from mcaprl.offline.algorithms.learner import Learner
+    from mcaprl.offline.algorithms.registry import ALGORITHMS
+    from mcaprl.offline.batches.buffer import TransitionBuffer
+    from mcaprl.offline.estimate.evidence import EvidenceCollector, fqe_config
+    from mcaprl.offline.estimate.fqe import FQEConfig
+    from mcaprl.offline.estimate.importance import ESTIMATORS, EpisodeTable
+    from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
+    from mcaprl.offline.policy import Scores
+    from mcaprl.offline.selection.portfolio import DETERMINISTIC
+    from mcaprl.offline.training.train import train
 
 for _package in ("torch", "safetensors", "tensorboard"):
     if find_spec(_package) is None:

@@ -11,9 +11,19 @@ Raises:
 """
 
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 from mcaprl.errors import MissingExtraError
 from mcaprl.lazy import lazy_attributes
+
+if TYPE_CHECKING:
+    from mcaprl.online.agent import Agent
+    from mcaprl.online.curves import VALUES, CurvePoint, curve_figure, draw_curves, read_run
+    from mcaprl.online.evaluation import FRESH_SEED, SELECTION_SEED, Scale, measure_scale
+    from mcaprl.online.live import LiveTraining
+    from mcaprl.online.policy import OnlinePolicy, describe_run, read_policy, save_policy
+    from mcaprl.online.presets import SIM_SETTINGS
+    from mcaprl.online.task import Task
 
 for _package in ("stable_baselines3", "tensorboard"):
     if find_spec(_package) is None:

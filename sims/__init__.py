@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Iterable, Iterator
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
 
@@ -20,6 +20,14 @@ from mcaprl.errors import UnknownNameError, UsageError, import_extra
 from mcaprl.lazy import lazy_attributes
 from mcaprl.sims import highway, lane, powerline, racer
 from mcaprl.sims.spec import SimCatalog, SimSpec
+
+if TYPE_CHECKING:
+    from mcaprl.sims.drawing.depth import encode_depth
+    from mcaprl.sims.evaluation.evaluate import PolicyScore, evaluate, normalize
+    from mcaprl.sims.evaluation.pilots import make_pilot
+    from mcaprl.sims.evaluation.rollout import EpsilonGreedy, Policy, episode_seed, rollout
+    from mcaprl.sims.lane.camera import CarCamera
+    from mcaprl.sims.lane.env import LaneKeepingEnv
 
 SIMS: Final = SimCatalog((lane.SPEC, racer.SPEC, powerline.SPEC, highway.SPEC))
 """Gymnasium id of each sim by short name, including sims of installed packages."""

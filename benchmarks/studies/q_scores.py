@@ -24,7 +24,6 @@ count.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final
 
@@ -73,7 +72,8 @@ def bvft_losses(q: Floats, targets: Floats, width: float) -> Floats:
             for row, column in ((first, second), (second, first)):
                 means = np.bincount(group, targets[row]) / counts
                 errors[row, column] = np.sqrt(((q[row] - means[group]) ** 2).mean())
-    return errors.max(1)
+    largest: Floats = errors.max(1)
+    return largest
 
 
 def sbv(
@@ -141,10 +141,11 @@ def _regress(
         at = rows[torch.randint(len(rows), (_BATCH,), generator=random)]
         loss = (predicted(at) - wanted[:, at]).square().mean(1).sum()
         optimizer.zero_grad()
-        loss.backward()
+        torch.autograd.backward(loss)
         optimizer.param_groups[0]["lr"] = _RATE * (1 - step / updates)
         optimizer.step()
     with torch.no_grad():
-        parts: Sequence[Tensor] = [predicted(at) for at in torch.arange(len(inputs)).split(4_096)]
-        fitted: Floats = torch.cat(parts, 1).double().numpy()
-    return fitted * scale + mean
+        parts = [predicted(at) for at in torch.split(torch.arange(len(inputs)), 4_096)]
+        fitted = torch.cat(parts, 1).double().numpy()
+    values: Floats = fitted * scale + mean
+    return values

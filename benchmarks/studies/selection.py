@@ -76,7 +76,7 @@ CANDIDATES: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "bcq": ("bcq", {}),
     "iql": ("iql", {"normalize_advantages": True, "beta": 0.3}),
 }
-SMALL: Final = {"batch_size": 64, "hidden": (128, 128)}
+SMALL: Final[dict[str, Any]] = {"batch_size": 64, "hidden": (128, 128)}
 """Settings that differ from those of `sim_grid`, so that a log takes minutes."""
 SHORT, MODEL_UPDATES, SHORT_MODEL_UPDATES = 1_000, 1_000, 500
 """Updates of the short training, of FQE, and of FQE after the short training."""

@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.studies import selection, sim_grid
 from benchmarks.studies.selection import CHECKPOINT_RULES, Log, rules
+from benchmarks.studies.sim_data import log_names
 
 
 def row(candidate: str, kind: str = "full", seed: int = 0, **labels: Any) -> dict[str, Any]:
@@ -65,7 +66,7 @@ def test_regrets_of_checkpoints_by_hand(rule: str, entropy: float, regret: float
 def test_iql_is_a_candidate_and_all_environments_have_logs() -> None:
     assert "iql" in selection.CANDIDATES
     assert {"lane", "powerline", "racer", "CartPole-v1", "Acrobot-v1"} == set(sim_grid.SETTINGS)
-    assert sim_grid.log_names("lane") == [*sim_grid.log_names("CartPole-v1"), "weak"]
+    assert log_names("lane") == [*log_names("CartPole-v1"), "weak"]
 
 
 def test_settings_are_compared_on_logs_that_have_both() -> None:
