@@ -41,10 +41,10 @@ faults: $(VENV)/.dev
 	rm -f $(VENV)/fault-figures
 	MCAPRL_FAULTS=large MCAPRL_FAULT_FIGURES=$(VENV)/fault-figures OMP_NUM_THREADS=1 \
 	  $(BIN)/pytest -q -s tests/recorder/repair/test_faults_*.py tests/ray/test_record.py
-	$(BIN)/python -m tests.support.fault_table $(VENV)/fault-figures docs/reliability.md
+	$(BIN)/python -m tests.support.damage.fault_table $(VENV)/fault-figures docs/reliability.md
 
 fuzz: $(VENV)/.fuzz
-	OMP_NUM_THREADS=1 $(BIN)/python -m tests.support.fuzz_reader $(VENV)/fuzz \
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.support.damage.fuzz_reader $(VENV)/fuzz \
 	  -max_total_time=600 -max_len=60000 -timeout=20 -rss_limit_mb=2048
 
 check: $(VENV)/.dev

@@ -17,7 +17,7 @@ from mcaprl.cli import run
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.format.metadata import LogMetadata, same_env
 from mcaprl.sims import make_sim, make_sims
-from tests.support.forged_logs import forged
+from tests.support.damage.forged_logs import forged
 
 MODULE = '''
 """Registers an environment when it is imported, and leaves a file."""
@@ -139,5 +139,5 @@ def test_own_sims_need_no_trust(log_path: Path) -> None:
 @pytest.mark.parametrize("name", ["name", "id", "no_such_argument"])
 def test_arguments_that_a_sim_does_not_have_are_refused(log_path: Path, name: str) -> None:
     forged(log_path, env_id="mcaprl/LaneKeeping-v0", env_kwargs=f'{{"{name}": "os:x"}}')
-    with pytest.raises(UsageError, match="cannot make sim"):
+    with pytest.raises(UsageError, match="cannot make sim|has no argument"):
         mcaprl.verify(log_path)

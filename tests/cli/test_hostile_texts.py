@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 import mcaprl
 from mcaprl.cli import run
-from tests.support.forged_logs import forged
+from tests.support.damage.forged_logs import forged
 
 EVIL = "\x1b[2J\x9b1m\u202e\r"
 

@@ -22,7 +22,7 @@ from gymnasium.vector import SyncVectorEnv
 
 import mcaprl
 from mcaprl.recorder.repair.recover import recover_log
-from tests.support.faults import KnownEpisodes, play
+from tests.support.damage.faults import KnownEpisodes, play
 from tests.support.recordings import MIXED_SPACE, ScriptedEnv, leaves_of, record
 
 FOLDER = Path(__file__).parent

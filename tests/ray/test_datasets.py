@@ -21,7 +21,7 @@ from mcaprl.errors import (
 )
 from mcaprl.recorder.dataset.log_reader import Selection
 from mcaprl.recorder.repair.check import check_log
-from tests.support.faults import KnownEpisodes, write_log
+from tests.support.damage.faults import KnownEpisodes, write_log
 
 pytestmark = pytest.mark.usefixtures("ray_cluster")
 

@@ -20,7 +20,7 @@ import mcaprl
 from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.recorder.repair.check import check_log
 from tests.ray.seeded import SEEDED
-from tests.support.faults import count, tell
+from tests.support.damage.faults import count, tell
 from tests.support.processes import titled
 
 pytestmark = pytest.mark.usefixtures("ray_cluster")

@@ -23,7 +23,7 @@ from mcaprl.recorder.columns import compact, file_lock
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.repair.check import check_log
 from tests.recorder.repair.test_faults_writes import FailingFile, failing
-from tests.support.faults import KnownEpisodes, assert_is_known, play, write_log
+from tests.support.damage.faults import KnownEpisodes, assert_is_known, play, write_log
 from tests.support.paths import ROOT
 from tests.support.recordings import MIXED_SPACE, record
 
@@ -167,7 +167,7 @@ def test_killed_while_compacting(log_path: Path, writes: int) -> None:
         import os, signal, sys
         from pathlib import Path
         from mcaprl.recorder.columns.compact import _CompactedFile
-        from tests.support.faults import write_log
+        from tests.support.damage.faults import write_log
         write, left = _CompactedFile._write, int(sys.argv[2])
         def dying(out, *parts):
             global left

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.fuzz_target import try_bytes, write_seeds
+from tests.support.damage.fuzz_target import try_bytes, write_seeds
 from tests.support.paths import FUZZ_CORPUS
 
 CORPUS = sorted((FUZZ_CORPUS).iterdir())

@@ -10,7 +10,7 @@ import pytest
 import mcaprl
 from mcaprl.errors import LogError
 from mcaprl.recorder.dataset.manifest import LogFile, write_manifest
-from tests.support.faults import write_log
+from tests.support.damage.faults import write_log
 
 
 @pytest.fixture

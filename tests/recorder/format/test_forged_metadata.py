@@ -24,7 +24,7 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import MAX_ACTIONS, MAX_ELEMENTS, space_from_json
 from mcaprl.recorder.record.layout import LAYOUT_NAME, layout_of
 from mcaprl.recorder.repair.check import check_log
-from tests.support.forged_logs import forged
+from tests.support.damage.forged_logs import forged
 from tests.support.recordings import record
 
 DEEP = "[" * 100_000 + "]" * 100_000

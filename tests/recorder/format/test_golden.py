@@ -13,7 +13,7 @@ from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.episode_check import IMPOSSIBLE_ACTION
 from tests.golden.make import CONTENTS, FILES, FOLDER, contents_of
-from tests.support.faults import assert_is_known
+from tests.support.damage.faults import assert_is_known
 from tests.support.learner_topic import read_learner
 
 STATED = json.loads(CONTENTS.read_text())

@@ -22,7 +22,7 @@ from mcaprl.recorder.columns import valid_copy
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import recover_log
-from tests.support.faults import KnownEpisodes, assert_is_known, play, write_log
+from tests.support.damage.faults import KnownEpisodes, assert_is_known, play, write_log
 
 
 @pytest.fixture

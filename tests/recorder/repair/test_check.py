@@ -29,8 +29,8 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.schema import message_dtype
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import recover_log
-from tests.support.faults import write_log
-from tests.support.fuzz_target import without_crcs
+from tests.support.damage.faults import write_log
+from tests.support.damage.fuzz_target import without_crcs
 from tests.support.recordings import record
 
 SPACE = spaces.Dict(

@@ -18,11 +18,11 @@ import mcaprl
 from mcaprl.errors import LogError, NoStepsError
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import recover_log
-from tests.support.faults import KnownEpisodes, assert_is_known, count, play, tell
+from tests.support.damage.faults import KnownEpisodes, assert_is_known, count, play, tell
 
 # The fork server has imported all modules, so that a new recorder starts immediately.
 FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload(["tests.support.faults"])
+FORKS.set_forkserver_preload(["tests.support.damage.faults"])
 
 
 def _record_for_ever(path: Path, finished: Connection, number: int) -> None:

@@ -20,12 +20,12 @@ import mcaprl
 from mcaprl.errors import McaprlError
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import recover_log
-from tests.support.faults import assert_is_known, count, tell, write_log
-from tests.support.mutations import MUTATIONS, Mutation
+from tests.support.damage.faults import assert_is_known, count, tell, write_log
+from tests.support.damage.mutations import MUTATIONS, Mutation
 
 MEMORY_BYTES = 512 * 2**20
 FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload(["tests.support.faults"])
+FORKS.set_forkserver_preload(["tests.support.damage.faults"])
 
 
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda mutation: mutation.__name__)

@@ -21,7 +21,7 @@ import mcaprl
 from mcaprl.errors import LogError
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import recover_log
-from tests.support.faults import KnownEpisodes, assert_is_known, count, play, tell, write_log
+from tests.support.damage.faults import KnownEpisodes, assert_is_known, count, play, tell, write_log
 
 ERRORS = (errno.ENOSPC, errno.EIO, errno.EDQUOT)
 

@@ -235,7 +235,7 @@ def test_other_environments_are_batched_by_gymnasium() -> None:
         ("lane", {"autoreset_mode": "never"}, "unknown autoreset_mode 'never': .*SameStep"),
         ("CartPole-v1", {"autoreset_mode": "never"}, "unknown autoreset_mode 'never': .*SameStep"),
         ("lane", {"rules": "mine"}, "unknown rules 'mine': known: classic, classic-code, default"),
-        ("lane", {"color": "red"}, "cannot make sim 'lane' with .*color"),
+        ("lane", {"color": "red"}, "sim 'lane' has no argument color"),
         ("racer", {"render_mode": "human"}, "batched sims do not render"),
         ("powerline", {"wind_m_s": 99.0}, "wind_m_s must be 0 to 8, not 99.0"),
         ("boat", {}, "unknown sim 'boat'"),

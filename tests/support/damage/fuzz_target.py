@@ -15,7 +15,7 @@ import mcaprl
 from mcaprl.errors import McaprlError
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import recover_log
-from tests.support.mutations import records_of
+from tests.support.damage.mutations import records_of
 from tests.support.recordings import MIXED_SPACE, record
 
 _FOLDER = Path(tempfile.mkdtemp(prefix="mcaprl-fuzz-"))

@@ -1,6 +1,6 @@
 """Coverage-guided fuzzing of the reader: `make fuzz`.
 
-    python -m tests.support.fuzz_reader FOLDER [options of libFuzzer]
+    python -m tests.support.damage.fuzz_reader FOLDER [options of libFuzzer]
 
 Fuzzing starts from small logs in FOLDER. Some have no CRCs, so that the code after the CRC checks
 is reached. Inputs that fail are written to `crash-...`. Fix the cause, and add the inputs to
@@ -18,7 +18,7 @@ def main() -> None:
     import atheris
 
     with atheris.instrument_imports(include=["mcaprl"]):
-        from tests.support.fuzz_target import try_bytes, write_seeds
+        from tests.support.damage.fuzz_target import try_bytes, write_seeds
     write_seeds(Path(sys.argv[1]))
     atheris.Setup(sys.argv, try_bytes)
     atheris.Fuzz()

@@ -1,6 +1,6 @@
 """Write the results of `make faults` into docs/reliability.md, as a table.
 
-python -m tests.support.fault_table FIGURES PAGE
+python -m tests.support.damage.fault_table FIGURES PAGE
 """
 
 from __future__ import annotations

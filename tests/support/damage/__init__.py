@@ -1,0 +1,1 @@
+"""Damaged logs for tests: kills, failed writes, mutations, forged metadata and fuzzing."""
