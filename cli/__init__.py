@@ -98,8 +98,11 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         return _fail(f"{error.filename or 'output'}: {error.strerror}", 1)
     except (click.Abort, KeyboardInterrupt) as error:
-        # Click converts a KeyboardInterrupt to an Abort. The notes say what is kept.
-        notes = getattr(error.__cause__ or error, "__notes__", [])
+        # Click converts a KeyboardInterrupt or EOFError to an Abort. The notes say what is kept.
+        cause = error.__cause__ or error
+        if isinstance(cause, EOFError):
+            raise cause from None
+        notes = getattr(cause, "__notes__", [])
         return _fail("; ".join(["interrupted", *notes]), INTERRUPTED)
     return code if isinstance(code, int) else 0
 

@@ -527,6 +527,15 @@ def test_an_interruption_says_what_is_kept(
     assert f"mcaprl: interrupted{kept}" in capsys.readouterr().err
 
 
+def test_an_unexpected_end_of_a_file_is_no_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any, **__: Any) -> None:
+        raise EOFError("marshal data too short")
+
+    monkeypatch.setattr(mcaprl, "check", broken)
+    with pytest.raises(EOFError, match="marshal data too short"):
+        run(["check", str(LANE_LOG)])
+
+
 def test_help_has_the_defaults_of_each_sim(capsys: pytest.CaptureFixture[str]) -> None:
     from mcaprl.online.task import Task
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -77,6 +78,8 @@ def test_a_full_disk_is_one_line(
     done = subprocess.run(
         # On a busy machine, lines of progress would be printed too.
         [sys.executable, "-c", SCRIPT, str(limit), *command, "--quiet"],
+        # Otherwise the bytecode of imported modules is cut off, and cannot be read later.
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
         capture_output=True,
         text=True,
         check=False,
