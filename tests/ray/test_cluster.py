@@ -15,8 +15,8 @@ from mcaprl.cli import run
 from mcaprl.errors import ClusterError, MissingExtraError, UsageError
 from mcaprl.ray import cluster, workers
 from mcaprl.recorder.format.metadata import installed_versions
+from tests.ray.processes import open_files
 from tests.ray.seeded import SEEDED
-from tests.support.processes import open_files
 
 
 def record_elsewhere(folder: Path, address: str, before: str = "") -> str:

@@ -19,9 +19,9 @@ import pytest
 import mcaprl
 from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.recorder.repair.check import check_log
+from tests.ray.processes import titled
 from tests.ray.seeded import SEEDED
 from tests.support.damage.faults import count, tell
-from tests.support.processes import titled
 
 pytestmark = pytest.mark.usefixtures("ray_cluster")
 EPISODES_PER_KILL = count(40, 60)

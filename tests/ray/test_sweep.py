@@ -27,8 +27,8 @@ from mcaprl.ray.sweep_file import SweepPlan, Trial, read_plan
 from mcaprl.ray.sweep_report import table_of, write_sweep
 from mcaprl.ray.workers import check_machine
 from mcaprl.recorder.format.metadata import installed_versions
+from tests.ray.processes import open_files
 from tests.ray.seeded import SEEDED
-from tests.support.processes import open_files
 
 PLAN = """
 algos:

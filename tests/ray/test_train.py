@@ -22,9 +22,9 @@ from mcaprl.errors import ClusterError, LogError, SpaceError, UsageError
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.format.metadata import installed_versions
 from mcaprl.runs import read_curve
+from tests.ray.processes import titled
 from tests.ray.seeded import SEEDED
 from tests.support.paths import GOLDEN
-from tests.support.processes import titled
 
 pytest.importorskip("torch")
 from safetensors.torch import load_file
