@@ -40,7 +40,7 @@ test: $(VENV)/.dev $(VENV)/.lerobot $(VENV)/.s3 $(VENV)/.rivals tests/node/node_
 faults: $(VENV)/.dev
 	rm -f $(VENV)/fault-figures
 	MCAPRL_FAULTS=large MCAPRL_FAULT_FIGURES=$(VENV)/fault-figures OMP_NUM_THREADS=1 \
-	  $(BIN)/pytest -q -s tests/recorder/repair/test_faults_*.py tests/ray/test_record.py
+	  $(BIN)/pytest -q -s tests/recorder/repair/test_faults_*.py tests/ray/test_record.py tests/online/test_kills.py
 	$(BIN)/python -m tests.support.damage.fault_table $(VENV)/fault-figures docs/reliability.md
 
 fuzz: $(VENV)/.fuzz

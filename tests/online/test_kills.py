@@ -7,9 +7,11 @@ import sys
 import textwrap
 from pathlib import Path
 
+from tests.support.damage.faults import count
 from tests.support.paths import ROOT
 
-# With a stride of 1, training is killed at each operation once, which takes minutes.
+# With a stride of 1, training is killed at each operation once, which takes minutes. The stride of
+# `make faults` is smaller than that of `make test`.
 SCRIPT = """
     import os, sys, warnings
     from pathlib import Path
@@ -86,7 +88,8 @@ SCRIPT = """
 
 
 def test_a_run_killed_at_operations_on_its_files_resumes(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", textwrap.dedent(SCRIPT), str(tmp_path), "17"]
+    stride = count(small=37, large=5)
+    command = [sys.executable, "-c", textwrap.dedent(SCRIPT), str(tmp_path), str(stride)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     number, episodes, _ = map(int, done.stdout.split())
