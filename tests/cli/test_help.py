@@ -15,7 +15,7 @@ from mcaprl.cli import cli
 from mcaprl.cli.help import EXAMPLES, SECTIONS
 from tests.support.paths import GOLDEN
 
-TOP = click.Context(cli, info_name="mcaprl")
+TOP = click.Context(cli, info_name="mcaprl", **cli.context_settings)
 LINES = [(name, line) for name, lines in EXAMPLES.items() for line in lines]
 
 

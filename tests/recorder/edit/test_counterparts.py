@@ -209,7 +209,7 @@ def test_killed_command_leaves_nothing_under_the_name(tmp_path: Path, command: s
         path = tmp_path / f"{name}.mcap"
         record(path, space, spaces.Discrete(3), [3, 1], start_time_ns=start_ns)
     before = (tmp_path / "a.mcap").read_bytes()
-    out = tmp_path / "out"
+    out = tmp_path / "out.mcap"
     program = [sys.executable, "-c", _STOPPED, str(tmp_path / "a.mcap"), str(out), command]
     with subprocess.Popen(program, stdout=subprocess.PIPE) as process:
         try:
@@ -223,4 +223,4 @@ def test_killed_command_leaves_nothing_under_the_name(tmp_path: Path, command: s
     assert (tmp_path / "a.mcap").read_bytes() == before
     # The next command can write to `out`, and removes the temporary files of the killed command.
     mcaprl.filter("length > 1", tmp_path / "a.mcap", out)
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "out"]
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "out.mcap"]
