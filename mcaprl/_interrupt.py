@@ -16,9 +16,12 @@ INTERRUPTED = 130
 
 def _is_program() -> bool:
     """Return whether this process runs the program: `mcaprl` or `python -m mcaprl`."""
-    # Python sets sys.argv[0] to "-m" while it imports the parent packages of the module.
     name = os.path.basename(sys.argv[0]) if getattr(sys, "argv", None) else ""
-    return name == "-m" or os.path.splitext(name)[0] == "mcaprl"
+    if name == "-m":
+        # Python sets sys.argv[0] to "-m" while it imports the parent packages of any module.
+        module = sys.orig_argv[sys.orig_argv.index("-m") + 1] if "-m" in sys.orig_argv else ""
+        return module.partition(".")[0] == "mcaprl"
+    return os.path.splitext(name)[0] == "mcaprl"
 
 
 def _exit(number: int, frame: FrameType | None) -> None:

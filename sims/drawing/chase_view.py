@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.canvas import Canvas
-from mcaprl.sims.drawing.painter import NEAR_M, Eye, Faces, Painter, joined
+from mcaprl.sims.drawing.painter import NEAR_M, RIM, Eye, Faces, Painter, joined
 from mcaprl.sims.drawing.scene import Color, Frame, Shape
 from mcaprl.sims.geometry.mesh import box_mesh
 
@@ -30,7 +30,6 @@ _SKY: Color = (0.55, 0.68, 0.80, 1.0)
 _INK, _PLATE = (255, 255, 255), (20, 22, 26)
 _DOT = np.array([[0.0, 0.0, -1e-3], [0.0, 0.0, 1e-3]])
 """Two ends that are almost the same point. A stroke between them is drawn as a dot."""
-_RIM = np.array([(math.cos(a), math.sin(a)) for a in np.arange(12) * math.pi / 6]) / 2
 _AT_ORIGIN = (np.eye(3), np.zeros(3))
 
 
@@ -257,7 +256,7 @@ def _outlines(shape: Shape) -> tuple[Sequence[Floats] | Floats, float]:
 
 
 def _cylinder(size: tuple[float, float, float]) -> list[Floats]:
-    rim = _RIM * size[:2]
+    rim = RIM * size[:2]
     low, high = (np.column_stack([rim, np.full(12, z * size[2])]) for z in (-0.5, 0.5))
     sides = [np.array([low[i - 1], low[i], high[i], high[i - 1]]) for i in range(12)]
     return [*sides, high, low[::-1]]

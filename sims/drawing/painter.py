@@ -25,14 +25,15 @@ SMOOTH = 2
 NEAR_M = 0.3
 """Distance of the near plane."""
 FAR_M = 400.0
-"""Distance beyond which the first faces are left out; see `keys`."""
+"""Maximum distance at which faces are drawn, for the faces that the argument `far` counts."""
 _WIDEST_PX = 24.0
 """Maximum width of a stroke; a wide stroke close to the camera would hide everything."""
 _SUN = (0.36, 0.28, 0.89)
 _FLAT_M, _LEVEL_M = 0.15, 0.01
 _GROUND_KEY = -1e9
 """Key of a face on the ground at z = 0; all other faces are nearer than 1e9 m."""
-_ROUND = np.array([(math.cos(a), math.sin(a)) for a in np.arange(12) * math.pi / 6]) / 2
+RIM = np.array([(math.cos(a), math.sin(a)) for a in np.arange(12) * math.pi / 6]) / 2
+"""(12, 2) points on a circle of diameter 1."""
 
 
 class Faces(NamedTuple):
@@ -85,7 +86,7 @@ class Painter:
 
         Args:
             faces: Faces in the map.
-            far: Number of faces, from the first, that are left out beyond `FAR_M`.
+            far: Number of faces at the start of `faces` that are drawn only within `FAR_M`.
             eye: Camera.
             sky: Red, green and blue of the background, each 0 to 1.
         """
@@ -115,7 +116,7 @@ def keys(faces: Faces, far: int, eye: Eye, width_px: int, height_px: int, order_
 
     Args:
         faces: Faces in the map.
-        far: Number of faces, from the first, that are left out beyond `FAR_M`.
+        far: Number of faces at the start of `faces` that are drawn only within `FAR_M`.
         eye: Camera.
         width_px: Width of the image.
         height_px: Height of the image.
@@ -257,9 +258,9 @@ def _stroke(ends: Floats, scale: float, flat: Floats) -> int:
     half = 0.5 * min(max(scale / ends[0, 2], 1.0 * SMOOTH), _WIDEST_PX * SMOOTH)
     half_end = 0.5 * min(max(scale / ends[1, 2], 1.0 * SMOOTH), _WIDEST_PX * SMOOTH)
     if length < half / 2:
-        for i in range(len(_ROUND)):
-            flat[i, 0], flat[i, 1] = x + 2 * half * _ROUND[i, 0], y + 2 * half * _ROUND[i, 1]
-        return len(_ROUND)
+        for i in range(len(RIM)):
+            flat[i, 0], flat[i, 1] = x + 2 * half * RIM[i, 0], y + 2 * half * RIM[i, 1]
+        return len(RIM)
     across_x, across_y = -along_y / length, along_x / length
     end_x, end_y = x + along_x, y + along_y
     flat[0, 0], flat[0, 1] = x + across_x * half, y + across_y * half

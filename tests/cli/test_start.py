@@ -125,8 +125,11 @@ def test_options_are_grouped(name: str) -> None:
     assert max([len(own - set(grouped)), *map(len, groups.values())]) <= 9
 
 
-@pytest.mark.parametrize("program", ["/usr/bin/mcaprl", "-m", "train.py"])
-def test_ctrl_c_during_the_imports_is_one_line(program: str) -> None:
+@pytest.mark.parametrize(
+    ("program", "module"),
+    [("/usr/bin/mcaprl", ""), ("-m", "mcaprl"), ("-m", "robot.train"), ("train.py", "")],
+)
+def test_ctrl_c_during_the_imports_is_one_line(program: str, module: str) -> None:
     code = f"""
 import os, signal, sys
 class StopAtGymnasium:
@@ -134,14 +137,14 @@ class StopAtGymnasium:
         if name == "gymnasium":
             os.kill(os.getpid(), signal.SIGINT)
 sys.meta_path.insert(0, StopAtGymnasium())
-sys.argv = [{program!r}, "--help"]
+sys.argv, sys.orig_argv = [{program!r}, "--help"], ["python", "-m", {module!r}, "--help"]
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from mcaprl.cli import main
 main()
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout == ""
-    if program == "train.py":
+    if program == "train.py" or module == "robot.train":
         assert "Traceback" in done.stderr, "other programs handle the signal themselves"
     else:
         assert (done.returncode, done.stderr) == (130, "mcaprl: interrupted\n")
