@@ -93,9 +93,9 @@ def ray_cluster() -> Iterator[None]:
         patch.setenv("RAY_TRAIN_HEALTH_CHECK_INTERVAL_S", "0.2")
         patch.setenv("RAY_TRAIN_ENABLE_PREEMPTION_WATCHER", "0")
         yield
-    # Ray's thread for errors sometimes waits for the server forever: end the server after a minute.
+    # Ray's thread for errors sometimes waits for the server forever: end the server after 10 s.
     command = ["pkill", "-P", str(os.getpid()), "gcs_server"]
-    timer = threading.Timer(60, subprocess.run, [command])
+    timer = threading.Timer(10, subprocess.run, [command])
     timer.daemon = True
     timer.start()
     ray.shutdown()

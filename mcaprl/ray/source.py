@@ -28,6 +28,7 @@ from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 from mcaprl.recorder.dataset.open import Episodes, episode_indexes
 from mcaprl.recorder.dataset.tables import described
 from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
+from mcaprl.texts import counted
 
 # Preferred minimum size of a block, because smaller blocks take more time in total. Blocks are
 # smaller only if there would otherwise be too few of them.
@@ -134,7 +135,7 @@ class LogSource(Datasource):  # type: ignore[misc]
                 if spaces[0] != spaces[1]:
                     raise SpaceError(f"{path} differs in {role}: {spaces[1]}, not {spaces[0]}")
         if not descriptions:
-            raise NoEpisodesError(f"none of {len(self._paths)} logs has a finished episode")
+            raise NoEpisodesError(f"no finished episode in {counted(len(self._paths), 'log')}")
         return LogMetadata.common(descriptions)
 
     def get_name(self) -> str:

@@ -43,6 +43,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader
 from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
 from mcaprl.runs import RunIdentity, locked_run, open_run
+from mcaprl.texts import counted
 
 _POLL_S = 0.2
 
@@ -305,12 +306,12 @@ def _workers(wanted: int | None, device: str, episodes: int) -> int:
     kind = "GPU" if device == "cuda" else "CPU"
     available = int(ray.cluster_resources().get("GPU", 0)) if kind == "GPU" else cpus()
     if available < (wanted or 1):
-        raise ClusterError(
-            f"the cluster has {available} {kind}s for {wanted or 1} workers: start more machines,"
-            " or lower --workers"
-        )
+        few = f"{counted(available, kind)} for {counted(wanted or 1, 'worker')}"
+        raise ClusterError(f"the cluster has {few}: start more machines, or lower --workers")
     if wanted is not None and wanted > episodes:
-        raise UsageError(f"--workers {wanted}: the logs have only {episodes} episodes to divide")
+        raise UsageError(
+            f"--workers {wanted}: the logs have only {counted(episodes, 'episode')} to divide"
+        )
     return min(wanted or available, episodes)
 
 

@@ -16,6 +16,7 @@ from mcaprl.offline.algorithms.config import BootstrapConfig, TrainingConfig
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.share import ALONE, Share
+from mcaprl.texts import counted
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -126,8 +127,8 @@ def horizon_warning(config: TrainingConfig) -> str | None:
         return None
     target_updates = config.updates // config.target_interval
     return (
-        f"{target_updates} updates of the target network in {config.updates} updates: values cover"
-        f" {config.horizon_fraction:.0%} of the horizon of gamma {config.gamma}; lower"
+        f"{counted(target_updates, 'update')} of the target network in {config.updates}: values"
+        f" cover {config.horizon_fraction:.0%} of the horizon of gamma {config.gamma}; lower"
         " target_interval or gamma, or raise updates or n_steps"
     )
 

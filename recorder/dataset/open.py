@@ -18,6 +18,7 @@ from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 from mcaprl.recorder.dataset.manifest import is_manifest, listed_logs
 from mcaprl.remote import as_path, find_remote, is_url
+from mcaprl.texts import counted
 
 Result = TypeVar("Result")
 Episodes = int | slice | Sequence[int]
@@ -84,7 +85,7 @@ def _call_each(
                 raise
             warnings.warn(f"{error}: skipped", stacklevel=4)
     if not results:
-        raise NoEpisodesError(f"none of {len(logs)} logs has a finished episode")
+        raise NoEpisodesError(f"no finished episode in {counted(len(logs), 'log')}")
     return results
 
 
@@ -113,7 +114,7 @@ def episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
     outside = selected[(selected < -count) | (selected >= count)]
     if len(outside) or not len(selected):
         what = f"no episode {outside[0]}" if len(outside) else "no episodes are selected"
-        raise UsageError(f"{what}: the logs have {count} episodes; indexes start at 0")
+        raise UsageError(f"{what}: the logs have {counted(count, 'episode')}; indexes start at 0")
     return np.unique(selected % count)
 
 

@@ -14,6 +14,7 @@ from mcaprl.recorder.edit.source import Edited, FinishedLog
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.selected_copy import Source, copy_selected
 from mcaprl.recorder.mapping.expression import Column, Expression
+from mcaprl.texts import counted
 
 _NS_PER_S = 10**9
 # Expressions compare numbers as float64, which cannot represent all integers above this limit.
@@ -35,7 +36,7 @@ def filter_log(
     chosen = np.flatnonzero(holds)
     if not len(chosen):
         raise NoEpisodesError(
-            f"{path}: '{expression}' is true for none of {len(log.lengths)} episodes"
+            f"{path}: '{expression}' is true for no episode of {len(log.lengths)}"
         )
     with replacing(Path(out), LogError, overwrite=overwrite) as unfinished:
         return _copy_episodes(log, chosen, unfinished, Path(out))
@@ -133,5 +134,7 @@ def _parts(
     bounds = np.rint(np.cumsum(shares) / shares.sum() * count).astype(np.int64)
     starts = np.concatenate([[0], bounds[:-1]])
     if (starts == bounds).any():
-        raise UsageError(f"{count} episodes are too few for {len(shares)} parts of this ratio")
+        raise UsageError(
+            f"{counted(count, 'episode')} cannot be divided into {len(shares)} parts of this ratio"
+        )
     return list(zip(starts.tolist(), bounds.tolist(), strict=True))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.recorder.format import messages
+from mcaprl.texts import counted
 
 INTERRUPTED = "interrupted"
 """End reason of an episode that was ended by the recorder instead of the environment."""
@@ -53,7 +54,7 @@ class EpisodeSummary(NamedTuple):
     def end_line(self) -> str:
         """Return the log line of the episode's end."""
         return (
-            f"episode {self.episode} ends after {self.length} steps: {self.reason},"
+            f"episode {self.episode} ends after {counted(self.length, 'step')}: {self.reason},"
             f" return {self.total_reward:.4g}"
         )
 

@@ -51,7 +51,7 @@ class FieldReport:
 
 
 def _dropped(lengths: list[int]) -> str:
-    return f"{len(lengths)}, at most {max(lengths)} steps" if lengths else "none"
+    return f"{len(lengths)}, at most {counted(max(lengths), 'step')}" if lengths else "none"
 
 
 @dataclass(frozen=True)
@@ -143,5 +143,6 @@ class MappingReport:
         if share == 1.0:
             return f"{worst} ({self.fields[worst].topic}) has no value at any step"
         if self.dropped:
-            return f"the longest of {len(self.dropped)} episodes has {max(self.dropped)} steps"
+            longest = counted(max(self.dropped), "step")
+            return f"the longest of {counted(len(self.dropped), 'episode')} has {longest}"
         return f"no episode begins; {worst} is missing at {share:.0%} of {self.clock_steps} steps"

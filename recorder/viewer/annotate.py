@@ -27,6 +27,7 @@ from mcaprl.recorder.record.display import SCENE, Display
 from mcaprl.recorder.record.layout import LAYOUT_NAME, VALUES_TOPIC, layout_bytes
 from mcaprl.recorder.viewer.log_layout import layout_of_log
 from mcaprl.recorder.viewer.verify import Verification, verify
+from mcaprl.texts import counted
 
 
 @contextmanager
@@ -110,7 +111,8 @@ class AnnotatedCopy:
             )
         if found.unseeded:
             raise LogError(
-                f"no scene was added, since the log has no seed for {len(found.unseeded)} episodes"
+                "no scene was added, since the log has no seed for"
+                f" {counted(len(found.unseeded), 'episode')}"
                 f" (first: {found.unseeded[0]})"
             )
         if LOG_TOPIC not in self._topics:

@@ -140,7 +140,7 @@ def test_table_image_and_page_have_all_trials(tmp_path: Path) -> None:
     assert (tmp_path / "sweep.png").read_bytes().startswith(b"\x89PNG")
 
 
-UPDATES, EVERY = 40, 4
+UPDATES, EVERY = 24, 4
 
 
 def kill_once(out: Path, killed: list[int]) -> None:

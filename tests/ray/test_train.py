@@ -157,7 +157,7 @@ def test_options_that_cannot_be_used_with_ray(logs: Path, tmp_path: Path) -> Non
         train(ray=True, follow=True)
     with pytest.raises(ClusterError, match="the cluster has 2 CPUs for 3 workers"):
         train(ray=True, workers=3)
-    with pytest.raises(ClusterError, match="the cluster has 0 GPUs for 1 workers"):
+    with pytest.raises(ClusterError, match="the cluster has 0 GPUs for 1 worker:"):
         train(ray=True, device="cuda")
     with pytest.raises(SpaceError, match="needs discrete actions, got Box"):
         train(GOLDEN / "multi-binary.mcap", ray=True)

@@ -15,6 +15,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
 from mcaprl.recorder.dataset.formats.infos import masked
 from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.texts import counted
 
 NAMES = {
     "observations": ("observations",),
@@ -166,8 +167,10 @@ def _without_next(
 def _warn(where: object, terminal: int, dropped: int) -> None:
     found = []
     if terminal:
-        found.append(f"{terminal} terminal steps repeat their observation as next observation")
+        episodes = counted(terminal, "terminated episode")
+        found.append(f"the last observation of {episodes} is repeated as next observation")
     if dropped:
-        found.append(f"the last steps of {dropped} episodes without a terminal step are left out")
+        episodes = counted(dropped, "episode")
+        found.append(f"the last steps of {episodes} without a terminal step are left out")
     if found:
         warnings.warn(f"{where} has no next_observations: {', and '.join(found)}", stacklevel=5)

@@ -37,6 +37,7 @@ from mcaprl.recorder.dataset.formats.npz import (
 )
 from mcaprl.recorder.dataset.formats.robomimic import read_demos
 from mcaprl.recorder.format.spaces import leaves_of, nest, observation_leaves
+from mcaprl.texts import counted
 
 _DESCRIPTION, _FINALS = "description", "final_infos"
 _BLOCK_ROWS = 1024
@@ -77,7 +78,8 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     timeouts[lasts] |= ~dataset.terminated[lasts]
     changed = int((timeouts != dataset.truncated).sum())
     if changed:
-        lost.append(f"{changed} episodes that end without an end flag are written with a timeout")
+        episodes = counted(changed, "episode")
+        lost.append(f"{episodes} without an end flag: a timeout is written at the last step")
     space, _ = nodes.with_names_for_hdf5(dataset.observation_space)
     names = ["".join(f"/{key}" for key in leaf.path) for leaf in observation_leaves(space)]
     with h5py.File(path, "w") as file:

@@ -220,7 +220,7 @@ def test_wrong_expressions(log: Path, tmp_path: Path, expression: str, message: 
 
 
 def test_filter_without_a_match(log: Path, tmp_path: Path) -> None:
-    with pytest.raises(NoEpisodesError, match="'length > 99' is true for none of 4 episodes"):
+    with pytest.raises(NoEpisodesError, match="'length > 99' is true for no episode of 4"):
         mcaprl.filter("length > 99", log, tmp_path / "out.mcap")
     assert list(tmp_path.iterdir()) == [log]
 
@@ -246,7 +246,7 @@ def test_seeds_that_floats_cannot_hold_are_not_compared(tmp_path: Path) -> None:
         ({"ratio": (1,)}, "two or more positive numbers"),
         ({"ratio": (1, -1)}, "two or more positive numbers"),
         ({"ratio": (1, math.inf)}, "two or more positive numbers"),
-        ({"ratio": (100, 1)}, "4 episodes are too few for 2 parts"),
+        ({"ratio": (100, 1)}, "4 episodes cannot be divided into 2 parts"),
     ],
 )
 def test_wrong_splits(log: Path, tmp_path: Path, options: dict[str, Any], message: str) -> None:

@@ -20,6 +20,7 @@ from mcaprl.recorder.dataset.formats.lerobot import features
 from mcaprl.recorder.dataset.formats.lerobot.features import Feature
 from mcaprl.recorder.dataset.formats.lerobot.files import Files
 from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.texts import counted
 
 # LeRobot uses the same tolerance. In episodes of more than half an hour, the rounding error of the
 # 32-bit timestamps exceeds this tolerance.
@@ -190,8 +191,8 @@ def _warn_of_ends(files: Files, repeated: int, dropped: int) -> None:
     if repeated:
         _warn(
             files,
-            f"the final observation is not stored for {repeated} episodes that end in a terminal"
-            " state; the last observation is repeated instead",
+            "the final observation is not stored for"
+            f" {counted(repeated, 'terminated episode')}; the last observation is repeated instead",
         )
     if dropped:
         _warn(

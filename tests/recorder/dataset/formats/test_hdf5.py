@@ -63,7 +63,7 @@ def _write(path: Path, arrays: dict[str, Any]) -> Path:
 def test_a_dataset_is_read_back_unchanged(tmp_path: Path) -> None:
     data = _two_episodes()
     assert data.to_hdf5(tmp_path / "toy.hdf5") == [
-        "1 episodes that end without an end flag are written with a timeout"
+        "1 episode without an end flag: a timeout is written at the last step"
     ]
     _same(Dataset.from_hdf5(tmp_path / "toy.hdf5"), data)
 
@@ -143,7 +143,7 @@ def test_a_file_of_d4rl_without_next_observations(tmp_path: Path) -> None:
             "metadata/algorithm": "SAC",
         },
     )
-    with pytest.warns(UserWarning, match=r"no next_observations: 1 terminal.*last steps of 2"):
+    with pytest.warns(UserWarning, match=r"no next_observations: the last observation of 1 term.*last steps of 2"):
         found = mcaprl.open(path)
     assert found.episode_lengths.tolist() == [2, 1, 1]
     assert found.frames.ravel().tolist() == [0, 1, 1, 2, 3, 4, 5]

@@ -380,10 +380,10 @@ def _opened(path: Path) -> tuple[Dataset, list[str]]:
 
 def test_a_dataset_of_lerobots_writer_with_rewards_and_images() -> None:
     dataset, said = _golden("image")
-    assert [text.partition(" episodes")[0] for text in said] == [
+    assert [text.partition(" episode")[0] for text in said] == [
         "'next.done' may also mean truncation, because there is no feature 'next.truncated'; it is"
         " read as termination",
-        "the final observation is not stored for 1",
+        "the final observation is not stored for 1 terminated",
         "the observation after the last action is not stored for 1 other",
     ]
     space = dataset.observation_space

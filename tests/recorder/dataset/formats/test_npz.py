@@ -142,7 +142,7 @@ def test_without_next_observations_the_last_step_is_left_out_unless_terminal(
         "timeouts": np.array([0, 0, 0, 0, 1, 0, 0], bool),
     }
     np.savez_compressed(tmp_path / "their.npz", **arrays)
-    message = "1 terminal steps repeat their observation as .*, and the last steps of 2 episodes"
+    message = "observation of 1 terminated episode is repeated .*, and the last steps of 2 episodes"
     with pytest.warns(UserWarning, match=message):
         found = mcaprl.open(tmp_path / "their.npz")
     assert found.episode_lengths.tolist() == [3, 1, 1]
