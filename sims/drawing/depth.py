@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.compiled import compiled
 from mcaprl.sims.drawing.camera import (
     Lens,
     draw,
@@ -17,7 +18,6 @@ from mcaprl.sims.drawing.camera import (
     lengths,
     ray_lengths,
 )
-from mcaprl.sims.geometry.compiled import compiled
 
 Floats = NDArray[np.float64]
 

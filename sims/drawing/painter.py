@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.compiled import compiled
 
 Floats = NDArray[np.float64]
 Samples = NDArray[np.uint32]

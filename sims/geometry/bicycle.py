@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from mcaprl.sims.geometry.compiled import inlined
+from mcaprl.compiled import inlined
 from mcaprl.sims.geometry.paths import Heading, heading_of, sine, turned
 
 

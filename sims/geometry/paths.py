@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mcaprl.sims.geometry.compiled import compiled, inlined
+from mcaprl.compiled import compiled, inlined
 
 
 class Path(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.compiled import compiled
 
 FAR_M = 100.0
 """Length of a ray that hits nothing."""

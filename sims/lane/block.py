@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.compiled import compiled, inlined
 from mcaprl.sims.geometry.bicycle import Motion
-from mcaprl.sims.geometry.compiled import compiled, inlined
 from mcaprl.sims.geometry.paths import Heading, heading_of
 from mcaprl.sims.lane.rules import (
     BRAKE,

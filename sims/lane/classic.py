@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.compiled import compiled
 from mcaprl.sims.lane.course import COURSE
 from mcaprl.sims.lane.obstacles import touches
 from mcaprl.sims.lane.rules import (

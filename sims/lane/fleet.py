@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.compiled import ready
 from mcaprl.sims.drawing.depth import encode_depth, encode_nearness
-from mcaprl.sims.geometry.compiled import ready
 from mcaprl.sims.lane.block import car_info, step_cars, step_only_car
 from mcaprl.sims.lane.camera import IMAGE_SHAPE, CarCamera
 from mcaprl.sims.lane.classic import CLASSIC_DECISION_S, CLASSIC_SUBSTEPS, step_classic

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.ray_code import FAR_M
 from mcaprl.sims.lane.course import COURSE, SECOND_SQUARE_M, Box, barriers, buildings, rails
 from mcaprl.sims.lane.rules import Car

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaprl.sims.geometry.compiled import inlined
+from mcaprl.compiled import inlined
 from mcaprl.sims.geometry.paths import Projection
 from mcaprl.sims.lane.course import COURSE
 

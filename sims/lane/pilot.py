@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 
+from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.bicycle import steering_of
-from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.paths import in_body_frame, leg_at, point_at
 from mcaprl.sims.lane.course import COURSE
 from mcaprl.sims.lane.env import LaneKeepingEnv

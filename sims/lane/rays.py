@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.paths import in_body_frame, point_at
 from mcaprl.sims.geometry.ray_code import log_code, ray_name
 from mcaprl.sims.lane.course import COURSE

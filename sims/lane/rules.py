@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.compiled import compiled, inlined
 from mcaprl.sims.geometry.bicycle import (
     Motion,
     moving,
@@ -16,7 +17,6 @@ from mcaprl.sims.geometry.bicycle import (
     slip_of,
     steering_of,
 )
-from mcaprl.sims.geometry.compiled import compiled, inlined
 from mcaprl.sims.geometry.paths import Heading, heading_of, in_body_frame, wrap_angle
 from mcaprl.sims.lane.course import LANE_HALF_WIDTH_M
 from mcaprl.sims.lane.path import (

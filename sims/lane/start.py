@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.compiled import compiled
 from mcaprl.errors import UsageError
 from mcaprl.sims.geometry.bicycle import moving
-from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.paths import leg_at, project
 from mcaprl.sims.lane.classic import CLASSIC_SUBSTEPS, STRAIGHT
 from mcaprl.sims.lane.course import COURSE, LANE_HALF_WIDTH_M

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.compiled import compiled, inlined
+from mcaprl.compiled import compiled, inlined
 from mcaprl.sims.geometry.vectors import Quaternion, Vector
 from mcaprl.sims.powerline.quadrotor import (
     DRONE_SIZE,

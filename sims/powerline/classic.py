@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.vectors import Vector, norm, plus, times
 from mcaprl.sims.powerline.course import LEGS, distance_to_infinite_line, nearest_on_line
 from mcaprl.sims.powerline.quadrotor import fly

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.vectors import Vector, minus, norm, times
 from mcaprl.sims.powerline.course import ALONG_M, LEGS, TANGENTS, nearest_on_line, point_on_line
 from mcaprl.sims.powerline.env import PowerlineEnv

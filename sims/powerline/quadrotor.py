@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.compiled import compiled, inlined
+from mcaprl.compiled import compiled, inlined
 from mcaprl.sims.geometry.vectors import (
     Quaternion,
     Vector,

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.vectors import Vector, minus, norm, plus, times
 from mcaprl.sims.powerline.block import fly_all
 from mcaprl.sims.powerline.course import (

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.paths import project, wrap_angle
 from mcaprl.sims.racer.course import IMAGE_HEIGHT_PX, METERS_PER_PX, Track
 

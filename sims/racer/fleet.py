@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.compiled import ready
 from mcaprl.errors import UsageError
-from mcaprl.sims.geometry.compiled import ready
 from mcaprl.sims.racer.car import STARTED_AT, Car, store_car
 from mcaprl.sims.racer.course import IMAGE_HEIGHT_PX, METERS_PER_PX, Track, make_track
 from mcaprl.sims.racer.rules import (

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.compiled import compiled
 from mcaprl.sims.racer.car import Car
 from mcaprl.sims.racer.course import Track
 from mcaprl.sims.racer.env import RacerEnv

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.paths import heading_of
 from mcaprl.sims.geometry.ray_code import FAR_M, ray_name
 from mcaprl.sims.racer.car import Car, corner_at

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.paths import project, wrap_angle
 from mcaprl.sims.geometry.ray_code import log_code
 from mcaprl.sims.racer.car import CAR_LENGTH_PX, CAR_WIDTH_PX, Car, car_at, corner_at, store_car

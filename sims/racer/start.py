@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.compiled import compiled
 from mcaprl.errors import UsageError
-from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.paths import leg_at, point_at
 from mcaprl.sims.racer.car import STARTED_AT, Car, placed, store_car
 from mcaprl.sims.racer.course import HALF_WIDTH_PX, IMAGE_HEIGHT_PX, METERS_PER_PX, Track

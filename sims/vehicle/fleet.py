@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.compiled import ready
+from mcaprl.compiled import ready
 
 GOING_ON = 0
 """Value of `Fleet.ends` while an episode runs."""

@@ -48,6 +48,28 @@ def car_at(x_m: float, y_m: float = 0.0, yaw_rad: float = 0.0) -> list[Frame]:
     return [Frame("car", (x_m, y_m, 0.0), yaw_rotation(yaw_rad))]
 
 
+def test_images_are_converted_for_the_encoder() -> None:
+    """Red is Y 82, Cb 90 and Cr 240 in BT.601; PyAV's conversion is at most one level different."""
+    import av
+
+    from mcaprl.recorder.viewer.yuv import fill_frame
+
+    x, y = np.meshgrid(np.arange(50), np.arange(36))
+    image = np.stack([5 * x, 7 * y, 2 * (x + y)], axis=-1).astype(np.uint8)
+    image[:2, :2] = 255, 0, 0
+    frame = av.VideoFrame(50, 36, "yuv420p")
+    fill_frame(image, frame)
+    theirs = av.VideoFrame.from_ndarray(image, format="rgb24")
+    expected = theirs.reformat(format="yuv420p", interpolation="BILINEAR")
+    for plane, other, red in zip(frame.planes, expected.planes, (82, 90, 240), strict=True):
+        values, others = (
+            np.frombuffer(one, np.uint8).reshape(-1, one.line_size)[:, : one.width].astype(int)
+            for one in (plane, other)
+        )
+        assert values[0, 0] == red
+        assert abs(values - others)[4:, 4:].max() <= 1
+
+
 def box(color: Any, x_m: float, frame: str = "map", **others: Any) -> Shape:
     size = (1.0, 1.0, 1.0)
     return Shape("box", "box", color, size=size, position=(x_m, 0.0, 0.5), frame=frame, **others)

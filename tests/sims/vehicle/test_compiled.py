@@ -44,7 +44,7 @@ def run(package: Path, user_cache: Path) -> list[str]:
 
 
 def test_compilation_is_announced_once_and_cached(package: Path, tmp_path: Path) -> None:
-    assert run(package, tmp_path) == ["compiling the sim (geometry.paths) for this machine, once"]
+    assert run(package, tmp_path) == ["compiling geometry.paths for this machine, once"]
     assert run(package, tmp_path) == []
     assert list((package / CACHE).glob("paths.wrap_angle*.nbi"))
 
@@ -52,7 +52,7 @@ def test_compilation_is_announced_once_and_cached(package: Path, tmp_path: Path)
 def test_without_a_writable_package_the_users_cache_is_used(package: Path, tmp_path: Path) -> None:
     # With a file in place of the folder, even root cannot write there.
     (package / CACHE).touch()
-    assert run(package, tmp_path) == ["compiling the sim (geometry.paths) for this machine, once"]
+    assert run(package, tmp_path) == ["compiling geometry.paths for this machine, once"]
     assert run(package, tmp_path) == []
 
 
@@ -63,6 +63,6 @@ def test_without_a_writable_cache_each_process_compiles(package: Path, tmp_path:
     for _ in range(2):
         (line,) = run(package, nowhere)
         assert line == (
-            "compiling the sim (geometry.paths) for this machine, again in each process:"
+            "compiling geometry.paths for this machine, again in each process:"
             " no cache folder is writable; set NUMBA_CACHE_DIR"
         )

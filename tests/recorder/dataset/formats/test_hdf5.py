@@ -143,7 +143,8 @@ def test_a_file_of_d4rl_without_next_observations(tmp_path: Path) -> None:
             "metadata/algorithm": "SAC",
         },
     )
-    with pytest.warns(UserWarning, match=r"no next_observations: the last observation of 1 term.*last steps of 2"):
+    message = "no next_observations: the last observation of 1 term.*last steps of 2"
+    with pytest.warns(UserWarning, match=message):
         found = mcaprl.open(path)
     assert found.episode_lengths.tolist() == [2, 1, 1]
     assert found.frames.ravel().tolist() == [0, 1, 1, 2, 3, 4, 5]

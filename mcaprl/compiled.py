@@ -1,4 +1,4 @@
-"""Decorators that compile the equations of the sims to machine code."""
+"""Decorators that compile the equations of the sims, and other loops, to machine code."""
 
 from __future__ import annotations
 
@@ -83,8 +83,8 @@ class _Announcer(event.Listener):  # type: ignore[misc]
         if module.startswith("mcaprl.") and not _Announcer.is_silent:
             _Announcer.is_silent = True
             # Commands compile what they need, so a later one may compile another part.
-            part = module.removeprefix("mcaprl.sims.")
-            print(f"compiling the sim ({part}) for this machine, {self.lasts}", file=sys.stderr)
+            part = module.removeprefix("mcaprl.").removeprefix("sims.")
+            print(f"compiling {part} for this machine, {self.lasts}", file=sys.stderr)
 
     def on_end(self, event: Any) -> None:
         """Do nothing."""
