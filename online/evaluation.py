@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from mcaprl.errors import UnknownNameError
 from mcaprl.online.curves import CurvePoint
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.record.vector_wrapper import VectorWrapper
 from mcaprl.sims.evaluation.evaluate import evaluate
 from mcaprl.sims.evaluation.pilots import make_pilot
 
@@ -154,7 +155,7 @@ class _Step(NamedTuple):
     next_observations: Any
 
 
-class FirstEpisodes(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
+class FirstEpisodes(VectorWrapper):
     """Recorder of each environment's first episode since the last reset.
 
     Environments reset themselves in the step that ends an episode. Their later episodes are not

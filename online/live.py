@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import Any, cast
 
-import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -27,6 +26,7 @@ from mcaprl.online.task import Task
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.record.session import reason_of
+from mcaprl.recorder.record.vector_wrapper import VectorWrapper
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.live_stream import DEFAULT_SPEED, LiveStep, LiveStream, Pace
 from mcaprl.sims import make_sim
@@ -123,7 +123,7 @@ class LiveTraining:
         return lambda action: None
 
 
-class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
+class WatchedBatch(VectorWrapper):
     """Wrapper of a batch of environments that shows the first one in the live view.
 
     Attributes:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -34,8 +34,14 @@ from mcaprl.recorder.record.step_rows import as_declared, converters
 from mcaprl.recorder.record.unclosed import FinishesAtExit
 from mcaprl.recorder.record.vector_rows import OpenRows, OpenSteps
 
+if TYPE_CHECKING:
+    VectorWrapper = gym.vector.VectorWrapper[Any, Any, Any, Any, Any]
+else:
+    # This class is generic only since version 1.4 of Gymnasium.
+    VectorWrapper = gym.vector.VectorWrapper
 
-class RecordVecMcap(FinishesAtExit, gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
+
+class RecordVecMcap(FinishesAtExit, VectorWrapper):
     """A wrapper that records every transition of a vector environment to an MCAP file.
 
     An episode is on disk when the `step` that ends it returns, in every autoreset mode. An episode

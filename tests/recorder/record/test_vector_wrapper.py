@@ -21,6 +21,7 @@ import mcaprl
 from mcaprl.errors import LogError, NoStepsError, SpaceError, UsageError
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.record.vector_wrapper import VectorWrapper
 from mcaprl.recorder.repair.check import check_log
 from tests.support.learner_topic import read_learner
 from tests.support.recordings import MIXED_SPACE, assert_same_bits, leaves_of
@@ -295,7 +296,7 @@ def test_invalid_arguments_are_refused(log_path: Path) -> None:
 
 
 def test_the_final_observation_is_required(log_path: Path) -> None:
-    class Forgetful(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
+    class Forgetful(VectorWrapper):
         def step(self, actions: Any) -> Any:
             return *self.env.step(actions)[:4], {}
 

@@ -61,10 +61,11 @@ def test_images_are_converted_for_the_encoder() -> None:
     fill_frame(image, frame)
     theirs = av.VideoFrame.from_ndarray(image, format="rgb24")
     expected = theirs.reformat(format="yuv420p", interpolation="BILINEAR")
-    for plane, other, red in zip(frame.planes, expected.planes, (82, 90, 240), strict=True):
+    pairs: list[tuple[Any, Any]] = list(zip(frame.planes, expected.planes, strict=True))
+    for pair, red in zip(pairs, (82, 90, 240), strict=True):
         values, others = (
             np.frombuffer(one, np.uint8).reshape(-1, one.line_size)[:, : one.width].astype(int)
-            for one in (plane, other)
+            for one in pair
         )
         assert values[0, 0] == red
         assert abs(values - others)[4:, 4:].max() <= 1
