@@ -147,13 +147,17 @@ def info_columns(
         if problem := info_problem(name, info):
             raise SpaceError(problem)
         metadata = {"dtype": values.dtype.str, "shape": json.dumps(values.shape[1:])}
-        array = arrow.array(np.ascontiguousarray(values).reshape(-1))
         if values.ndim > 1:
-            kind = arrow.list_(array.type, math.prod(values.shape[1:]))
-            missing = arrow.array(is_missing)
-            array = arrow.FixedSizeListArray.from_arrays(array, type=kind, mask=missing)
-        elif is_missing.any():
-            array = arrow.compute.if_else(arrow.array(~is_missing), array, None)
+            # Many versions of PyArrow cannot read nulls among lists of a fixed size from Parquet.
+            sizes = np.where(is_missing, 0, math.prod(values.shape[1:]))
+            offsets = np.concatenate([[0], np.cumsum(sizes)])
+            nulls = np.append(is_missing, False)
+            flat = arrow.array(np.ascontiguousarray(values[~is_missing]).reshape(-1))
+            array = arrow.LargeListArray.from_arrays(arrow.array(offsets, mask=nulls), flat)
+        else:
+            array = arrow.array(np.ascontiguousarray(values))
+            if is_missing.any():
+                array = arrow.compute.if_else(arrow.array(~is_missing), array, None)
         yield arrow.field(f"{prefix}.{name}", array.type, metadata=metadata), array
 
 

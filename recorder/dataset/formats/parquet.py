@@ -11,7 +11,7 @@ and the last observation, `final_observation`. The columns of next observations 
 other tools; `read` ignores them.
 
 The columns `info.<name>` contain the infos of each step, and `reset_info.<name>` the infos of each
-reset. A null means that the environment returned no info.
+reset; an array is a list. A null means that the environment returned no info.
 """
 
 from __future__ import annotations
@@ -230,12 +230,9 @@ class _Table:
             described = {key.decode(): value for key, value in field.metadata.items()}
             dtype = info_type(described["dtype"].decode())
             shape = [int(size) for size in parse_json(described["shape"])]
-            if shape:
-                # Unlike `array.flatten()`, `array.values` also contains the values of null lists.
-                size = array.type.list_size
-                array = array.values[array.offset * size : (array.offset + len(array)) * size]
-            filled = array.fill_null("" if dtype.kind == "U" else False if dtype.kind == "b" else 0)
-            values = filled.to_numpy(zero_copy_only=False).reshape(-1, *shape).astype(dtype)
+            found = (array.flatten() if shape else array.drop_null()).to_numpy(zero_copy_only=False)
+            values = np.zeros((len(array), *shape), dtype)
+            values[~is_missing] = found.reshape(-1, *shape)
         except (AttributeError, KeyError, TypeError, ValueError, arrow.ArrowException) as error:
             raise LogError(f"{self._path}: {column} is damaged: {error}") from error
         return masked(values, is_missing, dtype)

@@ -197,8 +197,9 @@ def _warn_of_ends(files: Files, repeated: int, dropped: int) -> None:
     if dropped:
         _warn(
             files,
-            f"the observation after the last action is not stored for {dropped} other episodes;"
-            " this action is left out, and these episodes are marked as truncated",
+            "the observation after the last action is not stored for"
+            f" {counted(dropped, 'other episode')}; such an episode is read without its last"
+            " action, as truncated",
         )
 
 

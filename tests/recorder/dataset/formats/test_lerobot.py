@@ -477,7 +477,7 @@ def test_irregular_timestamps_become_times(written: Path) -> None:
     shutil.rmtree(written / "meta/mcaprl")
     times = pa.array([0, 0.1, 0.35, 0, 0.1], pa.float32())
     _edited(written, lambda t: _with(t, "timestamp", times))
-    with pytest.warns(UserWarning, match="episodes"):
+    with pytest.warns(UserWarning, match="is not stored for 1"):
         dataset = Dataset.from_lerobot(written)
     found = dataset.episodes[0].log_time_ns / 1e9
     np.testing.assert_allclose(found, [0, 0.1, 0.35, 0.45], rtol=1e-6)
