@@ -16,7 +16,7 @@ class FinishesAtExit(ABC):
     A log that is not finished has no summary, so viewers cannot open it.
     """
 
-    _process = -1
+    _process: int | None = None
 
     def _watch(self) -> None:
         """Finish the log at exit; call this at the end of the constructor."""
@@ -34,6 +34,9 @@ class FinishesAtExit(ABC):
 
     def __del__(self) -> None:
         """Finish the log, and call the environment's own `__del__`, if it has one."""
+        if self._process is None:
+            # The constructor raised an error, so the environment still belongs to the caller.
+            return
         try:
             self._finish_own()
         finally:
