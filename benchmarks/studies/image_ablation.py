@@ -5,8 +5,9 @@
 
 Each variant differs from the sim's default settings in one respect. Every seed of every variant is
 trained and then evaluated on fresh episodes. The table has the mean score over seeds (random 0,
-pilot 1) with its range, and the CPU time of the training. Finished seeds are not repeated. Thus two
-processes with different `--seeds` can share the work on two cores.
+pilot 1) with its range, the mean difference from the default of the same seeds with its standard
+error, and the CPU time of the training. Finished seeds are kept in `image_ablation.json` beside
+this file and are not repeated. Thus two processes with different `--seeds` can share the work.
 """
 
 from __future__ import annotations
@@ -50,6 +51,8 @@ VARIANTS: Final[dict[str, dict[str, Any]]] = {
     "n-step 3": {"n_steps": 3},
     MIRRORED: {},
 }
+RESULTS: Final = Path(__file__).with_suffix(".json")
+Result = dict[str, Any]
 LANE_MIRROR: Final = (0, 1, 3, 2, 5, 4)
 """Mirror image of each action of the lane sim."""
 
@@ -92,10 +95,8 @@ def differs(variant: str, task: Task, default: Task) -> bool:
     return variant == "default" or task.config != default.config
 
 
-def run(variant: str, task: Task, seed: int, folder: Path, scales: tuple[Scale, Scale]) -> None:
-    """Train and evaluate one seed; write FOLDER/result.json."""
-    if (folder / "result.json").exists():
-        return
+def run(variant: str, task: Task, seed: int, folder: Path, scales: tuple[Scale, Scale]) -> Result:
+    """Train a seed into a folder, and evaluate it."""
     folder.mkdir(parents=True, exist_ok=True)
     began_s = time.process_time()
     with closing(Agent(task, task.sim, folder, seed, scales[0])) as agent:
@@ -109,28 +110,32 @@ def run(variant: str, task: Task, seed: int, folder: Path, scales: tuple[Scale, 
         policy = read_policy(folder / BEST_NAME)
         score = evaluate(env, [policy], name="", episodes=100, seed=FRESH_SEED)
     fresh = scales[1].score(score.mean_return)
-    found = {"score": fresh, "curve": points, "cpu_minutes": seconds / 60, "ends": score.ends}
-    write_json(folder / "result.json", found, OSError)
+    return {"score": fresh, "curve": points, "cpu_minutes": seconds / 60, "ends": score.ends}
 
 
-def show(folder: Path) -> None:
-    """Print a row for each variant."""
-    for variant in VARIANTS:
-        name = _file_name(variant)
-        found = [
-            json.loads(path.read_text()) for path in sorted(folder.glob(f"{name}/*/result.json"))
-        ]
-        if found:
-            scores = np.array([each["score"] for each in found])
-            minutes = np.mean([each["cpu_minutes"] for each in found])
-            print(
-                f"| {variant} | {scores.mean():.2f} | {scores.min():.2f} to {scores.max():.2f} |"
-                f" {len(scores)} | {minutes:.1f} |"
-            )
+def read_results() -> dict[str, dict[str, dict[str, Result]]]:
+    """Return the result of each seed of each variant of each task."""
+    found: dict[str, dict[str, dict[str, Result]]] = json.loads(RESULTS.read_text())
+    return found
 
 
-def _file_name(variant: str) -> str:
-    return variant.replace(" ", "-").replace(",", "")
+def show(task: str) -> None:
+    """Print a row for each variant, the best first."""
+    results = read_results()[task]
+    rows = []
+    for variant, seeds in results.items():
+        scores = np.array([each["score"] for each in seeds.values()])
+        default = results.get("default", {})
+        changes = [each["score"] - default[k]["score"] for k, each in seeds.items() if k in default]
+        change = "" if variant == "default" or not changes else f"{np.mean(changes):+.2f}"
+        if change and len(changes) > 1:
+            change += f" ({np.std(changes, ddof=1) / np.sqrt(len(changes)):.2f})"
+        minutes = np.mean([each["cpu_minutes"] for each in seeds.values()])
+        spread = f"{scores.min():.2f} to {scores.max():.2f}"
+        row = (variant, f"{scores.mean():.2f}", spread, change, len(scores), f"{minutes:.1f}")
+        rows.append((scores.mean(), f"| {' | '.join(map(str, row))} |"))
+    for _, text in sorted(rows, reverse=True):
+        print(text)
 
 
 def main() -> None:
@@ -145,7 +150,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     options = {"observation": given.observation}
-    folder = given.folder / f"{given.sim}-{given.observation}"
+    name = f"{given.sim} {given.observation} {given.steps}"
     default = Task.for_sim(given.sim, None, options, steps=given.steps)
     with closing(make_sim(given.sim, **options)) as env:
         selection = measure_scale(env, episodes=default.config.eval_episodes, seed=SELECTION_SEED)
@@ -154,10 +159,14 @@ def main() -> None:
         for variant in given.variants:
             settings = {**VARIANTS[variant], "steps": given.steps}
             task = Task.for_sim(given.sim, None, options, **settings)
-            if differs(variant, task, default):
-                place = folder / _file_name(variant) / f"seed-{seed}"
-                run(variant, task, seed, place, (selection, fresh))
-    show(folder)
+            finished = read_results().get(name, {}).get(variant, {})
+            if differs(variant, task, default) and str(seed) not in finished:
+                place = given.folder / name / variant / f"seed-{seed}"
+                result = run(variant, task, seed, place, (selection, fresh))
+                results = read_results()
+                results.setdefault(name, {}).setdefault(variant, {})[str(seed)] = result
+                write_json(RESULTS, results)
+    show(name)
 
 
 if __name__ == "__main__":
