@@ -273,7 +273,7 @@ def test_the_better_action_is_found_if_the_data_has_both(config: Any) -> None:
 def test_iql_values_are_between_mean_and_maximum() -> None:
     values = []
     for expectile in (0.5, 0.7, 0.99):
-        config = IQLConfig(**{**SMALL_Q, "updates": 1500}, expectile=expectile)
+        config = IQLConfig(**{**SMALL_Q, "updates": 900}, expectile=expectile)
         learner = trained(learner_of(config, corridor()))
         values.append(outputs(learner, inner_observations()[1:2], "v").item())
     # Both actions are logged equally often. The mean values v1, v2 and v3 of the three cells are

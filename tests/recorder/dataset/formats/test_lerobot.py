@@ -646,7 +646,7 @@ def test_lerobot_merges_what_we_write(tmp_path: Path) -> None:
     metadata = LogMetadata(space, spaces.Box(-np.inf, np.inf, (2,), np.float32))
     dataset_of([episode], metadata, "test").to_lerobot(tmp_path / "out")
     _run_lerobot("merge", tmp_path / "out", tmp_path / "merged", home=tmp_path / "home")
-    with pytest.warns(UserWarning, match="is not stored for 2 episodes that end in a"):
+    with pytest.warns(UserWarning, match="is not stored for 2 terminated episodes"):
         merged = Dataset.from_lerobot(tmp_path / "merged")
     assert merged.rewards.tolist() == [1, 2, 4, 1, 2, 4]
     np.testing.assert_array_equal(merged.observations["front"][3:], values["front"][:3])
