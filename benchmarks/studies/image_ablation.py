@@ -120,7 +120,7 @@ def read_results() -> dict[str, dict[str, dict[str, Result]]]:
 
 
 def show(task: str) -> None:
-    """Print a row for each variant, the best first."""
+    """Print a table with a row for each variant, the best first."""
     results = read_results()[task]
     rows = []
     for variant, seeds in results.items():
@@ -134,6 +134,8 @@ def show(task: str) -> None:
         spread = f"{scores.min():.2f} to {scores.max():.2f}"
         row = (variant, f"{scores.mean():.2f}", spread, change, len(scores), f"{minutes:.1f}")
         rows.append((scores.mean(), f"| {' | '.join(map(str, row))} |"))
+    print("| variant | mean score | range over seeds | change | seeds | CPU minutes per seed |")
+    print("|---|---|---|---|---|---|")
     for _, text in sorted(rows, reverse=True):
         print(text)
 

@@ -36,7 +36,7 @@ def filter_log(
     chosen = np.flatnonzero(holds)
     if not len(chosen):
         raise NoEpisodesError(
-            f"{path}: '{expression}' is true for no episode of {len(log.lengths)}"
+            f"{path}: '{expression}' is true for no episode ({len(log.lengths)} in the log)"
         )
     with replacing(Path(out), LogError, overwrite=overwrite) as unfinished:
         return _copy_episodes(log, chosen, unfinished, Path(out))

@@ -58,14 +58,15 @@ def write_video(path: Path, images: Iterable[Image], fps: float) -> int:
 
     Args:
         path: Path of the video, `.mp4`, `.gif` or `.webp`.
-        images: (height, width, 3) frames of one size with an even height and width.
+        images: (height, width, 3) frames of one size. An `.mp4` lacks the last row or column of an
+            odd height or width.
         fps: Frames per second.
 
     Returns:
         Number of frames.
 
     Raises:
-        UsageError: There are no frames.
+        UsageError: There are no frames, or their sizes differ.
         ReportError: The file cannot be written.
     """
     with replacing(path, ReportError) as unfinished:
@@ -90,20 +91,25 @@ def _write(path: Path, kind: str, images: Iterable[Image], fps: float) -> int:
 def _encode(path: Path, images: Iterable[Image], fps: float) -> int:
     """Write an H.264 encoded `.mp4`; see `write_video`."""
     av = import_extra("av", "video")
-    # It imports numba. PyAV's own conversion takes three times as long.
+    # This module imports numba. PyAV's own conversion takes three times as long.
     from mcaprl.recorder.viewer.yuv import fill_frame
 
     # imageio does not offer the options of the encoder.
     count, stream = 0, None
+    shape: tuple[int, ...] = ()
     # The encoder cannot be closed after a failed write, so it writes to memory.
     content = BytesIO()
     with av.open(content, "w", format="mp4") as container:
         for count, image in enumerate(images, 1):  # noqa: B007
             if stream is None:
+                shape = image.shape
                 rate = Fraction(fps).limit_denominator(10_000)
                 stream = container.add_stream("libx264", rate=rate, options=_H264_OPTIONS)
-                stream.height, stream.width = image.shape[:2]
+                # The encoder needs an even height and width.
+                stream.height, stream.width = (edge // 2 * 2 for edge in shape[:2])
                 stream.pix_fmt = "yuv420p"
+            if image.shape != shape:
+                raise UsageError(f"a video needs images of one size, got {shape} and {image.shape}")
             frame = av.VideoFrame(stream.width, stream.height, "yuv420p")
             fill_frame(image, frame)
             container.mux(stream.encode(frame))

@@ -19,8 +19,8 @@ def to_yuv420(image: Bytes, luma: Bytes, blue: Bytes, red: Bytes) -> None:
     A chroma sample is the mean of its 2x2 pixels.
 
     Args:
-        image: (height, width, 3) image with an even height and width.
-        luma: (height, width) output for Y, 16 to 235.
+        image: (height, width, 3) image, which may have one row or column more than `luma`.
+        luma: (height, width) output for Y, 16 to 235, with an even height and width.
         blue: (height / 2, width / 2) output for Cb, 16 to 240.
         red: (height / 2, width / 2) output for Cr, 16 to 240.
     """

@@ -44,11 +44,13 @@ def test_numbers_are_those_of_one_process(lane_run: Path, tmp_path: Path) -> Non
     assert (report / "index.html").exists()
 
 
-def test_the_command_prints_the_same_with_one_worker(capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["evaluate", "random", "--sim", SEEDED, "--episodes", "3", "--json"]
+def test_the_command_prints_the_same_with_one_worker(
+    lane_run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(lane_run.parent)
     printed = []
     for options in ([], ["--ray", "--workers", "1"]):
-        assert run([*command, *options]) == 0
+        assert run(["evaluate", "run", "--sim", "lane", "--episodes", "3", "--json", *options]) == 0
         printed.append(json.loads(capsys.readouterr().out))
     assert printed[0] == printed[1]
 

@@ -79,7 +79,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     changed = int((timeouts != dataset.truncated).sum())
     if changed:
         episodes = counted(changed, "episode")
-        lost.append(f"{episodes} without an end flag: a timeout is written at the last step")
+        lost.append(f"{episodes} without an end flag: a timeout is written at the end")
     space, _ = nodes.with_names_for_hdf5(dataset.observation_space)
     names = ["".join(f"/{key}" for key in leaf.path) for leaf in observation_leaves(space)]
     with h5py.File(path, "w") as file:

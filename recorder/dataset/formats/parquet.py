@@ -230,9 +230,11 @@ class _Table:
             described = {key.decode(): value for key, value in field.metadata.items()}
             dtype = info_type(described["dtype"].decode())
             shape = [int(size) for size in parse_json(described["shape"])]
-            found = (array.flatten() if shape else array.drop_null()).to_numpy(zero_copy_only=False)
+            found = array.flatten() if shape else array.drop_null()
+            if found.null_count:
+                raise ValueError("a list has nulls")
             values = np.zeros((len(array), *shape), dtype)
-            values[~is_missing] = found.reshape(-1, *shape)
+            values[~is_missing] = found.to_numpy(zero_copy_only=False).reshape(-1, *shape)
         except (AttributeError, KeyError, TypeError, ValueError, arrow.ArrowException) as error:
             raise LogError(f"{self._path}: {column} is damaged: {error}") from error
         return masked(values, is_missing, dtype)

@@ -220,7 +220,8 @@ def test_wrong_expressions(log: Path, tmp_path: Path, expression: str, message: 
 
 
 def test_filter_without_a_match(log: Path, tmp_path: Path) -> None:
-    with pytest.raises(NoEpisodesError, match="'length > 99' is true for no episode of 4"):
+    message = r"'length > 99' is true for no episode \(4 in the log\)"
+    with pytest.raises(NoEpisodesError, match=message):
         mcaprl.filter("length > 99", log, tmp_path / "out.mcap")
     assert list(tmp_path.iterdir()) == [log]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import mcaprl
+from mcaprl.recorder.record.unclosed import FinishesAtExit
 from mcaprl.recorder.repair.check import check_log
 
 SINGLE = """
@@ -89,3 +91,28 @@ def test_a_recorder_that_was_not_created_has_nothing_to_finish(tmp_path: Path) -
     done = run(SINGLE + "record()", tmp_path)
     assert done.stderr.splitlines()[-1].startswith("mcaprl.errors.OutputExistsError")
     assert "Exception ignored" not in done.stderr
+
+
+def test_an_error_in_the_constructor_leaves_the_environment_open() -> None:
+    deleted: list[str] = []
+
+    class Wrapper:
+        def __del__(self) -> None:
+            deleted.append("environment")
+
+    class Recorder(FinishesAtExit, Wrapper):
+        def __init__(self, fails: bool) -> None:
+            if fails:
+                raise ValueError
+            self._watch()
+
+        def _finish(self) -> None:
+            deleted.append("log")
+
+    with pytest.raises(ValueError, match=r"^$"):
+        Recorder(fails=True)
+    gc.collect()
+    assert deleted == []
+    Recorder(fails=False)
+    gc.collect()
+    assert deleted == ["log", "environment"]

@@ -245,6 +245,23 @@ def test_a_video_needs_frames(tmp_path: Path) -> None:
         assert not path.exists()
 
 
+def test_images_of_an_odd_size_lose_a_row_and_a_column(tmp_path: Path) -> None:
+    import imageio.v3 as imageio
+
+    image = np.full((41, 51, 3), (0, 255, 0), np.uint8)
+    assert write_video(tmp_path / "video.mp4", [image], 20.0) == 1
+    (seen,) = imageio.imiter(tmp_path / "video.mp4", plugin="pyav")
+    assert seen.shape == (40, 50, 3)
+    assert np.abs(seen.astype(int) - (0, 255, 0)).max() < 10
+
+
+def test_images_of_different_sizes_are_refused(tmp_path: Path) -> None:
+    images = [np.zeros((size, 50, 3), np.uint8) for size in (40, 20)]
+    with pytest.raises(mcaprl.errors.UsageError, match=r"\(40, 50, 3\) and \(20, 50, 3\)"):
+        write_video(tmp_path / "video.mp4", images, 20.0)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_log_without_a_scene_has_no_video(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

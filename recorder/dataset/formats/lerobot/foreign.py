@@ -198,8 +198,8 @@ def _warn_of_ends(files: Files, repeated: int, dropped: int) -> None:
         _warn(
             files,
             "the observation after the last action is not stored for"
-            f" {counted(dropped, 'other episode')}; such an episode is read without its last"
-            " action, as truncated",
+            f" {counted(dropped, 'other episode')}; such an episode is read as truncated,"
+            " without its last action",
         )
 
 

@@ -63,7 +63,7 @@ def _write(path: Path, arrays: dict[str, Any]) -> Path:
 def test_a_dataset_is_read_back_unchanged(tmp_path: Path) -> None:
     data = _two_episodes()
     assert data.to_hdf5(tmp_path / "toy.hdf5") == [
-        "1 episode without an end flag: a timeout is written at the last step"
+        "1 episode without an end flag: a timeout is written at the end"
     ]
     _same(Dataset.from_hdf5(tmp_path / "toy.hdf5"), data)
 

@@ -163,6 +163,18 @@ def test_infos_of_steps_and_resets_come_back(tmp_path: Path) -> None:
     assert dataset.to_arrow()["info.why"].to_pylist() == [None, None, None, "ß"]
 
 
+def test_a_null_inside_the_list_of_an_info_is_refused(tmp_path: Path) -> None:
+    _vectors(infos=[{"place": [[1, 2], [3, 4]]}]).to_parquet(tmp_path / "out")
+    path = tmp_path / "out/transitions.parquet"
+    table = pq.read_table(path)
+    field = table.schema.field("info.place")
+    place = table.schema.get_field_index("info.place")
+    values = [[3, None], *table["info.place"].to_pylist()[1:]]
+    pq.write_table(table.set_column(place, field, pa.array(values, field.type)), path)
+    with pytest.raises(LogError, match=r"info\.place is damaged: a list has nulls"):
+        mcaprl.open(tmp_path / "out")
+
+
 def test_infos_that_a_table_cannot_hold_are_refused(tmp_path: Path) -> None:
     for value, message in (
         (1j, "the info 'x' has complex128"),
