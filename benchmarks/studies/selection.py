@@ -3,10 +3,10 @@
     python -m benchmarks.studies.selection FOLDER [--sims lane,racer] [--data weak] [--seeds 2]
 
 The candidates are algorithms of offline learning. On each log of `sim_data`, each candidate is
-trained with the settings of `sim_grid`. Its true score is measured in the sim. Other scores are
-computed from the log: FQE with and without pessimism, the policy's own values, its Bellman error,
-its support in the log, and the losses of BVFT and SBV (`q_scores`). FOLDER/SIM has the policies and
-three JSON files for each log, so an interrupted run resumes.
+trained with the settings of `sim_grid` for a study. Its true score is measured in the sim. Other
+scores are computed from the log: FQE with and without pessimism, the policy's own values, its
+Bellman error, its support in the log, and the losses of BVFT and SBV (`q_scores`). FOLDER/SIM has
+the policies and three JSON files for each log, so an interrupted run resumes.
 
 BVFT and SBV rate Q-functions. BC has none, so both are computed in two ways: with the Q-function of
 the candidate, in which case BC is not chosen, and with the one by which FQE evaluates the
@@ -52,7 +52,7 @@ from numpy.typing import NDArray
 import mcaprl
 from benchmarks.studies.q_scores import bvft, sbv
 from benchmarks.studies.sim_data import log_names, make_logs, pilot_of
-from benchmarks.studies.sim_grid import SETTINGS, normalize_mean, run, settings_of
+from benchmarks.studies.sim_grid import SETTINGS, SMALL, normalize_mean, run, settings_of
 from mcaprl.api import load_policies
 from mcaprl.errors import PolicyError
 from mcaprl.files import write_json
@@ -76,8 +76,6 @@ CANDIDATES: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "bcq": ("bcq", {}),
     "iql": ("iql", {"normalize_advantages": True, "beta": 0.3}),
 }
-SMALL: Final[dict[str, Any]] = {"batch_size": 64, "hidden": (128, 128)}
-"""Settings that differ from those of `sim_grid`, so that a log takes minutes."""
 SHORT, MODEL_UPDATES, SHORT_MODEL_UPDATES = 1_000, 1_000, 500
 """Updates of the short training, of FQE, and of FQE after the short training."""
 AT_SHORT: Final = f" after {SHORT}"

@@ -12,8 +12,11 @@ for each missing cell.
     python -m benchmarks.studies.sim_grid FOLDER --study [--sims lane,racer] [--data weak]
 
 compares settings instead of algorithms, on the same logs and with the same seeds: the columns of
-STUDY. The last rows are the mean over the logs, and the mean difference from the default of the
-same algorithm, with a 95 % bootstrap interval over the logs on which both have been run.
+STUDY. All of them are trained with the smaller networks and batches of SMALL, a fifth of the
+computation, so its scores are comparable with one another, and not with those of the grid. The
+results are in FOLDER/SIM/study.json. The last rows are the mean over the logs, and the mean
+difference from the default of the same algorithm, with a 95 % bootstrap interval over the logs on
+which both have been run.
 """
 
 from __future__ import annotations
@@ -70,6 +73,8 @@ STUDY: dict[str, tuple[str, Special]] = {
 }
 """Columns of the comparison of settings; the first column of an algorithm is its default."""
 SHARED: dict[str, Any] = {"updates": 4_000, "batch_size": 128}
+SMALL: dict[str, Any] = {"batch_size": 64, "hidden": (128, 128)}
+"""Settings that differ from SHARED in the studies of settings and of selection."""
 TARGET_INTERVAL = 150
 """Updates between two target syncs; the default has too few syncs for the effective horizon."""
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -105,8 +110,9 @@ def main() -> None:
             for name in arguments.data.split(",")
             if name in log_names(sim)
         ]
-        _fill(folder, sim, paths, wanted)
-        found = {sim: _read(arguments.folder / sim) for sim in SIMS}
+        name = "study.json" if arguments.study else "scores.json"
+        _fill(folder / name, sim, paths, wanted, SMALL if arguments.study else {})
+        found = {sim: _read(arguments.folder / sim / name) for sim in SIMS}
         if arguments.study:
             print(text := study_table(found))
             write_section("sim-settings", text)
@@ -115,33 +121,45 @@ def main() -> None:
 
 
 def _fill(
-    folder: Path, sim: str, paths: dict[str, Path], wanted: Sequence[tuple[str, str]]
+    results: Path,
+    sim: str,
+    paths: dict[str, Path],
+    wanted: Sequence[tuple[str, str]],
+    shared: dict[str, Any],
 ) -> None:
-    """Compute the missing cells."""
+    """Compute the missing cells of the file `results`; `shared` overrides the settings of all."""
+    folder = results.parent
     with closing(make_sim(sim)) as env:
         random = run(sim, [None])
         pilot = run(sim, [pilot_of(sim, folder, env)], env)
     for name, algo in wanted:
-        cells = _read(folder)
+        cells = _read(results)
         row = cells.setdefault(name, {})
         if algo in row:
             continue
         data = mcaprl.open(paths[name])
         behavior = normalize_mean(data.statistics.mean_return, random, pilot)
         row["behavior"] = {"score": behavior, "transitions": len(data)}
-        row[algo] = learn(sim, data, algo, folder / "run", random, pilot)
+        row[algo] = learn(sim, data, algo, shared, folder / "run", random, pilot)
         print(sim, name, f"behavior {behavior:.2f}", algo, row[algo], flush=True)
-        write_json(folder / "scores.json", cells)
+        write_json(results, cells)
 
 
 def learn(
-    sim: str, data: mcaprl.Dataset, algo: str, out: Path, random: PolicyScore, pilot: PolicyScore
+    sim: str,
+    data: mcaprl.Dataset,
+    algo: str,
+    shared: dict[str, Any],
+    out: Path,
+    random: PolicyScore,
+    pilot: PolicyScore,
 ) -> Cell:
     """Train all seeds on a log and score them."""
     shutil.rmtree(out, ignore_errors=True)
     name, special = {**ALGOS, **STUDY}[algo]
     special = special(data) if callable(special) else special
-    train(data, settings_of(sim, name, special), out, seeds=SEEDS, progress=lambda _: None)
+    settings = settings_of(sim, name, {**shared, **special})
+    train(data, settings, out, seeds=SEEDS, progress=lambda _: None)
     score = normalize(run(sim, list(load_policies(out))), random, pilot)
     assert score.normalized_score is not None
     assert score.normalized_interval is not None
@@ -240,8 +258,7 @@ def _text(cell: Cell | None) -> str:
     return f"{cell['score']:.2f} ({low:.2f} to {high:.2f})"
 
 
-def _read(folder: Path) -> dict[str, dict[str, Cell]]:
-    path = folder / "scores.json"
+def _read(path: Path) -> dict[str, dict[str, Cell]]:
     found: dict[str, dict[str, Cell]] = json.loads(path.read_text()) if path.exists() else {}
     return found
 
