@@ -13,7 +13,8 @@ The better actions are in the log, and its rewards identify them. A car that doe
 leave its lane within eight seconds, and its log would show little of the course.
 
 CartPole and Acrobot have the same logs except the weak one. Their pilot is the best policy of an
-online training with Double DQN, and the medium policy is one of an earlier stage of that training.
+online training, with PPO for CartPole and Double DQN for Acrobot. The medium policy is one of an
+earlier stage of that training.
 All logs have the probabilities of their actions.
 """
 
@@ -61,19 +62,23 @@ class GymTask(NamedTuple):
     settings: dict[str, Any]
 
 
-_STEADY: Final[dict[str, Any]] = {
-    "hidden": (128, 128),
-    "learning_rate": 1e-3,
-    "final_learning_rate_fraction": 0.04,
-    "batch_size": 64,
-    "learning_starts": 1_000,
-    "target_update_interval": 500,
-    "exploration_fraction": 0.2,
-    "buffer_size": 50_000,
-}
 GYM: Final = {
-    "CartPole-v1": GymTask(200.0, {**_STEADY, "steps": 40_000}),
-    "Acrobot-v1": GymTask(-200.0, {**_STEADY, "steps": 40_000}),
+    "CartPole-v1": GymTask(200.0, {"algo": "ppo", "steps": 40_000}),
+    "Acrobot-v1": GymTask(
+        -200.0,
+        {
+            "hidden": (128, 128),
+            "learning_rate": 1e-3,
+            "final_learning_rate_fraction": 0.04,
+            "batch_size": 64,
+            "learning_starts": 1_000,
+            "steps_per_update": 1,
+            "target_update_interval": 500,
+            "exploration_fraction": 0.2,
+            "buffer_size": 50_000,
+            "steps": 40_000,
+        },
+    ),
 }
 """Environments by Gymnasium id."""
 
