@@ -68,9 +68,9 @@ from mcaprl.progress import TrainingProgress
 from mcaprl.sims import PolicyScore, make_sim
 
 CANDIDATES: Final[dict[str, tuple[str, dict[str, Any]]]] = {
-    "cql": ("cql", {}),
+    "cql": ("cql", {"scale_rewards": False}),
     "cql, scaled": ("cql", {"scale_rewards": True}),
-    "cql, alpha .1": ("cql", {"alpha": 0.1}),
+    "cql, alpha .1": ("cql", {"scale_rewards": False, "alpha": 0.1}),
     "bc": ("bc", {}),
     "double-dqn": ("double-dqn", {}),
     "bcq": ("bcq", {}),
