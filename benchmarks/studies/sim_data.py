@@ -62,8 +62,9 @@ class GymTask(NamedTuple):
     settings: dict[str, Any]
 
 
+# With seed 0, the untrained policy of CartPole already returns 405.
 GYM: Final = {
-    "CartPole-v1": GymTask(200.0, {"algo": "ppo", "steps": 40_000}),
+    "CartPole-v1": GymTask(200.0, {"algo": "ppo", "seed": 1, "steps": 40_000}),
     "Acrobot-v1": GymTask(
         -200.0,
         {
@@ -142,9 +143,8 @@ def _learn_online(sim: str, out: Path, log: Path) -> None:
         if sim not in GYM:
             is_medium = now.terms["score"] >= MEDIUM_SCORE
         else:
-            curve = out / "seed-0" / "curve.csv"
-            returns = read_curve(curve)["mean_return"] if curve.exists() else np.array([])
-            is_medium = bool((returns >= GYM[sim].medium_return).any())
+            curves = [read_curve(curve) for curve in out.glob("seed-*/curve.csv")]
+            is_medium = any((c["mean_return"] >= GYM[sim].medium_return).any() for c in curves)
         if is_medium:
             raise _HalfwayError
 
