@@ -21,7 +21,7 @@ runs = mcaprl.train(train, run, algo="cql", updates=1500, gamma=0.9, target_inte
 # %%
 def show(epsilon):
     """Print the estimates of the policy with this probability of a random action."""
-    found = mcaprl.estimate(run, test, gamma=0.9, epsilon=epsilon, updates=1500)
+    found = mcaprl.estimate(run, test, gamma=0.9, epsilon=epsilon, updates=500)
     print(f"policy of the log: {found.behavior_return:.2f}")
     for one in found.estimates:
         interval = "" if one.interval is None else "{:.2f} to {:.2f}".format(*one.interval)
