@@ -1,12 +1,15 @@
 """Measure how well the best offline policy can be chosen from a log alone.
 
     python -m benchmarks.studies.selection FOLDER [--sims lane,racer] [--data weak] [--seeds 2]
+    python -m benchmarks.studies.selection
 
 The candidates are algorithms of offline learning. On each log of `sim_data`, each candidate is
 trained with the settings of `sim_grid` for a study. Its true score is measured in the sim. Other
 scores are computed from the log: FQE with and without pessimism, the policy's own values, its
 Bellman error, its support in the log, and the losses of BVFT and SBV (`q_scores`). FOLDER/SIM has
-the policies and three JSON files for each log, so an interrupted run resumes.
+the policies and three JSON files for each log, so an interrupted run resumes. With `--save`, the
+scores of all finished logs are saved in `selection.json` beside this file; the second command shows
+the tables from there.
 
 BVFT and SBV rate Q-functions. BC has none, so both are computed in two ways: with the Q-function of
 the candidate, in which case BC is not chosen, and with the one by which FQE evaluates the
@@ -82,6 +85,9 @@ AT_SHORT: Final = f" after {SHORT}"
 """Suffix of a candidate in the file of scores, for its policies after the short training."""
 FQE_NAME: Final = "fqe.npz"
 ORDER: Final = ("expert", "weak", "mixed", "replay", "medium", "random")
+RESULTS: Final = Path(__file__).with_suffix(".json")
+LABELS: Final = ("pessimistic", "plain", "tournament")
+"""Kinds of evidence in a row."""
 Row = dict[str, Any]
 
 
@@ -220,6 +226,19 @@ class Log:
                 found.setdefault(row["candidate"], []).append(value)
         return {name: float(np.mean(values)) for name, values in found.items()}
 
+    def summary(self) -> dict[str, Any]:
+        """Return the attributes as JSON types; its rows have the means over the seeds."""
+        kept: dict[tuple[str, str], Row] = {}
+        for row in self.rows:
+            key = row["candidate"], row["kind"]
+            kept.setdefault(key, {"candidate": key[0], "seed": 0, "kind": key[1]})
+            for label in LABELS:
+                numbers = {k: v for k, v in row.get(label, {}).items() if isinstance(v, float)}
+                for field in numbers:
+                    mean = self.means(label, field, key[1])[key[0]]
+                    kept[key].setdefault(label, {})[field] = float(f"{mean:.4g}")
+        return {**vars(self), "rows": list(kept.values())}
+
     def regret(self, rule: Rule) -> float:
         """Return the regret of a rule."""
         return max(self.scores.values()) - self.scores[rule(self)]
@@ -288,6 +307,25 @@ def auto(log: Log, threshold: float = DETERMINISTIC, survivors: int | None = Non
     return largest(values)
 
 
+def ranks(log: Log) -> str:
+    """Return the candidate with the largest sum of two ranks, or of agreement as in `auto`.
+
+    The ranks are those of its mean value by pessimistic FQE, and of the loss of FQE's Q-function by
+    SBV: a value counts for less if the function that gives it has a large error.
+    """
+    if log.agrees:
+        return auto(log)
+    values = log.means("pessimistic", "mean_value")
+    losses = log.means("tournament", "sbv_fqe")
+    return largest(
+        {
+            name: sum(value > other for other in values.values())
+            + sum(losses[name] < other for other in losses.values())
+            for name, value in values.items()
+        }
+    )
+
+
 def rules(candidates: Iterable[str]) -> dict[str, Rule]:
     """Return the rules: functions that choose a candidate on a log."""
 
@@ -314,6 +352,7 @@ def rules(candidates: Iterable[str]) -> dict[str, Rule]:
         "pessimistic FQE, all states": highest("pessimistic", "mean_value"),
         "agreement with the behavior": highest("pessimistic", "agreement"),
         **{f"auto, entropy below {t}": partial(auto, threshold=t) for t in (0.02, 0.05, 0.1, 0.2)},
+        "ranks of pessimistic FQE and SBV": ranks,
         "auto, 3 survivors": partial(auto, survivors=3),
         "auto, 4 survivors": partial(auto, survivors=4),
     }
@@ -346,9 +385,8 @@ def read_logs(folder: Path) -> list[Log]:
     ]
 
 
-def show(folder: Path) -> None:
-    """Print the regret of each rule over all finished logs, in two tables."""
-    logs = read_logs(folder)
+def show(logs: list[Log]) -> None:
+    """Print the regret of each rule over the logs, in two tables."""
     names = [f"{log.sim} {log.name}" for log in logs]
     print(f"{len(logs)} logs: {', '.join(names)}; candidates: {', '.join(logs[0].scores)}")
     table = rules(logs[0].scores)
@@ -383,20 +421,27 @@ def _print(regrets: dict[str, NDArray[np.float64]]) -> None:
 
 
 def main() -> None:
-    """Collect the missing logs, and print the table."""
+    """Collect the missing logs, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, nargs="?", help="default: show the saved scores")
     parser.add_argument("--sims", default=",".join(SETTINGS))
     parser.add_argument("--data", default=",".join(ORDER))
     parser.add_argument("--algos", default=";".join(CANDIDATES))
     parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--save", action="store_true", help="save the scores for later")
     given = parser.parse_args()
     torch.set_num_threads(1)
+    if given.folder is None:
+        show([Log(**log) for log in json.loads(RESULTS.read_text())])
+        return
     for name in given.data.split(","):
         for sim in given.sims.split(","):
             if name in log_names(sim):
                 _fill(given.folder / sim, sim, name, given.algos.split(";"), given.seeds)
-    show(given.folder)
+    logs = read_logs(given.folder)
+    if given.save:
+        write_json(RESULTS, [log.summary() for log in logs])
+    show(logs)
 
 
 def _fill(folder: Path, sim: str, name: str, candidates: list[str], seeds: int) -> None:

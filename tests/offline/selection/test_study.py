@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
@@ -63,6 +64,32 @@ def test_regrets_of_checkpoints_by_hand(rule: str, entropy: float, regret: float
     assert log(entropy).checkpoint_regret(CHECKPOINT_RULES[rule]) == pytest.approx(regret)
 
 
+def test_two_ranks_choose_the_candidate_that_is_good_by_both() -> None:
+    """BC is second by value and first by loss: 1 + 2 ranks. The others have 2 + 0 and 0 + 1."""
+    found = {"cql": (3.0, 0.9), "bc": (2.0, 0.1), "iql": (1.0, 0.5)}
+    rows = [
+        row(name, pessimistic={"mean_value": value}, tournament={"sbv_fqe": loss})
+        for name, (value, loss) in found.items()
+    ]
+    scores = dict.fromkeys(found, 0.0)
+    table = rules(found)
+    assert (
+        table["ranks of pessimistic FQE and SBV"](Log("lane", "x", 0.5, scores, {}, rows)) == "bc"
+    )
+
+
+def test_saved_logs_have_the_same_regrets() -> None:
+    saved = Log(**json.loads(json.dumps(log().summary())))
+    assert len(saved.rows) == 4
+    names = ("BVFT, FQE's Q", "largest own Q", "pessimistic FQE, first states", "always cql")
+    for name in names:
+        rule = rules(["cql", "bc"])[name]
+        assert saved.regret(rule) == log().regret(rule)
+    for name, choose in CHECKPOINT_RULES.items():
+        expected = log().checkpoint_regret(choose)
+        assert saved.checkpoint_regret(choose) == pytest.approx(expected), name
+
+
 def test_iql_is_a_candidate_and_all_environments_have_logs() -> None:
     assert "iql" in selection.CANDIDATES
     assert {"lane", "powerline", "racer", "CartPole-v1", "Acrobot-v1"} == set(sim_grid.SETTINGS)
@@ -88,7 +115,7 @@ def test_settings_are_compared_on_logs_that_have_both() -> None:
         "-",
     ]
     assert rows["mean"][:3] == ["0.50 (0.10 to 0.90; n = 2)", "0.40 (0.40 to 0.40; n = 1)", "-"]
-    assert rows["minus the default"][1] == "0.30 (0.30 to 0.30; n = 1)"
+    assert rows["minus the first column"][1] == "0.30 (0.30 to 0.30; n = 1)"
 
 
 def test_the_target_gap_is_above_the_entropy_of_the_behavior() -> None:
