@@ -236,7 +236,7 @@ class Log:
                 numbers = {k: v for k, v in row.get(label, {}).items() if isinstance(v, float)}
                 for field in numbers:
                     mean = self.means(label, field, key[1])[key[0]]
-                    kept[key].setdefault(label, {})[field] = float(f"{mean:.4g}")
+                    kept[key].setdefault(label, {})[field] = float(f"{mean:.8g}")
         return {**vars(self), "rows": list(kept.values())}
 
     def regret(self, rule: Rule) -> float:
@@ -392,7 +392,7 @@ def show(logs: list[Log]) -> None:
     table = rules(logs[0].scores)
     regrets = {name: np.array([log.regret(rule) for log in logs]) for name, rule in table.items()}
     fair = np.zeros(len(logs))
-    for sim in {log.sim for log in logs}:
+    for sim in sorted({log.sim for log in logs}):
         mine = np.array([log.sim == sim for log in logs])
         if not mine.all():
             best = min(regrets, key=lambda name: regrets[name][~mine].mean())
