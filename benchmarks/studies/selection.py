@@ -4,12 +4,12 @@
     python -m benchmarks.studies.selection
 
 The candidates are algorithms of offline learning. On each log of `sim_data`, each candidate is
-trained with the settings of `sim_grid` for a study. Its true score is measured in the sim. Other
-scores are computed from the log: FQE with and without pessimism, the policy's own values, its
-Bellman error, its support in the log, and the losses of BVFT and SBV (`q_scores`). FOLDER/SIM has
-the policies and three JSON files for each log, so an interrupted run resumes. With `--save`, the
-scores of all finished logs are saved in `selection.json` beside this file; the second command shows
-the tables from there.
+trained with the settings of `sim_grid --study`. Its true score is measured in the sim. Other scores
+are computed from the log: FQE with and without pessimism, the policy's own values, its Bellman
+error, its support in the log, and the losses of BVFT and SBV (`q_scores`). FOLDER/SIM has the
+policies and three JSON files for each log, so an interrupted run resumes. `--save` saves the scores
+of all finished logs in `selection.json` beside this file, from which the second command prints the
+tables.
 
 BVFT and SBV rate Q-functions. BC has none, so both are computed in two ways: with the Q-function of
 the candidate, in which case BC is not chosen, and with the one by which FQE evaluates the

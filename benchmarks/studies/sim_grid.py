@@ -12,9 +12,9 @@ for each missing cell.
     python -m benchmarks.studies.sim_grid FOLDER --study [--sims lane,racer] [--data weak]
 
 compares settings instead of algorithms, on the same logs and with the same seeds: the columns of
-STUDY. All of them are trained with the smaller networks and batches of SMALL, a fifth of the
-computation, so its scores are comparable with one another, and not with those of the grid. The
-results are in FOLDER/SIM/study.json. The last rows are the mean over the logs, and the mean
+STUDY. All of them are trained with the smaller networks and batches of SMALL, so the scores can be
+compared with one another, but not with those of the grid. The results are in
+FOLDER/SIM/study.json. The last rows are the mean over the logs, and the mean
 difference from the first column of the same algorithm, with a 95 % bootstrap interval over the logs
 on which both have been run.
 """
@@ -127,7 +127,7 @@ def _fill(
     wanted: Sequence[tuple[str, str]],
     shared: dict[str, Any],
 ) -> None:
-    """Compute the missing cells of the file `results`; `shared` overrides the settings of all."""
+    """Compute the missing cells of the file `results`; `shared` overrides values of SHARED."""
     folder = results.parent
     with closing(make_sim(sim)) as env:
         random = run(sim, [None])
