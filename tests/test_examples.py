@@ -78,11 +78,13 @@ def test_an_example_has_at_most_60_lines(script: Path) -> None:
 
 @pytest.mark.parametrize("script", SHELL_SCRIPTS, ids=lambda path: path.name)
 def test_the_commands_of_a_script_are_valid(script: Path, tmp_path: Path) -> None:
-    # The programs that the script calls write their arguments to a file.
+    # The programs that the script calls append their arguments to a file. A line is written at
+    # once, since demo.sh runs two programs at a time.
     calls = tmp_path / "calls"
     for name in ("mcaprl", "python"):
         stub = tmp_path / name
-        stub.write_text(f'#!/bin/sh\nprintf "%s\\t" {name} "$@" >> "{calls}"; echo >> "{calls}"\n')
+        line = f'line=$(printf "%s\\t" {name} "$@")'
+        stub.write_text(f'#!/bin/sh\n{line}\nprintf "%s\\n" "$line" >> "{calls}"\n')
         stub.chmod(0o755)
     path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
     out = str(tmp_path / "out")
