@@ -1,15 +1,17 @@
 """Measure how well the best offline policy can be chosen from a log alone.
 
     python -m benchmarks.studies.selection FOLDER [--sims lane,racer] [--data weak] [--seeds 2]
-    python -m benchmarks.studies.selection
+    python -m benchmarks.studies.selection FOLDER --second [...]
+    python -m benchmarks.studies.selection [--second]
 
 The candidates are algorithms of offline learning. On each log of `sim_data`, each candidate is
 trained with the settings of `sim_grid --study`. Its true score is measured in the sim. Other scores
 are computed from the log: FQE with and without pessimism, the policy's own values, its Bellman
 error, its support in the log, and the losses of BVFT and SBV (`q_scores`). FOLDER/SIM has the
 policies and three JSON files for each log, so an interrupted run resumes. `--save` saves the scores
-of all finished logs in `selection.json` beside this file, from which the second command prints the
-tables.
+of all finished logs in `selection.json` beside this file, from which the last command prints the
+tables. With `--second`, the logs are those of the second set of `sim_data`, in another FOLDER, and
+the scores are saved in `selection_second.json`.
 
 BVFT and SBV rate Q-functions. BC has none, so both are computed in two ways: with the Q-function of
 the candidate, in which case BC is not chosen, and with the one by which FQE evaluates the
@@ -54,7 +56,7 @@ from numpy.typing import NDArray
 
 import mcaprl
 from benchmarks.studies.q_scores import bvft, sbv
-from benchmarks.studies.sim_data import log_names, make_logs, pilot_of
+from benchmarks.studies.sim_data import FIRST, SECOND, LogSet, log_names, make_logs, pilot_of
 from benchmarks.studies.sim_grid import SETTINGS, SMALL, normalize_mean, run, settings_of
 from mcaprl.api import load_policies
 from mcaprl.errors import PolicyError
@@ -86,6 +88,7 @@ AT_SHORT: Final = f" after {SHORT}"
 FQE_NAME: Final = "fqe.npz"
 ORDER: Final = ("expert", "weak", "mixed", "replay", "medium", "random")
 RESULTS: Final = Path(__file__).with_suffix(".json")
+SECOND_RESULTS: Final = RESULTS.with_name("selection_second.json")
 LABELS: Final = ("pessimistic", "plain", "tournament")
 """Kinds of evidence in a row."""
 Row = dict[str, Any]
@@ -428,25 +431,29 @@ def main() -> None:
     parser.add_argument("--data", default=",".join(ORDER))
     parser.add_argument("--algos", default=";".join(CANDIDATES))
     parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--second", action="store_true", help="use the second set of logs")
     parser.add_argument("--save", action="store_true", help="save the scores for later")
     given = parser.parse_args()
     torch.set_num_threads(1)
+    logs, results = (SECOND, SECOND_RESULTS) if given.second else (FIRST, RESULTS)
     if given.folder is None:
-        show([Log(**log) for log in json.loads(RESULTS.read_text())])
+        show([Log(**log) for log in json.loads(results.read_text())])
         return
     for name in given.data.split(","):
         for sim in given.sims.split(","):
             if name in log_names(sim):
-                _fill(given.folder / sim, sim, name, given.algos.split(";"), given.seeds)
-    logs = read_logs(given.folder)
+                _fill(given.folder / sim, sim, name, logs, given.algos.split(";"), given.seeds)
+    found = read_logs(given.folder)
     if given.save:
-        write_json(RESULTS, [log.summary() for log in logs])
-    show(logs)
+        write_json(results, [log.summary() for log in found])
+    show(found)
 
 
-def _fill(folder: Path, sim: str, name: str, candidates: list[str], seeds: int) -> None:
+def _fill(
+    folder: Path, sim: str, name: str, logs: LogSet, candidates: list[str], seeds: int
+) -> None:
     """Train and score the missing candidates on a log, and collect the evidence."""
-    log = make_logs(folder, sim)[name]
+    log = make_logs(folder, sim, logs)[name]
     path, result = folder / f"scores-{name}.json", folder / f"evidence-{name}.json"
     scores: dict[str, list[float]] = json.loads(path.read_text()) if path.exists() else {}
     rows: list[Row] = json.loads(result.read_text()) if result.exists() else []

@@ -16,6 +16,9 @@ CartPole and Acrobot have the same logs except the weak one. Their pilot is the 
 online training, with PPO for CartPole and Double DQN for Acrobot. The medium policy is one of an
 earlier stage of that training.
 All logs have the probabilities of their actions.
+
+These are the logs of FIRST. SECOND has other seeds, half as many transitions, and other behavior
+policies of the same kinds, to test on new logs what was chosen on the first ones.
 """
 
 from __future__ import annotations
@@ -36,60 +39,97 @@ from mcaprl.progress import TrainingProgress
 from mcaprl.runs import read_curve
 from mcaprl.sims import EpsilonGreedy, LaneKeepingEnv, Policy, make_pilot, make_sim, rollout
 
-STEPS = 20_000
 NAMES = ("random", "medium", "expert", "replay", "mixed", "weak")
-MEDIUM_SCORE = 0.5
-"""Score (random 0, pilot 1) of an evaluation during training at which the training stops."""
 WRONG = {"lane": "brake", "powerline": "no change", "racer": "none"}
 """Wrong action of the weak pilot, by sim."""
 TIMID_ABOVE_M_S = {"lane": 5.0}
 """Minimum speed at which the weak pilot does the wrong thing, for the sims that have a minimum."""
-WEAK, CLUMSY = 0.6, 0.1
-"""Probability of the wrong action, and probability of a random action in the other cases."""
-MIXED_EPSILONS = (0.1, 0.3, 0.6, 1.0)
 MakeBehavior = Callable[[gym.Env[Any, Any]], EpsilonGreedy]
 
 
-class GymTask(NamedTuple):
-    """Environment of Gymnasium without a scripted pilot.
+class LogSet(NamedTuple):
+    """Parameters of the logs of a sim.
 
     Attributes:
-        medium_return: Mean return of an evaluation at which the policy is medium.
-        settings: Settings of the online training.
+        steps: Number of transitions of each log, before the last episode is finished.
+        seed: Seed of the episodes and of the online trainings.
+        medium_score: Score (random 0, pilot 1) of an evaluation during training at which the policy
+            is medium.
+        medium_returns: The same as mean returns, for the environments of Gymnasium.
+        expert_epsilon: Probability of a random action in the expert log.
+        medium_epsilon: The same in the medium log.
+        mixed_epsilons: The same in each part of the mixed log.
+        wrong: Probability of the wrong action in the weak log.
+        clumsy: Probability of a random action in the other cases in the weak log.
     """
 
-    medium_return: float
-    settings: dict[str, Any]
+    steps: int
+    seed: int
+    medium_score: float
+    medium_returns: dict[str, float]
+    expert_epsilon: float
+    medium_epsilon: float
+    mixed_epsilons: tuple[float, ...]
+    wrong: float
+    clumsy: float
 
 
-# With seed 0, the untrained policy of CartPole already returns 405.
-GYM: Final = {
-    "CartPole-v1": GymTask(200.0, {"algo": "ppo", "seed": 1, "steps": 40_000}),
-    "Acrobot-v1": GymTask(
-        -200.0,
-        {
-            "hidden": (128, 128),
-            "learning_rate": 1e-3,
-            "final_learning_rate_fraction": 0.04,
-            "batch_size": 64,
-            "learning_starts": 1_000,
-            "steps_per_update": 1,
-            "target_update_interval": 500,
-            "exploration_fraction": 0.2,
-            "buffer_size": 50_000,
-            "steps": 40_000,
-        },
-    ),
+FIRST: Final = LogSet(
+    steps=20_000,
+    seed=0,
+    medium_score=0.5,
+    medium_returns={"CartPole-v1": 200.0, "Acrobot-v1": -200.0},
+    expert_epsilon=0.0,
+    medium_epsilon=0.1,
+    mixed_epsilons=(0.1, 0.3, 0.6, 1.0),
+    wrong=0.6,
+    clumsy=0.1,
+)
+SECOND: Final = LogSet(
+    steps=10_000,
+    seed=1,
+    medium_score=0.75,
+    medium_returns={"CartPole-v1": 300.0, "Acrobot-v1": -150.0},
+    expert_epsilon=0.05,
+    medium_epsilon=0.3,
+    mixed_epsilons=(0.2, 0.5),
+    wrong=0.4,
+    clumsy=0.2,
+)
+# With seed 0, the untrained PPO policy of CartPole already returns 405.
+GYM: Final[dict[str, dict[str, Any]]] = {
+    "CartPole-v1": {"algo": "ppo", "seed": 1, "steps": 40_000},
+    "Acrobot-v1": {
+        "seed": 0,
+        "hidden": (128, 128),
+        "learning_rate": 1e-3,
+        "final_learning_rate_fraction": 0.04,
+        "batch_size": 64,
+        "learning_starts": 1_000,
+        "steps_per_update": 1,
+        "target_update_interval": 500,
+        "exploration_fraction": 0.2,
+        "buffer_size": 50_000,
+        "steps": 40_000,
+    },
 }
-"""Environments by Gymnasium id."""
+"""Settings of the online training by Gymnasium id, for environments without a scripted pilot."""
 
 
 class WeakPilot(EpsilonGreedy):
     """A pilot that does the wrong thing most of the time."""
 
-    def __init__(self, env: gym.Env[Any, Any], sim: str) -> None:
-        """Wrap the pilot of `env`, and set CLUMSY as the probability of a random action."""
-        super().__init__(make_pilot(env), CLUMSY, env.action_space)
+    def __init__(self, env: gym.Env[Any, Any], sim: str, wrong: float, clumsy: float) -> None:
+        """Wrap the pilot of `env`.
+
+        Args:
+            env: Environment of the sim.
+            sim: Name of the sim.
+            wrong: Probability of the wrong action.
+            clumsy: Probability of a random action in the other cases.
+        """
+        super().__init__(make_pilot(env), clumsy, env.action_space)
+        self._probability, self._clumsy = wrong, clumsy
         meanings: tuple[str, ...] = env.get_wrapper_attr("action_meanings")
         self.name, self._wrong = "weak pilot", meanings.index(WRONG[sim])
         self._sim, self._timid_above_m_s = env.unwrapped, TIMID_ABOVE_M_S.get(sim)
@@ -97,9 +137,9 @@ class WeakPilot(EpsilonGreedy):
     def choose(self, observation: Any) -> tuple[Any, float]:
         """Return the action for one observation, and its probability."""
         assert self.policy is not None
-        weak = WEAK if self._is_weak_here() else 0.0
-        chances = np.full(self._count, (1 - weak) * CLUMSY / self._count)
-        chances[int(self.policy.act(observation[None])[0])] += (1 - weak) * (1 - CLUMSY)
+        weak = self._probability if self._is_weak_here() else 0.0
+        chances = np.full(self._count, (1 - weak) * self._clumsy / self._count)
+        chances[int(self.policy.act(observation[None])[0])] += (1 - weak) * (1 - self._clumsy)
         chances[self._wrong] += weak
         action = int(self._random.choice(self._count, p=chances))
         return action, float(chances[action])
@@ -115,19 +155,19 @@ def log_names(sim: str) -> list[str]:
     return [name for name in NAMES if name != "weak" or sim in WRONG]
 
 
-def make_logs(folder: Path, sim: str) -> dict[str, Path]:
+def make_logs(folder: Path, sim: str, logs: LogSet = FIRST) -> dict[str, Path]:
     """Create the missing logs of a sim, and return the paths of all."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = {name: folder / f"{name}.mcap" for name in log_names(sim)}
     if sim in GYM and not (folder / "pilot").exists():
         shutil.rmtree(part := folder / "pilot.part", ignore_errors=True)
-        mcaprl.train_online(sim, part, **GYM[sim].settings, eval_interval=2_000)
+        mcaprl.train_online(sim, part, **_online_settings(sim, logs))
         part.rename(folder / "pilot")
     if not paths["replay"].exists():
-        _learn_online(sim, folder / "online", paths["replay"])
-    for name, make_behaviors in _behaviors(sim, folder).items():
+        _learn_online(sim, folder / "online", paths["replay"], logs)
+    for name, make_behaviors in _behaviors(sim, folder, logs).items():
         if not paths[name].exists():
-            _record(paths[name], sim, make_behaviors)
+            _record(paths[name], sim, make_behaviors, logs)
     return paths
 
 
@@ -136,56 +176,62 @@ def pilot_of(sim: str, folder: Path, env: gym.Env[Any, Any]) -> Policy:
     return load_policies(folder / "pilot")[0] if sim in GYM else make_pilot(env)
 
 
-def _learn_online(sim: str, out: Path, log: Path) -> None:
+def _online_settings(sim: str, logs: LogSet) -> dict[str, Any]:
+    given = GYM.get(sim, {"seed": 0})
+    return {**given, "seed": given["seed"] + logs.seed, "eval_interval": 2_000}
+
+
+def _learn_online(sim: str, out: Path, log: Path, logs: LogSet) -> None:
     """Train until the policy is medium; save the best policy in `out`."""
 
-    def stop_halfway(now: TrainingProgress) -> None:
+    def stop_early(now: TrainingProgress) -> None:
         if sim not in GYM:
-            is_medium = now.terms["score"] >= MEDIUM_SCORE
+            is_medium = now.terms["score"] >= logs.medium_score
         else:
             curves = [read_curve(curve) for curve in out.glob("seed-*/curve.csv")]
-            is_medium = any((c["mean_return"] >= GYM[sim].medium_return).any() for c in curves)
+            least = logs.medium_returns[sim]
+            is_medium = any((c["mean_return"] >= least).any() for c in curves)
         if is_medium:
-            raise _HalfwayError
+            raise _MediumError
 
     shutil.rmtree(out, ignore_errors=True)
     part = log.with_suffix(".part.mcap")
     part.unlink(missing_ok=True)
-    with contextlib.suppress(_HalfwayError):
-        settings = GYM[sim].settings if sim in GYM else {}
+    with contextlib.suppress(_MediumError):
         mcaprl.train_online(
-            sim, out, record=part, progress=stop_halfway, eval_interval=2_000, **settings
+            sim, out, record=part, progress=stop_early, **_online_settings(sim, logs)
         )
     part.rename(log)
 
 
-class _HalfwayError(Exception):
+class _MediumError(Exception):
     """Exception that stops an online training."""
 
 
-def _behaviors(sim: str, folder: Path) -> dict[str, list[MakeBehavior]]:
+def _behaviors(sim: str, folder: Path, logs: LogSet) -> dict[str, list[MakeBehavior]]:
     """Return the behavior policies of each log, in the order in which they are recorded."""
 
     def pilot(epsilon: float) -> MakeBehavior:
         return lambda env: EpsilonGreedy(pilot_of(sim, folder, env), epsilon, env.action_space)
 
     def medium(env: gym.Env[Any, Any]) -> EpsilonGreedy:
-        return EpsilonGreedy(load_policies(folder / "online")[0], 0.1, env.action_space)
+        policy = load_policies(folder / "online")[0]
+        return EpsilonGreedy(policy, logs.medium_epsilon, env.action_space)
 
     def weak(env: gym.Env[Any, Any]) -> EpsilonGreedy:
-        return WeakPilot(env, sim)
+        return WeakPilot(env, sim, logs.wrong, logs.clumsy)
 
     return {
         "random": [pilot(1.0)],
         "medium": [medium],
-        "expert": [pilot(0.0)],
-        "mixed": [pilot(epsilon) for epsilon in MIXED_EPSILONS],
+        "expert": [pilot(logs.expert_epsilon)],
+        "mixed": [pilot(epsilon) for epsilon in logs.mixed_epsilons],
         **({"weak": [weak]} if sim in WRONG else {}),
     }
 
 
-def _record(path: Path, sim: str, make_behaviors: list[MakeBehavior]) -> None:
-    """Record whole episodes. Each behavior policy makes an equal share of STEPS."""
+def _record(path: Path, sim: str, make_behaviors: list[MakeBehavior], logs: LogSet) -> None:
+    """Record whole episodes. Each behavior policy makes an equal share of the transitions."""
     part = path.with_suffix(".part.mcap")
     with (
         closing(make_sim(sim)) as env,
@@ -199,11 +245,11 @@ def _record(path: Path, sim: str, make_behaviors: list[MakeBehavior]) -> None:
 
         for make_behavior in make_behaviors:
             behavior, done = make_behavior(env), 0
-            while done < STEPS // len(make_behaviors):
+            while done < logs.steps // len(make_behaviors):
                 (episode,) = rollout(
                     recorder,
                     behavior,
-                    seed=NAMES.index(path.stem),
+                    seed=NAMES.index(path.stem) + len(NAMES) * logs.seed,
                     episodes=1,
                     first_episode=recorder.episodes,
                     on_action=tell_probability,
