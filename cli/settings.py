@@ -56,36 +56,51 @@ def setting_options(
 ) -> list[click.Option]:
     """Return one option for each field of the given settings.
 
-    Help and default come from the first algorithm that has the field. An omitted option is None,
-    so that the default of the algorithm, or of the sim, is used.
+    The help comes from the first algorithm that has the field. It shows the default of this
+    algorithm, and the defaults of other algorithms and of sims if they differ. An omitted option is
+    None, so that the default of the algorithm, or of the sim, is used.
     """
-    options: dict[str, click.Option] = {}
-    for config in configs.values():
+    lines: dict[str, str] = {}
+    defaults: dict[str, dict[str, Any]] = {}
+    for algo, config in configs.items():
         for name, line in field_help(type(config)).items():
-            if name not in options:
-                options[name] = _option(name, line, getattr(config, name), tuned)
-    return list(options.values())
+            lines.setdefault(name, line)
+            defaults.setdefault(name, {})[algo] = getattr(config, name)
+    return [_option(name, line, defaults[name], tuned) for name, line in lines.items()]
 
 
 def _option(
-    name: str, line: str, default: Any, tuned: Mapping[str, Mapping[str, Any]]
+    name: str, line: str, defaults: Mapping[str, Any], tuned: Mapping[str, Mapping[str, Any]]
 ) -> click.Option:
+    default = next(iter(defaults.values()))
+    help_text = f"{line}  [default: {_all_defaults(name, default, defaults, tuned)}]"
     if isinstance(default, bool):
         both = f"{flag(name)}/--no-{name.replace('_', '-')}"
-        state = "yes" if default else "no"
-        return click.Option([both, name], default=None, help=f"{line}  [default: {state}]")
+        return click.Option([both, name], default=None, help=help_text)
     kind = _Widths() if isinstance(default, tuple) else type(default)
-    sims: dict[Any, list[str]] = {}
-    for sim, settings in tuned.items():
-        if settings.get(name, default) != default:
-            sims.setdefault(settings[name], []).append(sim)
-    shown = [_shown(default), *(f"{', '.join(sims[value])}: {_shown(value)}" for value in sims)]
-    return click.Option(
-        [flag(name), name], type=kind, help=f"{line}  [default: {'; '.join(shown)}]"
+    return click.Option([flag(name), name], type=kind, help=help_text)
+
+
+def _all_defaults(
+    name: str,
+    default: Any,
+    defaults: Mapping[str, Any],
+    tuned: Mapping[str, Mapping[str, Any]],
+) -> str:
+    """Return the default, then each other value with the algorithms and sims that use it."""
+    others: dict[Any, list[str]] = {}
+    of_sims = {sim: settings[name] for sim, settings in tuned.items() if name in settings}
+    for where, value in (*defaults.items(), *of_sims.items()):
+        if value != default:
+            others.setdefault(value, []).append(where)
+    return "; ".join(
+        [_shown(default), *(f"{', '.join(each)}: {_shown(value)}" for value, each in others.items())]
     )
 
 
 def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return ",".join(map(str, value)) or "none" if isinstance(value, tuple) else f"{value}"
 
 

@@ -13,6 +13,8 @@ from click.testing import CliRunner
 import mcaprl
 from mcaprl.cli import cli
 from mcaprl.cli.help import EXAMPLES, SECTIONS
+from mcaprl.cli.settings import SettingsCommand
+from mcaprl.offline.algorithms.config import BCConfig
 from tests.support.paths import GOLDEN
 
 TOP = click.Context(cli, info_name="mcaprl", **cli.context_settings)
@@ -63,6 +65,21 @@ def test_settings_are_listed_with_the_algorithms_that_have_them() -> None:
     online = help_of("train-online")
     assert "Settings of dqn, double-dqn:" in online
     assert "Settings of ppo:" in online
+
+
+def test_defaults_that_differ_between_algorithms_and_sims_are_all_shown() -> None:
+    offline, online = (
+        " ".join(help_of(command).split()) for command in ("train-offline", "train-online")
+    )
+    assert "[default: 500; iql: 50; auto: 150]" in offline
+    assert "[default: 10.0; ppo, a2c: 0.5]" in online
+    assert "[default: 32; ppo: 64; lane, racer, powerline, highway-lane: 128]" in online
+    switch = SettingsCommand(
+        "switch", configs=lambda: {"one": BCConfig(), "two": BCConfig(normalize=True)}
+    )
+    (option,) = [each for each in switch.get_params(TOP) if each.name == "normalize"]
+    assert isinstance(option, click.Option)
+    assert (option.help or "").endswith("[default: no; two: yes]")
 
 
 def test_the_condition_of_the_filter_example_is_valid(tmp_path: Path) -> None:
