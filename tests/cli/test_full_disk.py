@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import multiprocessing
 import os
 import shutil
-import subprocess
 import sys
 import warnings
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
 
 import mcaprl
-from mcaprl.cli import run
+from mcaprl.cli import main, run
 
 resource = pytest.importorskip("resource", reason="needs limits on the size of files")
 
-# The limit on the size of files simulates a full disk. Python ignores SIGXFSZ, so a write raises.
-SCRIPT = """
-import resource, sys
-from mcaprl.cli import main
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
-main(sys.argv[2:])
-"""
 LOG, POLICY = "cartpole.mcap", "bc"
 SMALL = ["--hidden", "8", "--checkpoint-interval", "50"]
 OFTEN = ["--log-interval", "1", "--updates", "30"]
@@ -43,6 +40,22 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def limited(limit: int, command: Sequence[str], folder: Path, errors: Connection) -> None:
+    """Run a command in `folder`, and send its messages to `errors`.
+
+    The limit on the size of files simulates a full disk. Python ignores SIGXFSZ, so a write raises.
+    """
+    # The limit also holds for the caches of compiled code, which would be cut off.
+    sys.dont_write_bytecode = True
+    os.chdir(folder)
+    with contextlib.redirect_stderr(io.StringIO()) as text:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+        try:
+            main(command)
+        finally:
+            errors.send(text.getvalue())
+
+
 @pytest.mark.parametrize(
     ("limit", "command", "path"),
     [
@@ -50,7 +63,6 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (100_000, ["record", "lane", "--steps", "9999", "--policy", "random"], "x.mcap"),
         (20_000, [*CARTPOLE, "--envs", "2"], "x/shard-0"),
         (20_000, ["annotate", LOG, "--policy", POLICY], "x.mcap"),
-        (2_000, ["export", POLICY], "x.npz"),
         (2_000, ["recover", LOG], "x.mcap"),
         (10, ["layout", LOG], "x.json"),
         (2_000, ["info", LOG, "--report"], "x"),
@@ -75,19 +87,20 @@ def test_a_full_disk_is_one_line(
         command = [*command, out]
     elif "run" not in command:
         command = [*command, "--out", out]
-    done = subprocess.run(
-        # On a busy machine, lines of progress would be printed too.
-        [sys.executable, "-c", SCRIPT, str(limit), *command, "--quiet"],
-        # Otherwise the bytecode of imported modules is cut off, and cannot be read later.
-        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    # A fork of a process that has imported everything starts sooner than a new process.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__, "mcaprl.online.train"])
+    receiver, sender = context.Pipe(duplex=False)
+    # On a busy machine, lines of progress would be printed too.
+    arguments = (limit, [*command, "--quiet"], Path.cwd(), sender)
+    process = context.Process(target=limited, args=arguments)
+    process.start()
+    text = receiver.recv()
+    process.join()
     notes = ("mcaprl: warning:", "compiling ")
-    lines = [line for line in done.stderr.splitlines() if line and not line.startswith(notes)]
-    assert done.returncode == 1, done
-    assert len(lines) == 1, done.stderr
+    lines = [line for line in text.splitlines() if line and not line.startswith(notes)]
+    assert process.exitcode == 1, text
+    assert len(lines) == 1, text
     assert lines[0].startswith("mcaprl: cannot write "), lines
     assert path in lines[0]
     assert "File too large" in lines[0]

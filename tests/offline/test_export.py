@@ -103,3 +103,25 @@ def test_the_command_writes_a_file_once(tmp_path: Path, capsys: pytest.CaptureFi
     assert "exists" in capsys.readouterr().err
     assert run(["export", str(tmp_path), "--out", str(out / "x.onnx")]) == 1
     assert "cannot write" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    need(onnxruntime is not None, "onnxruntime is not installed")
+    resource = pytest.importorskip("resource", reason="needs limits on the size of files")
+    policy_of(DQNConfig(**TINY), VECTOR, tmp_path / "policy")
+    out = tmp_path / "out" / "policy.onnx"
+    out.parent.mkdir()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000, hard))
+    try:
+        status = run(["export", str(tmp_path / "policy"), "--out", str(out), "--quiet"])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert status == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"mcaprl: cannot write {out}: ")
+    assert "File too large" in error
+    assert error.count("\n") == 1
+    assert list(out.parent.iterdir()) == []

@@ -256,9 +256,10 @@ def test_more_alpha_means_lower_values_of_unseen_actions() -> None:
     [
         CQLConfig(**SMALL_Q, alpha=0.01),
         BCQConfig(**SMALL_Q),
-        # The log goes left twice as often as right. With this large `beta`, the weight of the
-        # better action, right, makes up for this.
-        IQLConfig(**SMALL_Q, expectile=0.9, beta=20.0),
+        # The log goes left twice as often as right. The weights of the better action, right, make
+        # up for this.
+        IQLConfig(**SMALL_Q, expectile=0.9, beta=1.0),
+        IQLConfig(**SMALL_Q, expectile=0.9, beta=20.0, normalize_advantages=False),
     ],
 )
 def test_the_better_action_is_found_if_the_data_has_both(config: Any) -> None:
@@ -286,8 +287,8 @@ def test_iql_values_are_between_mean_and_maximum() -> None:
 
 
 def test_normalized_advantages_do_not_depend_on_the_unit_of_the_reward() -> None:
-    settings = {**SMALL_Q, "updates": 1, "normalize_advantages": True, "beta": 1.0}
-    learner = cast(IQL, learner_of(IQLConfig(**settings), corridor(), 0, 1))
+    learner = cast(IQL, learner_of(IQLConfig(**{**SMALL_Q, "updates": 1}), corridor(), 0, 1))
+    assert learner.config.normalize_advantages
     advantages = torch.tensor([3.0, -4.0, 0.0, 0.0, 30.0, -40.0, 0.0, 0.0])
     # The advantages of the two seeds have the root mean squares 2.5 and 25.
     found = learner.normalized(advantages).tolist()

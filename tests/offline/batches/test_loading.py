@@ -278,8 +278,8 @@ def test_ranks_share_an_epoch(
 ) -> None:
     monkeypatch.setenv("GLOO_SOCKET_IFNAME", "lo")
     numbered([40, 30, 31]).save(log_path)
-    torch.multiprocessing.spawn(  # type: ignore[attr-defined, no-untyped-call]
-        _ranks, (str(log_path), str(tmp_path)), nprocs=2
+    torch.multiprocessing.start_processes(  # type: ignore[attr-defined, no-untyped-call]
+        _ranks, (str(log_path), str(tmp_path)), nprocs=2, start_method="fork"
     )
     seen = torch.cat([torch.load(tmp_path / f"{rank}.pt") for rank in range(2)])
     assert sorted(seen.tolist()) == list(range(101))

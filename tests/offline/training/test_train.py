@@ -223,7 +223,7 @@ def test_a_killed_run_resumes_bit_for_bit(whole: OfflineSummary, tmp_path: Path)
     assert_same_result(tmp_path / "cut", whole.folder.parent)
 
 
-LONG_CQL = replace(SHORT_CQL, updates=1500, checkpoint_interval=20)
+LONG_CQL = replace(SHORT_CQL, updates=700, checkpoint_interval=20)
 
 
 def test_a_run_killed_at_random_moments_resumes_bit_for_bit(tmp_path: Path) -> None:
