@@ -173,10 +173,10 @@ class IQLConfig(BootstrapConfig):
     """updates between two syncs of the target networks"""
     expectile: float = 0.8
     """expectile of the action values that V estimates; 0.5 is the mean, near 1 the maximum"""
-    beta: float = 3.0
+    beta: float = 0.5
     """inverse temperature of the advantage weights in cloning; 0 weights all actions equally"""
-    normalize_advantages: bool = False
-    """divide advantages by their root mean square in the batch; beta is then about 0.3 to 1"""
+    normalize_advantages: bool = True
+    """divide advantages by their root mean square in the batch; otherwise beta is per reward"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""

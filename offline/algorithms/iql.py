@@ -11,7 +11,8 @@ two target networks. They are synced every `target_interval` updates.
 
 Departures from the paper: actions are discrete, so the policy is a classifier and Q has one output
 per action. Target networks are synced at intervals instead of averaged. Q is trained with the Huber
-loss. Advantages can be divided by their root mean square, because their size differs between tasks.
+loss. By default, advantages are divided by their root mean square, because their size differs
+between tasks; with `normalize_advantages=False`, they are those of the paper.
 """
 
 from __future__ import annotations
