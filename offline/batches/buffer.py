@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 
 DEVICES = ("cpu", "cuda")
+_BLOCK_ROWS = 1 << 18
+"""Rows that are checked at once."""
 _ON_DEVICE = ("frames", "starts", "places", "actions", "returns")
 
 
@@ -72,7 +74,7 @@ class TransitionBuffer:
         action_space: Action space of the log.
         packing: Settings with which the transitions were built.
         frames: All observations, each stored once.
-        starts: (F,) int64, first frame of each frame's episode.
+        starts: (F,) int64, first frame of each frame's episode; empty if frames are not stacked.
         places: (2, N) int64, frame indexes of each transition's observation and next observation.
         actions: (N,) int64 action indexes, starting at 0.
         returns: (2, N) float32, n-step rewards and discounts; see `Batch`.
@@ -135,27 +137,26 @@ class TransitionBuffer:
         if len(dataset) == 0:
             raise TrainingError("the dataset has no transitions to learn from")
         lengths = dataset.episode_lengths
-        counts = lengths + 1
         if reward_scale is None:
             spread = packing.scale_rewards and return_spread(dataset, packing.gamma, share)
             reward_scale = spread or 1.0
         places, returns = n_step_returns(dataset, packing.n_steps, packing.gamma)
         returns[0] /= reward_scale
         frames = encoder.encode(dataset.frames)
-        actions = dataset.actions.astype(np.int64) - int(action_space.start)
+        actions = np.subtract(dataset.actions, action_space.start, dtype=np.int64)
         if actions.min() < 0 or actions.max() >= action_space.n:
             raise SpaceError(
                 f"the dataset has actions from {dataset.actions.min()} to {dataset.actions.max()},"
                 f" but its action space is {action_space}"
             )
-        _check_finite("rewards", torch.from_numpy(returns[0]))
+        _require_finite("rewards", _is_finite(torch.from_numpy(returns[0])))
         _check_data(dataset, frames, actions)
         buffer = cls(
             encoder=encoder,
             action_space=action_space,
             packing=packing,
             frames=frames,
-            starts=torch.from_numpy(np.repeat(np.cumsum(counts) - counts, counts)),
+            starts=_first_frames(lengths + 1, packing.frame_stack),
             places=torch.from_numpy(places),
             actions=torch.from_numpy(actions),
             returns=torch.from_numpy(returns),
@@ -282,20 +283,40 @@ def discrete_actions(space: spaces.Space[Any]) -> spaces.Discrete:
     return space
 
 
+def _first_frames(counts: NDArray[np.int64], frame_stack: int) -> Tensor:
+    """Return the first frame of each frame's episode if frames are stacked, else an empty tensor.
+
+    Args:
+        counts: (E,) number of frames of each episode.
+        frame_stack: Number of frames in a stack.
+    """
+    if frame_stack == 1:
+        return torch.empty(0, dtype=torch.int64)
+    return torch.from_numpy(np.repeat(np.cumsum(counts) - counts, counts))
+
+
 def _check_data(dataset: Dataset, frames: Observations, actions: NDArray[np.int64]) -> None:
     """Raise if a number is not finite or a logged action is masked out."""
-    rows = torch.from_numpy(dataset.frame_of_step)
-    _check_finite("observations", frames.vector[rows])
-    _check_finite("next_observations", frames.vector[rows + 1])
+    # All at once, the comparison would need more memory than the frames.
+    finite = torch.cat([_is_finite(block) for block in torch.split(frames.vector, _BLOCK_ROWS)])
+    if not finite.all():
+        rows = torch.from_numpy(dataset.frame_of_step)
+        _require_finite("observations", finite[rows])
+        _require_finite("next_observations", finite[rows + 1])
     if frames.mask is not None:
+        rows = torch.from_numpy(dataset.frame_of_step)
         allowed = frames.mask[rows, torch.from_numpy(actions)]
         if not allowed.all():
             row = int(allowed.int().argmin())
             raise TrainingError(f"action {dataset.actions[row]} of row {row} is masked out")
 
 
-def _check_finite(column: str, values: Tensor) -> None:
-    finite = values.isfinite().reshape(len(values), -1).all(1)
+def _is_finite(values: Tensor) -> Tensor:
+    """Return for each row whether all of its numbers are finite."""
+    return values.isfinite().reshape(len(values), -1).all(1)
+
+
+def _require_finite(column: str, finite: Tensor) -> None:
     if not finite.all():
         row = int(finite.int().argmin())
         raise TrainingError(f"{column} of row {row} have NaN or infinite numbers")

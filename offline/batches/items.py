@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 Arrays = dict[str, Any]
 """Arrays by name; observations of a Dict space are dicts of arrays."""
+_BLOCK_ROWS = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -164,20 +165,26 @@ def n_step_returns(
         observation if that comes earlier. The second, (2, N), contains the discounted sum of the
         rewards between these two observations, and the discount for the later observation's value.
     """
-    n_rows, lengths = len(dataset), dataset.episode_lengths
-    rows = np.arange(n_rows)
+    count, lengths = len(dataset), dataset.episode_lengths
     ends = np.repeat(np.cumsum(lengths), lengths)
-    ahead = np.minimum(n_steps, ends - rows)
-    rewards = np.zeros(n_rows)
-    for k in range(n_steps):
-        counts = ahead > k
-        rewards[counts] += gamma**k * dataset.rewards[rows[counts] + k]
-    lasts = rows + ahead - 1
-    discounts = np.where(dataset.terminated[lasts], 0.0, gamma ** ahead.astype(float))
     here = dataset.frame_of_step
-    places = np.stack([here, here + ahead])
-    with np.errstate(over="ignore"):
-        return places, np.stack([rewards, discounts]).astype(np.float32)
+    places, returns = np.empty((2, count), np.int64), np.empty((2, count), np.float32)
+    places[0] = here
+    # In blocks, so that the intermediate arrays need little memory.
+    for first in range(0, count, _BLOCK_ROWS):
+        block = slice(first, first + _BLOCK_ROWS)
+        rows = np.arange(first, min(first + _BLOCK_ROWS, count))
+        ahead = np.minimum(n_steps, ends[block] - rows)
+        rewards = np.zeros(len(rows))
+        for k in range(n_steps):
+            counts = ahead > k
+            rewards[counts] += gamma**k * dataset.rewards[rows[counts] + k]
+        discounts = gamma ** ahead.astype(float)
+        discounts[dataset.terminated[rows + ahead - 1]] = 0
+        places[1, block] = here[block] + ahead
+        with np.errstate(over="ignore"):
+            returns[0, block], returns[1, block] = rewards, discounts
+    return places, returns
 
 
 def returns_to_go(

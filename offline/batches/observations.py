@@ -153,6 +153,8 @@ class ObservationEncoder:
     def encode(self, observations: Any) -> Observations:
         """Encode B observations of the space: arrays (B, *shape), or nested dicts of these.
 
+        The result shares the memory of the arrays if they need no conversion.
+
         Raises:
             SpaceError: The observations have other shapes.
         """
@@ -174,7 +176,10 @@ class ObservationEncoder:
     def _vector(self, observations: Any) -> NDArray[Any]:
         rows = len(self.leaves[0].of(observations))
         parts = [_numbers(leaf.of(observations), part) for leaf, part in self.numbers]
-        vector = np.concatenate(parts, 1) if parts else np.empty((rows, 0), np.float32)
+        if len(parts) == 1:
+            vector = parts[0]
+        else:
+            vector = np.concatenate(parts, 1) if parts else np.empty((rows, 0), np.float32)
         if self.shift.any():
             vector = vector - self.shift
         return vector / self.scale if (self.scale != 1).any() else vector
