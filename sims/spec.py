@@ -7,12 +7,14 @@ import importlib
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
 
 from mcaprl.errors import UsageError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 GROUP: Final = "mcaprl.sims"
 """Entry point group; each entry point is named after its sim."""
@@ -132,6 +134,8 @@ class SimCatalog(Mapping[str, str]):
 @functools.cache
 def _installed() -> dict[str, EntryPoint]:
     """Return the entry points of installed packages by name."""
+    from importlib.metadata import entry_points
+
     return {found.name: found for found in entry_points(group=GROUP)}
 
 

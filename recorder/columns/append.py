@@ -8,13 +8,12 @@ from pathlib import Path
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
-from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.message_rows import RECORD_HEADER_BYTES
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import parse_record
+from mcaprl.recorder.columns.records import MAGIC, parse_record
 from mcaprl.recorder.columns.summary import Summary
 
 TopLevelRecord = Metadata | Schema | Channel | Attachment
@@ -74,7 +73,7 @@ def finished_state(reader: McapReader) -> WrittenState:
         if any(messages.chunk is None for messages in ranges):
             raise CorruptLogError(f"{channel.topic} has messages outside of chunks")
         summary.counts[channel.id] = sum(map(len, ranges))
-    for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
+    for offset, opcode, content in reader.records(len(MAGIC)):
         if opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             record: TopLevelRecord = parse_record(opcode, content)
             summary.add(record, offset, RECORD_HEADER_BYTES + len(content))

@@ -20,7 +20,6 @@ from pathlib import Path
 
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
-from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.files import is_at, work_folder
@@ -28,7 +27,7 @@ from mcaprl.recorder.columns.chunks import Compressors, Scratch, chunk_records
 from mcaprl.recorder.columns.file_lock import create
 from mcaprl.recorder.columns.output import OutputFile
 from mcaprl.recorder.columns.reader import end_of
-from mcaprl.recorder.columns.records import contents_of, map_file, records_of
+from mcaprl.recorder.columns.records import MAGIC, contents_of, map_file, records_of
 from mcaprl.recorder.columns.summary import Summary
 
 SMALL_CHUNK_BYTES = 2**16
@@ -157,7 +156,7 @@ class _CompactedFile(OutputFile):
         """Copy the bytes between two chunks; usually there are none."""
         if part.start == part.stop:
             return
-        first_record = part.start or len(MCAP0_MAGIC)
+        first_record = part.start or len(MAGIC)
         if any(op in _CHUNK_RECORDS for _, op, _ in records_of(view, first_record, part.stop)):
             raise CorruptLogError("the summary does not list all chunks and indexes")
         shift = self.position - part.start

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Statistics
-from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl.problem import Problem
@@ -22,7 +21,7 @@ from mcaprl.recorder.columns.message_rows import (
     windows,
 )
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import contents_of, is_intact_attachment, parse_record
+from mcaprl.recorder.columns.records import MAGIC, contents_of, is_intact_attachment, parse_record
 
 
 def place(reader: McapReader, chunk: ChunkIndex) -> str:
@@ -147,7 +146,7 @@ def check_file(reader: McapReader) -> list[Problem]:
         )
         found.append(Problem(what, f"after byte {reader.data_end}"))
     end = None
-    for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
+    for offset, opcode, content in reader.records(len(MAGIC)):
         if opcode == Opcode.ATTACHMENT and not is_intact_attachment(content):
             found.append(Problem("an attachment does not match its CRC", f"byte {offset}"))
         if opcode == Opcode.DATA_END:

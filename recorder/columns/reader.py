@@ -30,7 +30,6 @@ from mcap.records import (
     Schema,
     Statistics,
 )
-from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
@@ -44,6 +43,7 @@ from mcaprl.recorder.columns.message_rows import (
     message_index,
 )
 from mcaprl.recorder.columns.records import (
+    MAGIC,
     MESSAGE_START,
     RECORD_HEADER,
     ChunkContents,
@@ -94,7 +94,7 @@ class McapReader:
         self._view, self._state = map_unchanged(self.path)
         size = len(self._view)
         self.fetch([(0, _HEAD_BYTES), (size - _TAIL_BYTES, size)])
-        if bytes(self._view[: len(MCAP0_MAGIC)]) != MCAP0_MAGIC:
+        if bytes(self._view[: len(MAGIC)]) != MAGIC:
             raise NotMcapError(f"{self.path} is not an MCAP file: it has no magic bytes")
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -341,7 +341,7 @@ class McapReader:
         self.check_unchanged()
         found = None
         with self._named():
-            for offset, opcode, content in self.records(len(MCAP0_MAGIC)):
+            for offset, opcode, content in self.records(len(MAGIC)):
                 if opcode == Opcode.DATA_END:
                     break
                 if opcode == Opcode.ATTACHMENT:
@@ -395,7 +395,7 @@ class McapReader:
 
     def _read_between_chunks(self, unchunked: UnindexedMessages) -> None:
         """Read the records that the summary does not list. Without a summary, read all records."""
-        start, before = len(MCAP0_MAGIC), None
+        start, before = len(MAGIC), None
         found: list[ChunkIndex] = []
         if self._remote is not None and self.summary_start:
             starts = [start, *map(end_of, self.chunks)]

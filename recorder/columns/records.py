@@ -26,7 +26,6 @@ from mcap.records import (
     Schema,
     Statistics,
 )
-from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
@@ -34,6 +33,8 @@ from mcaprl.files import open_at_once
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 
+MAGIC = b"\x89MCAP0\r\n"
+"""First and last bytes of an MCAP file."""
 RECORD_HEADER = struct.Struct("<BQ")
 # The first fields of a message: channel, sequence number, log_time.
 MESSAGE_START = struct.Struct("<HIQ")
@@ -229,8 +230,8 @@ def _uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
 
 def start_of_summary(view: memoryview) -> int:
     """Return the offset of the summary section; 0 if the file has no summary or no footer."""
-    start = len(view) - len(MCAP0_MAGIC) - _FOOTER_BYTES
-    if start < len(MCAP0_MAGIC) or bytes(view[-len(MCAP0_MAGIC) :]) != MCAP0_MAGIC:
+    start = len(view) - len(MAGIC) - _FOOTER_BYTES
+    if start < len(MAGIC) or bytes(view[-len(MAGIC) :]) != MAGIC:
         return 0
     (found,) = struct.unpack_from("<Q", view, start + RECORD_HEADER_BYTES)
     return int(found) if found <= start else 0
@@ -242,8 +243,8 @@ def footer_of(view: memoryview) -> Footer | None:
     Raises:
         CorruptLogError: The summary is outside of the file, or does not match its CRC.
     """
-    start = len(view) - len(MCAP0_MAGIC) - _FOOTER_BYTES
-    if start < len(MCAP0_MAGIC) or bytes(view[-len(MCAP0_MAGIC) :]) != MCAP0_MAGIC:
+    start = len(view) - len(MAGIC) - _FOOTER_BYTES
+    if start < len(MAGIC) or bytes(view[-len(MAGIC) :]) != MAGIC:
         return None
     opcode, length = RECORD_HEADER.unpack_from(view, start)
     if opcode != Opcode.FOOTER or length != _FOOTER_BYTES - RECORD_HEADER_BYTES:
@@ -251,7 +252,7 @@ def footer_of(view: memoryview) -> Footer | None:
     footer: Footer = parse_record(opcode, view[start + RECORD_HEADER_BYTES :])
     if footer.summary_start == 0:
         return footer
-    if not len(MCAP0_MAGIC) <= footer.summary_start <= start:
+    if not len(MAGIC) <= footer.summary_start <= start:
         raise CorruptLogError("the footer points outside the file")
     covered = view[footer.summary_start : start + _FOOTER_BYTES - 4]
     if footer.summary_crc and crc32(covered) != footer.summary_crc:

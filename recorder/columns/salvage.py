@@ -17,13 +17,18 @@ from typing import Any
 import numpy as np
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.chunks import parse_chunk_index
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
-from mcaprl.recorder.columns.records import RECORD_HEADER, footer_of, parse_record, records_of
+from mcaprl.recorder.columns.records import (
+    MAGIC,
+    RECORD_HEADER,
+    footer_of,
+    parse_record,
+    records_of,
+)
 
 ValidRecord = tuple[int, int, memoryview]
 """Offset, opcode and content of a valid record."""
@@ -55,8 +60,8 @@ class Damage:
 
 def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidRecord]:
     """Yield the valid records of the data section; add each damaged range to `damages`."""
-    offset = len(MCAP0_MAGIC)
-    if bytes(view[:offset]) != MCAP0_MAGIC:
+    offset = len(MAGIC)
+    if bytes(view[:offset]) != MAGIC:
         damages.append(Damage(0, min(offset, len(view)), "no magic bytes"))
     while offset < len(view):
         content = _valid_record(view, offset)
@@ -76,7 +81,7 @@ def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidReco
         yield offset, opcode, content
         offset += RECORD_HEADER_BYTES + len(content)
         # Compare lengths first; otherwise, `bytes` would copy the rest of the file for each record.
-        if len(view) - offset == len(MCAP0_MAGIC) and bytes(view[offset:]) == MCAP0_MAGIC:
+        if len(view) - offset == len(MAGIC) and bytes(view[offset:]) == MAGIC:
             return
 
 

@@ -20,10 +20,10 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.chunks import chunk_index_record
+from mcaprl.recorder.columns.records import MAGIC
 
 
 @dataclass
@@ -98,7 +98,7 @@ class Summary:
         Footer(start, offsets_start, 0).write(builder)
         footer = builder.end()
         crc = crc32(footer[:-4], crc32(summary))
-        return bytes(summary + footer[:-4] + crc.to_bytes(4, "little") + MCAP0_MAGIC)
+        return bytes(summary + footer[:-4] + crc.to_bytes(4, "little") + MAGIC)
 
     def _statistics(self) -> Statistics:
         chunks = self.chunks

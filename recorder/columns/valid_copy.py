@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Metadata, Schema
-from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
@@ -19,7 +18,7 @@ from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.chunks import Scratch, chunk_header, chunk_records
 from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, RECORD_HEADER_BYTES
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import contents_of, map_file, only, parse_record
+from mcaprl.recorder.columns.records import MAGIC, contents_of, map_file, only, parse_record
 from mcaprl.recorder.columns.salvage import Damage, ValidRecord, intact_summary, valid_records
 from mcaprl.recorder.columns.writer import COMPRESSIONS, McapWriter
 from mcaprl.texts import counted
@@ -82,7 +81,7 @@ def copy_messages(
     Yields:
         The writer, for more messages.
     """
-    with writer_like(reader.view, reader.records(len(MCAP0_MAGIC)), target) as writer:
+    with writer_like(reader.view, reader.records(len(MAGIC)), target) as writer:
         top_level = written_state(reader.path).top_level
         for record in sorted(top_level, key=lambda record: not isinstance(record, Metadata)):
             writer.announce(record)

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema
-from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl._version import __version__
@@ -32,6 +31,7 @@ from mcaprl.recorder.columns.compact import compact
 from mcaprl.recorder.columns.file_lock import copy_start, create, release, reopen, replaced
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, adjacent_offsets, message_record
 from mcaprl.recorder.columns.output import OutputFile
+from mcaprl.recorder.columns.records import MAGIC
 from mcaprl.recorder.columns.signals import HoldSignals
 from mcaprl.recorder.columns.summary import Summary
 
@@ -251,7 +251,7 @@ class McapWriter(OutputFile):
     def _begin(self, path: Path, overwrite: bool) -> None:
         self._file, self.untouched = create(path, overwrite=overwrite), False
         self.path, self.position, self._crc, self._summary = path, 0, 0, Summary()
-        self._write(MCAP0_MAGIC)
+        self._write(MAGIC)
         self._write_record(Header(self._profile, f"mcaprl {__version__}"))
 
     def _continue(self, path: Path) -> None:

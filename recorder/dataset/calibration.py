@@ -116,7 +116,7 @@ def calibration(
             int((place == k).sum()),
             float(inverse[place == k].sum() / len(probs)),
         )
-        for k in np.unique(place)
+        for k in np.flatnonzero(np.bincount(place))
     ]
     actions, smallest = float(inverse.mean()), float(probs.min())
     error = float(inverse.std(ddof=1) / math.sqrt(len(inverse)))

@@ -11,7 +11,7 @@ successive dots, the CRC-32 of the name is appended to the topic.
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,8 @@ from mcaprl.recorder.format.reading import McapReader, Topic
 
 INFO_TOPICS = "/rl/info/"
 """Prefix of the topic names of infos."""
-Masked = np.ma.MaskedArray[Any, Any]
+# A string, because NumPy imports `np.ma` when it is first used.
+Masked: TypeAlias = "np.ma.MaskedArray[Any, Any]"
 
 
 def read_infos(reader: McapReader, times_ns: NDArray[np.int64]) -> dict[str, Masked]:

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import struct
 from functools import lru_cache
-from typing import Any
-
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
+from typing import TYPE_CHECKING, Any
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.texts import encodable
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 TEXT_TYPE = "std_msgs/msg/String"
 LOG_TYPE = "rcl_interfaces/msg/Log"
@@ -56,6 +56,8 @@ _EPISODE_START, _LOG_START = struct.Struct("<dqqqdII??"), struct.Struct("<IIB")
 @lru_cache(maxsize=1)
 def typestore() -> Typestore:
     """Return the type store with the message types of ROS 2 and mcaprl."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(EPISODE_TEXT, EPISODE_TYPE))
     return store

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema
-from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError
@@ -29,7 +28,7 @@ from mcaprl.recorder.columns.message_rows import (
     message_index,
 )
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import RECORD_HEADER, contents_of
+from mcaprl.recorder.columns.records import MAGIC, RECORD_HEADER, contents_of
 from mcaprl.recorder.columns.valid_copy import writer_like
 from mcaprl.recorder.columns.writer import McapWriter
 
@@ -196,7 +195,7 @@ def copy_selected(
         LogError: A file is damaged, or the new file cannot be written.
     """
     like = like or sources[0].reader
-    with writer_like(like.view, like.records(len(MCAP0_MAGIC)), target) as writer:
+    with writer_like(like.view, like.records(len(MAGIC)), target) as writer:
         for record in top_level:
             writer.announce(record)
         copy = _Copy(writer)
@@ -339,7 +338,7 @@ def _kept(source: Source, channel_id: int, index: NDArray[Any]) -> NDArray[np.bo
 def _top_level_ids(reader: McapReader) -> set[int]:
     """Return the ids of the channels that are stored outside of chunks and summary."""
     found = set()
-    for _, opcode, content in reader.records(len(MCAP0_MAGIC)):
+    for _, opcode, content in reader.records(len(MAGIC)):
         if opcode == Opcode.CHANNEL:
             found.add(int.from_bytes(content[:2], "little"))
         elif opcode == Opcode.DATA_END:
