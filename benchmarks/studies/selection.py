@@ -42,7 +42,7 @@ import argparse
 import functools
 import json
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -81,6 +81,8 @@ CANDIDATES: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "bcq": ("bcq", {}),
     "iql": ("iql", {"normalize_advantages": True, "beta": 0.3}),
 }
+FINALISTS: Final = ("iql", "cql, alpha .1")
+"""Candidates among which `auto` chooses by default."""
 SHORT, MODEL_UPDATES, SHORT_MODEL_UPDATES = 1_000, 1_000, 500
 """Updates of the short training, of FQE, and of FQE after the short training."""
 AT_SHORT: Final = f" after {SHORT}"
@@ -295,14 +297,22 @@ def largest(values: dict[str, float]) -> str:
     return max(values, key=values.__getitem__)
 
 
-def auto(log: Log, threshold: float = DETERMINISTIC, survivors: int | None = None) -> str:
+def auto(
+    log: Log,
+    finalists: Sequence[str] = (),
+    threshold: float = DETERMINISTIC,
+    survivors: int | None = None,
+) -> str:
     """Return the candidate that `auto` chooses.
 
     Below the entropy `threshold`, this is the candidate with the largest agreement, otherwise the
-    candidate with the largest value by pessimistic FQE.
+    candidate with the largest value by pessimistic FQE. If there are `finalists`, it is one of
+    them.
     """
     field = "agreement" if log.entropy < threshold else "first_value"
     values = log.means("pessimistic", field)
+    if finalists:
+        return largest({name: values[name] for name in finalists})
     if survivors is not None:
         short = log.means("pessimistic", field, "short")
         kept = sorted(short, key=short.__getitem__)[-survivors:]
@@ -354,10 +364,14 @@ def rules(candidates: Iterable[str]) -> dict[str, Rule]:
         "pessimistic FQE, first states": highest("pessimistic", "first_value"),
         "pessimistic FQE, all states": highest("pessimistic", "mean_value"),
         "agreement with the behavior": highest("pessimistic", "agreement"),
-        **{f"auto, entropy below {t}": partial(auto, threshold=t) for t in (0.02, 0.05, 0.1, 0.2)},
+        "auto": partial(auto, finalists=FINALISTS),
+        **{
+            f"auto, all candidates, entropy below {t}": partial(auto, threshold=t)
+            for t in (0.02, 0.05, 0.1, 0.2)
+        },
         "ranks of pessimistic FQE and SBV": ranks,
-        "auto, 3 survivors": partial(auto, survivors=3),
-        "auto, 4 survivors": partial(auto, survivors=4),
+        "auto, all candidates, 3 survivors": partial(auto, survivors=3),
+        "auto, all candidates, 4 survivors": partial(auto, survivors=4),
     }
 
 

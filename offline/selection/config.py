@@ -9,6 +9,8 @@ from mcaprl.offline.algorithms.config import BootstrapConfig
 
 AUTO: Final = "auto"
 """Name of the algorithm that chooses among the others."""
+ALL: Final = "all"
+"""Value of `finalists` that allows the choice of every candidate."""
 
 
 @dataclass(frozen=True)
@@ -17,8 +19,10 @@ class AutoConfig(BootstrapConfig):
 
     target_interval: int = 150
     """updates between two updates of the target network"""
+    finalists: str = "iql,cql-alpha-0.1"
+    """candidates among which the choice is made, separated by commas; `all` for all of them"""
     survivors: int = 4
-    """number of candidates that are trained with all updates"""
+    """maximum number of finalists that are trained with all updates"""
     short_fraction: float = 0.25
     """fraction of the updates after which the candidates are first compared"""
     model_updates: int = 2_000

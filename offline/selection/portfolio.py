@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from mcaprl.errors import UnknownNameError
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.estimate.evidence import Clone, likely
 from mcaprl.offline.estimate.values import by_rows
-from mcaprl.offline.selection.config import AutoConfig
+from mcaprl.offline.selection.config import ALL, AutoConfig
 from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.format.probability import is_impossible
 
@@ -24,7 +25,7 @@ DETERMINISTIC: Final = 0.05
 LEAST_COVERAGE: Final = 0.5
 """Fraction of the actions that must be likely in the log before Double DQN is tried."""
 _IQL_INTERVAL: Final = 50
-_OWN: Final = ("survivors", "short_fraction", "model_updates")
+_OWN: Final = ("finalists", "survivors", "short_fraction", "model_updates")
 
 
 @dataclass(frozen=True)
@@ -115,12 +116,12 @@ class Candidate:
 
 
 PORTFOLIO: Final = (
+    Candidate("iql", "iql", {"normalize_advantages": True, "beta": 0.3}),
+    Candidate("cql-alpha-0.1", "cql", {"alpha": 0.1}),
     Candidate("bcq", "bcq", {}),
     Candidate("cql", "cql", {}),
     Candidate("bc", "bc", {}),
-    Candidate("cql-alpha-0.1", "cql", {"alpha": 0.1}),
     Candidate("cql-scaled", "cql", {"scale_rewards": True}),
-    Candidate("iql", "iql", {"normalize_advantages": True, "beta": 0.3}),
     Candidate("double-dqn", "double-dqn", {}),
 )
 """All candidates, in the order of their training; the first is used if none can be evaluated."""
@@ -138,6 +139,28 @@ def candidates_for(traits: LogTraits) -> dict[str, str]:
         alike = "all episodes have the same return, so there is nothing to prefer"
         skipped |= {one.name: alike for one in PORTFOLIO if one.algo not in ("bc", "bcq", "cql")}
     return skipped
+
+
+def check_finalists(config: AutoConfig) -> None:
+    """Check the names of the finalists.
+
+    Raises:
+        UnknownNameError: There is no candidate of this name.
+    """
+    known = [one.name for one in PORTFOLIO]
+    for name in config.finalists.split(","):
+        if name not in (*known, ALL):
+            raise UnknownNameError("candidate", name, known)
+
+
+def eligible(config: AutoConfig, trying: Sequence[Candidate]) -> frozenset[str]:
+    """Return the names of the candidates among which the choice is made.
+
+    These are the finalists, or all that are tried if a finalist is not.
+    """
+    names = frozenset(one.name for one in trying)
+    finalists = frozenset(config.finalists.split(","))
+    return finalists if finalists <= names else names
 
 
 def tried(skipped: Sequence[str] | Mapping[str, str]) -> list[Candidate]:

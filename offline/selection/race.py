@@ -7,9 +7,9 @@
     RUN/choice.json       what was chosen, and why
     RUN/seed-K            policy of the chosen candidate
 
-All candidates are trained with a fraction of the updates (the short training). The best of them, by
-`rule`, are trained with the rest. After the first candidate's short training, RUN/seed-K always has
-a policy, also if the run is interrupted.
+All candidates are trained with a fraction of the updates (the short training). The best of the
+finalists, by `rule`, are trained with the rest, and one of them is chosen. After the first
+candidate's short training, RUN/seed-K always has a policy, also if the run is interrupted.
 """
 
 from __future__ import annotations
@@ -49,6 +49,8 @@ from mcaprl.offline.selection.portfolio import (
     Candidate,
     LogTraits,
     candidates_for,
+    check_finalists,
+    eligible,
     traits_of,
     tried,
 )
@@ -144,8 +146,10 @@ def select(
         SpaceError: The algorithms do not support these observations or actions.
         TrainingError: A loss is not finite; `out` cannot be written, or contains a run with other
             data or settings; or the budget ended before any policy was trained.
+        UnknownNameError: A finalist is not a candidate.
         UsageError: There are too few episodes.
     """
+    check_finalists(config)
     if len(dataset.episodes) < FOLDS:
         raise UsageError(f"--algo {AUTO} needs {FOLDS} episodes or more in the log")
     weights = np.ones(len(dataset.episodes)) if weights is None else weights
@@ -212,6 +216,7 @@ class _Race:
         self._seeds, self._weights, self._device = seeds, weights, device
         self._clock, self._progress = clock, progress
         self._in_time = True
+        self._eligible: frozenset[str] = frozenset()
 
     def run(self) -> tuple[Choice, list[OfflineSummary]]:
         """Run both stages. Return the choice, and a summary for each seed."""
@@ -219,7 +224,9 @@ class _Race:
         skipped = candidates_for(traits)
         trying = tried(skipped)
         short, full = self._config.short_updates, self._config.updates
-        total = len(trying) * short + min(len(trying), self._config.survivors) * (full - short)
+        self._eligible = eligible(self._config, trying)
+        count = min(len(self._eligible), self._config.survivors)
+        total = len(trying) * short + count * (full - short)
         bar = _Bar(self._progress, total)
         stages = self._read_stages()
         for k, candidate in enumerate(trying):
@@ -237,9 +244,9 @@ class _Race:
             fraction=_SHORT_MODEL_FRACTION,
             share=SHARES[1],
         )
-        going = names
+        going = self._finalists(names)
         if first:
-            going = ranked(first.ratings)[: self._config.survivors]
+            going = self._finalists(ranked(first.ratings))[: self._config.survivors]
             self._publish(going[0])
         for k, name in enumerate(going):
             candidate = next(one for one in trying if one.name == name)
@@ -256,6 +263,10 @@ class _Race:
         self._publish(choice.chosen)
         choice.write(self._out)
         return choice, self._summaries(choice.chosen)
+
+    def _finalists(self, names: Sequence[str]) -> list[str]:
+        """Return the finalists among the candidates; all candidates if none is a finalist."""
+        return [name for name in names if name in self._eligible] or list(names)
 
     def _look(self) -> tuple[Policy, LogTraits]:
         """Clone the behavior policy, and determine the properties of the log."""
@@ -425,8 +436,8 @@ class _Race:
         """Return the choice according to the latest evaluation."""
         last = second or first
         ratings = last.ratings if last else {}
-        order = ranked(ratings)
-        chosen = order[0] if order else names[0]
+        order = self._finalists(ranked(ratings))
+        chosen = (order or self._finalists(names))[0]
         rest = [name for name in ranked(first.ratings) if name not in order] if first else []
         known = {name: Tried(self._updates(name), outcome="not evaluated") for name in names}
         for stage, outcome in ((first, "stopped early"), (second, "")):

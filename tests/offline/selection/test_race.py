@@ -15,7 +15,7 @@ from mcaprl.errors import OutputExistsError, TrainingError, UsageError
 from mcaprl.offline.policy import read_policy
 from mcaprl.offline.selection.choice import read_choice
 from mcaprl.offline.selection.config import AutoConfig
-from mcaprl.offline.selection.portfolio import PORTFOLIO
+from mcaprl.offline.selection.portfolio import PORTFOLIO, eligible
 from mcaprl.offline.selection.race import select
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -75,6 +75,20 @@ def test_two_candidates_make_all_updates_and_the_others_a_quarter(finished: Path
     assert sorted(outcomes.values()) == ["runner-up"] + ["stopped early"] * (len(done) - 2)
     assert next(iter(choice.tried)) == choice.chosen
     assert choice.chosen in choice.reason
+    finalists = [name for name, one in choice.tried.items() if one.outcome != "stopped early"]
+    assert sorted(finalists) == ["cql-alpha-0.1", "iql"]
+
+
+def test_with_all_finalists_the_best_candidates_make_all_updates(
+    data: Dataset, tmp_path: Path
+) -> None:
+    choice, _ = select(data, replace(CONFIG, finalists="all"), tmp_path / "run")
+    stages = json.loads((tmp_path / "run" / "stages.json").read_text())
+    short = {name: one["rating"]["score"] for name, one in stages["short"].items()}
+    best = sorted(short, key=lambda name: -short[name])[:2]
+    assert sorted(stages["full"]) == sorted(best)
+    assert {name for name, count in updates(tmp_path / "run").items() if count == 40} == set(best)
+    assert choice.chosen in best
 
 
 def test_the_run_contains_the_policy_of_the_chosen_candidate(finished: Path) -> None:
@@ -111,6 +125,13 @@ def test_actions_that_are_rare_in_the_log_exclude_double_dqn(tmp_path: Path) -> 
     assert ratings[0].agreement == ratings[0].score == 1
     assert "double-dqn" not in updates(tmp_path / "run")
     assert choice.tried["double-dqn"].outcome.startswith("not tried: only 50% of the actions")
+
+
+def test_all_candidates_are_eligible_if_a_finalist_is_not_tried() -> None:
+    iql, cql, *others = PORTFOLIO
+    assert eligible(CONFIG, PORTFOLIO) == {"iql", "cql-alpha-0.1"} == {iql.name, cql.name}
+    assert eligible(CONFIG, [cql, *others]) == {cql.name, *(one.name for one in others)}
+    assert len(eligible(replace(CONFIG, finalists="all"), PORTFOLIO)) == len(PORTFOLIO)
 
 
 def test_the_same_run_again_is_bit_equal(data: Dataset, finished: Path, tmp_path: Path) -> None:
@@ -168,6 +189,7 @@ def test_a_budget_ends_the_run_with_a_policy(data: Dataset, tmp_path: Path) -> N
     assert "--budget-minutes" in choice.advice[0]
     assert 0 < max(updates(run).values()) < 100_000
     assert set(choice.tried) == {candidate.name for candidate in PORTFOLIO}
+    assert choice.chosen in ("iql", "cql-alpha-0.1")
     assert mcaprl.load_policy(run).act(np.eye(2, dtype=np.float32)).shape == (2,)
 
 
@@ -223,6 +245,7 @@ def test_auto_in_the_api_with_a_report(data: Dataset, tmp_path: Path) -> None:
         ({"algo": "auto", "budget_minutes": 0}, "--budget-minutes 0: give a number above 0"),
         ({"algo": "auto", "frame_stack": 2}, "frame_stack must be 1 for auto, got 2"),
         ({"algo": "auto", "survivors": 0}, "survivors must be at least 1"),
+        ({"algo": "auto", "finalists": "iql,ppo"}, "unknown candidate 'ppo'"),
         ({"algo": "auto", "alpha": 1.0}, "auto has no setting --alpha"),
     ],
 )
