@@ -39,6 +39,11 @@ SHARED: dict[str, Any] = {
     "final_learning_rate_fraction": 1.0,
 }
 VALUES: dict[str, Any] = {"gamma": 0.99, "target_interval": 200}
+# The table compares the algorithms of the papers, without our normalization.
+SPECIAL: dict[str, dict[str, Any]] = {
+    "cql": {"scale_rewards": False},
+    "iql": {"normalize_advantages": False, "beta": 3.0},
+}
 ALGOS = ("cql", "double-dqn", "bc", "bcq", "iql")
 RIVALS = {
     "double-dqn": "DoubleDQNConfig",
@@ -67,7 +72,7 @@ def ours(data: mcaprl.Dataset, algo: str, seeds: int) -> list[float]:
     """Return the mean return of each seed."""
     learner_type = ALGORITHMS[algo]
     values = VALUES if issubclass(learner_type.config_type, BootstrapConfig) else {}
-    config = learner_type.config_type(**SHARED, **values)
+    config = learner_type.config_type(**SHARED, **values, **SPECIAL.get(learner_type.name, {}))
     learner = learner_type(
         config, TransitionBuffer.from_dataset(data, config.packing), range(seeds)
     )

@@ -1,4 +1,4 @@
-"""Train five algorithms on six logs of each sim, with four seeds.
+"""Train five algorithms on six logs of each sim, two of them in several ways, with four seeds.
 
     python -m benchmarks.studies.sim_grid FOLDER [--sims lane,racer] [--data weak] [--algos cql]
 
@@ -42,15 +42,20 @@ from mcaprl.sims import Policy, PolicyScore, evaluate, make_sim, make_sims, norm
 
 Special = dict[str, Any] | Callable[[mcaprl.Dataset], dict[str, Any]]
 SEEDS, EPISODES, EPISODE_SEED = 4, 30, 1_000_000
+PLAIN_CQL: Special = {"scale_rewards": False}
+PLAIN_IQL: Special = {"normalize_advantages": False, "beta": 3.0}
+NORMALIZED: Special = {"normalize_advantages": True, "beta": 0.5}
 ALGOS: dict[str, tuple[str, Special]] = {
-    "cql": ("cql", {}),
-    "cql, alpha .1": ("cql", {"alpha": 0.1}),
+    "cql": ("cql", PLAIN_CQL),
+    "cql, scaled": ("cql", {"scale_rewards": True}),
+    "cql, alpha .1": ("cql", {"scale_rewards": False, "alpha": 0.1}),
     "bc": ("bc", {}),
     "double-dqn": ("double-dqn", {}),
     "bcq": ("bcq", {}),
-    "iql": ("iql", {}),
+    "iql": ("iql", PLAIN_IQL),
+    "iql, normalized, beta .5": ("iql", NORMALIZED),
 }
-"""Algorithm and settings, by column; CQL has a penalty weight of 1, its default, or of 0.1."""
+"""Algorithm and settings, by column; without normalization if its name does not say so."""
 
 
 def above_entropy(data: mcaprl.Dataset) -> dict[str, Any]:
@@ -64,12 +69,12 @@ def above_entropy(data: mcaprl.Dataset) -> dict[str, Any]:
 
 
 STUDY: dict[str, tuple[str, Special]] = {
-    "cql": ("cql", {"scale_rewards": False}),
+    "cql": ("cql", PLAIN_CQL),
     "cql, scaled": ("cql", {"scale_rewards": True}),
     "cql, gap 1, scaled": ("cql", {"target_gap": 1.0, "scale_rewards": True}),
     "cql, gap of a clone + .2, scaled": ("cql", above_entropy),
-    "iql": ("iql", {"normalize_advantages": False, "beta": 3.0}),
-    "iql, normalized, beta .5": ("iql", {"normalize_advantages": True, "beta": 0.5}),
+    "iql": ("iql", PLAIN_IQL),
+    "iql, normalized, beta .5": ("iql", NORMALIZED),
 }
 """Columns of the comparison of settings; the first one of each algorithm has no normalization."""
 SHARED: dict[str, Any] = {"updates": 4_000, "batch_size": 128}
