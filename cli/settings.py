@@ -93,9 +93,8 @@ def _all_defaults(
     for where, value in (*defaults.items(), *of_sims.items()):
         if value != default:
             others.setdefault(value, []).append(where)
-    return "; ".join(
-        [_shown(default), *(f"{', '.join(each)}: {_shown(value)}" for value, each in others.items())]
-    )
+    differing = [f"{', '.join(where)}: {_shown(value)}" for value, where in others.items()]
+    return "; ".join([_shown(default), *differing])
 
 
 def _shown(value: Any) -> str:

@@ -42,9 +42,9 @@ from mcaprl.sims import Policy, PolicyScore, evaluate, make_sim, make_sims, norm
 
 Special = dict[str, Any] | Callable[[mcaprl.Dataset], dict[str, Any]]
 SEEDS, EPISODES, EPISODE_SEED = 4, 30, 1_000_000
-PLAIN_CQL: Special = {"scale_rewards": False}
-PLAIN_IQL: Special = {"normalize_advantages": False, "beta": 3.0}
-NORMALIZED: Special = {"normalize_advantages": True, "beta": 0.5}
+PLAIN_CQL: dict[str, Any] = {"scale_rewards": False}
+PLAIN_IQL: dict[str, Any] = {"normalize_advantages": False, "beta": 3.0}
+NORMALIZED_IQL: dict[str, Any] = {"normalize_advantages": True, "beta": 0.3}
 ALGOS: dict[str, tuple[str, Special]] = {
     "cql": ("cql", PLAIN_CQL),
     "cql, scaled": ("cql", {"scale_rewards": True}),
@@ -53,7 +53,7 @@ ALGOS: dict[str, tuple[str, Special]] = {
     "double-dqn": ("double-dqn", {}),
     "bcq": ("bcq", {}),
     "iql": ("iql", PLAIN_IQL),
-    "iql, normalized, beta .5": ("iql", NORMALIZED),
+    "iql, normalized": ("iql", NORMALIZED_IQL),
 }
 """Algorithm and settings, by column; without normalization if its name does not say so."""
 
@@ -74,7 +74,7 @@ STUDY: dict[str, tuple[str, Special]] = {
     "cql, gap 1, scaled": ("cql", {"target_gap": 1.0, "scale_rewards": True}),
     "cql, gap of a clone + .2, scaled": ("cql", above_entropy),
     "iql": ("iql", PLAIN_IQL),
-    "iql, normalized, beta .5": ("iql", NORMALIZED),
+    "iql, normalized, beta .5": ("iql", {**NORMALIZED_IQL, "beta": 0.5}),
 }
 """Columns of the comparison of settings; the first one of each algorithm has no normalization."""
 SHARED: dict[str, Any] = {"updates": 4_000, "batch_size": 128}
