@@ -1,4 +1,4 @@
-"""Train five algorithms on six logs of each sim, two of them in several ways, with four seeds.
+"""Train five algorithms on six logs of each sim, CQL and IQL in two ways, with four seeds.
 
     python -m benchmarks.studies.sim_grid FOLDER [--sims lane,racer] [--data weak] [--algos cql]
 
@@ -47,8 +47,7 @@ PLAIN_IQL: dict[str, Any] = {"normalize_advantages": False, "beta": 3.0}
 NORMALIZED_IQL: dict[str, Any] = {"normalize_advantages": True, "beta": 0.3}
 ALGOS: dict[str, tuple[str, Special]] = {
     "cql": ("cql", PLAIN_CQL),
-    "cql, scaled": ("cql", {"scale_rewards": True}),
-    "cql, alpha .1": ("cql", {"scale_rewards": False, "alpha": 0.1}),
+    "cql, alpha .1": ("cql", {**PLAIN_CQL, "alpha": 0.1}),
     "bc": ("bc", {}),
     "double-dqn": ("double-dqn", {}),
     "bcq": ("bcq", {}),
