@@ -44,7 +44,7 @@ Special = dict[str, Any] | Callable[[mcaprl.Dataset], dict[str, Any]]
 SEEDS, EPISODES, EPISODE_SEED = 4, 30, 1_000_000
 PLAIN_CQL: dict[str, Any] = {"scale_rewards": False}
 PLAIN_IQL: dict[str, Any] = {"normalize_advantages": False, "beta": 3.0}
-NORMALIZED_IQL: dict[str, Any] = {"normalize_advantages": True, "beta": 0.3}
+NORMALIZED_IQL: dict[str, Any] = {"normalize_advantages": True, "beta": 0.5}
 ALGOS: dict[str, tuple[str, Special]] = {
     "cql": ("cql", PLAIN_CQL),
     "cql, alpha .1": ("cql", {**PLAIN_CQL, "alpha": 0.1}),
@@ -52,7 +52,7 @@ ALGOS: dict[str, tuple[str, Special]] = {
     "double-dqn": ("double-dqn", {}),
     "bcq": ("bcq", {}),
     "iql": ("iql", PLAIN_IQL),
-    "iql, normalized": ("iql", NORMALIZED_IQL),
+    "iql, normalized, beta .5": ("iql", NORMALIZED_IQL),
 }
 """Algorithm and settings, by column; without normalization if its name does not say so."""
 
@@ -73,7 +73,7 @@ STUDY: dict[str, tuple[str, Special]] = {
     "cql, gap 1, scaled": ("cql", {"target_gap": 1.0, "scale_rewards": True}),
     "cql, gap of a clone + .2, scaled": ("cql", above_entropy),
     "iql": ("iql", PLAIN_IQL),
-    "iql, normalized, beta .5": ("iql", {**NORMALIZED_IQL, "beta": 0.5}),
+    "iql, normalized, beta .5": ("iql", NORMALIZED_IQL),
 }
 """Columns of the comparison of settings; the first one of each algorithm has no normalization."""
 SHARED: dict[str, Any] = {"updates": 4_000, "batch_size": 128}

@@ -173,7 +173,7 @@ class IQLConfig(BootstrapConfig):
     """updates between two syncs of the target networks"""
     expectile: float = 0.8
     """expectile of the action values that V estimates; 0.5 is the mean, near 1 the maximum"""
-    beta: float = 0.3
+    beta: float = 0.5
     """inverse temperature of the advantage weights in cloning; 0 weights all actions equally"""
     normalize_advantages: bool = True
     """divide advantages by their root mean square in the batch; otherwise beta is per reward"""
