@@ -31,6 +31,7 @@ from mcaprl.ray.sweep_file import SweepPlan, Trial
 from mcaprl.ray.workers import MOST_DEATHS, check_machine, check_machines
 from mcaprl.recorder.dataset.log_reader import LogReader
 from mcaprl.recorder.format.metadata import installed_versions
+from mcaprl.runs import POLICY_NAME
 
 PLAN_NAME, SCORES_NAME = "sweep.json", "scores.json"
 _SPLIT_SEED = 0
@@ -232,16 +233,21 @@ def _train(job: _Job, trial: Trial, folder: Path) -> None:
         tune.report({"score": score.mean, "updates": score.updates})
     done = scores[-1].updates if scores else 0
 
-    def progress(now: TrainingProgress) -> None:
+    def add(updates: int) -> None:
         nonlocal done
-        is_due = now.done % plan.score.every == 0 or now.done == now.total
-        if now.seed != plan.seed + plan.seeds - 1 or not is_due or now.done <= done:
-            return
-        done = now.done
-        scores.append(_score(folder, plan, evaluator, now.done))
+        done = updates
+        scores.append(_score(folder, plan, evaluator, updates))
         _save(folder, scores, "")
-        tune.report({"score": scores[-1].mean, "updates": now.done})
+        tune.report({"score": scores[-1].mean, "updates": updates})
 
+    def progress(now: TrainingProgress) -> None:
+        is_due = now.done % plan.score.every == 0 or now.done == now.total
+        if now.seed == plan.seed + plan.seeds - 1 and is_due and now.done > done:
+            add(now.done)
+
+    # A worker can be killed after it has written a checkpoint, and before its score.
+    if (saved := _saved_updates(folder, plan)) > done:
+        add(saved)
     train(
         dataset._take(learned),
         trial.config,
@@ -252,6 +258,15 @@ def _train(job: _Job, trial: Trial, folder: Path) -> None:
         resume=folder.exists(),
         progress=progress,
     )
+
+
+def _saved_updates(folder: Path, plan: SweepPlan) -> int:
+    """Return the number of updates of the saved policies; 0 if it differs between the seeds."""
+    found = set()
+    for seed in range(plan.seed, plan.seed + plan.seeds):
+        path = folder / f"seed-{seed}" / POLICY_NAME
+        found.add(int(parse_json(path.read_bytes())["updates"]) if path.exists() else 0)
+    return found.pop() if len(found) == 1 else 0
 
 
 def _score(folder: Path, plan: SweepPlan, evaluator: OffPolicyEvaluator, updates: int) -> Score:

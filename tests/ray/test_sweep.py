@@ -215,6 +215,26 @@ def test_a_sweep_ranks_policies_by_the_episodes_that_they_have_not_learned_from(
     assert "--updates and --sweep: write the setting into" in capsys.readouterr().err
 
 
+def test_a_trial_killed_between_checkpoint_and_score_has_all_scores(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ray import tune
+
+    reported: list[int] = []
+    monkeypatch.setattr(tune, "report", lambda found: reported.append(found["updates"]))
+    tree = {"algos": ["bc"], "settings": {"updates": 8, "hidden": [8]}, "seeds": 2}
+    plan = read_plan({**tree, "score": {"every": 4, "updates": 5, "fraction": 0.5}})
+    job = sweep._Job((str(log),), plan, tmp_path, installed_versions())
+    (trial,) = plan.trials
+    sweep._train(job, trial, tmp_path / trial.name)
+    whole = sweep._result(trial, tmp_path).scores
+    assert [one.updates for one in whole] == reported == [4, 8]
+    sweep._save(tmp_path / trial.name, whole[:1], "")
+    sweep._train(job, trial, tmp_path / trial.name)
+    assert sweep._result(trial, tmp_path).scores == whole
+    assert reported == [4, 8, 4, 8]
+
+
 @pytest.mark.usefixtures("ray_cluster")
 def test_other_versions_and_unseen_paths_are_found_before_the_trials_start(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
