@@ -6,6 +6,8 @@ BIN := $(VENV)/bin
 # Without the cache of compiled modules, every process that is started compiles what it imports.
 unexport PYTHONDONTWRITEBYTECODE
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
+# CI also runs the tests that take minutes.
+QUICK := $(if $(filter true,$(CI)),,-m "not slow and not long")
 # A change of these files reinstalls the environments.
 SETTINGS := pyproject.toml constraints.txt
 
@@ -13,7 +15,7 @@ SETTINGS := pyproject.toml constraints.txt
 
 help:
 	@echo "make demo             record a car, train on its log offline, evaluate, and write the replay"
-	@echo "make test             run all tests"
+	@echo "make test             run the tests; with CI=true, also those that take minutes"
 	@echo "make faults           run the fault tests at full size: kills, damaged files, failed writes"
 	@echo "make fuzz             fuzz the reader for ten minutes"
 	@echo "make check            check format, lint, words, types and import contracts"
@@ -35,7 +37,7 @@ demo: $(VENV)/.demo
 	  "Next: docs/tutorial.md, and docs/howto/environment.md for your environment."
 
 test: $(VENV)/.dev $(VENV)/.lerobot $(VENV)/.s3 $(VENV)/.rivals tests/node/node_modules
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder $(QUICK)
 
 faults: $(VENV)/.dev
 	rm -f $(VENV)/fault-figures

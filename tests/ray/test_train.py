@@ -101,6 +101,7 @@ def trained(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Trained:
     return Trained(data, mcaprl.train(data, folder / "local", **OPTIONS), found, done)
 
 
+@pytest.mark.long
 def test_weights_are_those_of_one_process_if_a_worker_is_killed(trained: Trained) -> None:
     assert [one.seed for one in trained.found] == [0, 1]
     assert all(0 < one.resumed_at < one.steps for one in trained.found), "no worker was lost"
@@ -122,6 +123,7 @@ def test_weights_are_those_of_one_process_if_a_worker_is_killed(trained: Trained
     assert sorted(path.name for path in ray.iterdir()) == sorted(p.name for p in local.iterdir())
 
 
+@pytest.mark.long
 def test_a_run_is_resumed_by_another_number_of_workers_with_the_same_data(
     trained: Trained, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
