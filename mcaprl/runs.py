@@ -218,6 +218,19 @@ def policy_files(path: Path) -> list[Path]:
     return [file for file in files if file.exists()]
 
 
+def saved_updates(run: Path, seeds: int) -> int:
+    """Return the number of updates that all saved policies of a run have.
+
+    Args:
+        run: Run folder.
+        seeds: Number of seeds. If fewer have a saved policy, the result is 0.
+    """
+    files = policy_files(run)
+    if len(files) < seeds:
+        return 0
+    return min(int(parse_json(file.read_bytes())["updates"]) for file in files)
+
+
 def read_curve(path: Path) -> Curve:
     """Read the columns of a `metrics.csv` or `curve.csv`.
 

@@ -60,7 +60,7 @@ class LogSet(NamedTuple):
         medium_epsilon: The same in the medium log.
         mixed_epsilons: The same in each part of the mixed log.
         wrong: Probability of the wrong action in the weak log.
-        clumsy: Probability of a random action in the other cases in the weak log.
+        clumsy: Probability of a random action in the weak log if the wrong one is not taken.
     """
 
     steps: int
@@ -126,7 +126,7 @@ class WeakPilot(EpsilonGreedy):
             env: Environment of the sim.
             sim: Name of the sim.
             wrong: Probability of the wrong action.
-            clumsy: Probability of a random action in the other cases.
+            clumsy: Probability of a random action if the wrong one is not taken.
         """
         super().__init__(make_pilot(env), clumsy, env.action_space)
         self._probability, self._clumsy = wrong, clumsy

@@ -31,7 +31,7 @@ from mcaprl.ray.sweep_file import SweepPlan, Trial
 from mcaprl.ray.workers import MOST_DEATHS, check_machine, check_machines
 from mcaprl.recorder.dataset.log_reader import LogReader
 from mcaprl.recorder.format.metadata import installed_versions
-from mcaprl.runs import POLICY_NAME
+from mcaprl.runs import saved_updates
 
 PLAN_NAME, SCORES_NAME = "sweep.json", "scores.json"
 _SPLIT_SEED = 0
@@ -246,7 +246,7 @@ def _train(job: _Job, trial: Trial, folder: Path) -> None:
             add(now.done)
 
     # A worker can be killed after it has written a checkpoint, and before its score.
-    if (saved := _saved_updates(folder, plan)) > done:
+    if (saved := saved_updates(folder, plan.seeds)) > done:
         add(saved)
     train(
         dataset._take(learned),
@@ -258,15 +258,6 @@ def _train(job: _Job, trial: Trial, folder: Path) -> None:
         resume=folder.exists(),
         progress=progress,
     )
-
-
-def _saved_updates(folder: Path, plan: SweepPlan) -> int:
-    """Return the number of updates of the saved policies; 0 if it differs between the seeds."""
-    found = set()
-    for seed in range(plan.seed, plan.seed + plan.seeds):
-        path = folder / f"seed-{seed}" / POLICY_NAME
-        found.add(int(parse_json(path.read_bytes())["updates"]) if path.exists() else 0)
-    return found.pop() if len(found) == 1 else 0
 
 
 def _score(folder: Path, plan: SweepPlan, evaluator: OffPolicyEvaluator, updates: int) -> Score:

@@ -176,7 +176,7 @@ class IQLConfig(BootstrapConfig):
     beta: float = 0.5
     """inverse temperature of the advantage weights in cloning; 0 weights all actions equally"""
     normalize_advantages: bool = True
-    """divide advantages by their root mean square in the batch; otherwise beta is per reward"""
+    """divide advantages by their root mean square in the batch, so that beta has no unit"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""

@@ -58,7 +58,15 @@ from mcaprl.offline.selection.rule import Rating, ranked, rate
 from mcaprl.offline.training.metrics import OfflineSummary
 from mcaprl.offline.training.train import fingerprint, train
 from mcaprl.progress import ProgressCallback, TrainingProgress
-from mcaprl.runs import METRICS_NAME, POLICY_NAME, RunIdentity, locked_run, open_run, policy_files
+from mcaprl.runs import (
+    METRICS_NAME,
+    POLICY_NAME,
+    RunIdentity,
+    locked_run,
+    open_run,
+    policy_files,
+    saved_updates,
+)
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -468,14 +476,8 @@ class _Race:
         return self._out / "candidates" / name
 
     def _updates(self, name: str) -> int:
-        """Return the number of updates of a candidate's saved policies.
-
-        If a seed has no saved policy, the number is 0.
-        """
-        files = policy_files(self._folder(name)) if self._folder(name).exists() else []
-        if len(files) < len(self._seeds):
-            return 0
-        return min(int(parse_json(file.read_bytes())["updates"]) for file in files)
+        """Return the number of updates of a candidate's saved policies; 0 if a seed has none."""
+        return saved_updates(self._folder(name), len(self._seeds))
 
     def _policies(self, name: str) -> list[Policy]:
         return [read_policy(file.parent) for file in policy_files(self._folder(name))]
