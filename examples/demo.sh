@@ -26,7 +26,7 @@ first=$!
 mcaprl train-offline "$out/data" --algo double-dqn --seeds 4 --out "$out/runs/double-dqn" \
   >"$out/double-dqn.log" 2>&1 &
 second=$!
-tail -f "$out/cql.log" &
+tail -F "$out/cql.log" 2>/dev/null &
 shown=$!
 # Background jobs ignore Ctrl-C; stop them when this script ends early.
 trap 'kill "$first" "$second" "$shown" 2>/dev/null || true' EXIT
