@@ -16,7 +16,7 @@ from typing import Any
 
 import click
 
-from mcaprl._interrupt import INTERRUPTED
+from mcaprl._interrupt import INTERRUPTED, raise_interrupt, repeat_lost_interrupt
 from mcaprl._version import __version__
 from mcaprl.cli.completion import completion
 from mcaprl.cli.convert import convert
@@ -75,7 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, signal.default_int_handler)
+            signal.signal(number, raise_interrupt)
+    sys.unraisablehook = repeat_lost_interrupt
     warnings.showwarning = _print_warning
     threading.excepthook = _on_thread_error
     sys.exit(run(arguments))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any, ClassVar, TypeVar, cast
 
 import numba
-from numba.core import event
+from numba.core import event, pythonapi
+from numba.core.types.containers import NamedTuple, NamedUniTuple
 
 AnyFunction = TypeVar("AnyFunction", bound=Callable[..., object])
 Result = TypeVar("Result")
@@ -79,6 +80,7 @@ class _Announcer(event.Listener):  # type: ignore[misc]
 
     def on_start(self, event: Any) -> None:
         """Print one line to stderr at the first compilation."""
+        _replace_conversion()
         module = event.data["dispatcher"].py_func.__module__
         if module.startswith("mcaprl.") and not _Announcer.is_silent:
             _Announcer.is_silent = True
@@ -88,6 +90,51 @@ class _Announcer(event.Listener):  # type: ignore[misc]
 
     def on_end(self, event: Any) -> None:
         """Do nothing."""
+
+
+@cache
+def _replace_conversion() -> None:
+    """Replace numba's conversion of a returned NamedTuple to an object for those of this package.
+
+    numba's conversion runs Python code for each NamedTuple and does not check for errors. If a
+    signal handler raises KeyboardInterrupt in that code, the process crashes.
+    """
+    # The conversions are loaded only to compile, because the import takes time.
+    from numba.core import boxing
+
+    def box(kind: Any, value: Any, context: Any) -> Any:
+        if kind.instance_class.__module__.startswith("mcaprl."):
+            return _box_named_tuple(kind, value, context)
+        return boxing.box_namedtuple(kind, value, context)
+
+    # numba has no public function that replaces a conversion.
+    for kind in (NamedTuple, NamedUniTuple):
+        pythonapi._boxers.functions[kind] = box
+
+
+def _box_named_tuple(kind: Any, value: Any, context: Any) -> Any:
+    """Return code that converts a NamedTuple to an object and runs no Python code.
+
+    Args:
+        kind: numba's type of the NamedTuple.
+        value: LLVM value of the NamedTuple.
+        context: numba's context of the conversion.
+
+    Returns:
+        LLVM value of the pointer to the object.
+    """
+    python, constants = context.pyapi, context.env_manager
+    fields = python.tuple_new(kind.count)
+    for i, field_kind in enumerate(kind):
+        field = context.box(field_kind, context.builder.extract_value(value, i))
+        python.tuple_setitem(fields, i, field)
+    new, cls = (
+        constants.read_const(constants.add_const(constant))
+        for constant in (tuple.__new__, kind.instance_class)
+    )
+    result = python.call_function_objargs(new, (cls, fields))
+    python.decref(fields)
+    return result
 
 
 event.register("numba:compile", _Announcer())

@@ -11,8 +11,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection, wait
+from types import FrameType
 from typing import Any, Literal, TypeVar
 
+from mcaprl._interrupt import is_postponed, send_to_main_thread
 from mcaprl.errors import McaprlError
 
 if sys.platform != "win32":
@@ -146,16 +148,12 @@ def _end_with(parent: Connection) -> None:
     """Interrupt the main thread when the parent exits or closes the pipe."""
     with suppress(EOFError, OSError):
         parent.recv()
-    if sys.platform == "win32":
-        signal.raise_signal(_END)
-    else:
-        # This also interrupts a system call in which the thread waits.
-        thread = threading.main_thread().ident
-        assert thread is not None
-        signal.pthread_kill(thread, _END)
+    send_to_main_thread(_END)
 
 
-def _interrupt_once(*_: Any) -> None:
+def _interrupt_once(number: int = _END, frame: FrameType | None = None) -> None:
+    if is_postponed(number, frame):
+        return
     # The terminal and the parent both send a signal. The second must not interrupt the clean-up.
     _ignore_stops()
     raise KeyboardInterrupt

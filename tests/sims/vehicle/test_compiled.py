@@ -7,10 +7,24 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import FrameType
+from typing import NamedTuple
 
+import numba
+import numpy as np
 import pytest
 
+from mcaprl.sims.geometry.paths import heading_of
+from mcaprl.sims.powerline.rules import FLIGHT_SIZE, flight_at
 from tests.support.paths import ROOT
+
+
+class OtherPair(NamedTuple):
+    """NamedTuple of another package, whose constructor is its own."""
+
+    first: float
+    second: float
+
 
 CODE = "from mcaprl.sims.geometry.paths import wrap_angle; print(wrap_angle(4.0))"
 CACHE = Path("sims", "geometry", "__pycache__")
@@ -66,3 +80,29 @@ def test_without_a_writable_cache_each_process_compiles(package: Path, tmp_path:
             "compiling geometry.paths for this machine, again in each process:"
             " no cache folder is writable; set NUMBA_CACHE_DIR"
         )
+
+
+def test_a_returned_namedtuple_runs_no_python_code() -> None:
+    # A KeyboardInterrupt in such code would crash the process.
+    row = np.arange(FLIGHT_SIZE, dtype=np.float64)
+    heading_of(0.0), flight_at(row)
+    called: list[str] = []
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        if event == "call":
+            called.append(frame.f_code.co_name)
+
+    before = sys.getprofile()
+    sys.setprofile(note)
+    heading, flight = heading_of(0.0), flight_at(row)
+    sys.setprofile(before)
+    assert called == ["heading_of", "flight_at"], "numba reports the compiled functions"
+    assert heading._asdict() == {"cos": 1.0, "sin": 0.0}
+    assert flight.drone.attitude._asdict() == {"w": 6.0, "x": 7.0, "y": 8.0, "z": 9.0}
+
+
+def test_other_packages_keep_numbas_conversion() -> None:
+    def swap(pair: OtherPair) -> OtherPair:
+        return OtherPair(pair.second, pair.first)
+
+    assert numba.njit(swap)(OtherPair(1.0, 2.0)) == OtherPair(2.0, 1.0)
