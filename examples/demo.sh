@@ -34,8 +34,8 @@ trap 'exit 130' INT TERM
 wait "$first"
 sleep 1 && kill "$shown"
 wait "$second" || { cat "$out/double-dqn.log"; exit 1; }
-echo "behavior cloning:"
-mcaprl train-offline "$out/data" --algo bc --seeds 4 --out "$out/runs/bc"
+echo "behavior cloning, half as many updates:"
+mcaprl train-offline "$out/data" --algo bc --updates 4000 --seeds 4 --out "$out/runs/bc"
 
 step "3 of 4: evaluate all of them, the pilot and random actions over 30 episodes"
 mcaprl evaluate "$out/runs/cql" "$out/runs/bc" "$out/runs/double-dqn" pilot random --sim lane \

@@ -164,6 +164,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
 @pytest.mark.usefixtures("ray_cluster")
+@pytest.mark.long
 def test_a_sweep_ranks_policies_by_the_episodes_that_they_have_not_learned_from(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -166,6 +166,7 @@ def test_options_that_cannot_be_used_with_ray(logs: Path, tmp_path: Path) -> Non
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.long
 def test_an_error_of_a_worker_ends_the_training_as_one_line(
     logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
