@@ -20,7 +20,7 @@ from torch import Tensor
 from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
 from mcaprl.networks import ImageInput
 from mcaprl.offline.batches.items import n_step_returns, returns_to_go
-from mcaprl.offline.batches.observations import ObservationEncoder, Observations
+from mcaprl.offline.batches.observations import FramesOnDisk, ObservationEncoder, Observations
 from mcaprl.offline.batches.packing import Packing
 from mcaprl.offline.batches.share import ALONE, Share
 from mcaprl.recorder.format.spaces import check_actions
@@ -73,7 +73,7 @@ class TransitionBuffer:
         encoder: Encoder that created the frames.
         action_space: Action space of the log.
         packing: Settings with which the transitions were built.
-        frames: All observations, each stored once.
+        frames: All observations, each stored once; images of a mapped dataset stay on disk.
         starts: (F,) int64, first frame of each frame's episode; empty if frames are not stacked.
         places: (2, N) int64, frame indexes of each transition's observation and next observation.
         actions: (N,) int64 action indexes, starting at 0.
@@ -88,7 +88,7 @@ class TransitionBuffer:
     encoder: ObservationEncoder
     action_space: spaces.Discrete
     packing: Packing
-    frames: Observations
+    frames: Observations | FramesOnDisk
     starts: Tensor
     places: Tensor
     actions: Tensor
@@ -142,7 +142,7 @@ class TransitionBuffer:
             reward_scale = spread or 1.0
         places, returns = n_step_returns(dataset, packing.n_steps, packing.gamma)
         returns[0] /= reward_scale
-        frames = encoder.encode(dataset.frames)
+        frames = encoder.encode_frames(dataset.frames)
         actions = np.subtract(dataset.actions, action_space.start, dtype=np.int64)
         if actions.min() < 0 or actions.max() >= action_space.n:
             raise SpaceError(
@@ -198,7 +198,8 @@ class TransitionBuffer:
         here, there = self.places.index_select(1, rows)
         rewards, discounts = self.returns.index_select(1, rows)
         actions = self.actions.index_select(0, rows)
-        states = self.observe(here), self.observe(there)
+        # Reading both at once from the disk takes half the time.
+        states = self.observe(torch.cat((here, there))).split(len(rows))
         return Batch(rows, states[0], actions, rewards, discounts, states[1], factors)
 
     def with_weights(self, weights: NDArray[np.float64]) -> TransitionBuffer:
@@ -295,7 +296,9 @@ def _first_frames(counts: NDArray[np.int64], frame_stack: int) -> Tensor:
     return torch.from_numpy(np.repeat(np.cumsum(counts) - counts, counts))
 
 
-def _check_data(dataset: Dataset, frames: Observations, actions: NDArray[np.int64]) -> None:
+def _check_data(
+    dataset: Dataset, frames: Observations | FramesOnDisk, actions: NDArray[np.int64]
+) -> None:
     """Raise if a number is not finite or a logged action is masked out."""
     # All at once, the comparison would need more memory than the frames.
     finite = torch.cat([_is_finite(block) for block in torch.split(frames.vector, _BLOCK_ROWS)])

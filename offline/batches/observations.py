@@ -10,7 +10,7 @@ marks the allowed actions, as in PettingZoo. Logs contain it as part of the obse
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from torch import Tensor
 from mcaprl.errors import SpaceError
 from mcaprl.networks import ImageInput
 from mcaprl.offline.batches.share import ALONE, Share
+from mcaprl.recorder.dataset.mapped import Frames, MappedImages
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, observation_leaves
 
 MIN_CONVOLUTION_EDGE = 36
@@ -87,6 +88,48 @@ class Observations:
     def to(self, device: torch.device) -> Observations:
         """Return the same observations on another device."""
         return self.like([part.to(device) for part in self.parts()])
+
+
+@dataclass(frozen=True, eq=False)
+class FramesOnDisk:
+    """F observations whose images stay on disk until `rows` selects them.
+
+    Attributes:
+        numbers: The observations without images.
+        images: Images (F, height, width) or (F, height, width, channels), one array per camera.
+        shapes: Shape (height, width, channels) of one image of each camera.
+    """
+
+    numbers: Observations
+    images: tuple[Frames, ...]
+    shapes: tuple[tuple[int, ...], ...]
+
+    def __len__(self) -> int:
+        """Return the number of observations, F."""
+        return len(self.numbers)
+
+    @property
+    def vector(self) -> Tensor:
+        """Vectors (F, V), float32."""
+        return self.numbers.vector
+
+    @property
+    def mask(self) -> Tensor | None:
+        """Allowed actions (F, A), bool; None if every action is always allowed."""
+        return self.numbers.mask
+
+    def rows(self, index: Tensor) -> Observations:
+        """Read the rows with these indexes (R,), onto the device of `index`."""
+        places = index.cpu().numpy()
+        images = tuple(
+            torch.from_numpy(np.asarray(image[places])).view(-1, *shape).to(index.device)
+            for image, shape in zip(self.images, self.shapes, strict=True)
+        )
+        return replace(self.numbers.rows(index), images=images)
+
+    def to(self, device: torch.device) -> FramesOnDisk:
+        """Return the same observations with the numbers on another device."""
+        return replace(self, numbers=self.numbers.to(device))
 
 
 class ObservationEncoder:
@@ -166,6 +209,21 @@ class ObservationEncoder:
         ]
         vector = _tensor(self._vector(observations), np.float32)
         return Observations(vector, tuple(images), self._allowed(observations))
+
+    def encode_frames(self, frames: Any) -> Observations | FramesOnDisk:
+        """Encode all frames of a dataset; images on disk stay there.
+
+        Raises:
+            SpaceError: The frames have other shapes.
+        """
+        images = tuple(leaf.of(frames) for leaf in self.images)
+        if not any(isinstance(image, MappedImages) for image in images):
+            return self.encode(frames)
+        for leaf in self.leaves:
+            _check_shape(leaf, frames)
+        vector = _tensor(self._vector(frames), np.float32)
+        numbers = Observations(vector, mask=self._allowed(frames))
+        return FramesOnDisk(numbers, images, tuple(image.shape for image in self.image_inputs))
 
     @property
     def leaves(self) -> list[Leaf]:

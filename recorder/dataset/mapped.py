@@ -6,11 +6,18 @@ memory-mapped file at memory speed. The CRC of a chunk is checked at the first r
 
 from __future__ import annotations
 
+import math
+import mmap
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+# Windows has no `madvise`.
+_WILL_NEED = getattr(mmap, "MADV_WILLNEED", None)
+_PREFETCHED_BYTES = 1 << 30
+"""Size of the images from which on they are prefetched. Fewer are soon in the system's cache."""
 
 
 class ImageFile:
@@ -41,10 +48,16 @@ class ImageFile:
             (len(bytes_) - image_bytes + 1,),
             (1,),
         )
+        self._map = view.obj if isinstance(view.obj, mmap.mmap) else None
         self._checks = checks
         self._is_checked = np.zeros(len(checks), bool)
 
-    def read(self, offsets: NDArray[np.int64], chunks: NDArray[np.int32]) -> NDArray[np.uint8]:
+    def prefetch(self, start: int, stop: int) -> None:
+        """Let the system start to load the pages of a range of bytes from the disk."""
+        if self._map is not None and _WILL_NEED is not None:
+            self._map.madvise(_WILL_NEED, start, stop - start)
+
+    def read(self, offsets: NDArray[np.int64], chunks: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Copy K images, given their byte offsets (K,) and the indexes (K,) of their chunks.
 
         Raises:
@@ -129,16 +142,40 @@ class MappedImages:
         return self[:] if dtype is None else self[:].astype(dtype, copy=False)
 
     def _read(self, places: NDArray[np.int64]) -> NDArray[np.uint8]:
-        number, chunk, offset = places.T
         shape = (len(places), *self.shape[1:])
         if len(self._files) == 1:
-            return self._files[0].read(offset, chunk).reshape(shape)
+            if self.size >= _PREFETCHED_BYTES:
+                self._prefetch(places[np.argsort(places[:, 2])])
+            return self._files[0].read(places[:, 2], places[:, 1]).reshape(shape)
+        order = np.lexsort((places[:, 2], places[:, 0]))
+        if self.size >= _PREFETCHED_BYTES:
+            self._prefetch(places[order])
+        number, chunk, offset = places[order].T
         images = np.empty(shape, np.uint8)
-        for index in np.unique(number).tolist():
-            mine = number == index
-            found = self._files[index].read(offset[mine], chunk[mine])
-            images[mine] = found.reshape(-1, *self.shape[1:])
+        ends = [*(np.flatnonzero(np.diff(number)) + 1).tolist(), len(order)]
+        for first, stop in zip([0, *ends], ends, strict=False):
+            if first < stop:
+                found = self._files[number[first]].read(offset[first:stop], chunk[first:stop])
+                images[order[first:stop]] = found.reshape(-1, *self.shape[1:])
         return images
+
+    def _prefetch(self, places: NDArray[np.int64]) -> None:
+        """Let the system start to load images, given in the order of their files and offsets.
+
+        Without this, `read` would wait for one image after the other, and the system would load
+        their surroundings too.
+        """
+        if not len(places):
+            return
+        number, _, offset = places.T
+        first = offset // mmap.PAGESIZE * mmap.PAGESIZE
+        stop = offset + math.prod(self.shape[1:])
+        apart = (np.diff(number) != 0) | (first[1:] > stop[:-1])
+        begins = np.flatnonzero(np.concatenate([[True], apart]))
+        ends = np.flatnonzero(np.concatenate([apart, [True]]))
+        ranges = (number[begins], first[begins], stop[ends])
+        for index, start, end in zip(*(part.tolist() for part in ranges), strict=True):
+            self._files[index].prefetch(start, end)
 
 
 Frames = NDArray[Any] | MappedImages

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import mmap
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from gymnasium import spaces
 import mcaprl
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.dataset import image_cache as storage
+from mcaprl.recorder.dataset import mapped as mapped_images
 from mcaprl.recorder.dataset.mapped import MappedImages
 from tests.recorder.dataset.test_selection import damage
 from tests.support.recordings import MIXED_SPACE, assert_same_bits, leaves_of, record
@@ -152,3 +155,31 @@ def test_auto_depends_on_free_memory(
     monkeypatch.setattr(storage, "free_memory_bytes", lambda: free)
     data = mcaprl.open(log)
     assert isinstance(data.observations["camera"], MappedImages) == expected
+
+
+@pytest.mark.parametrize("files", [1, 3])
+def test_prefetched_images_are_the_same(
+    log: Path, tmp_path: Path, files: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for number in range(files):
+        shutil.copy(log, folder / f"{number}.mcap")
+    ranges: list[tuple[int, int]] = []
+    prefetch = mapped_images.ImageFile.prefetch
+
+    def note(file: mapped_images.ImageFile, start: int, stop: int) -> None:
+        ranges.append((start, stop))
+        prefetch(file, start, stop)
+
+    monkeypatch.setattr(mapped_images, "_PREFETCHED_BYTES", 0)
+    monkeypatch.setattr(mapped_images.ImageFile, "prefetch", note)
+    memory = mcaprl.open(folder, images="memory").observations["camera"]
+    mapped = mcaprl.open(folder, images="mapped").observations["camera"]
+    rows = np.random.default_rng(0).integers(len(memory), size=50)
+    assert_same_bits(mapped[rows], memory[rows])
+    assert files <= len(ranges) <= 50
+    assert all(start % mmap.PAGESIZE == 0 for start, _ in ranges)
+    wanted = sum(stop - start for start, stop in ranges)
+    assert len(np.unique(rows)) * memory[0].nbytes <= wanted
+    assert mapped[:0].shape == memory[:0].shape
