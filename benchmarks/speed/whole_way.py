@@ -24,13 +24,15 @@ RECORDED = 1_000_000
 LARGER = 1.2
 """Size of the images, as a multiple of the free memory."""
 _LEARN = """
-import json, sys, threading, time
+import json, sys, threading, time, warnings
 from pathlib import Path
 import torch
 import mcaprl
 from mcaprl.offline import CQLConfig, train
 
 torch.set_num_threads(1)
+# So few updates learn nothing, of which `train` warns.
+warnings.simplefilter("ignore")
 path, out, storage, settings = sys.argv[1], Path(sys.argv[2]), sys.argv[3], json.loads(sys.argv[4])
 peak = 0
 
@@ -44,11 +46,6 @@ def watch():
     while True:
         peak = max(peak, memory())
         time.sleep(0.01)
-
-def timed(task):
-    start = time.perf_counter(), time.process_time()
-    result = task()
-    return result, time.perf_counter() - start[0], time.process_time() - start[1]
 
 times = []
 report = lambda now: times.append(time.perf_counter())

@@ -198,8 +198,11 @@ class TransitionBuffer:
         here, there = self.places.index_select(1, rows)
         rewards, discounts = self.returns.index_select(1, rows)
         actions = self.actions.index_select(0, rows)
-        # Reading both at once from the disk takes half the time.
-        states = self.observe(torch.cat((here, there))).split(len(rows))
+        if isinstance(self.frames, FramesOnDisk):
+            # Reading both at once from the disk takes half the time.
+            states = self.observe(torch.cat((here, there))).split(len(rows))
+        else:
+            states = [self.observe(here), self.observe(there)]
         return Batch(rows, states[0], actions, rewards, discounts, states[1], factors)
 
     def with_weights(self, weights: NDArray[np.float64]) -> TransitionBuffer:
