@@ -31,7 +31,7 @@ import mcaprl
 from mcaprl.offline import CQLConfig, train
 
 torch.set_num_threads(1)
-# So few updates learn nothing, of which `train` warns.
+# `train` warns that 2,000 updates are too few to learn.
 warnings.simplefilter("ignore")
 path, out, storage, settings = sys.argv[1], Path(sys.argv[2]), sys.argv[3], json.loads(sys.argv[4])
 peak = 0
