@@ -157,6 +157,7 @@ class Killer(threading.Thread):
                     self.killed += 1
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
 def test_killed_workers_lose_and_double_no_episode(tmp_path: Path) -> None:
     kills, shards = count(5, 200), count(4, 40)
