@@ -79,7 +79,7 @@ class _Announcer(event.Listener):  # type: ignore[misc]
     is_silent: ClassVar[bool] = False
 
     def on_start(self, event: Any) -> None:
-        """Print one line to stderr at the first compilation."""
+        """Replace numba's conversion, and print one line to stderr at the first compilation."""
         _replace_conversion()
         module = event.data["dispatcher"].py_func.__module__
         if module.startswith("mcaprl.") and not _Announcer.is_silent:

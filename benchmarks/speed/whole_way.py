@@ -2,9 +2,10 @@
 
     python -m benchmarks.speed.whole_way FOLDER [--largest 100000000] [--larger-than-memory]
 
-A log of the lane sim is recorded, and copied for the longer ones. Each size has a process to open
-the logs and to train with CQL. With `--larger-than-memory`, the second part trains on images that
-take 1.2 times the free memory, and on a small log of them; it needs as much space in FOLDER.
+A log of 1,000,000 transitions of the lane sim is recorded; larger sizes are folders of its copies.
+For each size, a new process opens the logs and trains with CQL. `--larger-than-memory` also trains
+on images that take 1.2 times the free memory, and on a small log of images. FOLDER needs as much
+space on the disk.
 """
 
 from __future__ import annotations
@@ -67,7 +68,9 @@ def learn(path: Path, folder: Path, storage: str = "auto", **settings: object) -
     """Train on logs in a new process, and return its times in s, rate and peak memory in bytes."""
     out = folder / "run"
     arguments = [str(path), str(out), storage, json.dumps(settings)]
-    done = subprocess.run([sys.executable, "-c", _LEARN, *arguments], stdout=-1, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", _LEARN, *arguments], stdout=subprocess.PIPE, check=True
+    )
     shutil.rmtree(out)
     found: dict[str, float] = json.loads(done.stdout)
     return found
@@ -154,9 +157,13 @@ def image_table(folder: Path) -> Table:
 def main() -> None:
     """Measure the requested sizes, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--largest", type=int, default=10 * RECORDED)
-    parser.add_argument("--larger-than-memory", action="store_true")
+    parser.add_argument("folder", type=Path, help="folder for the logs, which are deleted")
+    parser.add_argument(
+        "--largest", type=int, default=10 * RECORDED, help="transitions of the largest logs"
+    )
+    parser.add_argument(
+        "--larger-than-memory", action="store_true", help="also train on images on disk"
+    )
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     tables = vector_tables(given.folder, given.largest)
