@@ -6,6 +6,7 @@ supports only the lane sim's course: eight legs, each longer than the lookahead 
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -106,7 +107,7 @@ def course_project(x_m: float, y_m: float, from_m: float, to_m: float) -> Projec
     far_m, far_square, far_left = _on_leg(course_leg(after), x_m, y_m, 0.0, to_m - after_start_m)
     is_after = (after_start_m <= to_m) & (far_square < near_square)
     along_m = after_start_m + far_m if is_after else start_m + near_m
-    distance_m = np.sqrt(far_square if is_after else near_square)
+    distance_m = math.sqrt(far_square if is_after else near_square)
     leftward = far_left if is_after else near_left
     yaw_rad = _of(after if is_after else here.leg, _YAW_RAD)
     return Projection(along_m, distance_m if leftward >= 0.0 else -distance_m, yaw_rad)

@@ -11,7 +11,7 @@ from mcaprl.compiled import compiled
 from mcaprl.sims.racer.car import Car
 from mcaprl.sims.racer.course import Track
 from mcaprl.sims.racer.env import RacerEnv
-from mcaprl.sims.racer.rays import CENTER_RAYS, CENTER_RAYS_RAD, RAYS, measure
+from mcaprl.sims.racer.rays import BLOCK_SIZE, CENTER_RAYS, CENTER_RAYS_RAD, LENGTH, measure
 from mcaprl.sims.racer.rules import MAX_SPEED_PX, SPEED_CHANGE_PX, THROTTLE, TURN
 from mcaprl.sims.vehicle.pilot import ScriptedPilot
 
@@ -30,8 +30,9 @@ def choose(track: Track, car: Car, allowed: NDArray[np.int64], classic: bool) ->
     The mean direction of the rays, weighted by length, determines the turn. The ray straight ahead
     determines the speed. If no allowed action fits both, the turn has priority.
     """
-    lengths_px = np.empty(RAYS)
-    measure(track.walls_px, car, False, lengths_px)
+    block = np.empty(BLOCK_SIZE)
+    measure(track.walls_px, car, False, block)
+    lengths_px = block[LENGTH:]
     weights, moments = 0.0, 0.0
     for i in range(CENTER_RAYS):
         if abs(CENTER_RAYS_RAD[i]) <= 0.5 * math.pi:

@@ -23,6 +23,12 @@ _COS: NDArray[np.float64] = np.cos(CENTER_RAYS_RAD)
 _SIN: NDArray[np.float64] = np.sin(CENTER_RAYS_RAD)
 CENTER_RAYS = len(CENTER_RAYS_DEG)
 RAYS = CENTER_RAYS + 4
+SLOTS = 20
+"""Number of rays in a block: `RAYS`, rounded up to a multiple of 4, the width of AVX2."""
+X, Y, DX, DY, SHARE, BLOCK_SIZE = (SLOTS * part for part in range(6))
+LENGTH = SHARE
+"""Indices of the parts of a block. The offsets between parts are constants, so that the compiler
+can prove that they do not overlap. Lengths replace the shares."""
 RAY_NAMES = (
     *(ray_name(angle if angle == 180 else -angle) for angle in CENTER_RAYS_DEG),
     "left_corner_sideways",
@@ -59,8 +65,8 @@ def crossing(
 
 
 @compiled
-def write_rays(car: Car, classic: bool, rays: NDArray[np.float64]) -> None:
-    """Write a car's rays (4, 18): x, y, dx and dy.
+def write_rays(car: Car, classic: bool, block: NDArray[np.float64]) -> None:
+    """Write a car's rays into a block: x, y, dx and dy.
 
     A ray starts at (x, y) and ends at (x + dx, y + dy), 1000 pixels away.
 
@@ -68,24 +74,24 @@ def write_rays(car: Car, classic: bool, rays: NDArray[np.float64]) -> None:
     """
     cos, sin = heading_of(car.heading_rad)
     for ray in range(CENTER_RAYS):
-        rays[0, ray], rays[1, ray] = car.x_px, car.y_px
-        rays[2, ray] = FAR_PX * (cos * _COS[ray] - sin * _SIN[ray])
-        rays[3, ray] = FAR_PX * (sin * _COS[ray] + cos * _SIN[ray])
+        block[X + ray], block[Y + ray] = car.x_px, car.y_px
+        block[DX + ray] = FAR_PX * (cos * _COS[ray] - sin * _SIN[ray])
+        block[DY + ray] = FAR_PX * (sin * _COS[ray] + cos * _SIN[ray])
     for corner in range(2):
         right = 2.0 * corner - 1.0
         side = -right if classic else right
         sideways, ahead = CENTER_RAYS + corner, CENTER_RAYS + 2 + corner
         x_px, y_px = corner_at(car, 1.0, right)
-        rays[0, sideways], rays[1, sideways] = x_px, y_px
-        rays[0, ahead], rays[1, ahead] = x_px, y_px
-        rays[2, sideways], rays[3, sideways] = -FAR_PX * side * sin, FAR_PX * side * cos
-        rays[2, ahead], rays[3, ahead] = FAR_PX * cos, FAR_PX * sin
+        block[X + sideways], block[Y + sideways] = x_px, y_px
+        block[X + ahead], block[Y + ahead] = x_px, y_px
+        block[DX + sideways], block[DY + sideways] = -FAR_PX * side * sin, FAR_PX * side * cos
+        block[DX + ahead], block[DY + ahead] = FAR_PX * cos, FAR_PX * sin
+    for ray in range(RAYS, SLOTS):
+        block[X + ray], block[Y + ray], block[DX + ray], block[DY + ray] = 0.0, 0.0, 0.0, 0.0
 
 
 @compiled
-def cast(
-    walls: NDArray[np.float64], rays: NDArray[np.float64], shares: NDArray[np.float64]
-) -> None:
+def cast(walls: NDArray[np.float64], block: NDArray[np.float64]) -> None:
     """Compute the first hit of each ray on a wall.
 
     The equations are those of `crossing`, without branches, so that the compiler can vectorize the
@@ -93,22 +99,24 @@ def cast(
 
     Args:
         walls: (W, 4) walls.
-        rays: (4, R) rays as written by `write_rays`.
-        shares: (R,) output: distance of the hit as a fraction of the ray's length; 1 without a hit.
+        block: (BLOCK_SIZE,) rays as written by `write_rays`, followed by the output: distance of
+            the hit as a fraction of the ray's length; 1 without a hit.
     """
-    x_px, y_px, dx, dy = rays[0], rays[1], rays[2], rays[3]
-    shares[:] = 1.0
+    for ray in range(SLOTS):
+        block[SHARE + ray] = 1.0
     for wall in range(len(walls)):
         x1, y1 = walls[wall, 0], walls[wall, 1]
         ex, ey = walls[wall, 2] - x1, walls[wall, 3] - y1
-        for ray in range(len(shares)):
-            ax, ay = x1 - x_px[ray], y1 - y_px[ray]
-            inverse = 1.0 / (dx[ray] * ey - dy[ray] * ex)
+        for ray in range(SLOTS):
+            dx, dy = block[DX + ray], block[DY + ray]
+            ax, ay = x1 - block[X + ray], y1 - block[Y + ray]
+            inverse = 1.0 / (dx * ey - dy * ex)
             share = (ax * ey - ay * ex) * inverse
-            along = (ax * dy[ray] - ay * dx[ray]) * inverse
-            is_nearer = (share > 0.0) & (share < shares[ray])
+            along = (ax * dy - ay * dx) * inverse
+            nearest = block[SHARE + ray]
+            is_nearer = (share > 0.0) & (share < nearest)
             is_hit = is_nearer & (along >= -JOINT) & (along <= 1.0 + JOINT)
-            shares[ray] = share if is_hit else shares[ray]
+            block[SHARE + ray] = share if is_hit else nearest
 
 
 @compiled
@@ -125,15 +133,16 @@ def floored_distance(car: Car, line: NDArray[np.float64], share: float) -> float
 
 @compiled
 def floored_ray_length(
-    walls: NDArray[np.float64], car: Car, rays: NDArray[np.float64], ray: int
+    walls: NDArray[np.float64], car: Car, block: NDArray[np.float64], ray: int
 ) -> float:
     """Return the classic length of a ray: the distance from the car's center to the nearest hit.
 
     The coordinates of hits are rounded down to whole pixels. Without a hit, the length is 1000.
     """
     nearest = math.inf
+    x, y, dx, dy = block[X + ray], block[Y + ray], block[DX + ray], block[DY + ray]
     for wall in walls:
-        share, along_wall = crossing(rays[0, ray], rays[1, ray], rays[2, ray], rays[3, ray], wall)
+        share, along_wall = crossing(x, y, dx, dy, wall)
         if 0.0 < share < 1.0 and 0.0 < along_wall < 1.0:
             nearest = min(nearest, floored_distance(car, wall, along_wall))
     return nearest if nearest < math.inf else FAR_PX
@@ -141,27 +150,30 @@ def floored_ray_length(
 
 @compiled
 def measure(
-    walls: NDArray[np.float64], car: Car, classic: bool, lengths_px: NDArray[np.float64]
+    walls: NDArray[np.float64], car: Car, classic: bool, block: NDArray[np.float64]
 ) -> None:
-    """Write the lengths (18,) of the car's rays. Classic lengths begin at the car's center."""
-    rays = np.empty((4, RAYS))
-    write_rays(car, classic, rays)
+    """Write the car's rays into a block, followed by their lengths in pixels.
+
+    Classic lengths begin at the car's center.
+    """
+    write_rays(car, classic, block)
     if classic:
         for ray in range(RAYS):
-            lengths_px[ray] = floored_ray_length(walls, car, rays, ray)
+            block[LENGTH + ray] = floored_ray_length(walls, car, block, ray)
     else:
-        cast(walls, rays, lengths_px)
+        cast(walls, block)
         for ray in range(RAYS):
-            lengths_px[ray] *= FAR_PX
+            block[LENGTH + ray] *= FAR_PX
 
 
 def ray_ends(walls: NDArray[np.float64], car: Car) -> NDArray[np.float64]:
     """Return the rays as segments from the car to the walls, (18, 2, 2) pixels."""
-    rays, shares = np.empty((4, RAYS)), np.empty(RAYS)
-    write_rays(car, False, rays)
-    cast(walls, rays, shares)
-    starts = rays[:2].T
-    return np.stack([starts, starts + shares[:, np.newaxis] * rays[2:].T], axis=1)
+    block = np.empty(BLOCK_SIZE)
+    write_rays(car, False, block)
+    cast(walls, block)
+    x, y, dx, dy, shares = block.reshape(-1, SLOTS)[:, :RAYS]
+    starts = np.column_stack([x, y])
+    return np.stack([starts, starts + np.column_stack([shares * dx, shares * dy])], axis=1)
 
 
 @compiled

@@ -10,12 +10,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.compiled import compiled
+from mcaprl.compiled import compiled, inlined
 from mcaprl.sims.geometry.paths import project, wrap_angle
 from mcaprl.sims.geometry.ray_code import log_code
 from mcaprl.sims.racer.car import CAR_LENGTH_PX, CAR_WIDTH_PX, Car, car_at, corner_at, store_car
 from mcaprl.sims.racer.course import IMAGE_HEIGHT_PX, METERS_PER_PX, Track
 from mcaprl.sims.racer.rays import (
+    BLOCK_SIZE,
+    LENGTH,
     RAY_NAMES,
     RAYS,
     classic_code,
@@ -69,15 +71,17 @@ OBSERVATION_NAMES = (*RAY_NAMES, "speed")
 @compiled
 def walls_hit(track: Track, car: Car) -> int:
     """Return the number of walls that intersect an edge of the car."""
+    # This loop has no branches, so that the compiler can vectorize it. Most cars end here.
+    near = 0
+    for wall in range(len(track.walls_px)):
+        near += 1 if is_near(track.walls_px[wall], car) else 0
+    if near == 0:
+        return 0
     count = 0
     front = corner_at(car, 1.0, -1.0), corner_at(car, 1.0, 1.0)
     corners = (*front, corner_at(car, -1.0, 1.0), corner_at(car, -1.0, -1.0))
     for wall in track.walls_px:
-        along_x, along_y = wall[2] - wall[0], wall[3] - wall[1]
-        away = (wall[0] - car.x_px) * along_y - (wall[1] - car.y_px) * along_x
-        if away * away > CORNER_PX_2 * (along_x * along_x + along_y * along_y):
-            # The wall cannot hit the car: the line through the wall is farther from the center of
-            # the car than any corner of the car.
+        if not is_near(wall, car):
             continue
         for i in range(4):
             (x, y), (end_x, end_y) = corners[i], corners[(i + 1) % 4]
@@ -86,6 +90,22 @@ def walls_hit(track: Track, car: Car) -> int:
                 count += 1
                 break
     return count
+
+
+@inlined
+def is_near(wall: NDArray[np.float64], car: Car) -> bool:
+    """Return whether a wall (4,) may touch a car.
+
+    It cannot if the line through the wall is farther from the car's center than a corner of the
+    car, or if the center is farther beyond an end of the wall, measured along the wall.
+    """
+    along_x, along_y = wall[2] - wall[0], wall[3] - wall[1]
+    x, y = car.x_px - wall[0], car.y_px - wall[1]
+    square = along_x * along_x + along_y * along_y
+    away, along = x * along_y - y * along_x, x * along_x + y * along_y
+    beyond = max(max(along - square, -along), 0.0)
+    reach = CORNER_PX_2 * square
+    return bool((away * away <= reach) & (beyond * beyond <= reach))
 
 
 @compiled
@@ -157,12 +177,29 @@ def outcome_of(track: Track, before: Car, after: Car, classic: bool) -> tuple[fl
 @compiled
 def observe(track: Track, car: Car, classic: bool, observation: NDArray[np.float32]) -> None:
     """Write the 19 observed numbers; see "Observation Space" of `RacerEnv`."""
-    lengths_px = np.empty(RAYS)
-    measure(track.walls_px, car, classic, lengths_px)
-    for i in range(RAYS):
-        length_px = lengths_px[i]
-        code = classic_code(length_px) if classic else log_code(METERS_PER_PX * length_px)
-        observation[i] = code
+    observe_with(track, car, classic, np.empty(BLOCK_SIZE), observation)
+
+
+@compiled
+def observe_with(
+    track: Track,
+    car: Car,
+    classic: bool,
+    block: NDArray[np.float64],
+    observation: NDArray[np.float32],
+) -> None:
+    """Write the observed numbers like `observe`, and the car's rays and lengths into a block."""
+    measure(track.walls_px, car, classic, block)
+    if classic:
+        for ray in range(RAYS):
+            block[LENGTH + ray] = classic_code(block[LENGTH + ray])
+    else:
+        # This also encodes the slots beyond the last ray, so that the vectorized loop has no
+        # remainder. A constant number of turns would be unrolled instead.
+        for slot in range(LENGTH, len(block)):
+            block[slot] = log_code(METERS_PER_PX * block[slot])
+    for ray in range(RAYS):
+        observation[ray] = block[LENGTH + ray]
     observation[RAYS] = (-car.speed_px if classic else car.speed_px) / MAX_SPEED_PX
 
 
@@ -190,11 +227,20 @@ def step_cars(
         drift: Whether the direction of travel lags behind the heading.
     """
     for i in range(len(cars)):
-        before = car_at(cars[i])
-        after = drive(track, before, actions[i], classic, drift)
-        rewards[i], ends[i] = outcome_of(track, before, after, classic)
+        after, rewards[i], ends[i] = advance(track, cars[i], actions[i], classic, drift)
         observe(track, after, classic, observations[i])
-        store_car(after, cars[i])
+
+
+@inlined
+def advance(
+    track: Track, row: NDArray[np.float64], action: int, classic: bool, drift: bool
+) -> tuple[Car, float, int]:
+    """Advance the car in a row of `step_cars`; return the car, its reward and its end."""
+    before = car_at(row)
+    after = drive(track, before, action, classic, drift)
+    store_car(after, row)
+    reward, end = outcome_of(track, before, after, classic)
+    return after, reward, end
 
 
 StepResult = tuple[float, int, float, float, float, float, int]

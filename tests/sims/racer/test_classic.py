@@ -12,7 +12,7 @@ from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.pilots import make_pilot
 from mcaprl.sims.racer.course import Track
 from mcaprl.sims.racer.env import RacerEnv
-from mcaprl.sims.racer.rays import RAY_NAMES, RAYS, measure
+from mcaprl.sims.racer.rays import BLOCK_SIZE, LENGTH, RAY_NAMES, RAYS, measure
 from mcaprl.sims.racer.rules import CRASH, DRIVING, NO_GATE, TIME_LIMIT, drive, observe, outcome_of
 from tests.support.racer_tracks import car_in, corridor
 
@@ -27,8 +27,9 @@ def classic(**kwargs: Any) -> RacerEnv:
 
 def lengths_of(track: Track, x_px: float, y_px: float) -> dict[str, float]:
     """Return the classic ray lengths of a car that faces right."""
-    lengths = np.zeros(RAYS)
-    measure(track.walls_px, car_in(track, x_px, y_px), True, lengths)
+    block = np.zeros(BLOCK_SIZE)
+    measure(track.walls_px, car_in(track, x_px, y_px), True, block)
+    lengths = block[LENGTH : LENGTH + RAYS]
     return dict(zip(RAY_NAMES, lengths.tolist(), strict=True))
 
 

@@ -11,7 +11,17 @@ from hypothesis import strategies as st
 
 from mcaprl.sims.racer.car import car_at, is_beyond, placed
 from mcaprl.sims.racer.course import make_track
-from mcaprl.sims.racer.rays import FAR_PX, RAY_NAMES, RAYS, cast, measure, ray_ends
+from mcaprl.sims.racer.rays import (
+    BLOCK_SIZE,
+    FAR_PX,
+    LENGTH,
+    RAY_NAMES,
+    RAYS,
+    SLOTS,
+    cast,
+    measure,
+    ray_ends,
+)
 from mcaprl.sims.racer.rules import (
     ACTION_MEANINGS,
     CRASH,
@@ -137,8 +147,9 @@ def test_a_drifting_course_follows_by_100_over_speed_plus_1_degrees() -> None:
 
 def test_rays_by_hand() -> None:
     track = corridor()
-    lengths = np.zeros(RAYS)
-    measure(track.walls_px, car_in(track, 500.0, 150.0), False, lengths)
+    block = np.zeros(BLOCK_SIZE)
+    measure(track.walls_px, car_in(track, 500.0, 150.0), False, block)
+    lengths = block[LENGTH : LENGTH + RAYS]
     ten, twenty = 50 / math.sin(math.radians(10)), 50 / math.sin(math.radians(20))
     expected = [500, 100, 100, 50 * 2**0.5, 50 * 2**0.5, 50, 50, 500, ten, ten]
     expected += [50 * 2**0.5, 50 * 2**0.5, twenty, twenty, 43, 43, 485, 485]
@@ -147,8 +158,9 @@ def test_rays_by_hand() -> None:
 
 def test_left_and_right_rays_differ() -> None:
     track = corridor()
-    lengths = np.zeros(RAYS)
-    measure(track.walls_px, car_in(track, 500.0, 130.0), False, lengths)
+    block = np.zeros(BLOCK_SIZE)
+    measure(track.walls_px, car_in(track, 500.0, 130.0), False, block)
+    lengths = block[LENGTH : LENGTH + RAYS]
     seen = dict(zip(RAY_NAMES, lengths.tolist(), strict=True))
     assert (seen["left_90"], seen["right_90"]) == pytest.approx((30.0, 70.0))
     assert seen["left_corner_sideways"] == pytest.approx(23.0)
@@ -172,10 +184,13 @@ def test_no_ray_passes_through_a_joint_of_walls() -> None:
     x_px, y_px = 50.0, 300.0
     away = track.walls_px[:, :2] - (x_px, y_px)
     reach = FAR_PX * away.T / np.hypot(*away.T)
-    rays = np.vstack([np.full_like(reach, [[x_px], [y_px]]), reach])
-    shares = np.empty(len(away))
-    cast(track.walls_px, rays, shares)
-    assert (FAR_PX * shares < 990.0).all()
+    rays = np.vstack([np.full_like(reach, [[x_px], [y_px]]), reach, np.empty(len(away))])
+    for first in range(0, len(away), SLOTS):
+        block = np.zeros((5, SLOTS))
+        part = rays[:, first : first + SLOTS]
+        block[:, : part.shape[1]] = part
+        cast(track.walls_px, block.ravel())
+        assert (FAR_PX * block[4, : part.shape[1]] < 990.0).all()
 
 
 @given(st.floats(0, 250), st.floats(-20, 20), st.floats(-3, 3))
