@@ -82,7 +82,7 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         "Ray cluster": ("ray", "workers", "address", "shards"),
     },
     "train-online": {
-        "Run": ("out", "algo", "preset", "seeds", "seed", "threads", "sources", "resume"),
+        "Run": ("out", "algo", "preset", "seeds", "seed", "threads", "device", "sources", "resume"),
         "Sim": ("observation", "rules"),
         "Log": ("record", "upload"),
         "Live view": ("live", "live_speed", "port", "allow_origin"),

@@ -84,6 +84,11 @@ def _tuned() -> dict[str, dict[str, Any]]:
     default=8765,
 )
 @origin_option
+@click.option(
+    "--device",
+    help="cuda or cpu: sims, replay buffers and networks of all seeds stay on it and train at once;"
+    " lane and racer only. Without it, Stable-Baselines3 trains one seed after the other.",
+)
 @sim_options
 def train_online(sim: str | None, out: Path, **request: Any) -> None:
     """Train a policy in SIM: lane, powerline, racer, highway-lane, or any Gymnasium id.
@@ -115,4 +120,5 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
         ["run", "steps", "best at", "mean return", "random 0, pilot 1", "ends"],
         rows,
     )
-    hint(f"curves: {out / 'curve.png'}, or tensorboard --logdir {out}")
+    curves = "" if request["device"] else f"{out / 'curve.png'}, or "
+    hint(f"curves: {curves}tensorboard --logdir {out}")

@@ -187,18 +187,29 @@ class _Run:
 
     def conclude(self, summaries: Sequence[OnlineSummary], fresh: Scale) -> None:
         """Write the scores of all seeds, and the image of their curves."""
-        seeds = {
-            summary.folder.name: {
-                "best_step": summary.best_step,
-                "mean_return": summary.mean_return,
-                "score": summary.score,
-                "ends": summary.ends,
-            }
-            for summary in summaries
-        }
-        scale = {"random": fresh.random, "pilot": fresh.pilot}
-        written = {"episodes": self.task.config.final_episodes, "scale": scale, "seeds": seeds}
-        write_json(self.folder / SCORES_NAME, written, TrainingError)
+        write_scores(self.folder, summaries, fresh, self.task.config.final_episodes)
         if find_spec("matplotlib") is not None:
             title = f"{self.task.algo} in {self.task.sim}"
             draw_curves(self.folder / IMAGE_NAME, [read_run(self.folder)], title)
+
+
+def write_scores(
+    folder: Path, summaries: Sequence[OnlineSummary], scale: Scale, episodes: int
+) -> None:
+    """Write the scores of all seeds on new episodes into a run folder.
+
+    Raises:
+        TrainingError: The file cannot be written.
+    """
+    seeds = {
+        summary.folder.name: {
+            "best_step": summary.best_step,
+            "mean_return": summary.mean_return,
+            "score": summary.score,
+            "ends": summary.ends,
+        }
+        for summary in summaries
+    }
+    ends = {"random": scale.random, "pilot": scale.pilot}
+    written = {"episodes": episodes, "scale": ends, "seeds": seeds}
+    write_json(folder / SCORES_NAME, written, TrainingError)

@@ -10,7 +10,9 @@ Importing this package does not import numba or pygame; making or rendering a si
 from __future__ import annotations
 
 import contextlib
+import importlib
 import re
+import sys
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any, Final
 
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from mcaprl.sims.evaluation.rollout import EpsilonGreedy, Policy, episode_seed, rollout
     from mcaprl.sims.lane.camera import CarCamera
     from mcaprl.sims.lane.env import LaneKeepingEnv
+    from mcaprl.sims.vehicle.device import DeviceSims
 
 SIMS: Final = SimCatalog((lane.SPEC, racer.SPEC, powerline.SPEC, highway.SPEC))
 """Gymnasium id of each sim by short name, including sims of installed packages."""
@@ -87,6 +90,45 @@ def make_sims(
     return envs
 
 
+def make_device_sims(
+    name: str,
+    num_envs: int,
+    *,
+    device: str,
+    seed: int = 0,
+    max_episode_steps: int | None = None,
+    **kwargs: Any,
+) -> DeviceSims:
+    """Make vehicles whose states and observations stay on one device between steps.
+
+    The sims `lane` and `racer` support this, with their default rules, and with vectors as
+    observations. On a GPU, this needs the extra `gpu`.
+
+    Args:
+        name: `lane` or `racer`, or the short name or id of another sim that supports it.
+        num_envs: Number of vehicles.
+        device: `cpu` or `cuda`.
+        seed: Seed of the starting states.
+        max_episode_steps: Steps after which an episode is truncated; default: as in `make_sim`.
+        **kwargs: `start`, and for the racer `drift` and `track_seed`; see the sims.
+
+    Raises:
+        UnknownNameError, MissingExtraError: As in `make_sim`.
+        UsageError: The sim does not support this, an argument is invalid, or there is no GPU.
+    """
+    spec = _resolve(name)[1]
+    if spec is None or spec.device_entry_point is None:
+        specs = [SIMS.find(env_id, loads=False) for env_id in SIMS.values()]
+        able = " and ".join(one.name for one in specs if one and one.device_entry_point)
+        raise UsageError(f"sim '{name}' cannot stay on a device; {able} can")
+    module, _, attribute = spec.device_entry_point.partition(":")
+    steps = max_episode_steps or spec.max_episode_steps or sys.maxsize
+    options = {"num_envs": num_envs, "device": device, "seed": seed, "max_episode_steps": steps}
+    with _clear_errors(name, spec, kwargs):
+        sims: DeviceSims = getattr(importlib.import_module(module), attribute)(**options, **kwargs)
+    return sims
+
+
 def _set_module(envs: Iterable[gym.Env[Any, Any]], env_id: str) -> None:
     """Store the module part of `env_id` in the environments, so that recorders can log it."""
     module = env_id.rpartition(":")[0]
@@ -124,6 +166,7 @@ def _clear_errors(name: str, spec: SimSpec | None, kwargs: dict[str, Any]) -> It
 __all__ = [
     "SIMS",
     "CarCamera",
+    "DeviceSims",
     "EpsilonGreedy",
     "LaneKeepingEnv",
     "Policy",
@@ -132,6 +175,7 @@ __all__ = [
     "encode_depth",
     "episode_seed",
     "evaluate",
+    "make_device_sims",
     "make_pilot",
     "make_sim",
     "make_sims",
@@ -149,5 +193,6 @@ __getattr__ = lazy_attributes(
         "mcaprl.sims.evaluation.rollout": ("EpsilonGreedy", "Policy", "episode_seed", "rollout"),
         "mcaprl.sims.lane.camera": ("CarCamera",),
         "mcaprl.sims.lane.env": ("LaneKeepingEnv",),
+        "mcaprl.sims.vehicle.device": ("DeviceSims",),
     },
 )

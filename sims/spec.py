@@ -40,6 +40,9 @@ class SimSpec:
     """Environment class, or `module:class`."""
     vector_entry_point: str | None = None
     """`module:class` of the vector environment, if there is one."""
+    device_entry_point: str | None = None
+    """`module:class` of the `mcaprl.sims.DeviceSims` that keep all vehicles on one device, if there
+    are any."""
     max_episode_steps: int | None = None
     """Steps after which an episode is truncated."""
     pilot: str | Callable[[Any], Any] | None = None

@@ -236,6 +236,7 @@ def train_online(
     live_speed: float = DEFAULT_SPEED,
     port: int = DEFAULT_PORT,
     allow_origin: str | Sequence[str] = (),
+    device: str | None = None,
     observation: str | None = None,
     rules: str | None = None,
     sim_options: Mapping[str, Any] | None = None,
@@ -266,6 +267,9 @@ def train_online(
         port: Port on 127.0.0.1 for viewers; 0 for any free port.
         allow_origin: Origin of other web pages that may connect, or a list of origins. Pages on
             this machine, Foxglove and Lichtblick may always connect.
+        device: `cuda` or `cpu`: sims, replay buffers and networks of all seeds stay on this device,
+            and all seeds are trained at once by `mcaprl.device.training`. Only for `double-dqn` in
+            the sims `lane` and `racer`; nothing is recorded. None trains with SB3.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
         sim_options: Other arguments of the environment.
@@ -301,6 +305,16 @@ def train_online(
             raise UsageError("upload needs record: there is no log to copy")
     out = Path(out)
     options = all_options(observation, rules, sim_options)
+    if device is not None:
+        _check_device_request(
+            algo=algo not in (None, "double-dqn"),
+            preset=preset is not None,
+            record=record is not None,
+            sources=bool(as_names(sources)),
+            resume=resume,
+            live=live,
+        )
+        return _train_on_device(sim, out, device, seeds, seed, threads, options, settings, progress)
     task = choose_task(sim, algo, options, settings, preset=preset, resumed=out if resume else None)
     data, policy = _experience(as_names(sources))
     with ExitStack() as stack:
@@ -328,6 +342,35 @@ def train_online(
         folder = Path(record)
         upload_all(sorted(folder.glob("*.mcap")) if folder.is_dir() else [folder], upload)
     return trained
+
+
+def _check_device_request(**given: bool) -> None:
+    """Check that no argument is given that training on a device does not support."""
+    for name, is_given in given.items():
+        if is_given:
+            shown = "--from" if name == "sources" else flag(name)
+            raise UsageError(f"{shown} is not for --device: omit one of them")
+
+
+def _train_on_device(
+    sim: str | None,
+    out: Path,
+    device: str,
+    seeds: int,
+    seed: int,
+    threads: int,
+    options: dict[str, Any],
+    settings: dict[str, Any],
+    progress: ProgressCallback,
+) -> list[OnlineSummary]:
+    from mcaprl.device.training import device_task
+    from mcaprl.device.training import train as train_agents
+
+    if sim is None:
+        raise UsageError("--device needs a SIM: lane or racer")
+    task = device_task(sim, options, **settings)
+    with torch_threads(threads):
+        return train_agents(task, out, device=device, seeds=seeds, seed=seed, progress=progress)
 
 
 def _experience(sources: list[str]) -> tuple[Dataset | None, list[TrainedPolicy] | None]:

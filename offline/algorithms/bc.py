@@ -21,6 +21,7 @@ class BC(Learner):
     config_type = BCConfig
     acts_by = "logits"
     policy_models = ("logits",)
+    can_be_captured = True
     config: BCConfig
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:

@@ -40,6 +40,7 @@ class DQN(Learner):
     config_type = DQNConfig
     acts_by: ClassVar[ActsBy] = "q_values"
     policy_models: ClassVar[tuple[str, ...]] = ("q",)
+    can_be_captured = True
     config: DQNConfig
 
     def __init__(self, config: DQNConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:

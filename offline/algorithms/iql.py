@@ -46,6 +46,7 @@ class IQL(Learner):
     config_type = IQLConfig
     acts_by = "logits"
     policy_models = ("logits", "q")
+    can_be_captured = True
     config: IQLConfig
 
     def __init__(self, config: IQLConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:

@@ -12,11 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from mcaprl.networks import Network
+from mcaprl.offline.algorithms.captured import CapturedUpdate
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.losses import allowed_only
 from mcaprl.offline.algorithms.models import ALIGNMENT, Model, TargetNetwork, build_model
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
-from mcaprl.offline.batches.observations import Observations
+from mcaprl.offline.batches.observations import FramesOnDisk, Observations
 
 ActsBy = Literal["q_values", "logits", "filtered_q_values"]
 """Kinds of network outputs from which a trained policy selects actions; see `policy`."""
@@ -48,6 +49,8 @@ class Learner(ABC):
         config_type: Dataclass of the algorithm's settings.
         acts_by: Kind of outputs from which the policy selects actions.
         policy_models: Names of the models that the policy needs.
+        can_be_captured: Whether `losses` can be part of a CUDA graph: tensors have shapes that do
+            not depend on values, and no value is read by the CPU.
         seeds: K seeds.
         models: Models by name; each contains K networks.
         target_networks: Target networks by the name of the model that they copy.
@@ -59,6 +62,7 @@ class Learner(ABC):
     config_type: ClassVar[type[TrainingConfig]]
     acts_by: ClassVar[ActsBy]
     policy_models: ClassVar[tuple[str, ...]]
+    can_be_captured: ClassVar[bool] = False
     config: TrainingConfig
 
     def __init__(
@@ -85,8 +89,15 @@ class Learner(ABC):
         weights = [model.weights for model in self.models.values()]
         self.scalars: dict[str, nn.Parameter] = {}
         groups = [{"params": weights, "rate_factor": 1.0, "weight_decay": config.weight_decay}]
-        self.optimizer = torch.optim.AdamW(groups, fused=True)
+        on_gpu = buffer.device.type == "cuda"
+        self.optimizer = torch.optim.AdamW(
+            groups, lr=self._new_rate(), fused=True, capturable=on_gpu
+        )
         self._reset_moments(weights)
+        # Images on disk are read by the CPU, and processes wait for each other.
+        on_disk, alone = isinstance(buffer.frames, FramesOnDisk), buffer.share.processes == 1
+        self._is_captured = on_gpu and alone and not on_disk and self.can_be_captured
+        self._captured: CapturedUpdate | None = None
 
     @abstractmethod
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -114,32 +125,52 @@ class Learner(ABC):
         Update target networks if this is due.
 
         Returns:
-            The terms of `losses`, multiplied by the factors of the batch, and detached.
+            The terms of `losses`, multiplied by the factors of the batch, and detached. On a GPU,
+            the next update overwrites them.
 
         Raises:
             NotFiniteError: The loss is NaN or infinite; the weights have not changed.
         """
-        share = self.buffer.share
-        rows, factors = share.draw(self.buffer, self.config.batch_size, self.samplers)
-        batch = self.buffer.batch(rows.to(self.buffer.device), factors)
-        if self._losses is None:
-            self._losses = share.wrap(_Losses(self))
-        terms = {name: batch.weighted(term) for name, term in self._losses(batch).items()}
-        # A seed's loss depends only on that seed's weights, so one sum yields all gradients.
-        loss = terms["loss"].sum()
-        terms = {name: term.detach() for name, term in terms.items()}
-        if not math.isfinite(share.average(loss.detach()).item()):
+        buffer = self.buffer
+        rows, factors = buffer.share.draw(buffer, self.config.batch_size, self.samplers)
+        if self._is_captured and self._captured is None:
+            self._captured = CapturedUpdate(self._gradients, self.optimizer, rows)
+        if self._captured is None:
+            terms = self._gradients(rows.to(buffer.device), factors)
+        else:
+            terms = self._captured.gradients(rows)
+        if not math.isfinite(buffer.share.average(terms["loss"].sum()).item()):
             raise self._not_finite(self.seed_means(terms))
-        self.optimizer.zero_grad()
-        torch.autograd.backward(loss / (len(rows) // len(self.seeds)))
         for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate_at(self.step) * group["rate_factor"]
-        self.optimizer.step()
+            rate = self.config.learning_rate_at(self.step) * group["rate_factor"]
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+        if self._captured is None:
+            self.optimizer.step()
+        else:
+            self._captured.step()
         self.step += 1
         if self.target_networks and self.step % self._sync_interval == 0:
             for name, target in self.target_networks.items():
                 target.sync(self.models[name])
         return terms
+
+    def _gradients(self, rows: Tensor, factors: Tensor | None = None) -> dict[str, Tensor]:
+        """Compute the gradients of all weights for rows (R,) of the buffer, on its device.
+
+        Returns:
+            The terms of `losses`, multiplied by the factors of the rows, and detached.
+        """
+        batch = self.buffer.batch(rows, factors)
+        if self._losses is None:
+            self._losses = self.buffer.share.wrap(_Losses(self))
+        terms = {name: batch.weighted(term) for name, term in self._losses(batch).items()}
+        self.optimizer.zero_grad()
+        # A seed's loss depends only on that seed's weights, so one sum yields all gradients.
+        torch.autograd.backward(terms["loss"].sum() / (len(rows) // len(self.seeds)))
+        return {name: term.detach() for name, term in terms.items()}
 
     def add_target_network(
         self, name: str, interval: int, *, next_states: bool = True
@@ -175,7 +206,12 @@ class Learner(ABC):
         scalar = nn.Parameter(
             torch.full((len(self.seeds), ALIGNMENT), start, device=self.buffer.device)
         )
-        group = {"params": [scalar], "rate_factor": rate_factor, "weight_decay": 0.0}
+        group = {
+            "params": [scalar],
+            "lr": self._new_rate(),
+            "rate_factor": rate_factor,
+            "weight_decay": 0.0,
+        }
         self.optimizer.add_param_group(group)
         self._reset_moments([scalar])
         self.scalars[name] = scalar
@@ -256,6 +292,11 @@ class Learner(ABC):
             target.reset()
         self.samplers[k].set_state(tensors["generator.sampler"])
         self.step = step
+
+    def _new_rate(self) -> Tensor | float:
+        """Return a learning rate, which each update sets; CUDA graphs read it from a tensor."""
+        device = self.buffer.device
+        return torch.zeros((), device=device) if device.type == "cuda" else 0.0
 
     def _learned(self) -> dict[str, nn.Parameter]:
         """Return everything that the optimizer changes, (K, P) by name."""

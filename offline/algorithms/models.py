@@ -91,12 +91,13 @@ class StackedMLP(Model):
     def fits(network: Network) -> bool:
         """Return whether a network consists of linear layers and ReLU only.
 
-        Layers with a single input or output are excluded, because matrix-vector products round
-        differently for one seed than for several.
+        Layers with a single input or output are excluded on the CPU, because matrix-vector products
+        round differently for one seed than for several.
         """
         kinds = (Network, nn.ModuleList, nn.Sequential, nn.Linear, nn.ReLU)
         plain = len(network.stems) == 1 and all(isinstance(m, kinds) for m in network.modules())
-        return plain and all(min(p.shape) > 1 for p in network.parameters() if p.ndim == 2)
+        matrices = [weights for weights in network.parameters() if weights.ndim == 2]
+        return plain and all(one.is_cuda or min(one.shape) > 1 for one in matrices)
 
     def __call__(self, observations: Observations) -> Tensor:
         """Map the observations of all seeds to outputs (R, *output_shape)."""
@@ -144,7 +145,9 @@ class TargetNetwork:
         self.model = model.clone()
         self._buffer = buffer
         self._next_states = next_states
-        self._use_table = len(buffer) <= rows_per_sync * model.bulk_gain
+        # On a GPU, a CUDA graph contains the forward pass, which takes hardly any time there.
+        fixed = buffer.is_fixed and buffer.device.type == "cpu"
+        self._use_table = fixed and len(buffer) <= rows_per_sync * model.bulk_gain
         self._table: Tensor | None = None
         seeds = torch.arange(len(model.weights), device=buffer.device)
         self._offsets = seeds.unsqueeze(1) * len(buffer)

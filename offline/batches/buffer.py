@@ -83,6 +83,7 @@ class TransitionBuffer:
         cumulative: (M,) float64, cumulative weights of the drawable rows; None if the weights are
             equal.
         share: Share of all data that these transitions make up.
+        is_fixed: Whether the transitions stay the same during training.
     """
 
     encoder: ObservationEncoder
@@ -97,6 +98,7 @@ class TransitionBuffer:
     drawable: Tensor | None = None
     cumulative: Tensor | None = None
     share: Share = ALONE
+    is_fixed: bool = True
 
     @classmethod
     def from_dataset(

@@ -25,19 +25,19 @@ def logarithm(number: float) -> float:
     """Return the natural logarithm of a number from 1 to 181, with an error below 1e-15.
 
     The function has no branches or calls, so that the compiler can vectorize loops. It divides the
-    number by a power of 2, so that the quotient q is from sqrt(1/2) to sqrt(2). With
+    number by a power of 2, so that the result q is from sqrt(1/2) to sqrt(2). With
     s = (q - 1) / (q + 1), ln q = 2 (s + s^3/3 + s^5/5 + ...); the rest is below 1e-18.
     """
     is_large = number >= 8.0 * _ROOT_2
-    quotient = number * 0.0625 if is_large else number
+    scaled = number * 0.0625 if is_large else number
     twos = 4.0 if is_large else 0.0
-    is_large = quotient >= 2.0 * _ROOT_2
-    quotient = quotient * 0.25 if is_large else quotient
+    is_large = scaled >= 2.0 * _ROOT_2
+    scaled = scaled * 0.25 if is_large else scaled
     twos = twos + 2.0 if is_large else twos
-    is_large = quotient >= _ROOT_2
-    quotient = quotient * 0.5 if is_large else quotient
+    is_large = scaled >= _ROOT_2
+    scaled = scaled * 0.5 if is_large else scaled
     twos = twos + 1.0 if is_large else twos
-    share = (quotient - 1.0) / (quotient + 1.0)
+    share = (scaled - 1.0) / (scaled + 1.0)
     square = share * share
     rest = 1.0 / 19.0 + square * (1.0 / 21.0)
     rest = 1.0 / 17.0 + square * rest

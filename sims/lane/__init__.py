@@ -7,6 +7,7 @@ SPEC = SimSpec(
     env_id="mcaprl/LaneKeeping-v0",
     entry_point="mcaprl.sims.lane.env:LaneKeepingEnv",
     vector_entry_point="mcaprl.sims.lane.env:BatchedLaneKeepingEnv",
+    device_entry_point="mcaprl.sims.lane.device:DeviceLane",
     max_episode_steps=400,
     pilot="mcaprl.sims.lane.pilot:LanePilot",
     engine="numba",

@@ -59,11 +59,19 @@ def step_cars(
     if len(cars) >= LANES:
         first = _step_blocks(cars, actions, rewards, ends, observations)
     for i in range(first, len(cars)):
-        before = car_at(cars[i])
-        after = drive(before, actions[i])
-        rewards[i], ends[i] = reward_of(before, after), end_of(after)
-        observe(after, observations[i])
-        store_car(after, cars[i])
+        rewards[i], ends[i] = step_car(cars[i], actions[i], observations[i])
+
+
+@compiled
+def step_car(
+    row: NDArray[np.float64], action: int, observation: NDArray[np.float32]
+) -> tuple[float, int]:
+    """Advance the car in a row of `step_cars`, and return its reward and end."""
+    before = car_at(row)
+    after = drive(before, action)
+    observe(after, observation)
+    store_car(after, row)
+    return reward_of(before, after), end_of(after)
 
 
 @compiled
@@ -79,14 +87,11 @@ def step_only_car(
     Returns:
         Reward, end, offset, heading error, speed and progress.
     """
-    before = car_at(cars[0])
-    after = drive(before, action)
-    reward, end = reward_of(before, after), end_of(after)
+    reward, end = step_car(cars[0], action, observations[0])
     rewards[0], ends[0] = reward, end
-    observe(after, observations[0])
-    store_car(after, cars[0])
-    progress_m = after.along_m - cars[0, -1]
-    return reward, end, after.offset_m, after.heading_error_rad, after.speed_m_s, progress_m
+    car = car_at(cars[0])
+    progress_m = car.along_m - cars[0, -1]
+    return reward, end, car.offset_m, car.heading_error_rad, car.speed_m_s, progress_m
 
 
 @compiled

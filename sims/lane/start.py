@@ -20,6 +20,8 @@ from mcaprl.sims.vehicle.draws import spread, take
 ALONG, STARTED_AT = Car._fields.index("along_m"), len(Car._fields)
 """Indices of two values in a car's row: its distance along the path, now and at the start of the
 episode."""
+SHARES = 4
+"""Number of random numbers for a start; a start on the line uses the first two."""
 LINE_M = 2.0
 """Distance of the start line along the path."""
 AFTER_CORNER_M, BEFORE_CORNER_M = 2.0, 8.0

@@ -7,6 +7,7 @@ SPEC = SimSpec(
     env_id="mcaprl/Racer-v0",
     entry_point="mcaprl.sims.racer.env:RacerEnv",
     vector_entry_point="mcaprl.sims.racer.env:BatchedRacerEnv",
+    device_entry_point="mcaprl.sims.racer.device:DeviceRacer",
     # Only the classic rules reach this limit; the default rules truncate after 1,000 steps.
     max_episode_steps=10_000,
     pilot="mcaprl.sims.racer.pilot:RacerPilot",

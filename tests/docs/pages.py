@@ -55,6 +55,7 @@ ADDED = {
     "train-offline --sweep": "",
     "train-offline bc": "--updates 30 --hidden 16,16",
     "train-online": "--steps 200 --envs 2 --eval-episodes 1 --final-episodes 1 --hidden 16,16",
+    "train-online --device": "--steps 800 --envs 2 --final-episodes 1 --hidden 16,16",
     "evaluate": "--episodes 2",
     "evaluate --data": "--updates 10",
     "replay --video": "--speed 60",

@@ -1,0 +1,309 @@
+"""Double DQN in which sims, replay buffer and networks of all seeds stay on one device.
+
+Algorithm and settings are those of `mcaprl.online`, and the networks and losses those of
+`mcaprl.offline`, which train all seeds at once. Each seed has its own environments and transitions.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager, nullcontext
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from mcaprl.device.replay import ReplayBuffer
+from mcaprl.errors import TrainingError, UsageError
+from mcaprl.offline.algorithms.config import DoubleDQNConfig as LearnerConfig
+from mcaprl.offline.algorithms.dqn import DoubleDQN
+from mcaprl.offline.algorithms.learner import NotFiniteError
+from mcaprl.offline.batches.buffer import choose_device
+from mcaprl.offline.batches.observations import Observations
+from mcaprl.offline.policy import read_policy, save_policy
+from mcaprl.offline.training.metrics import MetricsWriter
+from mcaprl.online.config import DoubleDQNConfig
+from mcaprl.online.evaluation import FRESH_SEED, Scale, measure_scale
+from mcaprl.online.task import Task
+from mcaprl.online.train import OnlineSummary, write_scores
+from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
+from mcaprl.runs import locked_run, open_run, seed_folder
+from mcaprl.sims import DeviceSims, make_device_sims, make_sim
+from mcaprl.sims.evaluation.evaluate import evaluate
+from mcaprl.sims.vehicle.device import Batch
+
+SETTINGS: Final[dict[str, Any]] = {
+    "envs": 2_048,
+    "steps": 8_388_608,
+    "steps_per_update": 128,
+    "batch_size": 512,
+    "buffer_size": 524_288,
+    "learning_starts": 65_536,
+    "target_update_interval": 65_536,
+}
+"""Settings that replace those of `SIM_SETTINGS`; steps are those of one seed."""
+_UNUSED: Final = (
+    "alpha",
+    "center_images",
+    "channels",
+    "checkpoint_interval",
+    "encoder",
+    "eval_episodes",
+    "eval_interval",
+    "exploration_decay",
+    "frame_stack",
+    "image_shift",
+    "max_grad_norm",
+    "target_update_episodes",
+)
+"""Settings that this training does not use."""
+_ROWS: Final = 100
+"""Number of rows of metrics."""
+_ROWS_PER_SAVE: Final = 10
+"""Number of rows of metrics between two times that the policies are saved."""
+
+
+def device_task(sim: str, sim_options: Mapping[str, Any] | None = None, **settings: Any) -> Task:
+    """Return a task with the settings of the sim and of this module, except those that are given.
+
+    Raises:
+        UsageError: There is no such setting, it is not used here, or it is outside its range.
+    """
+    for name in settings:
+        if name in _UNUSED:
+            raise UsageError(f"{name} has no effect with a device: omit it")
+    return Task.for_sim(sim, "double-dqn", sim_options, **{**SETTINGS, **settings})
+
+
+def train(
+    task: Task,
+    out: str | Path,
+    *,
+    device: str,
+    seeds: int = 1,
+    seed: int = 0,
+    progress: ProgressCallback | None = None,
+) -> list[OnlineSummary]:
+    """Train K agents at once, and score their last policies on new episodes.
+
+    The run folder contains the policy and metrics of each seed, in the format of offline runs, and
+    `scores.json`. Nothing is recorded, and a training cannot be resumed.
+
+    Args:
+        task: Task of `device_task`.
+        out: Folder of the run; it must be empty or not exist.
+        device: `cpu` or `cuda`.
+        seeds: Number of agents K.
+        seed: Seed of the first agent; agent k uses seed + k.
+        progress: Callback for progress; None shows a bar if stderr is a terminal.
+
+    Returns:
+        One summary for each seed.
+
+    Raises:
+        UnknownNameError: There is no such sim or device.
+        OutputExistsError: `out` exists.
+        UsageError: The sim or the device is not supported.
+        TrainingError: The loss is NaN or infinite, or `out` cannot be written.
+    """
+    place = choose_device(device)
+    folder = Path(out)
+    config = task.config
+    assert isinstance(config, DoubleDQNConfig)
+    sims = make_device_sims(
+        task.sim, seeds * config.envs, device=device, seed=seed, **task.sim_options
+    )
+    with locked_run(folder, False), closing(make_sim(task.sim, **task.sim_options)) as env:
+        open_run(folder, task.identity, False, device=device, seeds=seeds)
+        agents = Agents(sims, config, range(seed, seed + seeds), place)
+        began_s = time.perf_counter()
+        env_id = env.spec.id if env.spec else task.sim
+
+        def save() -> None:
+            for number in agents.learner.seeds:
+                mine = seed_folder(folder, number)
+                save_policy(mine, agents.learner, number, env_id, task.sim_options)
+
+        bar = terminal_progress("steps", "mean_reward")
+        with nullcontext(progress) if progress else bar as report, fast_products():
+            _train(agents, folder, report, save)
+        seconds = time.perf_counter() - began_s
+        scale = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
+        summaries = [
+            _summary(env, task, seed_folder(folder, number), number, agents.steps, seconds, scale)
+            for number in agents.learner.seeds
+        ]
+        write_scores(folder, summaries, scale, config.final_episodes)
+    return summaries
+
+
+@contextmanager
+def fast_products() -> Iterator[None]:
+    """Let matrix products on GPUs round their factors to TF32, which takes half the time."""
+    before = torch.get_float32_matmul_precision()
+    if torch.cuda.is_available():
+        torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+class Agents:
+    """K agents, their environments, replay buffer and networks.
+
+    Attributes:
+        config: Settings of each agent.
+        learner: Learner of all agents.
+        steps: Number of finished steps of one agent, summed over its environments.
+    """
+
+    def __init__(
+        self, sims: DeviceSims, config: DoubleDQNConfig, seeds: range, device: torch.device
+    ) -> None:
+        """Create agents with new weights, and start their environments."""
+        space = sims.single_observation_space
+        assert isinstance(space, spaces.Box)
+        self.config, self._sims, self.steps = config, sims, 0
+        updates = (config.steps - config.learning_starts) // config.steps_per_update
+        learner_config = LearnerConfig(
+            updates=max(updates, 1),
+            batch_size=config.batch_size,
+            learning_rate=config.learning_rate,
+            final_learning_rate_fraction=config.final_learning_rate_fraction,
+            gamma=config.gamma,
+            n_steps=config.n_steps,
+            target_interval=max(config.target_update_interval // config.steps_per_update, 1),
+            hidden=config.hidden,
+            layer_norm=config.layer_norm,
+            dueling=config.dueling,
+        )
+        slots = max(config.buffer_size // config.envs, config.n_steps + 1)
+        self._replay = ReplayBuffer(
+            space,
+            sims.single_action_space,
+            learner_config,
+            len(seeds),
+            config.envs,
+            slots,
+            device,
+            seeds[0],
+        )
+        self.learner = DoubleDQN(learner_config, self._replay.transitions, seeds)
+        self._arrays = Batch(*(torch.as_tensor(array, device=device) for array in sims.batch))
+        self._generator = torch.Generator(device).manual_seed(seeds[0])
+        sims.reset()
+
+    @property
+    def epsilon(self) -> float:
+        """Probability of a random action."""
+        config = self.config
+        done = self.steps / max(config.exploration_fraction * config.steps, 1)
+        first, last = config.exploration_initial_eps, config.exploration_final_eps
+        return first + (last - first) * min(done, 1.0)
+
+    def step(self) -> Tensor:
+        """Take a step in each environment; then learn, unless it is too early.
+
+        Returns:
+            Mean reward (K,) of each agent.
+        """
+        arrays, config = self._arrays, self.config
+        arrays.actions.copy_(self._actions())
+        self._replay.add_actions(arrays.observations, arrays.actions)
+        self._sims.step()
+        self._replay.add_outcomes(
+            arrays.rewards, arrays.terminated, arrays.truncated, arrays.final_observations
+        )
+        before, self.steps = self.steps, self.steps + config.envs
+        if self.steps > config.learning_starts:
+            every = config.steps_per_update
+            due = self.steps // every - before // every
+            for _ in range(min(due, self.learner.config.updates - self.learner.step)):
+                self.learner.update()
+        rewards: Tensor = arrays.rewards
+        return rewards.view(len(self.learner.seeds), -1).mean(1)
+
+    @torch.no_grad()
+    def _actions(self) -> Tensor:
+        """Return the actions (K * E,) of epsilon-greedy policies."""
+        observations, count = self._arrays.observations, int(self._sims.single_action_space.n)
+        drawn = torch.empty_like(self._arrays.actions)
+        drawn.random_(count, generator=self._generator)
+        epsilon = self.epsilon
+        if epsilon >= 1:
+            return drawn
+        best = self.learner.models["q"](Observations(observations)).argmax(1)
+        explores = torch.empty(len(best), device=best.device)
+        explores.uniform_(generator=self._generator)
+        return torch.where(explores < epsilon, drawn, best)
+
+
+def _train(
+    agents: Agents, folder: Path, report: ProgressCallback, save: Callable[[], None]
+) -> None:
+    """Train until all steps are done; write `_ROWS` rows of metrics, and the policies now and then.
+
+    Raises:
+        TrainingError: The loss is NaN or infinite, or a file cannot be written.
+    """
+    learner, config = agents.learner, agents.config
+    seeds, row = learner.seeds, 0
+    with ExitStack() as stack:
+        writers = [
+            stack.enter_context(closing(MetricsWriter(seed_folder(folder, seed), 1)))
+            for seed in seeds
+        ]
+        while agents.steps < config.steps:
+            row += 1
+            try:
+                means = _rewards_until(agents, config.steps * row // _ROWS)
+            except NotFiniteError as error:
+                raise TrainingError(
+                    f"update {error.update} of {folder}: {error}; lower the learning rate"
+                ) from error
+            rate = learner.config.learning_rate_at(learner.step)
+            for seed, writer, mean in zip(seeds, writers, means, strict=True):
+                values = {"mean_reward": mean, "epsilon": agents.epsilon, "steps": agents.steps}
+                writer.write(learner.step, rate, values)
+                report(TrainingProgress(seed, agents.steps, config.steps, values))
+            if row % _ROWS_PER_SAVE == 0 or agents.steps >= config.steps:
+                save()
+
+
+def _rewards_until(agents: Agents, stop: int) -> list[float]:
+    """Train until `stop` steps are done, at least once; return the mean reward of each agent."""
+    rewards, count = agents.step(), 1
+    while agents.steps < stop:
+        rewards += agents.step()
+        count += 1
+    means: list[float] = (rewards / count).tolist()
+    return means
+
+
+def _summary(
+    env: Any, task: Task, folder: Path, seed: int, steps: int, seconds: float, scale: Scale
+) -> OnlineSummary:
+    """Score the saved policy of a seed on new episodes."""
+    score = evaluate(
+        env,
+        [read_policy(folder)],
+        name=task.algo,
+        episodes=task.config.final_episodes,
+        seed=FRESH_SEED,
+    )
+    return OnlineSummary(
+        folder=folder,
+        algo=task.algo,
+        seed=seed,
+        steps=steps,
+        resumed_at=0,
+        seconds=seconds,
+        best_step=steps,
+        mean_return=score.mean_return,
+        score=scale.score(score.mean_return),
+        ends=score.ends,
+    )
