@@ -29,6 +29,11 @@ settings.register_profile(
 settings.load_profile("mcaprl")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Start with the examples, which take long, so that no process runs them alone at the end."""
+    items.sort(key=lambda item: item.path.name != "test_examples.py")
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _one_thread() -> None:
     """Limit torch to one thread, because two threads are many times slower on a busy machine."""
