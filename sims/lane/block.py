@@ -59,19 +59,17 @@ def step_cars(
     if len(cars) >= LANES:
         first = _step_blocks(cars, actions, rewards, ends, observations)
     for i in range(first, len(cars)):
-        rewards[i], ends[i] = step_car(cars[i], actions[i], observations[i])
+        car, rewards[i], ends[i] = advance(cars[i], actions[i])
+        observe(car, observations[i])
 
 
-@compiled
-def step_car(
-    row: NDArray[np.float64], action: int, observation: NDArray[np.float32]
-) -> tuple[float, int]:
-    """Advance the car in a row of `step_cars`, and return its reward and end."""
+@inlined
+def advance(row: NDArray[np.float64], action: int) -> tuple[Car, float, int]:
+    """Advance the car in a row of `step_cars`; return the car, its reward and its end."""
     before = car_at(row)
     after = drive(before, action)
-    observe(after, observation)
     store_car(after, row)
-    return reward_of(before, after), end_of(after)
+    return after, reward_of(before, after), end_of(after)
 
 
 @compiled
@@ -87,9 +85,9 @@ def step_only_car(
     Returns:
         Reward, end, offset, heading error, speed and progress.
     """
-    reward, end = step_car(cars[0], action, observations[0])
+    car, reward, end = advance(cars[0], action)
     rewards[0], ends[0] = reward, end
-    car = car_at(cars[0])
+    observe(car, observations[0])
     progress_m = car.along_m - cars[0, -1]
     return reward, end, car.offset_m, car.heading_error_rad, car.speed_m_s, progress_m
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mcaprl.compiled import compiled
-from mcaprl.sims.lane.block import step_car
+from mcaprl.sims.lane.block import advance
 from mcaprl.sims.lane.fleet import LaneFleet
 from mcaprl.sims.lane.rules import DRIVING, Car, observe, store_car
 from mcaprl.sims.lane.start import SHARES, start_anywhere, start_on_line
@@ -98,6 +98,7 @@ def _start_car(batch: Batch, world: World, seed: Any, i: int, shares: Any) -> No
 
 @compiled
 def _step_car(batch: Batch, world: World, seed: Any, max_steps: int, i: int, shares: Any) -> None:
-    reward, end = step_car(batch.states[i], batch.actions[i], batch.observations[i])
+    car, reward, end = advance(batch.states[i], batch.actions[i])
+    observe(car, batch.observations[i])
     if finish_step(batch, i, reward, end != DRIVING, False, max_steps):
         _start_car(batch, world, seed, i, shares)
