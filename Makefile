@@ -110,7 +110,7 @@ $(BENCH)/.ready: $(SETTINGS)
 	$(PYTHON) -m venv $(BENCH)
 	$(BENCH)/bin/python -m pip install -qq --disable-pip-version-check --upgrade 'pip>=25.1'
 	$(BENCH)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt \
-	  -e '.[sims,offline,online,bags,tables,interop,fast]' --group bench
+	  -e '.[sims,offline,online,report,video,bags,tables,interop,fast]' --group bench
 	@touch $@
 
 # d3rlpy requires an older gymnasium but runs with the one of constraints.txt; it and SCOPE-RL are
