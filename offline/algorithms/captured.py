@@ -5,6 +5,7 @@ Launching the kernels of a small network one by one takes several times as long 
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 
 import torch
@@ -44,6 +45,9 @@ class CapturedUpdate:
         torch.cuda.current_stream(device).wait_stream(stream)
         # The capture allocates new gradients, which the graph overwrites instead of adding to them.
         optimizer.zero_grad()
+        # A learner is a reference cycle. If the garbage collector destroyed the graphs of an
+        # earlier learner during a capture, the capture would fail.
+        gc.collect()
         self._gradients, self._step = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._gradients):
             self.terms = gradients(self._rows)

@@ -17,7 +17,7 @@ from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.losses import allowed_only
 from mcaprl.offline.algorithms.models import ALIGNMENT, Model, TargetNetwork, build_model
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
-from mcaprl.offline.batches.observations import FramesOnDisk, Observations
+from mcaprl.offline.batches.observations import Observations
 
 ActsBy = Literal["q_values", "logits", "filtered_q_values"]
 """Kinds of network outputs from which a trained policy selects actions; see `policy`."""
@@ -94,9 +94,9 @@ class Learner(ABC):
             groups, lr=self._new_rate(), fused=True, capturable=on_gpu
         )
         self._reset_moments(weights)
-        # Images on disk are read by the CPU, and processes wait for each other.
-        on_disk, alone = isinstance(buffer.frames, FramesOnDisk), buffer.share.processes == 1
-        self._is_captured = on_gpu and alone and not on_disk and self.can_be_captured
+        # Processes wait for each other on the CPU, and kernels of images take longer than launches.
+        alone, vectors = buffer.share.processes == 1, not buffer.encoder.image_inputs
+        self._is_captured = on_gpu and alone and vectors and self.can_be_captured
         self._captured: CapturedUpdate | None = None
 
     @abstractmethod

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Sequence
+from typing import Any
 
 import pytest
 import torch
 
-from mcaprl.offline.algorithms.config import CQLConfig, TrainingConfig
+from mcaprl.offline.algorithms.config import BCQConfig, CQLConfig, DQNConfig, TrainingConfig
 from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from tests.offline.algorithms.test_algorithms import ALL
 from tests.support.offline_tasks import corridor
 
+SMALL: dict[str, Any] = {"updates": 40, "batch_size": 16, "hidden": (16, 16)}
 pytestmark = [
     pytest.mark.gpu,
     pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device"),
@@ -28,7 +32,7 @@ def learner_of(config: TrainingConfig, seeds: Sequence[int] = (0, 1)) -> Learner
 
 def small(learner_type: type[Learner]) -> TrainingConfig:
     """Return settings for a short training."""
-    return learner_type.config_type(updates=40, batch_size=16, hidden=(16, 16))
+    return learner_type.config_type(**SMALL)
 
 
 def weights_of(learner: Learner) -> dict[str, torch.Tensor]:
@@ -37,9 +41,16 @@ def weights_of(learner: Learner) -> dict[str, torch.Tensor]:
     return {name: weights.detach().clone() for name, weights in (models | learner.scalars).items()}
 
 
-@pytest.mark.parametrize("learner_type", ALL)
-def test_captured_updates_are_those_of_single_kernels(learner_type: type[Learner]) -> None:
-    captured, single = learner_of(small(learner_type)), learner_of(small(learner_type))
+@pytest.mark.parametrize(
+    "config",
+    [
+        *map(small, ALL),
+        DQNConfig(**SMALL, dueling=True, n_quantiles=5),
+        BCQConfig(**SMALL, layer_norm=True, normalize=True, frame_stack=2),
+    ],
+)
+def test_captured_updates_are_those_of_single_kernels(config: TrainingConfig) -> None:
+    captured, single = learner_of(config), learner_of(config)
     single._is_captured = False
     for _ in range(40):
         found, expected = captured.update(), single.update()
@@ -53,7 +64,7 @@ def test_captured_updates_are_those_of_single_kernels(learner_type: type[Learner
 
 
 def test_alpha_is_learned_with_its_own_learning_rate() -> None:
-    config = CQLConfig(updates=40, batch_size=16, hidden=(16, 16), target_gap=0.2)
+    config = CQLConfig(**SMALL, target_gap=0.2)
     captured, single = learner_of(config), learner_of(config)
     single._is_captured = False
     for _ in range(40):
@@ -84,7 +95,7 @@ def test_a_resumed_training_has_the_same_weights(learner_type: type[Learner]) ->
 
 
 def test_a_loss_that_is_not_finite_leaves_the_weights_unchanged() -> None:
-    learner = learner_of(CQLConfig(updates=40, batch_size=16, hidden=(16, 16)))
+    learner = learner_of(CQLConfig(**SMALL))
     learner.update()
     before = weights_of(learner)
     learner.buffer.returns[0] = torch.nan
@@ -95,7 +106,7 @@ def test_a_loss_that_is_not_finite_leaves_the_weights_unchanged() -> None:
 
 
 def test_the_target_network_follows_at_its_interval() -> None:
-    config = CQLConfig(updates=40, batch_size=16, hidden=(16, 16), target_interval=5)
+    config = CQLConfig(**SMALL, target_interval=5)
     learner = learner_of(config)
     for step in range(1, 12):
         learner.update()
@@ -113,6 +124,19 @@ def test_the_learning_rate_follows_its_schedule() -> None:
         learner.update()
         changes.append(bool((weights_of(learner)["q"] != before).any()))
     assert changes == [True, True, False]
+
+
+def test_graphs_of_an_earlier_learner_are_destroyed_before_a_capture() -> None:
+    earlier = learner_of(CQLConfig(**SMALL))
+    earlier.update()
+    graphs = weakref.ref(earlier._captured)
+    gc.disable()
+    try:
+        del earlier
+        learner_of(CQLConfig(**SMALL)).update()
+        assert graphs() is None
+    finally:
+        gc.enable()
 
 
 def test_algorithms_that_cannot_be_captured_are_trained_by_single_kernels() -> None:
