@@ -13,9 +13,8 @@ import time
 import numpy as np
 import torch
 
-from mcaprl.offline.algorithms.registry import choose_algorithm
-from mcaprl.offline.batches.buffer import TransitionBuffer
-from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl import Dataset
+from mcaprl.offline import ALGORITHMS, TransitionBuffer
 
 ROWS, NUMBERS, ACTIONS, EPISODE = 100_000, 19, 6, 1_000
 ALGOS = ("double-dqn", "cql", "iql", "bc")
@@ -64,8 +63,8 @@ def _rate(
     data: Dataset, algo: str, batch: int, seeds: int, device: str, graphs: bool, seconds: float
 ) -> float:
     """Return the updates per second of all seeds."""
-    kind, config = choose_algorithm(algo)
-    config = type(config)(updates=1_000_000, batch_size=batch)
+    kind = ALGORITHMS[algo]
+    config = kind.config_type(updates=1_000_000, batch_size=batch)
     buffer = TransitionBuffer.from_dataset(data, config.packing).to(torch.device(device))
     learner = kind(config, buffer, range(seeds))
     learner._is_captured &= graphs

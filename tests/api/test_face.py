@@ -21,7 +21,7 @@ from mcaprl.errors import UsageError
 from tests.support.paths import GOLDEN
 
 ROOT = Path(__file__).parent.parent.parent
-PACKAGES = ("api", "offline", "online", "recorder", "sims")
+PACKAGES = ("api", "device", "offline", "online", "recorder", "sims")
 CLASSES = ("Dataset", "Episode", "RecordMcap", "RecordVecMcap")
 FUNCTIONS = {
     "train-offline": ("train", "sweep"),
