@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -86,8 +87,9 @@ def _tuned() -> dict[str, dict[str, Any]]:
 @origin_option
 @click.option(
     "--device",
-    help="cuda or cpu: sims, replay buffers and networks of all seeds stay on it and train at once;"
-    " lane and racer only. Without it, Stable-Baselines3 trains one seed after the other.",
+    help="Train all seeds at once, with sims, replay buffers and networks on this device: cuda or"
+    " cpu. For double-dqn in lane and racer, with other default settings; the last policy is saved."
+    " Without it, Stable-Baselines3 trains one seed after the other.",
 )
 @sim_options
 def train_online(sim: str | None, out: Path, **request: Any) -> None:
@@ -99,7 +101,10 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
     selected on one set of episodes and scored on another set.
     """
     given = {name: value for name, value in request.items() if value is not None}
-    with checkpoints_kept(out), training_progress("steps", "score") as progress:
+    on_device = request["device"] is not None
+    kept = nullcontext() if on_device else checkpoints_kept(out)
+    term = "mean_reward" if on_device else "score"
+    with kept, training_progress("steps", term) as progress:
         found = mcaprl.train_online(sim, out, on_live=print_address, progress=progress, **given)
     rows = [
         [
@@ -115,10 +120,11 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
     from mcaprl.runs import read_config
 
     config = read_config(out)
+    policy = "last policy" if on_device else "best checkpoint"
     print_table(
-        f"{config['algo']} in {config['sim']}: the best checkpoint of each seed on new episodes",
-        ["run", "steps", "best at", "mean return", "random 0, pilot 1", "ends"],
+        f"{config['algo']} in {config['sim']}: the {policy} of each seed on new episodes",
+        ["run", "steps", "saved at", "mean return", "random 0, pilot 1", "ends"],
         rows,
     )
-    curves = "" if request["device"] else f"{out / 'curve.png'}, or "
+    curves = "" if on_device else f"{out / 'curve.png'}, or "
     hint(f"curves: {curves}tensorboard --logdir {out}")

@@ -83,9 +83,13 @@ class Task:
             **settings: Settings that the user repeats; they must have the same values in the run.
 
         Raises:
-            TrainingError: The folder has no online run.
+            TrainingError: The folder has no online run, or a run on a device.
         """
         found = read_config(folder)
+        if "device" in found:
+            raise TrainingError(
+                f"cannot resume: {folder} was trained with --device; train into another folder"
+            )
         try:
             earlier = settings_from_json(found["config"])
             return cls._checked(

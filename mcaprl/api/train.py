@@ -267,9 +267,10 @@ def train_online(
         port: Port on 127.0.0.1 for viewers; 0 for any free port.
         allow_origin: Origin of other web pages that may connect, or a list of origins. Pages on
             this machine, Foxglove and Lichtblick may always connect.
-        device: `cuda` or `cpu`: sims, replay buffers and networks of all seeds stay on this device,
-            and all seeds are trained at once by `mcaprl.device.training`. Only for `double-dqn` in
-            the sims `lane` and `racer`; nothing is recorded. None trains with SB3.
+        device: `cuda` or `cpu`, on which sims, replay buffers and networks of all seeds stay, and
+            all seeds are trained at once; only for `double-dqn` in the sims `lane` and `racer`,
+            without a recording. The settings have other defaults (`mcaprl.device.training`), and
+            the last policy is saved instead of the best checkpoint. None trains with SB3.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
         sim_options: Other arguments of the environment.
@@ -306,8 +307,9 @@ def train_online(
     out = Path(out)
     options = all_options(observation, rules, sim_options)
     if device is not None:
+        if algo not in (None, "double-dqn"):
+            raise UsageError(f"--device trains double-dqn only: omit --algo {algo}")
         _check_device_request(
-            algo=algo not in (None, "double-dqn"),
             preset=preset is not None,
             record=record is not None,
             sources=bool(as_names(sources)),
@@ -349,7 +351,7 @@ def _check_device_request(**given: bool) -> None:
     for name, is_given in given.items():
         if is_given:
             shown = "--from" if name == "sources" else flag(name)
-            raise UsageError(f"{shown} is not for --device: omit one of them")
+            raise UsageError(f"{shown} cannot be combined with --device: omit one of them")
 
 
 def _train_on_device(

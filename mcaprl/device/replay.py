@@ -22,7 +22,8 @@ class ReplayBuffer:
     observations of all rows, followed by the next observations of all rows.
 
     Attributes:
-        transitions: All transitions; its share draws each agent's rows from the agent's own.
+        transitions: All transitions. `transitions.share` draws rows of each agent from the agent's
+            own transitions.
     """
 
     def __init__(
@@ -145,9 +146,9 @@ class OwnRows(Share):
         self, buffer: TransitionBuffer, count: int, generators: Sequence[torch.Generator]
     ) -> tuple[Tensor, None]:
         """Draw rows as described for `Share`, with one generator on the device for all agents."""
-        kept = min(self.steps, self._slots) - self.n_steps + 1
+        stored = min(self.steps, self._slots) - self.n_steps + 1
         drawn = torch.randint(
-            kept * self._envs,
+            stored * self._envs,
             (len(generators), count),
             generator=self._generator,
             device=buffer.device,

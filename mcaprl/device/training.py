@@ -31,6 +31,7 @@ from mcaprl.online.task import Task
 from mcaprl.online.train import OnlineSummary, write_scores
 from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
 from mcaprl.runs import locked_run, open_run, seed_folder
+from mcaprl.settings import flag
 from mcaprl.sims import DeviceSims, make_device_sims, make_sim
 from mcaprl.sims.evaluation.evaluate import evaluate
 from mcaprl.sims.vehicle.device import Batch
@@ -74,7 +75,7 @@ def device_task(sim: str, sim_options: Mapping[str, Any] | None = None, **settin
     """
     for name in settings:
         if name in _UNUSED:
-            raise UsageError(f"{name} has no effect with a device: omit it")
+            raise UsageError(f"{flag(name)} has no effect with --device: omit it")
     return Task.for_sim(sim, "double-dqn", sim_options, **{**SETTINGS, **settings})
 
 
@@ -97,7 +98,8 @@ def train(
         out: Folder of the run; it must be empty or not exist.
         device: `cpu` or `cuda`.
         seeds: Number of agents K.
-        seed: Seed of the first agent; agent k uses seed + k.
+        seed: Seed of the first agent; agent k uses seed + k for its initial weights. Starting
+            states, exploration and batches depend on `seed` and on the number of agents.
         progress: Callback for progress; None shows a bar if stderr is a terminal.
 
     Returns:
@@ -142,7 +144,7 @@ def train(
 
 @contextmanager
 def fast_products() -> Iterator[None]:
-    """Let matrix products on GPUs round their factors to TF32, which takes half the time."""
+    """Context manager that allows matrix products on GPUs in TF32, which are faster."""
     before = torch.get_float32_matmul_precision()
     if torch.cuda.is_available():
         torch.set_float32_matmul_precision("high")
@@ -168,7 +170,9 @@ class Agents:
         space = sims.single_observation_space
         assert isinstance(space, spaces.Box)
         self.config, self._sims, self.steps = config, sims, 0
-        updates = (config.steps - config.learning_starts) // config.steps_per_update
+        # The returns of the first steps must be known.
+        self._starts = max(config.learning_starts, (config.n_steps - 1) * config.envs)
+        updates = (config.steps - self._starts) // config.steps_per_update
         learner_config = LearnerConfig(
             updates=max(updates, 1),
             batch_size=config.batch_size,
@@ -219,7 +223,7 @@ class Agents:
             arrays.rewards, arrays.terminated, arrays.truncated, arrays.final_observations
         )
         before, self.steps = self.steps, self.steps + config.envs
-        if self.steps > config.learning_starts:
+        if self.steps > self._starts:
             every = config.steps_per_update
             due = self.steps // every - before // every
             for _ in range(min(due, self.learner.config.updates - self.learner.step)):
@@ -245,7 +249,7 @@ class Agents:
 def _train(
     agents: Agents, folder: Path, report: ProgressCallback, save: Callable[[], None]
 ) -> None:
-    """Train until all steps are done; write `_ROWS` rows of metrics, and the policies now and then.
+    """Train until all steps are done; write `_ROWS` rows of metrics, and save the policies.
 
     Raises:
         TrainingError: The loss is NaN or infinite, or a file cannot be written.
@@ -275,7 +279,11 @@ def _train(
 
 
 def _rewards_until(agents: Agents, stop: int) -> list[float]:
-    """Train until `stop` steps are done, at least once; return the mean reward of each agent."""
+    """Step each environment at least once, until `stop` steps are done.
+
+    Returns:
+        Mean reward of each agent.
+    """
     rewards, count = agents.step(), 1
     while agents.steps < stop:
         rewards += agents.step()

@@ -11,8 +11,9 @@ import pytest
 import torch
 
 import mcaprl
+from mcaprl.cli import run
 from mcaprl.device.training import SETTINGS, Agents, device_task
-from mcaprl.errors import OutputExistsError, UnknownNameError, UsageError
+from mcaprl.errors import OutputExistsError, TrainingError, UnknownNameError, UsageError
 from mcaprl.online.config import DoubleDQNConfig
 from mcaprl.runs import read_curves
 from mcaprl.sims import make_device_sims
@@ -50,22 +51,24 @@ def agents_of(seeds: int, device: str = "cpu", **settings: Any) -> Agents:
 
 
 def test_a_run_has_the_policies_metrics_and_scores_of_all_seeds(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    found = mcaprl.train_online("lane", run, device="cpu", seeds=2, seed=5, **SMALL)
+    folder = tmp_path / "run"
+    found = mcaprl.train_online("lane", folder, device="cpu", seeds=2, seed=5, **SMALL)
     assert [summary.seed for summary in found] == [5, 6]
     assert all(summary.steps == 4_000 and summary.algo == "double-dqn" for summary in found)
-    scores = json.loads((run / "scores.json").read_text())
+    scores = json.loads((folder / "scores.json").read_text())
     assert scores["seeds"]["seed-6"]["mean_return"] == found[1].mean_return
-    assert json.loads((run / "config.json").read_text())["device"] == "cpu"
-    curves = read_curves(run, "metrics.csv")
+    assert json.loads((folder / "config.json").read_text())["device"] == "cpu"
+    curves = read_curves(folder, "metrics.csv")
     assert [curve["steps"][-1] for curve in curves] == [4_000, 4_000]
     # 3,600 steps after the random ones, 32 steps for each update.
     assert [curve["update"][-1] for curve in curves] == [112, 112]
-    policy = mcaprl.load_policy(run)
+    policy = mcaprl.load_policy(folder)
     assert policy.env_id == "mcaprl/LaneKeeping-v0"
     assert policy.act(np.zeros((3, 12), np.float32)).shape == (3,)
     with pytest.raises(OutputExistsError):
-        mcaprl.train_online("lane", run, device="cpu", **SMALL)
+        mcaprl.train_online("lane", folder, device="cpu", **SMALL)
+    with pytest.raises(TrainingError, match="was trained with --device"):
+        mcaprl.train_online("lane", folder, resume=True)
 
 
 def test_the_same_seed_trains_the_same_weights() -> None:
@@ -90,6 +93,28 @@ def test_updates_follow_the_random_steps_at_the_chosen_rate() -> None:
     assert updates[-1] == agents.learner.config.updates == 112
 
 
+def test_updates_wait_until_returns_are_known() -> None:
+    agents = agents_of(1, n_steps=3, learning_starts=0, steps_per_update=16)
+    updates = []
+    for _ in range(4):
+        agents.step()
+        updates.append(agents.learner.step)
+    assert updates == [0, 0, 1, 2]
+
+
+def test_the_command_names_the_last_policy(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    words = [f"--{name.replace('_', '-')}={value}" for name, value in SMALL.items()]
+    words = [word.replace("(16, 16)", "16,16") for word in words]
+    assert (
+        run(["train-online", "lane", "--device", "cpu", "--out", str(tmp_path / "a"), *words]) == 0
+    )
+    shown = capfd.readouterr()
+    assert "the last policy of each seed" in shown.out
+    assert "curve.png" not in shown.out + shown.err
+
+
 def test_epsilon_falls_linearly() -> None:
     agents = agents_of(1, exploration_fraction=0.5, exploration_final_eps=0.1)
     seen = []
@@ -111,12 +136,12 @@ def test_agents_learn_to_keep_the_lane() -> None:
 @pytest.mark.parametrize(
     ("request_", "message"),
     [
-        ({"algo": "ppo"}, "--algo is not for --device"),
-        ({"record": "log.mcap"}, "--record is not for --device"),
-        ({"resume": True}, "--resume is not for --device"),
-        ({"live": True}, "--live is not for --device"),
-        ({"sources": "log.mcap"}, "--from is not for --device"),
-        ({"eval_interval": 100}, "eval_interval has no effect"),
+        ({"algo": "ppo"}, "--device trains double-dqn only: omit --algo ppo"),
+        ({"record": "log.mcap"}, "--record cannot be combined with --device"),
+        ({"resume": True}, "--resume cannot be combined with --device"),
+        ({"live": True}, "--live cannot be combined with --device"),
+        ({"sources": "log.mcap"}, "--from cannot be combined with --device"),
+        ({"eval_interval": 100}, "--eval-interval has no effect with --device"),
         ({"observation": "depth"}, "has no argument observation"),
         ({"envs": 0}, "envs"),
     ],
