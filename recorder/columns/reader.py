@@ -247,21 +247,23 @@ class McapReader:
     def _find_ranges(self, channel_id: int, *, lazily: bool) -> list[MessageRange]:
         ranges = []
         # A writer that was killed may have written only some indexes of the last chunk.
-        uncertain = None if self.complete else self.chunks[-1:]
+        uncertain = None if self.complete or not self.chunks else self.chunks[-1]
         for chunk in self.chunks:
             offsets = chunk.message_index_offsets
-            if not offsets or [chunk] == uncertain:
+            if not offsets or chunk is uncertain:
                 index = self._contents_of(chunk).indexes.get(channel_id)
                 if index is not None:
                     ranges.append(MessageRange.of_index(chunk, index))
             elif channel_id in offsets:
-                read = partial(self._index_at, channel_id, offsets[channel_id])
+                offset = offsets[channel_id]
                 if lazily and len(offsets) == 1:
                     entries_bytes = chunk.message_index_length - _INDEX_HEAD_BYTES
                     count = max(entries_bytes, 0) // INDEX_ENTRY.itemsize
-                    ranges.append(MessageRange(chunk, count, partial(read, count)))
+                    read = partial(self._index_at, channel_id, offset, count)
+                    ranges.append(MessageRange(chunk, count, read))
                 else:
-                    ranges.append(MessageRange.of_index(chunk, read()))
+                    index = self._index_at(channel_id, offset)
+                    ranges.append(MessageRange.of_index(chunk, index))
         if channel_id in self._unchunked:
             ranges.append(MessageRange.of_index(None, self._unchunked[channel_id]))
         return ranges
@@ -402,12 +404,13 @@ class McapReader:
             stops = [*(one.chunk_start_offset for one in self.chunks), self.summary_start]
             gaps = zip(starts, stops, strict=True)
             self.fetch([(low, high) for low, high in gaps if low < high])
+        size = len(self._view)
         for chunk in self.chunks:
             # Most chunks follow each other without a gap.
             if start != chunk.chunk_start_offset:
                 found += self._read_records(start, chunk.chunk_start_offset, before, unchunked)
             before, start = chunk, end_of(chunk)
-            if start > len(self._view):
+            if start > size:
                 raise CorruptLogError(
                     f"{self.path}: the chunk at byte {chunk.chunk_start_offset} extends beyond the"
                     " end of the file"

@@ -43,6 +43,8 @@ class TopicRows:
         payload = rows["payload"]
         self.fields = {name: payload[name] for name in payload.dtype.names or ()}
         self._rows, self._write, self._log_time = rows, write, rows["log_time"]
+        # Copying items without fields is as fast as `memcpy`.
+        self._items = rows.view(np.dtype((np.void, rows.itemsize)))
 
     @classmethod
     def of_text(cls, text: str, channel_id: int, most: int, write: Write) -> Self:
@@ -86,6 +88,10 @@ class TopicRows:
         block = self.blank(len(self._rows), length)
         block._rows[:, : len(self)] = self._rows
         return block
+
+    def copy(self, where: Any, source: Self, rows: Any) -> None:
+        """Copy `rows` of another block of the same topic to the rows `where` of this block."""
+        self._items[where] = source._items[rows]
 
     def put(self, field: str, where: Any, values: Any) -> None:
         """Set values of a field.

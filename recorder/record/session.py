@@ -171,14 +171,17 @@ class EpisodeLog:
             options="" if episode.options is None else _json(episode.options),
         )
 
-    def advance(self, summary: EpisodeSummary) -> None:
-        """Update the episode count and the next start time; call this after writing an episode.
+    def count(self, summary: EpisodeSummary) -> None:
+        """Update the episode count and the next start time."""
+        self.next_start_ns = summary.end_time_ns + self.step_ns
+        self.episodes += 1
+
+    def check_in_place(self) -> None:
+        """Check the file after episodes were written.
 
         Raises:
             LogError: The file was removed or replaced. The log is closed in this case.
         """
-        self.next_start_ns = summary.end_time_ns + self.step_ns
-        self.episodes += 1
         if not self._is_in_place():
             self.log.close()
             raise self._removed()

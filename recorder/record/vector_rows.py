@@ -6,9 +6,11 @@ writes a field for all environments, and each episode is contiguous in memory.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.rows import StepRows, TopicRows
@@ -26,7 +28,7 @@ class OpenRows(Generic[Rows]):
 
     def __init__(self, chunk: Rows, environments: int) -> None:
         """Allocate the array; `chunk` contains blank rows whose constant fields are set."""
-        self._per_chunk = len(chunk)
+        self._chunk = chunk
         first = max(1, min(_FIRST_CAPACITY, _FIRST_BYTES // chunk.itemsize))
         self._rows = chunk.blank(environments, first)
 
@@ -34,6 +36,11 @@ class OpenRows(Generic[Rows]):
     def capacity(self) -> int:
         """Number of steps that fit into the array."""
         return len(self._rows)
+
+    @property
+    def per_chunk(self) -> int:
+        """Maximum number of rows of a chunk."""
+        return len(self._chunk)
 
     def make_room(self, step: int) -> None:
         """Grow the array if `step` does not fit."""
@@ -51,25 +58,63 @@ class OpenRows(Generic[Rows]):
         """
         self._rows.put(field, (environments, steps), values)
 
-    def write(self, environment: int, count: int, start_ns: int, step_ns: int) -> None:
-        """Write the first `count` rows of an environment in chunks; row 0 has time `start_ns`."""
-        times = start_ns + np.arange(count) * step_ns
-        for first in range(0, count, self._per_chunk):
-            chunk = slice(first, min(first + self._per_chunk, count))
-            self._rows.write((environment, chunk), times[chunk])
+    def write(
+        self, environments: Sequence[int], counts: NDArray[np.int64], starts_ns: Any, step_ns: int
+    ) -> None:
+        """Write the first rows of environments, one environment after the other.
+
+        Args:
+            environments: K indexes of environments.
+            counts: (K,) numbers of rows.
+            starts_ns: (K,) log_time of each environment's row 0.
+            step_ns: Time between two rows, nanoseconds.
+        """
+        starts = np.asarray(starts_ns)
+        for which, steps in self._chunks(environments, counts):
+            self._chunk.write(slice(len(steps)), starts[which] + steps * step_ns)
+
+    def _chunks(
+        self, environments: Sequence[int], counts: NDArray[np.int64]
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Copy the first rows of environments to `_chunk`, one full chunk after the other.
+
+        Yields:
+            For each row of a chunk, its position in `environments` and its step.
+        """
+        stops = np.cumsum(counts)
+        firsts = stops - counts
+        which = np.repeat(np.arange(len(stops)), counts)
+        steps = np.arange(len(which)) - firsts[which]
+        for start in range(0, len(which), self.per_chunk):
+            stop = min(start + self.per_chunk, len(which))
+            for place in range(which[start], which[stop - 1] + 1):
+                low, high = max(start, int(firsts[place])), min(stop, int(stops[place]))
+                rows = slice(low - int(firsts[place]), high - int(firsts[place]))
+                where = slice(low - start, high - start)
+                self._chunk.copy(where, self._rows, (environments[place], rows))
+            yield which[start:stop], steps[start:stop]
 
 
 class OpenSteps(OpenRows[StepRows]):
     """Rows of `/rl/step` of all open episodes."""
 
-    def end(self, environment: int, summary: EpisodeSummary, step_ns: int) -> None:
-        """Set the numbers and the end flags in the rows of an episode, and write the rows."""
-        rows, count, last = self._rows, summary.length + 1, summary.length - 1
-        rows.number((environment, slice(count)), summary.episode, np.arange(count))
-        rows.put("terminated", (environment, last), summary.terminated)
-        rows.put("truncated", (environment, last), summary.truncated)
-        rows.finish((environment, last + 1))
-        self.write(environment, count, summary.start_time_ns, step_ns)
+    def end(
+        self, environments: Sequence[int], summaries: Sequence[EpisodeSummary], step_ns: int
+    ) -> None:
+        """Set the numbers and end flags in the rows of ended episodes, and write the rows."""
+        numbers, lengths, starts, terminated, truncated = (
+            np.array([getattr(summary, name) for summary in summaries])
+            for name in ("episode", "length", "start_time_ns", "terminated", "truncated")
+        )
+        chunk = self._chunk
+        for which, steps in self._chunks(environments, lengths + 1):
+            left = lengths[which] - steps
+            last, where = np.flatnonzero(left == 1), slice(len(steps))
+            chunk.number(where, numbers[which], steps)
+            chunk.put("terminated", last, terminated[which[last]])
+            chunk.put("truncated", last, truncated[which[last]])
+            chunk.finish(np.flatnonzero(left == 0))
+            chunk.write(where, starts[which] + steps * step_ns)
 
     def total_reward(self, environment: int, steps: int) -> float:
         """Return the sum of an environment's first `steps` rewards, in the order of the steps."""

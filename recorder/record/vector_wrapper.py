@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -39,6 +39,15 @@ if TYPE_CHECKING:
 else:
     # This class is generic only since version 1.4 of Gymnasium.
     VectorWrapper = gym.vector.VectorWrapper
+
+
+class _Ended(NamedTuple):
+    """An environment whose episode has ended, and how."""
+
+    number: int
+    terminated: bool
+    truncated: bool
+    reason: str
 
 
 class RecordVecMcap(FinishesAtExit, VectorWrapper):
@@ -170,9 +179,9 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         observations, infos = self.env.reset(seed=seed, options=options)
         values = [convert(observations) for convert in self._converters]
         with HoldSignals():
+            self._begin(numbers, values, infos)
             for number in numbers.tolist():
-                episode = OpenEpisode(self.policy, self.epsilon, seeds[number], given or None)
-                self._begin(number, values, infos, episode)
+                self._open[number].seed, self._open[number].options = seeds[number], given or None
         return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -206,9 +215,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
                 with HoldSignals():
                     self._make_room()
                     self._observe(values)
-                    for number in np.flatnonzero(self._due).tolist():
-                        episode = OpenEpisode(self.policy, self.epsilon)
-                        self._begin(number, values, infos, episode)
+                    self._begin(np.flatnonzero(self._due), values, infos)
                     self._end_some(np.flatnonzero(ended), values, terminated, truncated, infos)
             else:
                 self._observe(values)
@@ -275,18 +282,16 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             self._infos[number].add(int(self._steps[number]) + 1, info_of(source, number))
 
     def _begin(
-        self,
-        number: int,
-        values: list[NDArray[Any]],
-        infos: dict[str, Any],
-        episode: OpenEpisode,
+        self, numbers: NDArray[np.int64], values: list[NDArray[Any]], infos: dict[str, Any]
     ) -> None:
-        """Begin an episode of one environment with its first observation."""
-        if self._infos:
-            self._infos[number].begin(info_of(infos, number))
-        self._put(number, 0, [value[number] for value in values])
-        self._open[number], self._steps[number] = episode, 0
-        self._running[number], self._due[number] = True, False
+        """Begin an episode of each of these environments with its first observation."""
+        for number in numbers.tolist():
+            self._open[number] = OpenEpisode(self.policy, self.epsilon)
+            if self._infos:
+                self._infos[number].begin(info_of(infos, number))
+        self._put(numbers, 0, [value[numbers] for value in values])
+        self._steps[numbers] = 0
+        self._running[numbers], self._due[numbers] = True, False
 
     def _end_some(
         self,
@@ -301,16 +306,21 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         In same-step mode, also begin their next episodes.
         """
         same_step = self._autoreset is AutoresetMode.SAME_STEP
-        ended = infos.get("final_info", {}) if same_step else infos
-        for number in numbers.tolist():
-            if same_step:
-                self._put(number, int(self._steps[number]), self._final_observation(infos, number))
-            is_terminal = bool(terminated[number])
-            reason = reason_of(_of_env(ended, "reason", number), is_terminal)
-            self._end(number, is_terminal, bool(truncated[number]), reason)
-            self._due[number] = self._autoreset is AutoresetMode.NEXT_STEP
-            if same_step:
-                self._begin(number, values, infos, OpenEpisode(self.policy, self.epsilon))
+        infos_of_ended = infos.get("final_info", {}) if same_step else infos
+        ended: list[_Ended] = []
+        try:
+            for number in numbers.tolist():
+                if same_step:
+                    final = self._final_observation(infos, number)
+                    self._put(number, int(self._steps[number]), final)
+                is_terminal = bool(terminated[number])
+                reason = reason_of(_of_env(infos_of_ended, "reason", number), is_terminal)
+                ended.append(_Ended(number, is_terminal, bool(truncated[number]), reason))
+        finally:
+            self._end(ended)
+        if same_step:
+            self._begin(numbers, values, infos)
+        self._due[numbers] = self._autoreset is AutoresetMode.NEXT_STEP
 
     def _final_observation(self, infos: dict[str, Any], number: int) -> list[NDArray[Any]]:
         """Return an episode's last observation from the infos of same-step mode."""
@@ -325,40 +335,67 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
     def _interrupt(self, numbers: NDArray[np.int64]) -> None:
         """Record unfinished episodes as truncated, and drop episodes without a transition."""
         with HoldSignals():
-            for number in numbers.tolist():
-                if self._running[number] and self._steps[number] and not self._recording.closed:
-                    self._end(number, False, True, INTERRUPTED)
+            if not self._recording.closed:
+                unfinished = numbers[self._running[numbers] & (self._steps[numbers] > 0)]
+                self._end([_Ended(each, False, True, INTERRUPTED) for each in unfinished.tolist()])
             self._running[numbers] = self._due[numbers] = False
             self._steps[numbers] = 0
             self._display.clear()
 
-    def _end(self, number: int, terminated: bool, truncated: bool, reason: str) -> None:
-        """Append an ended episode to the log."""
-        recording, episode = self._recording, self._open[number]
-        steps = episode.steps = int(self._steps[number])
-        # Set this before writing, so that an error does not cause a second write of the episode.
-        self._running[number], self._steps[number] = False, 0
-        summary = recording.summary(
-            episode,
-            total_reward=self._columns.total_reward(number, steps),
-            terminated=terminated,
-            truncated=truncated,
-            reason=reason,
-        )
-        start_ns, step_ns = summary.start_time_ns, recording.step_ns
+    def _end(self, ended: list[_Ended]) -> None:
+        """Append ended episodes to the log.
+
+        Episodes that together fit into one chunk of each topic share its chunks, since chunks of
+        single short episodes would take many times as long.
+        """
+        tables: list[OpenRows[Any]] = [self._columns, *self._images.values()]
+        most = min(table.per_chunk for table in tables)
+        batch: list[_Ended] = []
+        rows = 0
+        for one in ended:
+            count = int(self._steps[one.number]) + 1
+            if batch and rows + count > most:
+                self._write(batch)
+                batch, rows = [], 0
+            batch.append(one)
+            rows += count
+        if batch:
+            self._write(batch)
+        if self._infos:
+            self._infos[0].warn()
+
+    def _write(self, ended: list[_Ended]) -> None:
+        """Write ended episodes."""
+        recording, step_ns = self._recording, self._recording.step_ns
+        numbers = [one.number for one in ended]
+        lengths = self._steps[numbers]
+        # Set this before writing, so that an error does not cause a second write of the episodes.
+        self._running[numbers], self._steps[numbers] = False, 0
         recording.begin(self._display)
+        summaries = []
+        for one, length in zip(ended, lengths.tolist(), strict=True):
+            episode = self._open[one.number]
+            episode.steps = length
+            summary = recording.summary(
+                episode,
+                total_reward=self._columns.total_reward(one.number, length),
+                terminated=one.terminated,
+                truncated=one.truncated,
+                reason=one.reason,
+            )
+            recording.count(summary)
+            summaries.append(summary)
+        starts = [summary.start_time_ns for summary in summaries]
         for table in self._images.values():
-            table.write(number, steps + 1, start_ns, step_ns)
-        self._display.end(summary)
+            table.write(numbers, lengths + 1, starts, step_ns)
         if self._infos:
-            self._infos[number].end(steps, start_ns, step_ns)
-        recording.log.write_episodes([summary], log_lines=True)
+            for number, summary in zip(numbers, summaries, strict=True):
+                self._infos[number].end(summary.length, summary.start_time_ns, step_ns)
+        recording.log.write_episodes(summaries, log_lines=True)
         if self._learner is not None:
-            self._learner.write(number, steps, start_ns, step_ns)
-        self._columns.end(number, summary, step_ns)
-        recording.advance(summary)
-        if self._infos:
-            self._infos[number].warn()
+            self._learner.write(numbers, lengths, starts, step_ns)
+        self._columns.end(numbers, summaries, step_ns)
+        recording.check_in_place()
 
 
 # Reprs and pickles contain this public import path.
