@@ -1,17 +1,18 @@
 """Measure updates per second of Double DQN and CQL relative to d3rlpy's and SB3's DQN.
 
-    python -m benchmarks.speed.learning [--rounds 7] [--turn-s 1.0] [--only whole]
+    python -m benchmarks.speed.learning [--rounds 7] [--turn-s 1.0] [--only images]
     python -m benchmarks.speed.learning --only gradients
 
 All libraries take turns in one process, on the same random transitions (19 numbers, 9 actions) and
 with layer widths 256x256. The measure is CPU time on one thread, the best of several turns. The
+rows of images have observations of 84x84 bytes, batch size 32, and default settings otherwise. The
 last row covers all steps from a log to a policy: a log of LOG_ROWS steps on disk is read and
 packed, and CQL makes LOG_UPDATES updates with batch size 256. It is compared with reading by mcap
 and mcap-ros2-support, and training by d3rlpy. These libraries load only a tenth of the log, and
 the time to load it is multiplied by ten. The time of LOG_UPDATES updates is calculated from the
 rates in the turns. The ratios are printed and written to benchmarks/speed/learning.json. The table
-is written to docs/results.md. With --only 256, 32 or whole, the other rows keep the values of an
-earlier run.
+is written to docs/results.md. With --only 256, 32, images or whole, the other rows keep the values
+of an earlier run.
 
 --only gradients compares updates with autograd to the same updates with closed-form gradients,
 which this file implements. It prints the ratios of the speeds, and runs neither d3rlpy nor SB3.
@@ -35,6 +36,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
+from numpy.typing import NDArray
 from stable_baselines3 import DQN
 from stable_baselines3.common.logger import configure
 from torch.nn import functional
@@ -50,18 +52,22 @@ CHECKED_UPDATES = 10
 ROWS, EPISODE, WIDTH, ACTIONS = 20_000, 1_000, 19, 9
 LOG_ROWS, LOG_SHARE, LOG_UPDATES = 1_000_000, 0.1, 8_000
 HIDDEN = [256, 256]
+IMAGE_ROWS, IMAGE_EPISODE, IMAGE_SHAPE, IMAGE_BATCH = 2_000, 100, (84, 84), 32
 RESULTS = Path(__file__).with_name("learning.json")
 LIBRARIES = ("torch", "d3rlpy", "stable-baselines3", "mcap", "mcap-ros2-support")
 DDQN, CQL, SB3 = "Double DQN / d3rlpy's", "CQL / d3rlpy's", "Double DQN / SB3's DQN"
 SEEDS = "CQL, four seeds at once / one after the other"
+IMAGES = "Double DQN / SB3's DQN, images, batch 32"
+SAME_NETWORK = f"{IMAGES}, ours with SB3's network"
 WHOLE = "from a log of a million steps to a CQL policy / mcap-ros2-support and d3rlpy"
 GOALS = {
-    f"{DDQN}, batch 256": 2.5,
+    f"{DDQN}, batch 256": 3.0,
     f"{CQL}, batch 256": 3.3,
     f"{SB3}, batch 256": 1.25,
     f"{DDQN}, batch 32": 3.0,
     f"{CQL}, batch 32": 3.8,
     f"{SB3}, batch 32": 2.0,
+    IMAGES: 1.5,
     WHOLE: 4.0,
 }
 Update = Callable[[], object]
@@ -71,13 +77,28 @@ def transitions() -> mcaprl.Dataset:
     """Return random transitions in episodes of 1000."""
     random = np.random.default_rng(0)
     frames = random.normal(size=(ROWS // EPISODE, EPISODE + 1, WIDTH)).astype(np.float32)
+    return _with_rest(frames, random)
+
+
+def images() -> mcaprl.Dataset:
+    """Return transitions with random images of one channel, in episodes of 100."""
+    random = np.random.default_rng(0)
+    shape = (IMAGE_ROWS // IMAGE_EPISODE, IMAGE_EPISODE + 1, *IMAGE_SHAPE, 1)
+    return _with_rest(random.integers(256, size=shape, dtype=np.uint8), random)
+
+
+def _with_rest(frames: NDArray[Any], random: np.random.Generator) -> mcaprl.Dataset:
+    """Return transitions with the observations `frames` (episodes, steps + 1, ...)."""
+    shape = frames.shape[2:]
+    before, after = (part.reshape(-1, *shape) for part in (frames[:, :-1], frames[:, 1:]))
+    rows, episode = len(before), frames.shape[1] - 1
     return mcaprl.Dataset.from_arrays(
-        observations=frames[:, :-1].reshape(ROWS, WIDTH),
-        next_observations=frames[:, 1:].reshape(ROWS, WIDTH),
-        actions=random.integers(ACTIONS, size=ROWS),
-        rewards=random.normal(size=ROWS),
-        terminated=np.zeros(ROWS, bool),
-        truncated=np.arange(1, ROWS + 1) % EPISODE == 0,
+        observations=before,
+        next_observations=after,
+        actions=random.integers(ACTIONS, size=rows),
+        rewards=random.normal(size=rows),
+        terminated=np.zeros(rows, bool),
+        truncated=np.arange(1, rows + 1) % episode == 0,
         action_space=spaces.Discrete(ACTIONS),
     )
 
@@ -87,9 +108,11 @@ def ours(data: mcaprl.Dataset, algo: str, batch_size: int, seeds: int = 1) -> Up
     return learner_of(data, algo, batch_size, seeds).update
 
 
-def learner_of(data: mcaprl.Dataset, algo: str, batch_size: int, seeds: int = 1) -> Learner:
-    """Return a learner with `seeds` seeds and, except for the batch size, default settings."""
-    config = ALGORITHMS[algo].config_type(batch_size=batch_size)
+def learner_of(
+    data: mcaprl.Dataset, algo: str, batch_size: int, seeds: int = 1, **settings: Any
+) -> Learner:
+    """Return a learner with `seeds` seeds; all but the given settings have defaults."""
+    config = ALGORITHMS[algo].config_type(batch_size=batch_size, **settings)
     buffer = TransitionBuffer.from_dataset(data, config.packing)
     return ALGORITHMS[algo](config, buffer, range(seeds))
 
@@ -116,17 +139,27 @@ def d3rlpys(data: Any, config: str, batch_size: int) -> Update:
 
 def sb3s(data: mcaprl.Dataset, batch_size: int) -> Update:
     """Return a function that makes ten updates of SB3's DQN, which is not a Double DQN."""
+    before, after = data.observations, data.next_observations
+    if before.ndim > 2:
+        # SB3's convolutions expect the channels first.
+        before, after = (np.moveaxis(images, -1, 1) for images in (before, after))
+        policy, space = "CnnPolicy", spaces.Box(0, 255, before.shape[1:], np.uint8)
+    else:
+        policy, space = "MlpPolicy", spaces.Box(-np.inf, np.inf, before.shape[1:], np.float32)
 
     class Spaces(gym.Env[Any, Any]):
-        observation_space = spaces.Box(-np.inf, np.inf, (WIDTH,), np.float32)
+        observation_space = space
         action_space = spaces.Discrete(ACTIONS)
 
-    settings: dict[str, Any] = {"policy_kwargs": {"net_arch": HIDDEN}, "batch_size": batch_size}
-    model = DQN("MlpPolicy", Spaces(), buffer_size=ROWS, device="cpu", **settings)
+    settings: dict[str, Any] = {"batch_size": batch_size, "buffer_size": len(data)}
+    if policy == "MlpPolicy":
+        settings["policy_kwargs"] = {"net_arch": HIDDEN}
+    model = DQN(policy, Spaces(), device="cpu", **settings)
     model.set_logger(configure(None, []))
     assert model.replay_buffer is not None
-    rows = zip(data.observations, data.next_observations, data.actions, data.rewards, strict=True)
-    for observation, following, action, reward in rows:
+    for observation, following, action, reward in zip(
+        before, after, data.actions, data.rewards, strict=True
+    ):
         model.replay_buffer.add(
             observation[None], following[None], action[None, None], reward[None], np.zeros(1), [{}]
         )
@@ -284,12 +317,27 @@ def rows_of(size: int, turns: Turns) -> dict[str, float]:
     }
 
 
+def image_rows(turns: Turns) -> dict[str, float]:
+    """Return the ratios of updates per second from images."""
+    data = images()
+    sides = {
+        "default": (learner_of(data, "double-dqn", IMAGE_BATCH).update, 1),
+        "nature": (learner_of(data, "double-dqn", IMAGE_BATCH, encoder="nature").update, 1),
+        "sb3": (sb3s(data, IMAGE_BATCH), 10),
+    }
+    rates = best_rates(sides, turns)
+    return {
+        IMAGES: rates["default"] / rates["sb3"],
+        SAME_NETWORK: rates["nature"] / rates["sb3"],
+    }
+
+
 def main() -> None:
     """Measure, print ratios, and write them to learning.json."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--turn-s", type=float, default=1.0)
-    parser.add_argument("--only", choices=("256", "32", "whole", "gradients"))
+    parser.add_argument("--only", choices=("256", "32", "images", "whole", "gradients"))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     turns = Turns(arguments.rounds, arguments.turn_s)
@@ -303,6 +351,8 @@ def main() -> None:
     for size in (256, 32):
         if arguments.only in (None, str(size)):
             results |= rows_of(size, turns)
+    if arguments.only in (None, "images"):
+        results |= image_rows(turns)
     if arguments.only in (None, "whole"):
         with tempfile.TemporaryDirectory() as folder:
             results[WHOLE] = whole_way(Path(folder), turns)
