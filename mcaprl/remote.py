@@ -99,6 +99,10 @@ class RemoteFile:
                 parts = self._system.cat_ranges(
                     [self._path] * len(pieces), starts, stops, on_error="raise"
                 )
+                # Older versions of fsspec return some errors.
+                for part in parts:
+                    if isinstance(part, BaseException):
+                        raise part
             for (start, stop), part in zip(pieces, parts, strict=True):
                 if len(part) != stop - start:
                     raise LogError(

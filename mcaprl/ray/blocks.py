@@ -134,7 +134,7 @@ def dataset_of(columns: Columns, description: LogMetadata, where: str) -> Datase
 
 def _lengths(columns: Columns, where: str) -> NDArray[np.int64]:
     """Return the length of each episode of sorted columns; check that the episodes are whole."""
-    lengths = np.unique_counts(columns["episode"]).counts
+    lengths = np.unique(columns["episode"], return_counts=True)[1]
     lasts = np.cumsum(lengths) - 1
     steps = np.arange(len(columns["step"])) - np.repeat(lasts + 1 - lengths, lengths)
     ends = columns["terminated"] | columns["truncated"]

@@ -321,7 +321,9 @@ def _from_plain(plain: dict[str, Any]) -> spaces.Space[Any]:
             high = _bounds(plain["high"], shape, dtype)
             return spaces.Box(low, high, shape, dtype.type)
         case "Discrete":
-            kind: dict[str, Any] = {"dtype": _dtype(plain).type} if "dtype" in plain else {}
+            # In Gymnasium 1.1, Discrete spaces have no dtype.
+            dtype = _dtype({"dtype": "int64", **plain})
+            kind: dict[str, Any] = {} if dtype == np.int64 else {"dtype": dtype.type}
             return spaces.Discrete(plain["n"], start=plain["start"], **kind)
         case "MultiDiscrete":
             dtype = _dtype(plain)
@@ -371,6 +373,11 @@ def _number(value: float) -> float | str:
 
 def _bounds(plain: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     flat = plain if isinstance(plain, list) else [plain]
+    if dtype.kind in "iu":
+        # NumPy before 2.0 wraps numbers outside of these limits.
+        limits = np.iinfo(dtype)
+        if min(flat) < limits.min or max(flat) > limits.max:
+            raise ValueError(f"bounds outside of {dtype}")
     values = np.array([float(v) if isinstance(v, str) else v for v in flat], dtype)
     return np.broadcast_to(values if len(flat) > 1 else values[0], (math.prod(shape),)).reshape(
         shape

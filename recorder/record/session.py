@@ -154,16 +154,23 @@ class EpisodeLog:
         terminated: bool,
         truncated: bool,
         reason: str,
+        after: EpisodeSummary | None = None,
     ) -> EpisodeSummary:
-        """Return the summary of the episode that ends now; its number is `episodes`."""
+        """Return the summary of an episode that ends now.
+
+        It follows the episode `after`, by default the last episode in the log.
+        """
+        number, start_ns = self.episodes, self.next_start_ns
+        if after is not None:
+            number, start_ns = after.episode + 1, after.end_time_ns + self.step_ns
         return EpisodeSummary(
-            episode=self.episodes,
+            episode=number,
             length=episode.steps,
             total_reward=total_reward,
             terminated=terminated,
             truncated=truncated,
-            start_time_ns=self.next_start_ns,
-            end_time_ns=self.next_start_ns + episode.steps * self.step_ns,
+            start_time_ns=start_ns,
+            end_time_ns=start_ns + episode.steps * self.step_ns,
             reason=reason,
             policy=episode.policy,
             epsilon=episode.epsilon,
@@ -171,17 +178,14 @@ class EpisodeLog:
             options="" if episode.options is None else _json(episode.options),
         )
 
-    def count(self, summary: EpisodeSummary) -> None:
-        """Update the episode count and the next start time."""
-        self.next_start_ns = summary.end_time_ns + self.step_ns
-        self.episodes += 1
-
-    def check_in_place(self) -> None:
-        """Check the file after episodes were written.
+    def advance(self, last: EpisodeSummary) -> None:
+        """Update the episode count and the next start time after `last` was written.
 
         Raises:
             LogError: The file was removed or replaced. The log is closed in this case.
         """
+        self.next_start_ns = last.end_time_ns + self.step_ns
+        self.episodes = last.episode + 1
         if not self._is_in_place():
             self.log.close()
             raise self._removed()

@@ -20,7 +20,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError, UsageError
-from mcaprl.recorder.format.episode_summary import INTERRUPTED
+from mcaprl.recorder.format.episode_summary import INTERRUPTED, EpisodeSummary
 from mcaprl.recorder.format.info_topics import InfoTopics
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.probability import check_probability, is_impossible
@@ -89,7 +89,8 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         """Wrap `env` and create the file; for the other arguments, see `RecordMcap`.
 
         `env` must have spaces that `RecordMcap` supports and declare its autoreset mode. If
-        `policy_version` is None, the log has no `/rl/learner`.
+        `policy_version` is None, the log has no `/rl/learner`. Episodes that end in the same step
+        share chunks, so `max_file_bytes` applies to the chunk, not to each episode in it.
 
         Raises:
             SpaceError: The log format does not support the environments' spaces.
@@ -345,8 +346,8 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
     def _end(self, ended: list[_Ended]) -> None:
         """Append ended episodes to the log.
 
-        Episodes that together fit into one chunk of each topic share its chunks, since chunks of
-        single short episodes would take many times as long.
+        Episodes that fit into one chunk share it, because writing a chunk takes longer than
+        recording a short episode.
         """
         tables: list[OpenRows[Any]] = [self._columns, *self._images.values()]
         most = min(table.per_chunk for table in tables)
@@ -365,14 +366,17 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             self._infos[0].warn()
 
     def _write(self, ended: list[_Ended]) -> None:
-        """Write ended episodes."""
+        """Write ended episodes, one after the other, with one chunk for each topic.
+
+        If a single episode does not fit into one chunk, it has several.
+        """
         recording, step_ns = self._recording, self._recording.step_ns
         numbers = [one.number for one in ended]
         lengths = self._steps[numbers]
         # Set this before writing, so that an error does not cause a second write of the episodes.
         self._running[numbers], self._steps[numbers] = False, 0
         recording.begin(self._display)
-        summaries = []
+        summaries: list[EpisodeSummary] = []
         for one, length in zip(ended, lengths.tolist(), strict=True):
             episode = self._open[one.number]
             episode.steps = length
@@ -382,8 +386,8 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
                 terminated=one.terminated,
                 truncated=one.truncated,
                 reason=one.reason,
+                after=summaries[-1] if summaries else None,
             )
-            recording.count(summary)
             summaries.append(summary)
         starts = [summary.start_time_ns for summary in summaries]
         for table in self._images.values():
@@ -395,7 +399,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         if self._learner is not None:
             self._learner.write(numbers, lengths, starts, step_ns)
         self._columns.end(numbers, summaries, step_ns)
-        recording.check_in_place()
+        recording.advance(summaries[-1])
 
 
 # Reprs and pickles contain this public import path.

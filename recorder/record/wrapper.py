@@ -299,8 +299,7 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
             self._infos.end(episode.steps, recording.next_start_ns, recording.step_ns)
         self._recording.log.write_episodes([summary], log_lines=True)
         self._columns.end(episode.steps, terminated, truncated)
-        self._recording.count(summary)
-        self._recording.check_in_place()
+        self._recording.advance(summary)
         if self._infos is not None:
             self._infos.warn()
 

@@ -141,8 +141,6 @@ class DepthCamera:
         self._small = small
         self._small_focal_px = focal_lengths(view, small)
         self._small_lengths = lengths(small, *self._small_focal_px)
-        # New memory for each image would take as long as a quarter of the rendering.
-        self._inverse = np.empty_like(self._nearness)
 
     def inverse_distance(self, position_m: tuple[float, float, float], axes: Floats) -> Floats:
         """Render the image at full size, without wires.
@@ -152,10 +150,10 @@ class DepthCamera:
             axes: (3, 3) the camera's x, y and z axes as rows, in the mesh's coordinates.
 
         Returns:
-            (height, width) inverse distance along each ray, 1/m, 0 where there is no surface. The
-            next image has the same memory.
+            (height, width) inverse distance along each ray, 1/m, 0 where there is no surface.
         """
-        inverse, eye_m = self._inverse, np.array(position_m)
+        inverse = np.empty((self._view.height_px, self._view.width_px))
+        eye_m = np.array(position_m)
         draw(self._mesh, self._planes, eye_m, axes, self._view.focal_px, inverse)
         inverse *= self._nearness
         return inverse

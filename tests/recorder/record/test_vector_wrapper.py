@@ -21,6 +21,7 @@ import mcaprl
 from mcaprl.errors import LogError, NoStepsError, SpaceError, UsageError
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.record.vector_rows import OpenSteps
 from mcaprl.recorder.record.vector_wrapper import VectorWrapper
 from mcaprl.recorder.repair.check import check_log
 from tests.support.learner_topic import read_learner
@@ -182,6 +183,33 @@ def test_episodes_are_in_the_order_of_their_ends(tmp_path: Path) -> None:
         (1, None, "b", 0.25, "interrupted"),
         (1, None, "b", 0.25, "interrupted"),
     ]
+
+
+def test_episodes_that_end_in_one_step_share_chunks(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    space = spaces.Box(-1, 1, (2,), np.float32)
+    makers = members(log_path.parent, space, [[3], [3], [2], [3]])
+    env = mcaprl.RecordVecMcap(SyncVectorEnv(makers), log_path)
+    env.reset(seed=0)
+    act = np.zeros(4, np.int64)
+    for ended in (0, 1, 4):
+        env.step(act)
+        assert env.episodes == ended
+    # Read the growing file: closing it would merge its small chunks.
+    reader = McapReader(log_path)
+    counts = [len(part) for part in reader.message_ranges(reader.channels_of("/rl/step")[0])]
+    assert counts == [3, 12]
+    monkeypatch.setattr(OpenSteps, "end", failing_end)
+    with pytest.raises(LogError, match="no room"):  # noqa: PT012
+        for _ in range(4):
+            env.step(act)
+    assert env.episodes == 4, "episodes that were not written are not counted"
+
+
+def failing_end(*_: Any) -> None:
+    """Take the place of `OpenSteps.end`, as if the disk were full."""
+    raise LogError("no room")
 
 
 def cartpoles(count: int, mode: AutoresetMode = AutoresetMode.NEXT_STEP) -> Any:
