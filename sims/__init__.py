@@ -24,7 +24,8 @@ from mcaprl.sims import highway, lane, powerline, racer
 from mcaprl.sims.spec import SimCatalog, SimSpec
 
 if TYPE_CHECKING:
-    from mcaprl.sims.drawing.depth import encode_depth
+    from mcaprl.sims.drawing.camera import lens
+    from mcaprl.sims.drawing.depth import DepthCamera, encode_depth
     from mcaprl.sims.evaluation.evaluate import PolicyScore, evaluate, normalize
     from mcaprl.sims.evaluation.pilots import make_pilot
     from mcaprl.sims.evaluation.rollout import EpsilonGreedy, Policy, episode_seed, rollout
@@ -166,6 +167,7 @@ def _clear_errors(name: str, spec: SimSpec | None, kwargs: dict[str, Any]) -> It
 __all__ = [
     "SIMS",
     "CarCamera",
+    "DepthCamera",
     "DeviceSims",
     "EpsilonGreedy",
     "LaneKeepingEnv",
@@ -175,6 +177,7 @@ __all__ = [
     "encode_depth",
     "episode_seed",
     "evaluate",
+    "lens",
     "make_device_sims",
     "make_pilot",
     "make_sim",
@@ -187,7 +190,8 @@ __all__ = [
 __getattr__ = lazy_attributes(
     __name__,
     {
-        "mcaprl.sims.drawing.depth": ("encode_depth",),
+        "mcaprl.sims.drawing.camera": ("lens",),
+        "mcaprl.sims.drawing.depth": ("DepthCamera", "encode_depth"),
         "mcaprl.sims.evaluation.evaluate": ("PolicyScore", "evaluate", "normalize"),
         "mcaprl.sims.evaluation.pilots": ("make_pilot",),
         "mcaprl.sims.evaluation.rollout": ("EpsilonGreedy", "Policy", "episode_seed", "rollout"),
