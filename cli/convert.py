@@ -47,7 +47,9 @@ def convert(
     is a dataset in the format that --to names: lerobot, minari, parquet, npz, d3rlpy or hdf5.
     """
     if suggest:
-        click.echo(mcaprl.suggest_mapping(paths), nl=False)
+        with working("reading the topics"):
+            text = mcaprl.suggest_mapping(paths)
+        click.echo(text, nl=False)
         return
     if not dry_run and len(paths) < 2:
         raise UsageError("convert needs SRC and DST, or --dry-run to write nothing")

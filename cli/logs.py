@@ -110,10 +110,11 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def layout(source: str, out: Path, overwrite: bool) -> None:
     """Write the Foxglove layout of a log, or of the logs of a sim."""
+    with working("reading the topics"):
+        found = mcaprl.layout(source, None if str(out) == "-" else out, overwrite=overwrite)
     if str(out) == "-":
-        print_json(mcaprl.layout(source))
+        print_json(found)
         return
-    mcaprl.layout(source, out, overwrite=overwrite)
     echo(f"{out}: written")
     hint("in Foxglove, open the layout menu and import this file")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,9 +78,10 @@ def replay(
             "--verify, --browser, and writing a page, video or image exclude each other:"
             " run replay once for each"
         )
-    from mcaprl.recorder.dataset.open import find_logs
+    with working("reading the log"):
+        from mcaprl.recorder.dataset.open import find_logs
 
-    paths = find_logs(files)
+        paths = find_logs(files)
     if verifies:
         same = [_verify(path, episode, sim, trust_env) for path in paths]
         return int(not all(same))
@@ -86,7 +89,8 @@ def replay(
         raise UsageError("a page or video shows one log: run replay once for each log")
     chosen: dict[str, Any] = {"episode": episode or 0, "speed": speed, "overwrite": overwrite}
     if save is not None:
-        length = mcaprl.save_page(paths[0], save, loop=loop, **chosen)
+        with working("writing the page"):
+            length = mcaprl.save_page(paths[0], save, loop=loop, **chosen)
         echo(f"{save}: episode {chosen['episode']}, {size(length)}")
     if draws:
         _render(paths[0], video, contact_sheet, sim=sim, trust_env=trust_env, **chosen)
@@ -95,14 +99,31 @@ def replay(
     served: dict[str, Any] = {"speed": speed, "loop": loop}
     if port is not None:
         served["port"] = port
-    if browser:
-        mcaprl.browse(paths[0], episode=episode or 0, on_open=_print_page, **served)
-    else:
-        mcaprl.replay(
-            files, episode=episode, allow_origin=allow_origin, on_open=_print_open, **served
-        )
+    _serve(files if not browser else paths[:1], browser, episode, allow_origin, **served)
     echo("ended")
     return 0
+
+
+def _serve(
+    files: Sequence[str | Path],
+    browser: bool,
+    episode: int | None,
+    allow_origin: tuple[str, ...],
+    **options: Any,
+) -> None:
+    """Serve logs until Ctrl-C, and print the address when the server is ready."""
+    with ExitStack() as waiting:
+        waiting.enter_context(working("reading the log"))
+
+        def print_ready(address: Any) -> None:
+            waiting.close()
+            (_print_page if browser else _print_open)(address)
+
+        if browser:
+            mcaprl.browse(files[0], episode=episode or 0, on_open=print_ready, **options)
+        else:
+            options["allow_origin"] = allow_origin
+            mcaprl.replay(files, episode=episode, on_open=print_ready, **options)
 
 
 def _render(path: Path, video: Path | None, sheet: Path | None, **options: Any) -> None:

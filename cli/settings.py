@@ -34,12 +34,21 @@ class SettingsCommand(Command):
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         """Return the options of the command and of the algorithms."""
-        return [*super().get_params(ctx), *setting_options(self._configs(), self._tuned())]
+        return [*super().get_params(ctx), *self._load(ctx)[1]]
+
+    def _load(self, ctx: click.Context) -> tuple[Mapping[str, Settings], list[click.Option]]:
+        """Return the algorithms' default settings and their options; click asks several times."""
+        key = f"mcaprl.settings.{self.name}"
+        if key not in ctx.meta:
+            configs = self._configs()
+            ctx.meta[key] = configs, setting_options(configs, self._tuned())
+        loaded: tuple[Mapping[str, Settings], list[click.Option]] = ctx.meta[key]
+        return loaded
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options of the command, then the settings in groups for their algorithms."""
-        configs = self._configs()
-        settings = {option.name: option for option in setting_options(configs, self._tuned())}
+        configs, options = self._load(ctx)
+        settings = {option.name: option for option in options}
         own = [param for param in super().get_params(ctx) if param.name not in settings]
         self.write_options(ctx, formatter, own)
         sections: dict[str, list[click.Option]] = {}

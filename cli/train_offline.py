@@ -82,7 +82,7 @@ def train_offline(data: tuple[str, ...], out: Path, sweep: Path | None, **reques
     if sweep is not None:
         _sweep(data, out, sweep, request)
         return
-    with checkpoints_kept(out), training_progress("updates", "loss") as progress:
+    with training_progress("updates", "loss") as progress, checkpoints_kept(out):
         summaries = mcaprl.train(data, out, on_data=_print_data, progress=progress, **given)
     from mcaprl.offline.selection.choice import CHOICE_NAME, read_choice
     from mcaprl.offline.training.curves import CURVES_NAME

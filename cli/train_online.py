@@ -17,7 +17,6 @@ from mcaprl.cli.progress import checkpoints_kept, hint, training_progress
 from mcaprl.cli.settings import SettingsCommand
 from mcaprl.cli.show import print_address, print_table
 from mcaprl.settings import Settings
-from mcaprl.sims import SIMS
 
 
 def _configs() -> dict[str, Settings]:
@@ -35,7 +34,7 @@ def _presets() -> Iterable[str]:
 def _tuned() -> dict[str, dict[str, Any]]:
     from mcaprl.online.presets import SIM_SETTINGS
 
-    return {name: SIM_SETTINGS[sim] for name, sim in SIMS.items() if sim in SIM_SETTINGS}
+    return SIM_SETTINGS
 
 
 @click.command(cls=SettingsCommand, configs=_configs, tuned=_tuned)
@@ -102,9 +101,11 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
     """
     given = {name: value for name, value in request.items() if value is not None}
     on_device = request["device"] is not None
-    kept = nullcontext() if on_device else checkpoints_kept(out)
     term = "mean_reward" if on_device else "score"
-    with kept, training_progress("steps", term) as progress:
+    with (
+        training_progress("steps", term) as progress,
+        nullcontext() if on_device else checkpoints_kept(out),
+    ):
         found = mcaprl.train_online(sim, out, on_live=print_address, progress=progress, **given)
     rows = [
         [

@@ -12,12 +12,13 @@ is `train`, `evaluate --data` is `estimate`, and `replay` is split into `replay`
 
 from typing import TYPE_CHECKING
 
-import mcaprl._interrupt  # first, because the other imports take up to a second
-import mcaprl.sims  # noqa: F401  (registers the environments)
+from mcaprl._interrupt import is_program  # first, because the other imports take up to a second
 from mcaprl._version import __version__
 from mcaprl.errors import McaprlError
 from mcaprl.lazy import lazy_attributes
-from mcaprl.sims import make_sim
+
+if not is_program():  # The program imports them with `mcaprl.api`, so that its help is fast.
+    import mcaprl.sims  # noqa: F401  (registers the environments)
 
 if TYPE_CHECKING:
     from mcaprl import ray, torch
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from mcaprl.recorder.dataset.episode import Episode
     from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
     from mcaprl.recorder.record.wrapper import RecordMcap
+    from mcaprl.sims import make_sim
 
 __all__ = [
     "Dataset",
@@ -102,6 +104,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.recorder.dataset.episode": ["Episode"],
         "mcaprl.recorder.record.wrapper": ["RecordMcap"],
         "mcaprl.recorder.record.vector_wrapper": ["RecordVecMcap"],
+        "mcaprl.sims": ["make_sim"],
     },
 )
 

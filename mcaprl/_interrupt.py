@@ -82,7 +82,7 @@ def _send_later(number: int) -> None:
     timer.start()
 
 
-def _is_program() -> bool:
+def is_program() -> bool:
     """Return whether this process runs the program: `mcaprl` or `python -m mcaprl`."""
     name = os.path.basename(sys.argv[0]) if getattr(sys, "argv", None) else ""
     if name == "-m":
@@ -99,5 +99,5 @@ def _exit(number: int, frame: FrameType | None) -> None:
     os._exit(INTERRUPTED)
 
 
-if _is_program() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+if is_program() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, _exit)

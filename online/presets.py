@@ -25,7 +25,6 @@ from dataclasses import dataclass, fields
 from typing import Any, Final
 
 from mcaprl.errors import UnknownNameError
-from mcaprl.sims import SIMS
 
 
 @dataclass(frozen=True)
@@ -117,22 +116,22 @@ _LONG_HORIZON: Final[dict[str, Any]] = {
 }
 
 SIM_SETTINGS: Final[dict[str, dict[str, Any]]] = {
-    SIMS["lane"]: {
+    "lane": {
         **_STEADY,
         "steps": 80_000,
         "gamma": 0.97,
         "buffer_size": 100_000,
         "target_update_interval": 1_000,
     },
-    SIMS["powerline"]: {
+    "racer": {**_LONG_HORIZON, "steps": 100_000, "buffer_size": 100_000},
+    "powerline": {
         **_LONG_HORIZON,
         "steps": 150_000,
         "gamma": 0.95,
         "target_update_interval": 2_000,
         "buffer_size": 150_000,
     },
-    SIMS["racer"]: {**_LONG_HORIZON, "steps": 100_000, "buffer_size": 100_000},
-    SIMS["highway-lane"]: {
+    "highway-lane": {
         **_STEADY,
         "steps": 40_000,
         "gamma": 0.97,
@@ -140,7 +139,7 @@ SIM_SETTINGS: Final[dict[str, dict[str, Any]]] = {
         "target_update_interval": 1_000,
     },
 }
-"""Settings that differ from the algorithm's defaults, by the sim's id."""
+"""Settings that differ from the algorithm's defaults, by the sim's short name."""
 
 
 _FROM_IMAGES: Final[dict[str, Any]] = {
@@ -159,10 +158,10 @@ _LANE_IMAGES: Final[dict[str, Any]] = {
     "target_update_interval": 4_000,
 }
 IMAGE_SETTINGS: Final[dict[tuple[str, str], dict[str, Any]]] = {
-    (SIMS["lane"], "dashboard"): _LANE_IMAGES,
-    (SIMS["lane"], "depth"): {**_LANE_IMAGES, "frame_stack": 4},
-    (SIMS["lane"], "depth-commands"): {**_LANE_IMAGES, "frame_stack": 4},
-    (SIMS["powerline"], "depth"): {
+    ("lane", "dashboard"): _LANE_IMAGES,
+    ("lane", "depth"): {**_LANE_IMAGES, "frame_stack": 4},
+    ("lane", "depth-commands"): {**_LANE_IMAGES, "frame_stack": 4},
+    ("powerline", "depth"): {
         **_FROM_IMAGES,
         "steps": 240_000,
         "gamma": 0.95,
@@ -170,7 +169,7 @@ IMAGE_SETTINGS: Final[dict[tuple[str, str], dict[str, Any]]] = {
         "target_update_interval": 2_000,
     },
 }
-"""Settings for learning from images, by the sim's id and its argument `observation`."""
+"""Settings for learning from images, by the sim's short name and its argument `observation`."""
 
 
 def find_preset(name: str) -> Preset:
@@ -199,7 +198,10 @@ def settings_for(config_type: type, sim: str, sim_options: Mapping[str, Any]) ->
     default_rules = sim_options.get("rules", "default") == "default"
     if not (default_rules and {"n_steps", "buffer_size"} <= known):
         return {}
-    env_id, observation = SIMS.get(sim, sim), sim_options.get("observation", "state")
+    from mcaprl.sims import SIMS
+
+    spec = SIMS.find(SIMS.get(sim, sim), loads=False)
+    name, observation = spec.name if spec else sim, sim_options.get("observation", "state")
     if observation in ("state", "rays"):
-        return dict(SIM_SETTINGS.get(env_id, {}))
-    return dict(IMAGE_SETTINGS.get((env_id, observation), {}))
+        return dict(SIM_SETTINGS.get(name, {}))
+    return dict(IMAGE_SETTINGS.get((name, observation), {}))

@@ -21,7 +21,6 @@ import torch
 
 from mcaprl.online import SIM_SETTINGS, Agent, LiveTraining, Scale, Task
 from mcaprl.progress import TrainingProgress
-from mcaprl.sims import SIMS
 
 KINDS = ("plain", "recorded", "watched")
 _VIEWER = Path(__file__).parent.parent.parent / "tests" / "node" / "watch.mjs"
@@ -58,7 +57,7 @@ def _silent(_: TrainingProgress) -> None:
 def main() -> None:
     """Measure the trainings, and print what recording and a viewer add."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=SIM_SETTINGS[SIMS["lane"]]["steps"])
+    parser.add_argument("--steps", type=int, default=SIM_SETTINGS["lane"]["steps"])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     arguments = parser.parse_args()

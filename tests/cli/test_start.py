@@ -22,10 +22,10 @@ RUN = "from mcaprl.cli import run\nimport sys\n"
 LOADED = "print(*sorted({name.split('.')[0] for name in sys.modules}), file=sys.stderr)\n"
 
 
-def loaded_by(*code: str) -> set[str]:
+def loaded_by(*code: str, run: str = RUN) -> set[str]:
     """Run code in a new interpreter; return the names of the packages that it has imported."""
     done = subprocess.run(
-        [sys.executable, "-c", RUN + "\n".join(code) + "\n" + LOADED],
+        [sys.executable, "-c", run + "\n".join(code) + "\n" + LOADED],
         capture_output=True,
         text=True,
         check=True,
@@ -36,7 +36,79 @@ def loaded_by(*code: str) -> set[str]:
 def test_no_help_imports_an_engine_or_reads_logs() -> None:
     loaded = loaded_by(*(f"assert run([{name!r}, '--help']) == 0" for name in cli.commands))
     assert not loaded & (ENGINES | READING)
-    assert "gymnasium" in loaded
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--help"], ["--version"], ["train-offline", "--help"], ["train-online", "--help"]],
+)
+def test_help_imports_no_numpy_and_registers_no_environment(arguments: list[str]) -> None:
+    code = f"sys.argv = ['mcaprl']\nfrom mcaprl.cli import run\nassert run({arguments}) == 0"
+    assert not loaded_by(code, run="import sys\n") & {"numpy", "gymnasium"}
+
+
+def test_a_command_registers_the_environments() -> None:
+    code = f"""sys.argv = ["mcaprl"]
+from mcaprl.cli import run
+assert run(["info", {str(LANE_LOG)!r}, "--json"]) == 0
+import gymnasium
+assert "mcaprl/LaneKeeping-v0" in gymnasium.registry
+"""
+    assert "gymnasium" in loaded_by(code, run="import sys\n")
+
+
+WAITING = {
+    "record": ("record", "lane", "--episodes", "1", "--out", "OUT.mcap"),
+    "train-online": ("train-online", "lane", "--out", "OUT"),
+    "train-offline": ("train-offline", "LOG", "--out", "OUT"),
+    "evaluate": ("evaluate", "pilot", "--sim", "lane"),
+    "evaluate --data": ("evaluate", "pilot", "--data", "LOG"),
+    "export": ("export", "LOG", "--out", "OUT.onnx"),
+    "info": ("info", "LOG"),
+    "replay": ("replay", "LOG"),
+    "replay --browser": ("replay", "LOG", "--browser"),
+    "replay --save": ("replay", "LOG", "--save", "OUT.html"),
+    "replay --verify": ("replay", "LOG", "--verify"),
+    "layout": ("layout", "LOG", "--out", "-"),
+    "annotate": ("annotate", "LOG", "--scene", "--out", "OUT.mcap"),
+    "check": ("check", "LOG"),
+    "recover": ("recover", "LOG", "OUT.mcap"),
+    "convert": ("convert", "LOG", "OUT.npz", "--to", "npz"),
+    "convert --suggest": ("convert", "--suggest", "LOG"),
+    "merge": ("merge", "LOG", "LOG", "OUT.mcap"),
+    "split": ("split", "LOG", "OUT", "--ratio", "1:1"),
+    "filter": ("filter", "length > 1", "LOG", "OUT.mcap"),
+    "slice": ("slice", "LOG", "OUT.mcap", "--steps", "0:9"),
+}
+"""Arguments of each command that works; its name is the key's first word."""
+
+
+def test_every_command_is_checked_for_its_first_output() -> None:
+    assert {key.split()[0] for key in WAITING} == set(cli.commands) - {"completion"}
+
+
+@pytest.mark.parametrize("name", WAITING)
+def test_a_terminal_shows_what_a_command_does_before_the_long_imports(
+    name: str, tmp_path: Path
+) -> None:
+    code = """
+import os, sys
+class StopAtNumPy:
+    def find_spec(self, name, *_):
+        if name == "numpy":
+            os._exit(3)
+sys.meta_path.insert(0, StopAtNumPy())
+from mcaprl.cli import main
+main()
+"""
+    program = tmp_path / "mcaprl"
+    program.write_text(code)
+    arguments = [
+        word.replace("OUT", str(tmp_path / "out")).replace("LOG", str(LANE_LOG))
+        for word in WAITING[name]
+    ]
+    shown, _ = on_a_terminal(str(program), *arguments, module=(), code=3)
+    assert shown.strip()
 
 
 def test_commands_on_logs_import_no_engine_and_no_writer() -> None:
@@ -47,15 +119,28 @@ def test_commands_on_logs_import_no_engine_and_no_writer() -> None:
     assert "mcap" in loaded
 
 
-def on_a_terminal(*arguments: str, stdout: int | None = None, **env: str) -> tuple[bytes, bytes]:
+def on_a_terminal(
+    *arguments: str,
+    stdout: int | None = None,
+    module: tuple[str, ...] = ("-m", "mcaprl"),
+    code: int = 0,
+    **env: str,
+) -> tuple[bytes, bytes]:
     """Run a command with a terminal as its stderr, and as its stdout if `stdout` is None.
+
+    Args:
+        *arguments: Arguments of the command.
+        stdout: Standard output, if it is not the terminal.
+        module: Arguments of Python before those of the command.
+        code: Expected exit code.
+        **env: Environment variables.
 
     Returns:
         Output on the terminal, and output on stdout if stdout is a pipe.
     """
     terminal, inner = pty.openpty()
     process = subprocess.Popen(
-        [sys.executable, "-m", "mcaprl", *arguments],
+        [sys.executable, *module, *arguments],
         stdin=subprocess.DEVNULL,
         stdout=inner if stdout is None else stdout,
         stderr=inner,
@@ -73,7 +158,7 @@ def on_a_terminal(*arguments: str, stdout: int | None = None, **env: str) -> tup
         shown += part
     piped = process.communicate()[0] or b""
     os.close(terminal)
-    assert process.returncode == 0, shown
+    assert process.returncode == code, shown
     return shown, piped
 
 
@@ -132,11 +217,11 @@ def test_options_are_grouped(name: str) -> None:
 def test_ctrl_c_during_the_imports_is_one_line(program: str, module: str) -> None:
     code = f"""
 import os, signal, sys
-class StopAtGymnasium:
+class StopAtClick:
     def find_spec(self, name, *_):
-        if name == "gymnasium":
+        if name == "click":
             os.kill(os.getpid(), signal.SIGINT)
-sys.meta_path.insert(0, StopAtGymnasium())
+sys.meta_path.insert(0, StopAtClick())
 sys.argv, sys.orig_argv = [{program!r}, "--help"], ["python", "-m", {module!r}, "--help"]
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from mcaprl.cli import main

@@ -82,7 +82,7 @@ def test_an_unknown_algorithm_lists_the_known_ones() -> None:
 @pytest.mark.parametrize("sim", SIMS)
 def test_every_sim_has_settings_that_are_fields(sim: str) -> None:
     settings = settings_for(DoubleDQNConfig, sim, {})
-    assert settings == SIM_SETTINGS[SIMS[sim]]
+    assert settings == SIM_SETTINGS[sim]
     assert settings == settings_for(DoubleDQNConfig, SIMS[sim], {"rules": "default"})
     assert DoubleDQNConfig(**settings).steps == settings["steps"]
 
