@@ -40,6 +40,8 @@ LONG_RECORDS = _ZSTD(1)
 # Settings for messages of different lengths. Most of these are display messages, whose contents
 # repeat: a slower search halves their size.
 MIXED_RECORDS = _ZSTD(12)
+# Settings for a few messages, whose chunk is merged and compressed again when the file is closed.
+FEW_RECORDS = _ZSTD(1)
 # Settings for long messages that are rare, such as a static scene. The higher level takes 0.1 s and
 # reduces the size by a fifth.
 RARE_RECORDS = _ZSTD(16)
@@ -69,6 +71,7 @@ class Compressors:
         short: Compressor for short messages of one length.
         long: Compressor for long messages.
         mixed: Compressor for short messages of different lengths.
+        few: Compressor for a few such messages.
         rare: Compressor for rare long messages that are not images.
     """
 
@@ -78,6 +81,7 @@ class Compressors:
         self.short = _compressor(compression, SHORT_RECORDS)
         self.long = _compressor(compression, LONG_RECORDS)
         self.mixed = _compressor(compression, MIXED_RECORDS)
+        self.few = _compressor(compression, FEW_RECORDS)
         self.rare = _compressor(compression, RARE_RECORDS)
 
     def of(self, records: memoryview, count: int) -> Callable[[Any], bytes]:

@@ -38,6 +38,8 @@ MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEADER = struct.Struct("<BQ")
 # The first fields of a message: channel, sequence number, log_time.
 MESSAGE_START = struct.Struct("<HIQ")
+# The header of a record, then the first fields of a message.
+_MESSAGE_HEAD = struct.Struct("<BQHIQ")
 # An attachment consists of two timestamps, the lengths and bytes of the name, the media type and
 # the data, and a CRC.
 _ATTACHMENT_TIMES_BYTES = 16
@@ -179,9 +181,9 @@ def contents_of(chunk: memoryview) -> ChunkContents:
     Raises:
         CorruptLogError: A record is damaged, or extends beyond the end of the chunk.
     """
-    uniform = _uniform_indexes(chunk)
-    if uniform is not None:
-        return ChunkContents([], uniform)
+    indexes = _uniform_indexes(chunk) or _message_indexes(chunk)
+    if indexes is not None:
+        return ChunkContents([], indexes)
     topics, messages, end = [], UnindexedMessages(), 0
     for offset, opcode, content in records_of(chunk, 0):
         if opcode == Opcode.MESSAGE:
@@ -226,6 +228,27 @@ def _uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
     if (ids == ids[0]).all():
         return {int(ids[0]): entries}
     return {int(channel_id): entries[ids == channel_id] for channel_id in np.unique(ids)}
+
+
+def _message_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
+    """Return the message indexes of a chunk; None if it has other records or a damaged record."""
+    ids, times, offsets = [], [], []
+    message, least = int(Opcode.MESSAGE), MESSAGE_HEADER.itemsize - RECORD_HEADER_BYTES
+    offset, last = 0, len(chunk) - MESSAGE_HEADER.itemsize
+    while offset <= last:
+        # Reading the fields of both headers at once takes a third of the time of `records_of`.
+        opcode, length, channel_id, _, log_time = _MESSAGE_HEAD.unpack_from(chunk, offset)
+        if opcode != message or length < least:
+            return None
+        ids.append(channel_id)
+        times.append(log_time)
+        offsets.append(offset)
+        offset += RECORD_HEADER_BYTES + length
+    if offset != len(chunk):
+        return None
+    entries, channel_ids = np.empty(len(ids), INDEX_ENTRY), np.array(ids, np.uint16)
+    entries["log_time"], entries["offset"] = np.array(times, np.uint64), offsets
+    return {channel_id: entries[channel_ids == channel_id] for channel_id in dict.fromkeys(ids)}
 
 
 def start_of_summary(view: memoryview) -> int:

@@ -27,7 +27,7 @@ from mcaprl.recorder.columns.chunks import (
     RARE_MESSAGE_BYTES,
     Compressors,
 )
-from mcaprl.recorder.columns.compact import compact
+from mcaprl.recorder.columns.compact import SMALL_CHUNK_BYTES, compact
 from mcaprl.recorder.columns.file_lock import copy_start, create, release, reopen, replaced
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, adjacent_offsets, message_record
 from mcaprl.recorder.columns.output import OutputFile
@@ -198,13 +198,17 @@ class McapWriter(OutputFile):
             records += message_record(channel_id, counts[channel_id] % 2**32, time_ns, data)
             counts[channel_id] += 1
         times = [time_ns for _, time_ns, _ in messages]
-        is_rare = len(records) > RARE_MESSAGE_BYTES * len(messages)
+        compress = self._compressors.mixed
+        if len(records) > RARE_MESSAGE_BYTES * len(messages):
+            compress = self._compressors.rare
+        elif len(records) < SMALL_CHUNK_BYTES:
+            compress = self._compressors.few
         self._store(
             memoryview(records),
             # For a small number of entries, `struct` is faster than an array.
             {id_: struct.pack(f"<{len(pairs)}Q", *pairs) for id_, pairs in entries.items()},
             (min(times), max(times)),
-            self._compressors.rare if is_rare else self._compressors.mixed,
+            compress,
         )
 
     def write_records(self, records: memoryview, indexes: Mapping[int, NDArray[Any]]) -> None:

@@ -13,7 +13,6 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.texts import encodable
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -50,6 +49,8 @@ INFO, WARN = 20, 30
 # In CDR, the fields follow the encapsulation header, and are aligned relative to the end of this
 # header.
 _ENCAPSULATION = b"\0\1\0\0"
+# A NUL character ends a ROS string, so it is replaced.
+_NUL, _REPLACEMENT = b"\0", "\ufffd".encode()
 _EPISODE_START, _LOG_START = struct.Struct("<dqqqdII??"), struct.Struct("<IIB")
 
 
@@ -126,8 +127,9 @@ def seed_of(stored: int) -> int | None:
     return None if stored == -1 else stored % 2**64
 
 
+@lru_cache(maxsize=64)
 def text_message(text: str) -> bytes:
-    """Encode a `std_msgs/msg/String` as CDR bytes."""
+    """Encode a `std_msgs/msg/String` as CDR bytes; the phases of episodes have few texts."""
     return bytes(_append_strings(bytearray(_ENCAPSULATION), text))
 
 
@@ -146,13 +148,11 @@ def log_message(time_ns: int, text: str, level: int = INFO) -> bytes:
 def _append_strings(data: bytearray, *texts: str) -> bytearray:
     """Append CDR strings, each aligned to four bytes: length, characters and NUL.
 
-    A NUL character ends a ROS string, so a NUL in a text is replaced by U+FFFD.
+    A NUL in a text is replaced by U+FFFD, and lone surrogates are escaped.
     """
     for text in texts:
-        encoded = encodable(text).replace("\0", "\ufffd").encode() + b"\0"
-        data += bytes(-len(data) % 4)
-        data += len(encoded).to_bytes(4, "little")
-        data += encoded
+        encoded = text.encode(errors="backslashreplace").replace(_NUL, _REPLACEMENT) + _NUL
+        data += bytes(-len(data) % 4) + len(encoded).to_bytes(4, "little") + encoded
     return data
 
 
