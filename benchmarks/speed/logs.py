@@ -1,4 +1,4 @@
-"""Measure recording, writing and reading logs."""
+"""Measure writing and reading logs, and the other benchmarks of logs."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 
 import mcaprl
 from benchmarks.measure import OURS, SLOW_SHARE, SLOWEST_SHARE, Side, Table, after, compare
-from benchmarks.speed import limits, loading, log_parts, rivals
+from benchmarks.speed import limits, loading, log_parts, recording, rivals
 from benchmarks.speed.limits import LEAST_WORK, PLAIN
-from benchmarks.speed.workloads import EPISODE_STEPS, Constant, run_env, vectors
+from benchmarks.speed.workloads import vectors
 from mcaprl.recorder import STEP_TOPIC
 
 
@@ -24,7 +24,8 @@ def tables(folder: Path, transitions: int) -> list[Table]:
     log = folder / "log.mcap"
     data.save(log)
     return [
-        _recording(folder, encoded, minari),
+        recording.one(folder, encoded, minari),
+        recording.many(folder),
         _writing(folder, log, data, part, encoded, minari),
         _reading(folder, log, data, part, minari),
         _space(folder, log, data),
@@ -33,51 +34,6 @@ def tables(folder: Path, transitions: int) -> list[Table]:
         _checking(folder, log),
         loading.table(log, data),
     ]
-
-
-def _recording(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) -> Table:
-    episodes, unrecorded = 100, "the environment alone"
-    messages = (encoded * (1 + episodes * EPISODE_STEPS // len(encoded)))[
-        : episodes * EPISODE_STEPS
-    ]
-    scratch = folder / "recorded.mcap"
-
-    def record() -> None:
-        run_env(mcaprl.RecordMcap(Constant(), scratch, overwrite=True), episodes)
-
-    table = compare(
-        "Recording: CPU time added to each environment step",
-        [
-            Side(unrecorded, lambda: rivals.record_nothing(episodes)),
-            Side(OURS, record, floor=unrecorded),
-            Side("mcap's Writer, prebuilt messages", lambda: rivals.write_mcap(messages, scratch)),
-            Side(
-                "foxglove-sdk, prebuilt messages",
-                lambda: rivals.write_foxglove(messages, scratch),
-            ),
-            Side(
-                "rosbags' Writer, prebuilt messages",
-                lambda: rivals.write_rosbags(messages, folder / "bag"),
-            ),
-            Side(
-                "Minari's DataCollector, HDF5",
-                lambda: minari.record(10, "hdf5"),
-                share=10 / episodes,
-                floor=unrecorded,
-            ),
-            Side(
-                "Minari's DataCollector, Arrow",
-                lambda: minari.record(10, "arrow"),
-                share=10 / episodes,
-                floor=unrecorded,
-            ),
-        ],
-        goal="4 times less than mcap's Writer, 2 times less than foxglove-sdk,"
-        " 15 times less than Minari",
-        rounds=12,
-    )
-    table.ratios.pop(unrecorded)
-    return table
 
 
 def _writing(

@@ -52,6 +52,10 @@ _ENCAPSULATION = b"\0\1\0\0"
 # A NUL character ends a ROS string, so it is replaced.
 _NUL, _REPLACEMENT = b"\0", "\ufffd".encode()
 _EPISODE_START, _LOG_START = struct.Struct("<dqqqdII??"), struct.Struct("<IIB")
+# Number of bytes to which a string is aligned.
+_ALIGNMENT = 4
+# The name in a log line, aligned. After the text: two empty strings, and the field `line`, 0.
+_LOG_NAME, _LOG_END = b"\0\0\0\7\0\0\0mcaprl\0\0", 2 * b"\1\0\0\0\0\0\0\0" + bytes(4)
 
 
 @lru_cache(maxsize=1)
@@ -112,9 +116,8 @@ def episode_message(
 ) -> bytes:
     """Encode the fields of `EPISODE_TEXT` as CDR bytes."""
     times, counts = (start_time_ns, end_time_ns, stored_seed(seed)), (episode, length)
-    data = bytearray(_ENCAPSULATION)
-    data += _EPISODE_START.pack(total_reward, *times, epsilon, *counts, terminated, truncated)
-    return bytes(_append_strings(data, reason, policy, options))
+    start = _EPISODE_START.pack(total_reward, *times, epsilon, *counts, terminated, truncated)
+    return _ENCAPSULATION + start + _strings(len(start), reason, policy, options)
 
 
 def stored_seed(seed: int | None) -> int:
@@ -130,30 +133,35 @@ def seed_of(stored: int) -> int | None:
 @lru_cache(maxsize=64)
 def text_message(text: str) -> bytes:
     """Encode a `std_msgs/msg/String` as CDR bytes; the phases of episodes have few texts."""
-    return bytes(_append_strings(bytearray(_ENCAPSULATION), text))
+    return _ENCAPSULATION + _string(text)
 
 
 def log_message(time_ns: int, text: str, level: int = INFO) -> bytes:
     """Encode an `rcl_interfaces/msg/Log` as CDR bytes."""
-    data = bytearray(_ENCAPSULATION)
     sec, nanosec = divmod(time_ns, 10**9)
     # The 32-bit seconds of ROS wrap around; the log_time of the record does not.
-    data += _LOG_START.pack(sec % 2**32, nanosec, level)
-    _append_strings(data, "mcaprl", text, "", "")
-    # Align the last field, `line`, and set it to 0.
-    data += bytes(-len(data) % 4 + 4)
-    return bytes(data)
+    start, line = _LOG_START.pack(sec % 2**32, nanosec, level), _string(text)
+    return b"".join(
+        (_ENCAPSULATION, start, _LOG_NAME, line, bytes(-len(line) % _ALIGNMENT), _LOG_END)
+    )
 
 
-def _append_strings(data: bytearray, *texts: str) -> bytearray:
-    """Append CDR strings, each aligned to four bytes: length, characters and NUL.
-
-    A NUL in a text is replaced by U+FFFD, and lone surrogates are escaped.
-    """
+@lru_cache(maxsize=64)
+def _strings(at: int, *texts: str) -> bytes:
+    """Encode CDR strings that begin at the byte `at`, each aligned to four bytes."""
+    data = b""
     for text in texts:
-        encoded = text.encode(errors="backslashreplace").replace(_NUL, _REPLACEMENT) + _NUL
-        data += bytes(-len(data) % 4) + len(encoded).to_bytes(4, "little") + encoded
+        data += bytes(-(at + len(data)) % _ALIGNMENT) + _string(text)
     return data
+
+
+def _string(text: str) -> bytes:
+    """Encode a CDR string: length, characters and NUL.
+
+    A NUL in the text is replaced by U+FFFD, and lone surrogates are escaped.
+    """
+    encoded = text.encode(errors="backslashreplace").replace(_NUL, _REPLACEMENT) + _NUL
+    return len(encoded).to_bytes(4, "little") + encoded
 
 
 def stamp(time_ns: int) -> Any:

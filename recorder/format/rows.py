@@ -79,14 +79,15 @@ class TopicRows:
 
     def blank(self, *shape: int) -> Self:
         """Return a block of the given shape; all its rows are copies of this block's first row."""
-        rows = np.empty(shape, self._rows.dtype)
-        rows[...] = self._rows.flat[0]
-        return type(self)(rows, self._write)
+        block = type(self)(np.empty(shape, self._rows.dtype), self._write)
+        block._items[...] = self._items.flat[0]
+        return block
 
     def grown(self, length: int) -> Self:
         """Return a block with `length` rows per episode; its first rows are copies of `self`."""
-        block = self.blank(len(self._rows), length)
-        block._rows[:, : len(self)] = self._rows
+        block = type(self)(np.empty((len(self._rows), length), self._rows.dtype), self._write)
+        block._items[:, : len(self)] = self._items
+        block._items[:, len(self) :] = self._items.flat[0]
         return block
 
     def copy(self, where: Any, source: Self, rows: Any) -> None:

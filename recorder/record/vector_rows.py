@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
+from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up_rows
 from mcaprl.recorder.format.rows import StepRows, TopicRows
 
 # Limits of the initial capacity: number of steps, and number of bytes per environment. The capacity
@@ -116,6 +116,12 @@ class OpenSteps(OpenRows[StepRows]):
             chunk.finish(np.flatnonzero(left == 0))
             chunk.write(where, starts[which] + steps * step_ns)
 
-    def total_reward(self, environment: int, steps: int) -> float:
-        """Return the sum of an environment's first `steps` rewards, in the order of the steps."""
-        return add_up(self._rows.fields["reward"][environment, :steps])
+    def total_rewards(self, environments: Sequence[int], counts: NDArray[np.int64]) -> list[float]:
+        """Return the sums of environments' rewards, each added up in the order of the steps.
+
+        Args:
+            environments: K indexes of environments.
+            counts: (K,) numbers of rewards, 1 or more.
+        """
+        rewards = self._rows.fields["reward"][list(environments), : counts.max()]
+        return add_up_rows(rewards, counts)

@@ -376,13 +376,14 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         # Set this before writing, so that an error does not cause a second write of the episodes.
         self._running[numbers], self._steps[numbers] = False, 0
         recording.begin(self._display)
+        totals = self._columns.total_rewards(numbers, lengths)
         summaries: list[EpisodeSummary] = []
-        for one, length in zip(ended, lengths.tolist(), strict=True):
+        for one, length, total in zip(ended, lengths.tolist(), totals, strict=True):
             episode = self._open[one.number]
             episode.steps = length
             summary = recording.summary(
                 episode,
-                total_reward=self._columns.total_reward(one.number, length),
+                total_reward=total,
                 terminated=one.terminated,
                 truncated=one.truncated,
                 reason=one.reason,
