@@ -118,7 +118,7 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "replay": {
         "Playback": ("browser", "episode", "speed", "loop", "port", "allow_origin"),
         "Comparison with the sim": ("verifies", "sim", "trust_env"),
-        "Page, video and image": ("save", "video", "contact_sheet", "overwrite"),
+        "Page, video and image": ("save", "video", "contact_sheet", "height", "overwrite"),
     },
     "convert": {
         "Formats": ("source_format", "to", "lossy"),

@@ -48,6 +48,11 @@ if TYPE_CHECKING:
     "--video", type=click.Path(path_type=Path), help="Video to write, .mp4, .gif or .webp."
 )
 @click.option("--contact-sheet", type=click.Path(path_type=Path), help="PNG image to write.")
+@click.option(
+    "--height",
+    type=int,
+    help="Height of the images of a logged scene in pixels, 16/9 as wide.  [default: 540]",
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing page, video or image.")
 @click.option("--sim", type=Name(sims), help="Sim to step instead of the logged one.")
 @trust_option
@@ -65,6 +70,7 @@ def replay(
     trust_env: bool,
     video: Path | None,
     contact_sheet: Path | None,
+    height: int | None,
     overwrite: bool,
 ) -> int:
     """Play LOG... in Foxglove or in the browser, compare it with the sim, or render an episode.
@@ -93,7 +99,8 @@ def replay(
             length = mcaprl.save_page(paths[0], save, loop=loop, **chosen)
         echo(f"{save}: episode {chosen['episode']}, {size(length)}")
     if draws:
-        _render(paths[0], video, contact_sheet, sim=sim, trust_env=trust_env, **chosen)
+        sizes = {"height": height, "sim": sim, "trust_env": trust_env}
+        _render(paths[0], video, contact_sheet, **sizes, **chosen)
     if save is not None or draws:
         return 0
     served: dict[str, Any] = {"speed": speed, "loop": loop}

@@ -23,9 +23,9 @@ from benchmarks.measure import OURS, Side, Table, compare
 from mcaprl.sims import make_pilot, make_sim
 
 SIMS = ("lane", "powerline", "racer")
-STEPS = {"lane": 20, "powerline": 40, "racer": 100}
-"""Largest number of recorded steps; they are about 100 frames."""
-GOAL_MS = 10.0
+STEPS = {"lane": 60, "powerline": 80, "racer": 200}
+"""Largest number of recorded steps; they are 200 to 300 frames."""
+GOAL_MS, HEIGHT = 10.0, 480
 ROUNDS = 3
 
 
@@ -33,7 +33,7 @@ def tables(folder: Path) -> list[Table]:
     """Time the video of a short episode of each sim."""
     return [
         compare(
-            f"Video of an episode of {name}, 960x540",
+            f"Video of an episode of {name}, {HEIGHT} lines",
             _sides(name, folder),
             goal=f"{GOAL_MS:.0f} ms per frame, encoding included",
             rounds=ROUNDS,
@@ -59,7 +59,7 @@ def _sides(name: str, folder: Path) -> list[Side]:
     _record(name, log)
 
     def ours() -> None:
-        mcaprl.render(log, video=video, overwrite=True)
+        mcaprl.render(log, video=video, height=HEIGHT, overwrite=True)
 
     ours()
     images = _decoded(video)
@@ -132,7 +132,7 @@ def _matplotlib() -> Callable[[], object]:
     colors = random.random((500, 3))
 
     def run() -> object:
-        figure = Figure(figsize=(9.6, 5.4), dpi=100)
+        figure = Figure(figsize=(8.54, 4.8), dpi=100)
         canvas = FigureCanvasAgg(figure)
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()

@@ -48,7 +48,7 @@ from mcaprl.recorder.viewer.video import (
 from mcaprl.remote import as_path
 
 _Images = Iterator[NDArray[np.uint8]]
-_STILLS = 12
+_STILLS, _HEIGHTS_PX = 12, (16, 4320)
 
 
 @dataclass(frozen=True)
@@ -186,6 +186,7 @@ def render(
     speed: float = 1.0,
     video: str | Path | None = None,
     contact_sheet: str | Path | None = None,
+    height: int | None = None,
     overwrite: bool = False,
     sim: str | None = None,
     trust_env: bool = False,
@@ -202,6 +203,8 @@ def render(
         speed: Simulated seconds per second of the video.
         video: Video to write: .mp4, .gif or .webp.
         contact_sheet: PNG image to write; it shows evenly spaced steps.
+        height: Height of the images of a logged scene in pixels, 16 to 4320; default: 540. The
+            width is 16/9 of it.
         overwrite: Whether existing files are replaced.
         sim: Short name or Gymnasium id to use instead of the logged one.
         trust_env: Whether to import the module that the logged id names, and to pass the logged
@@ -209,7 +212,8 @@ def render(
         progress: Function that opens a progress bar.
 
     Raises:
-        UsageError: There is no output, the log has no such episode, `speed` is not positive, or the
+        UsageError: There is no output, the log has no such episode, `speed` is not positive,
+            `height` is out of range or the log has no scene of which it could be the height, or the
             sim renders no images.
         LogError: The log has no scene, and the sim does not reproduce the episode.
         OutputExistsError: An output exists.
@@ -218,6 +222,10 @@ def render(
     check_positive(speed=speed)
     if video is None and contact_sheet is None:
         raise UsageError("render needs a video, a contact sheet, or both")
+    if height is not None and not _HEIGHTS_PX[0] <= height <= _HEIGHTS_PX[1]:
+        raise UsageError(
+            f"height is {height}, expected {_HEIGHTS_PX[0]} to {_HEIGHTS_PX[1]} pixels"
+        )
     path = as_path(file)
     check_episode(open_logs(path, columns=[]), episode, path)
     movie, sheet = (None if out is None else Path(out) for out in (video, contact_sheet))
@@ -229,7 +237,11 @@ def render(
     reader = McapReader(path)
     has_scene = reader.channel_of(SCENE) is not None
     if has_scene:
-        draw = partial(_of_scene, reader, dataset, one)
+        draw = partial(_of_scene, reader, dataset, one, height=height)
+    elif height is not None:
+        raise UsageError(
+            f"{path} has no scene, and images of the sim have their own height: omit it"
+        )
     else:
         make = partial(sim_of, dataset, path, sim, trust_env=trust_env, render_mode="rgb_array")
         draw = partial(_of_sim, path, dataset, one, make)
@@ -254,12 +266,14 @@ def _of_scene(
     episode: Episode,
     steps: Collection[int],
     parts: int = 1,
+    *,
+    height: int | None,
 ) -> _Images:
-    from mcaprl.sims.drawing.chase_view import ChaseView
+    from mcaprl.sims.drawing.chase_view import HEIGHT_PX, ChaseView
     from mcaprl.sims.drawing.scene import Frame, Shape
 
     static, moving, last = [], [], SeenStep(0, 0)
-    with closing(ChaseView()) as view:
+    with closing(ChaseView(height or HEIGHT_PX)) as view:
         for moment in moments_of_episode(reader, episode, parts):
             if moment.step not in steps:
                 continue

@@ -21,11 +21,13 @@ from mcaprl.sims.geometry.mesh import box_mesh
 
 Floats = NDArray[np.float64]
 
-SIZE_PX = (960, 540)
+HEIGHT_PX = 540
+"""Default height of an image. The width is 16/9 of the height, rounded to an even number."""
 BACK_M, ABOVE_M, AHEAD_M = 15.0, 6.5, 7.0
 """The camera is `BACK_M` behind the body and `ABOVE_M` above it. The camera looks at the point
 `AHEAD_M` in front of the body."""
-_FOCAL_PX = 0.9 * SIZE_PX[0]
+_FOCAL = 0.9
+"""Focal length divided by the width of an image."""
 _SKY: Color = (0.55, 0.68, 0.80, 1.0)
 _INK, _PLATE = (255, 255, 255), (20, 22, 26)
 _DOT = np.array([[0.0, 0.0, -1e-3], [0.0, 0.0, 1e-3]])
@@ -62,14 +64,16 @@ class _Prepared(NamedTuple):
 class ChaseView:
     """Renderer that prepares lists of shapes once and then draws any number of images."""
 
-    def __init__(self) -> None:
-        """Prepare an empty image.
+    def __init__(self, height_px: int = HEIGHT_PX) -> None:
+        """Prepare an empty image of this height.
 
         Raises:
             MissingExtraError: Pygame is not installed.
         """
-        self._canvas = Canvas("rgb_array", SIZE_PX, "", 1)
-        self._painter = Painter(SIZE_PX)
+        width_px = 2 * round(height_px * 8 / 9)
+        self._center_px, self._focal_px = np.array([width_px, height_px]) / 2, _FOCAL * width_px
+        self._canvas = Canvas("rgb_array", (width_px, height_px), "", 1)
+        self._painter = Painter((width_px, height_px))
         self._static = self._moving = _Prepared(None, {}, {})
 
     def draw(
@@ -108,7 +112,7 @@ class ChaseView:
                 for name, part in faces.items()
                 if not (fixed and name == "map")
             ]
-        eye = Eye(body.at_m, body.axes, _FOCAL_PX)
+        eye = Eye(body.at_m, body.axes, self._focal_px)
         self._canvas.paste(self._painter.draw(joined(parts), far, eye, _SKY))
         for texts in (self._static.texts, self._moving.texts):
             self._write(texts, poses, body)
@@ -126,7 +130,7 @@ class ChaseView:
             for at_m, text in here:
                 x, y, z = (_placed(at_m, poses.get(name)) - eye.at_m) @ eye.axes
                 if z > NEAR_M:
-                    across, down = np.array(SIZE_PX) / 2 + _FOCAL_PX * np.array([x, y]) / z
+                    across, down = self._center_px + self._focal_px * np.array([x, y]) / z
                     # Pygame accepts no position that is far outside the image.
                     if abs(across) < 4000 and abs(down) < 4000:
                         at_px = (round(across) - 5 * len(text), round(down))

@@ -23,13 +23,13 @@ from mcaprl.recorder.viewer.video import (
     write_video,
 )
 from mcaprl.sims import make_sim
-from mcaprl.sims.drawing.chase_view import SIZE_PX, ChaseView, chase_eye, poses_of
+from mcaprl.sims.drawing.chase_view import HEIGHT_PX, ChaseView, chase_eye, poses_of
 from mcaprl.sims.drawing.scene import Frame, Kind, Shape, yaw_rotation
 from mcaprl.sims.lane.scene import static_shapes
 from tests.conftest import need
 
 RED, GREEN = (1.0, 0.0, 0.0, 1.0), (0.0, 1.0, 0.0, 1.0)
-WIDTH, HEIGHT = SIZE_PX
+WIDTH, HEIGHT = 960, HEIGHT_PX
 
 
 @pytest.fixture(autouse=True)
@@ -217,9 +217,17 @@ def test_videos_of_a_scene_and_of_a_sim(
         (["--video", "lane.avi"], "unknown kind of output '.avi'"),
         (["--video", "new.mp4", "--episode", "7"], "has episodes 0 to 0"),
         (["cart.mcap", "--video", "new.mp4"], "a page or video shows one log"),
+        (["--video", "new.mp4", "--height", "15"], "height is 15, expected 16 to 4320 pixels"),
     ):
         assert run(["replay", "lane.mcap", *arguments]) == 2
         assert why in capsys.readouterr().err
+    assert run(["replay", "cart.mcap", "--video", "new.mp4", "--height", "480"]) == 2
+    assert "cart.mcap has no scene" in capsys.readouterr().err
+    small = ["--video", "small.mp4", "--contact-sheet", "small.png", "--height", "480"]
+    assert run(["replay", "lane.mcap", *small]) == 0
+    assert imageio.imread("small.mp4", plugin="pyav", index=0).shape == (480, 854, 3)
+    # The sheet shows the images at half their size, in three columns.
+    assert imageio.imread("small.png").shape[1] - 3 * 427 in range(40)
     assert not Path("new.mp4").exists()
 
 
