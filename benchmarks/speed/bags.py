@@ -14,9 +14,9 @@ from threading import Event, Thread
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.measure import OURS, Side, Table, compare
+from benchmarks.speed import rivals
 from mcaprl.recorder import clear_types, open_bag
 
 MESSAGES = 100_000
@@ -49,7 +49,7 @@ def _fields(path: Path, kind: str) -> Table:
         f"Fields of {kind}, from the file to NumPy",
         [
             Side(OURS, lambda: _ours(path, topic, fields)),
-            Side("rerun's McapReader", lambda: _rerun(path, topic, fields)),
+            Side("rerun's McapReader", lambda: rivals.read_rerun(path, topic, fields)),
             Side(
                 "mcap-ros2-support, message by message",
                 lambda: _one_by_one(path, topic, fields, int(MESSAGES * SLOW_SHARE)),
@@ -65,35 +65,6 @@ def _ours(path: Path, topic: str, fields: Sequence[str]) -> Any:
     clear_types()
     with closing(open_bag(path)) as bag:
         return bag.read(topic, fields).columns
-
-
-def _rerun(path: Path, topic: str, fields: Sequence[str]) -> list[Any]:
-    from rerun.chunk import McapReader
-
-    reader = McapReader(path, decoders=["ros2_reflection"], include_topic_regex=[f"^{topic}$"])
-    found: list[Any] = []
-    for chunk in reader.stream():
-        batch = chunk.to_record_batch()
-        found.append([_arrow_field(batch, field) for field in fields])
-    assert sum(len(part[0]) for part in found) == MESSAGES
-    return found
-
-
-def _arrow_field(batch: Any, field: str) -> NDArray[Any]:
-    """Return one field as an array with a row for each message.
-
-    The column stores each message as a list of one struct.
-    """
-    messages = next(
-        column
-        for name, column in zip(batch.schema.names, batch.columns, strict=True)
-        if name.endswith(":message")
-    )
-    column = messages.flatten()
-    for part in field.split("."):
-        column = column.field(part)
-    values: NDArray[Any] = np.asarray(column.flatten() if hasattr(column, "offsets") else column)
-    return values.reshape(len(messages), -1)
 
 
 def _one_by_one(path: Path, topic: str, fields: Sequence[str], count: int) -> list[Any]:

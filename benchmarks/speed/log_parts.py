@@ -61,6 +61,8 @@ def _episode(folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.Minar
     start, stop = (int(episodes[number].log_time_ns[row]) for row in (0, -1))
     rows = slice(number * EPISODE_STEPS, (number + 1) * EPISODE_STEPS)
     table, part = folder / "table.h5", vectors(int(len(data) * SLOW_SHARE))
+    fewer = folder / "fewer.mcap"
+    part.save(fewer)
     one = data.episodes[number].observations
     return compare(
         f"Reading one episode of {len(episodes)}",
@@ -77,6 +79,10 @@ def _episode(folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.Minar
             ),
             Side("rosbags, by time", lambda: rivals.read_rosbags(log, span_ns=(start, stop + 1))),
             Side("h5py, gzip 1, by rows", lambda: rivals.read_h5py(table, rows)),
+            Side(
+                f"{OURS}, one of {len(part.episodes)} episodes",
+                lambda: mcaprl.open(fewer, episodes=len(part.episodes) // 2),
+            ),
             *(
                 Side(
                     f"Minari, {kind}, one of {len(part.episodes)} episodes",

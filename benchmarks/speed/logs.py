@@ -29,7 +29,7 @@ def tables(folder: Path, transitions: int) -> list[Table]:
         _writing(folder, log, data, part, encoded, minari),
         _reading(folder, log, data, part, minari),
         _space(folder, log, data),
-        _threads(log),
+        _threads(log, data),
         *log_parts.tables(folder, log, data, minari),
         _checking(folder, log),
         loading.table(log, data),
@@ -100,6 +100,10 @@ def _reading(
         Side("memcpy of the columns", lambda: [c.copy() for c in rivals.columns_of(data).values()]),
         Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(small), SLOWEST_SHARE),
         Side("rosbags", lambda: rivals.read_rosbags(small), SLOWEST_SHARE),
+        Side(
+            "rerun's McapReader",
+            lambda: rivals.read_rerun(log, STEP_TOPIC, rivals.VECTOR_FIELDS[STEP_TOPIC]),
+        ),
     ]
     # A table format can be read only after it was written.
     for name, write, read, path in (
@@ -116,7 +120,7 @@ def _reading(
         "Reading a log of vectors into columns, CRCs checked",
         sides,
         goal="70 % of plain zstd's speed at level 1, 100 times mcap + mcap-ros2-support, 5 times"
-        " Minari",
+        " Minari and rerun",
         rounds=8,
     )
 
@@ -151,11 +155,12 @@ def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
     return table
 
 
-def _threads(log: Path) -> Table:
+def _threads(log: Path, data: mcaprl.Dataset) -> Table:
     """Measure the wall-clock time of reading and checking with several threads.
 
     Threads do not reduce the CPU time.
     """
+    columns = list(rivals.columns_of(data).values())
     return compare(
         "Reading the log of vectors with several threads",
         [
@@ -164,7 +169,16 @@ def _threads(log: Path) -> Table:
             Side(f"{OURS}, 4 threads", lambda: mcaprl.open(log, threads=4)),
             Side("check", lambda: mcaprl.check(log)),
             Side("check, 2 threads", lambda: mcaprl.check(log, threads=2)),
+            *(
+                Side(
+                    f"{LEAST_WORK}, columns copied, {what}",
+                    limits.least_copied(log, columns, count),
+                )
+                for count, what in ((1, "1 thread"), (2, "2 threads"))
+            ),
         ],
+        goal="1.7 times as fast with two threads",
+        rounds=12,
         clock=time.perf_counter,
         unit=f"wall-clock time on {os.cpu_count()} cores, ours with one thread = 1",
     )

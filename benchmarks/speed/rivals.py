@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +114,35 @@ def read_mcap(
             for name in fields[channel.topic]:
                 columns[name].append(getattr(message, name))
     return _as_arrays(columns)
+
+
+def read_rerun(path: Path, topic: str, fields: Sequence[str]) -> list[list[NDArray[Any]]]:
+    """Read fields with rerun's McapReader; return one array for each field of each chunk."""
+    from rerun.chunk import McapReader
+
+    reader = McapReader(path, decoders=["ros2_reflection"], include_topic_regex=[f"^{topic}$"])
+    found = []
+    for chunk in reader.stream():
+        batch = chunk.to_record_batch()
+        found.append([_arrow_field(batch, field) for field in fields])
+    return found
+
+
+def _arrow_field(batch: Any, field: str) -> NDArray[Any]:
+    """Return one field as an array with a row for each message.
+
+    The column stores each message as a list of one struct.
+    """
+    messages = next(
+        column
+        for name, column in zip(batch.schema.names, batch.columns, strict=True)
+        if name.endswith(":message")
+    )
+    column = messages.flatten()
+    for part in field.split("."):
+        column = column.field(part)
+    values: NDArray[Any] = np.asarray(column.flatten() if hasattr(column, "offsets") else column)
+    return values.reshape(len(messages), -1)
 
 
 def read_rosbags(
