@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import mcaprl
 from benchmarks.measure import OURS, Side, Table, compare
 from benchmarks.speed import limits, rivals
-from benchmarks.speed.workloads import EPISODE_STEPS, Constant, run_env
+from benchmarks.speed.workloads import EPISODE_STEPS, OBSERVATION, Constant, run_env
 from mcaprl.recorder import STEP_TOPIC
 from mcaprl.sims import make_pilot, make_sim, make_sims
 
@@ -22,6 +22,31 @@ ENVS, VECTOR_STEPS = 256, 400
 _ALONE, _LIMIT = "stepping alone", "plain zstd 1 of the same chunks alone"
 _Actions = list[NDArray[Any]]
 _Make = Callable[[], gym.vector.VectorEnv[Any, Any, Any]]
+
+
+class _Arrays(gym.Wrapper[Any, Any, Any, Any]):
+    """Wrapper that keeps the last episode in arrays: the least that a recorder can do per step."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        """Allocate the arrays."""
+        super().__init__(env)
+        self._observations = np.zeros((EPISODE_STEPS, *OBSERVATION.shape), np.float32)
+        self._rewards = np.zeros(EPISODE_STEPS)
+        self._actions = np.zeros(EPISODE_STEPS, np.int64)
+        self._step = 0
+
+    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        self._step = 0
+        return self.env.reset(**arguments)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Step the environment, and keep the transition."""
+        found = self.env.step(action)
+        step = self._step
+        self._observations[step], self._rewards[step], self._actions[step] = *found[:2], action
+        self._step = step + 1
+        return found
 
 
 def one(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) -> Table:
@@ -40,6 +65,11 @@ def one(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) -> Tabl
         [
             Side(unrecorded, lambda: rivals.record_nothing(episodes)),
             Side(OURS, record, floor=unrecorded),
+            Side(
+                "a wrapper that assigns the values to NumPy arrays",
+                lambda: run_env(_Arrays(Constant()), episodes),
+                floor=unrecorded,
+            ),
             Side("mcap's Writer, prebuilt messages", lambda: rivals.write_mcap(messages, scratch)),
             Side(
                 "foxglove-sdk, prebuilt messages",
