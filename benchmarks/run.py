@@ -60,8 +60,8 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
 - Recording one environment: assigning the values to NumPy arrays, without writing them, takes more
   than half of our time.
 - Recording 256 environments: where a step is cheap, compressing the records alone takes half
-  as long as stepping or more. Where episodes are short, the five messages of each episode take most of the
-  time. Ordinary environments with long episodes come close to the goal.
+  as long as stepping or more. Where episodes are short, the five messages of each episode take
+  most of the time. Ordinary environments with long episodes come close to the goal.
 - Depth images: drawing takes half of the time, downsampling a quarter, and encoding an eighth; the
   inner loops of downsampling are near the throughput of scalar instructions.
 
