@@ -107,7 +107,6 @@ class McapReader:
         # a chunk one after another.
         self._last_chunk = (-1, memoryview(b""))
         self._contents: dict[int, ChunkContents] = {}
-        self._ranges: dict[int, list[MessageRange]] = {}
         with self._named():
             footer = self._footer()
         self.complete = footer is not None
@@ -225,24 +224,24 @@ class McapReader:
         Raises:
             CorruptLogError: An index is damaged, or the indexes and the summary disagree.
         """
-        if channel.id not in self._ranges:
-            if self._remote is not None:
-                # Fetch the indexes of all chunks with several channels in one call, not with
-                # one request for each chunk.
-                places = [one for one in self.chunks if len(one.message_index_offsets) > 1]
-                starts = [one.chunk_start_offset + one.chunk_length for one in places]
-                self.fetch(zip(starts, map(end_of, places), strict=True))
-            count, ranges = self._counts.get(channel.id), self._find_ranges(channel.id, lazily=True)
-            if sum(map(len, ranges)) != count:
-                ranges = self._find_ranges(channel.id, lazily=False)
-            found = sum(map(len, ranges))
-            if count not in (None, found):
-                raise CorruptLogError(
-                    f"{self.path}: the summary counts {count} messages of {channel.topic}, but"
-                    f" the message indexes have {found}"
-                )
-            self._ranges[channel.id] = ranges
-        return self._ranges[channel.id]
+        if self._remote is not None:
+            # Fetch the indexes of all chunks with several channels in one call, not with one
+            # request for each chunk.
+            places = [one for one in self.chunks if len(one.message_index_offsets) > 1]
+            starts = [one.chunk_start_offset + one.chunk_length for one in places]
+            self.fetch(zip(starts, map(end_of, places), strict=True))
+        # The ranges refer to this reader, so the reader does not store them: a file stays open
+        # until its reader is deleted, and a cycle of references would delay that.
+        count, ranges = self._counts.get(channel.id), self._find_ranges(channel.id, lazily=True)
+        if sum(map(len, ranges)) != count:
+            ranges = self._find_ranges(channel.id, lazily=False)
+        found = sum(map(len, ranges))
+        if count not in (None, found):
+            raise CorruptLogError(
+                f"{self.path}: the summary counts {count} messages of {channel.topic}, but the"
+                f" message indexes have {found}"
+            )
+        return ranges
 
     def _find_ranges(self, channel_id: int, *, lazily: bool) -> list[MessageRange]:
         ranges = []

@@ -6,6 +6,7 @@ import glob
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,6 +21,8 @@ from mcaprl.recorder.dataset.manifest import is_manifest, listed_logs
 from mcaprl.remote import as_path, find_remote, is_url
 from mcaprl.texts import counted
 
+# Largest number of logs that are open at the same time; a process may open only so many files.
+_MAX_OPEN = 64
 Result = TypeVar("Result")
 Episodes = int | slice | Sequence[int]
 
@@ -62,41 +65,44 @@ def open_logs(
         raise UsageError(f"threads is {threads}, expected 1 or more")
     chosen = None if columns is None else tuple(columns)
     selection = Selection(columns=chosen, images=images, threads=threads)
-    logs = [LogReader(path, selection) for path in find_logs(data)]
+    paths, log_at = find_logs(data), lru_cache(_MAX_OPEN)(partial(LogReader, selection=selection))
     if episodes is None:
-        return Dataset.concatenate([part for _, part in _call_each(logs, LogReader.read)])
-    return _read_episodes(logs, episodes)
+        parts = _call_each(paths, lambda path: log_at(path).read())
+        return Dataset.concatenate([part for _, part in parts])
+    return _read_episodes(paths, log_at, episodes)
 
 
 def _call_each(
-    logs: Sequence[LogReader], function: Callable[[LogReader], Result]
-) -> list[tuple[LogReader, Result]]:
+    paths: Sequence[Path], function: Callable[[Path], Result]
+) -> list[tuple[Path, Result]]:
     """Call a function on each log. If there are several logs, skip those without finished episodes.
 
     Raises:
         NoEpisodesError: No log has a finished episode.
     """
     results = []
-    for log in logs:
+    for path in paths:
         try:
-            results.append((log, function(log)))
+            results.append((path, function(path)))
         except NoEpisodesError as error:
-            if len(logs) == 1:
+            if len(paths) == 1:
                 raise
             warnings.warn(f"{error}: skipped", stacklevel=4)
     if not results:
-        raise NoEpisodesError(f"no finished episode in {counted(len(logs), 'log')}")
+        raise NoEpisodesError(f"no finished episode in {counted(len(paths), 'log')}")
     return results
 
 
-def _read_episodes(logs: Sequence[LogReader], episodes: Episodes) -> Dataset:
-    counted = _call_each(logs, lambda log: len(log.lengths))
+def _read_episodes(
+    paths: Sequence[Path], log_at: Callable[[Path], LogReader], episodes: Episodes
+) -> Dataset:
+    counted = _call_each(paths, lambda path: len(log_at(path).lengths))
     numbers = episode_indexes(episodes, sum(count for _, count in counted))
     parts, first = [], 0
-    for log, count in counted:
+    for path, count in counted:
         mine = numbers[(first <= numbers) & (numbers < first + count)]
         if len(mine):
-            parts.append(log.read(mine - first))
+            parts.append(log_at(path).read(mine - first))
         first += count
     return Dataset.concatenate(parts)
 
