@@ -21,7 +21,7 @@ from mcaprl.recorder.dataset.manifest import is_manifest, listed_logs
 from mcaprl.remote import as_path, find_remote, is_url
 from mcaprl.texts import counted
 
-# Largest number of logs that are open at the same time; a process may open only so many files.
+# Largest number of logs open at the same time; the system limits the open files of a process.
 _MAX_OPEN = 64
 Result = TypeVar("Result")
 Episodes = int | slice | Sequence[int]
