@@ -51,7 +51,8 @@ if TYPE_CHECKING:
 @click.option(
     "--height",
     type=int,
-    help="Height of the images of a logged scene in pixels, 16/9 as wide.  [default: 540]",
+    help="Height of the images of a logged scene in pixels; the width is 16/9 of the height."
+    "  [default: 540]",
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing page, video or image.")
 @click.option("--sim", type=Name(sims), help="Sim to step instead of the logged one.")
@@ -99,8 +100,8 @@ def replay(
             length = mcaprl.save_page(paths[0], save, loop=loop, **chosen)
         echo(f"{save}: episode {chosen['episode']}, {size(length)}")
     if draws:
-        sizes = {"height": height, "sim": sim, "trust_env": trust_env}
-        _render(paths[0], video, contact_sheet, **sizes, **chosen)
+        chosen |= {"height": height, "sim": sim, "trust_env": trust_env}
+        _render(paths[0], video, contact_sheet, **chosen)
     if save is not None or draws:
         return 0
     served: dict[str, Any] = {"speed": speed, "loop": loop}

@@ -17,7 +17,8 @@ from mcaprl._version import __version__
 from mcaprl.errors import McaprlError
 from mcaprl.lazy import lazy_attributes
 
-if not is_program():  # The program imports them with `mcaprl.api`, so that its help is fast.
+# The program imports the environments with `mcaprl.api`, so that its help is fast.
+if not is_program():
     import mcaprl.sims  # noqa: F401  (registers the environments)
 
 if TYPE_CHECKING:

@@ -212,9 +212,8 @@ def render(
         progress: Function that opens a progress bar.
 
     Raises:
-        UsageError: There is no output, the log has no such episode, `speed` is not positive,
-            `height` is out of range or the log has no scene of which it could be the height, or the
-            sim renders no images.
+        UsageError: Both outputs are None, the episode does not exist, `speed` or `height` is out of
+            range, `height` is given for a log without a scene, or the sim renders no images.
         LogError: The log has no scene, and the sim does not reproduce the episode.
         OutputExistsError: An output exists.
         MissingExtraError: The packages of the `video` extra are not installed.
@@ -240,7 +239,7 @@ def render(
         draw = partial(_of_scene, reader, dataset, one, height=height)
     elif height is not None:
         raise UsageError(
-            f"{path} has no scene, and images of the sim have their own height: omit it"
+            f"{path} has no scene, so the sim chooses the height of its images: omit the height"
         )
     else:
         make = partial(sim_of, dataset, path, sim, trust_env=trust_env, render_mode="rgb_array")

@@ -40,7 +40,8 @@ LONG_RECORDS = _ZSTD(1)
 # Settings for messages of different lengths. Most of these are display messages, whose contents
 # repeat: a slower search halves their size.
 MIXED_RECORDS = _ZSTD(12)
-# Settings for a few messages, whose chunk is merged and compressed again when the file is closed.
+# Settings for a few messages. If a file has many such chunks, they are merged and compressed again
+# when it is closed; otherwise, their size does not matter.
 FEW_RECORDS = _ZSTD(1)
 # Settings for long messages that are rare, such as a static scene. The higher level takes 0.1 s and
 # reduces the size by a fifth.

@@ -236,7 +236,7 @@ def _message_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
     message, least = int(Opcode.MESSAGE), MESSAGE_HEADER.itemsize - RECORD_HEADER_BYTES
     offset, last = 0, len(chunk) - MESSAGE_HEADER.itemsize
     while offset <= last:
-        # Reading the fields of both headers at once takes a third of the time of `records_of`.
+        # Reading both headers at once is faster than reading one record at a time by `records_of`.
         opcode, length, channel_id, _, log_time = _MESSAGE_HEAD.unpack_from(chunk, offset)
         if opcode != message or length < least:
             return None

@@ -65,11 +65,12 @@ def open_logs(
         raise UsageError(f"threads is {threads}, expected 1 or more")
     chosen = None if columns is None else tuple(columns)
     selection = Selection(columns=chosen, images=images, threads=threads)
-    paths, log_at = find_logs(data), lru_cache(_MAX_OPEN)(partial(LogReader, selection=selection))
+    paths, log_at = find_logs(data), partial(LogReader, selection=selection)
     if episodes is None:
         parts = _call_each(paths, lambda path: log_at(path).read())
         return Dataset.concatenate([part for _, part in parts])
-    return _read_episodes(paths, log_at, episodes)
+    # Each log is needed twice: for the number of its episodes, and for those that are selected.
+    return _read_episodes(paths, lru_cache(_MAX_OPEN)(log_at), episodes)
 
 
 def _call_each(

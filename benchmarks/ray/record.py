@@ -1,6 +1,6 @@
 """Compare the recording time of two Ray workers with that of two plain processes.
 
-    python -m benchmarks.speed.ray_record
+    python -m benchmarks.ray.record
 
 Both record the same episodes. CPU time counts all processes: ours, the workers and, for Ray, those
 of the cluster. Wall time is meaningful only on an idle machine. The start of the Ray cluster is not

@@ -1,6 +1,6 @@
 """Compare the read tasks of `mcaprl.ray.read` with those of `ray.data.read_mcap`.
 
-    python -m benchmarks.speed.ray_read
+    python -m benchmarks.ray.read
 
 This process runs the tasks that Ray's workers would run, and measures the CPU time. The tasks of
 `read_mcap` return the bytes of messages. The benchmark then decodes the bytes in the fastest

@@ -1,6 +1,6 @@
 """Estimate the resources for many transitions from rates that are measured here.
 
-    python -m benchmarks.speed.ray_sizing [--transitions 1e9] [--sim lane] [--workers 64]
+    python -m benchmarks.ray.sizing [--transitions 1e9] [--sim lane] [--workers 64]
 
 Rates are CPU time in one process, on a log of a few thousand transitions. The prices are examples:
 replace them with those of your provider. Nothing here measures a network or several machines.
