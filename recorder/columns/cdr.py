@@ -73,6 +73,25 @@ class Layout:
         """Return whether all messages have this layout."""
         return bool(self.matching(payloads).all())
 
+    def fits_one(self, message: bytes) -> bool:
+        """Return whether a message of the layout's length has this layout."""
+        # This takes a tenth of the time of `fits` with an array of one message.
+        code, constants = self._packed
+        return code.unpack_from(message) == constants
+
+    @cached_property
+    def _packed(self) -> tuple[struct.Struct, tuple[bytes, ...]]:
+        """Format that reads the constants as bytes, and these bytes."""
+        fields: Any = self.dtype.fields
+        code, end = "<", 0
+        # The constants are in the order of their positions.
+        for name in self.constants:
+            dtype, start = fields[name][:2]
+            code += f"{start - end}x{dtype.itemsize}s"
+            end = start + dtype.itemsize
+        values = (np.array(value, fields[name][0]) for name, value in self.constants.items())
+        return struct.Struct(code), tuple(value.tobytes() for value in values)
+
     def matching(self, payloads: NDArray[Any]) -> NDArray[np.bool_]:
         """Return a mask of the messages that have this layout."""
         found = np.ones(len(payloads), bool)
@@ -108,13 +127,15 @@ class MessageType:
         """Kind of each leaf field by its dotted path; see `definitions.leaf_kinds`."""
         return leaf_kinds(self._definitions.types, self.name)
 
-    def leaf_dtype(self, path: str) -> np.dtype[Any]:
-        """Return the dtype of a leaf field.
+    @cached_property
+    def leaf_dtypes(self) -> dict[str, np.dtype[Any]]:
+        """Dtype of each leaf field by its dotted path.
 
         It is int64 for timestamps, and `object` for strings and lists.
         """
-        kind = self.kinds.get(path, "").split("[")[0]
-        return np.dtype("i8") if kind == "time" else np.dtype(ROS_TO_NUMPY.get(kind, object))
+        found = {path: kind.split("[")[0] for path, kind in self.kinds.items()}
+        codes = {"time": "i8", **ROS_TO_NUMPY}
+        return {path: np.dtype(codes.get(kind, object)) for path, kind in found.items()}
 
     def decode(self, data: bytes) -> Any:
         """Decode one message to an object with an attribute for each field.
@@ -136,7 +157,7 @@ class MessageType:
         # Layouts are cached: building one takes as long as decoding a few messages.
         key = (len(example), *wanted)
         known = self._layouts.get(key)
-        if known is None or not known.fits(np.frombuffer(example, known.dtype)):
+        if known is None or not known.fits_one(example):
             known = self._new_layout(example, wanted)
             if len(self._layouts) >= _MAX_LAYOUTS:
                 self._layouts.clear()

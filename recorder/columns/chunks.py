@@ -27,6 +27,14 @@ _CHUNK_START = struct.Struct("<BQQQQII")
 # compression, and the end.
 _INDEX_START, _INDEX_MAP_ENTRY = struct.Struct("<QQQQI"), struct.Struct("<HQ")
 _INDEX_MIDDLE, _INDEX_END = struct.Struct("<QI"), struct.Struct("<QQ")
+# A ChunkIndex record, with its header, of a chunk with one channel and zstd compression; and the
+# bytes that are equal in all these records: the header, the length of the map, and the name.
+_INDEX_OF_ONE = struct.Struct("<9sQQQQ4sHQQ8sQQ")
+_HEADS_OF_ONE = (
+    struct.pack("<BQ", Opcode.CHUNK_INDEX, _INDEX_OF_ONE.size - RECORD_HEADER_BYTES),
+    struct.pack("<I", _INDEX_MAP_ENTRY.size),
+    struct.pack("<I4s", 4, b"zstd"),
+)
 _ZSTD = zstandard.ZstdCompressionParameters.from_level
 # Settings for short records of numbers. Each record is most similar to the records just before it.
 # A small hash table is therefore faster than the large table of zstd level 1, and it finds more
@@ -213,6 +221,36 @@ def parse_chunk_index(content: memoryview) -> ChunkIndex:
         start_time,
         raw_bytes,
     )
+
+
+def parse_chunk_indexes(summary: memoryview) -> tuple[list[ChunkIndex], int]:
+    """Parse the ChunkIndex records at the start of `summary` that are alike.
+
+    Returns them, and the number of their bytes. Stops before the first record that is not the index
+    of a chunk with a single channel and zstd compression. Compared with `parse_chunk_index`, this
+    takes a third of the time.
+    """
+    size, found = _INDEX_OF_ONE.size, list[ChunkIndex]()
+    records = _INDEX_OF_ONE.iter_unpack(summary[: len(summary) // size * size])
+    for (
+        head,
+        start,
+        end,
+        offset,
+        length,
+        ids,
+        channel,
+        place,
+        indexes,
+        name,
+        packed,
+        raw,
+    ) in records:
+        if (head, ids, name) != _HEADS_OF_ONE:
+            break
+        offsets = {channel: place}
+        found.append(ChunkIndex(length, offset, "zstd", packed, end, indexes, offsets, start, raw))
+    return found, len(found) * size
 
 
 _NOTHING = (-1, memoryview(b""))

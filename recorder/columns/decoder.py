@@ -71,10 +71,14 @@ class Decoder:
         The first message determines the dtypes and shapes.
         """
         records = self._reader.records_of(messages, scratch)
-        example = self._values(records, messages.index[0], wanted)
-        return {
-            name: np.empty((count, *value.shape), value.dtype) for name, value in example.items()
-        }
+        layout = self.type.layout(self._message(records, messages.index[0]), wanted)
+        if layout is not None:
+            shapes = {name: layout.dtype[name].shape for name in wanted}
+        else:
+            example = self._values(records, messages.index[0], wanted)
+            shapes = {name: value.shape for name, value in example.items()}
+        dtypes = self.type.leaf_dtypes
+        return {name: np.empty((count, *shapes[name]), dtypes[name]) for name in wanted}
 
     def fill(self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows) -> None:
         """Decode the messages that `index` lists, and store them in `rows` of the columns."""
@@ -207,9 +211,8 @@ class Decoder:
                 f"{self._reader.path}: {self.channel.topic} at log_time {entry['log_time']}:"
                 f" {error}"
             ) from error
-        return {
-            name: _as_array(_value_at(message, name), self.type.leaf_dtype(name)) for name in wanted
-        }
+        dtypes = self.type.leaf_dtypes
+        return {name: _as_array(_value_at(message, name), dtypes[name]) for name in wanted}
 
     def _lists_of_texts(self, values: NDArray[Any]) -> NDArray[Any]:
         """Convert structured values, which have one field for each string, to lists of strings."""

@@ -34,7 +34,13 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
 from mcaprl.recorder.columns.checksum import crc32
-from mcaprl.recorder.columns.chunks import Scratch, chunk_header, chunk_records, parse_chunk_index
+from mcaprl.recorder.columns.chunks import (
+    Scratch,
+    chunk_header,
+    chunk_records,
+    parse_chunk_index,
+    parse_chunk_indexes,
+)
 from mcaprl.recorder.columns.message_rows import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
@@ -233,9 +239,10 @@ class McapReader:
         # The ranges refer to this reader, so the reader does not store them: a file stays open
         # until its reader is deleted, and a cycle of references would delay that.
         count, ranges = self._counts.get(channel.id), self._find_ranges(channel.id, lazily=True)
-        if sum(map(len, ranges)) != count:
-            ranges = self._find_ranges(channel.id, lazily=False)
         found = sum(map(len, ranges))
+        if found != count:
+            ranges = self._find_ranges(channel.id, lazily=False)
+            found = sum(map(len, ranges))
         if count not in (None, found):
             raise CorruptLogError(
                 f"{self.path}: the summary counts {count} messages of {channel.topic}, but the"
@@ -386,10 +393,17 @@ class McapReader:
         return self._contents[start]
 
     def _read_summary(self) -> None:
+        view, end = self._view, self.summary_start
         with self._named():
-            for offset, opcode, content in records_of(self._view, self.summary_start):
+            while (record := next(records_of(view, end), None)) is not None:
+                offset, opcode, content = record
+                end = offset + RECORD_HEADER_BYTES + len(content)
                 if opcode == Opcode.CHUNK_INDEX:
                     self.chunks.append(parse_chunk_index(content))
+                    # Most logs have a row of similar chunk indexes.
+                    alike, size = parse_chunk_indexes(view[end:])
+                    self.chunks += alike
+                    end += size
                 elif opcode in _SUMMARY:
                     self._parse(opcode, content, offset)
         self.chunks.sort(key=_START_OF)

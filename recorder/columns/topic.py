@@ -184,11 +184,12 @@ class Topic:
 
     def _check(self, wanted: Collection[str]) -> None:
         """Check that all channels have the wanted fields, with equal dtypes."""
-        for decoder in self._decoders:
+        types = [decoder.type for decoder in self._decoders]
+        for one in types:
             for name in wanted:
-                if name not in decoder.type.kinds:
-                    raise UnknownNameError(f"field of {self.name}", name, decoder.type.kinds)
-                if decoder.type.leaf_dtype(name) != self._decoders[0].type.leaf_dtype(name):
+                if name not in one.kinds:
+                    raise UnknownNameError(f"field of {self.name}", name, one.kinds)
+                if one is not types[0] and one.leaf_dtypes[name] != types[0].leaf_dtypes[name]:
                     raise LogError(
                         f"{self._reader.path}: the channels of {self.name} have values of"
                         f" different types in {name}"

@@ -18,6 +18,8 @@ from mcaprl.recorder.format.topics import STEP_TOPIC
 
 COUNTERS = ("episode", "step", "final")
 """Fields of `/rl/step` that locate a record: episode, step and final-record flag."""
+# If a log has at most this many episodes, their summaries are read at once.
+_FEW_EPISODES = 256
 # Number of rows of a column that fit into the processor's cache.
 _BLOCK_ROWS = 2**15
 
@@ -123,7 +125,11 @@ class EpisodeTopic:
         fields, rows = EpisodeSummary._fields, None
         if len(ends) < len(self._topic) // 2:
             rows = np.flatnonzero(np.isin(self._columns["end_time_ns"], ends))
-        columns = self._topic.read([name for name in fields if name in self._topic.fields], rows)
+        if len(self._topic) > _FEW_EPISODES:
+            columns = self._topic.read(self._fields, rows)
+        else:
+            chosen = slice(None) if rows is None else rows
+            columns = {name: column[chosen] for name, column in self._columns.items()}
         for name in ("terminated", "truncated"):
             columns[name] = columns[name].astype(bool)
         values = {name: columns[name].tolist() for name in fields if name in columns}
@@ -139,8 +145,15 @@ class EpisodeTopic:
         return required <= set(self._topic.fields)
 
     @cached_property
+    def _fields(self) -> list[str]:
+        """Names of the fields of a summary that the messages have."""
+        return [name for name in EpisodeSummary._fields if name in self._topic.fields]
+
+    @cached_property
     def _columns(self) -> Columns:
-        return self._topic.read(("length", "end_time_ns"))
+        """Lengths and end times of all episodes; if there are few episodes, all fields."""
+        is_small = len(self._topic) <= _FEW_EPISODES
+        return self._topic.read(self._fields if is_small else ("length", "end_time_ns"))
 
 
 def summaries(

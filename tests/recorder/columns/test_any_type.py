@@ -16,6 +16,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaprl.errors import LogError
+from mcaprl.recorder.columns.cdr import MessageType
 from mcaprl.recorder.columns.definitions import TIME_TYPES
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.topic import Topic
@@ -135,6 +136,23 @@ def test_all_fields_equal_those_of_another_reader(text: str, seed: int, tmp_path
             assert len({len(value) for value in expected}) > 1
             continue
         assert [plain(value) for value in column.tolist()] == expected
+
+
+@settings(max_examples=60)
+@given(text=DEFINITIONS, seed=st.integers(0, 999), is_little=st.booleans())
+def test_a_layout_checks_one_message_like_many(text: str, seed: int, is_little: bool) -> None:
+    maker, wanted = Maker(text, seed), [f"f{number}" for number in range(4)]
+    type_ = MessageType(NAME, text)
+    messages = [
+        bytes(maker.store.serialize_cdr(maker.message(), NAME, little_endian=is_little))
+        for _ in range(12)
+    ]
+    layout = type_.layout(messages[0], wanted)
+    if layout is None:
+        return
+    alike = [message for message in messages if len(message) == len(messages[0])]
+    rows = np.frombuffer(b"".join(alike), layout.dtype)
+    assert [layout.fits_one(message) for message in alike] == layout.matching(rows).tolist()
 
 
 def test_times_are_leaves_and_lists_are_objects(tmp_path: Path) -> None:

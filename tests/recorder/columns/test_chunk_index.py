@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,11 @@ from mcap.records import ChunkIndex
 
 import mcaprl
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns.chunks import chunk_index_record, parse_chunk_index
+from mcaprl.recorder.columns.chunks import (
+    chunk_index_record,
+    parse_chunk_index,
+    parse_chunk_indexes,
+)
 from mcaprl.recorder.columns.message_rows import message_index
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import RECORD_HEADER
@@ -38,6 +43,10 @@ CHUNK_INDEXES = st.builds(
     uncompressed_size=_U8,
 )
 
+CHUNKS_OF_ONE = CHUNK_INDEXES.map(
+    lambda chunk: replace(chunk, compression="zstd", message_index_offsets={7: 8})
+)
+
 
 def content_of(chunk: ChunkIndex, after: bytes = b"") -> memoryview:
     """Return the content of the record that the library writes, followed by the bytes `after`."""
@@ -50,6 +59,21 @@ def content_of(chunk: ChunkIndex, after: bytes = b"") -> memoryview:
 def test_chunk_indexes_equal_those_of_the_library(chunk: ChunkIndex, after: bytes) -> None:
     assert parse_chunk_index(content_of(chunk, after)) == chunk
     assert chunk_index_record(chunk)[RECORD_HEADER.size :] == content_of(chunk)
+
+
+@given(st.lists(CHUNK_INDEXES | CHUNKS_OF_ONE, max_size=4), st.binary(max_size=120))
+def test_rows_of_chunk_indexes_are_parsed_like_each_one(
+    chunks: list[ChunkIndex], after: bytes
+) -> None:
+    records = list(map(chunk_index_record, chunks))
+    alike = list(
+        itertools.takewhile(
+            lambda chunk: chunk.compression == "zstd" and len(chunk.message_index_offsets) == 1,
+            chunks,
+        )
+    )
+    found, size = parse_chunk_indexes(memoryview(b"".join(records) + b"\0" + after))
+    assert (found, size) == (alike, sum(map(len, records[: len(alike)])))
 
 
 @pytest.mark.parametrize("every", [1, 2])

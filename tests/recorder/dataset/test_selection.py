@@ -130,6 +130,19 @@ def test_episodes_of_several_logs(tmp_path: Path) -> None:
     assert len(part.sources) == 2, "the log in the middle has none of them"
 
 
+@pytest.mark.parametrize("count", [256, 257])
+def test_summaries_of_few_and_of_many_episodes(count: int, tmp_path: Path) -> None:
+    """Summaries of at most 256 episodes are read at once, others when they are needed."""
+    box = spaces.Box(-1, 1, (2,), np.float32)
+    record(
+        tmp_path / "log.mcap", box, spaces.Discrete(2), [1 + number % 3 for number in range(count)]
+    )
+    whole = mcaprl.open(tmp_path / "log.mcap").episodes
+    for asked in ([7], [3, 200, 255], range(10, count)):
+        part = mcaprl.open(tmp_path / "log.mcap", episodes=list(asked)).episodes
+        assert str([one.summary for one in part]) == str([whole[k].summary for k in asked])
+
+
 def test_episodes_of_a_cut_log(log: Path, tmp_path: Path) -> None:
     path = tmp_path / "cut.mcap"
     data = log.read_bytes()
