@@ -122,7 +122,8 @@ def episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
     if len(outside) or not len(selected):
         what = f"no episode {outside[0]}" if len(outside) else "no episodes are selected"
         raise UsageError(f"{what}: the logs have {counted(count, 'episode')}; indexes start at 0")
-    return np.unique(selected % count)
+    # The first call of `np.unique` imports `numpy.ma`, which takes longer than reading an episode.
+    return np.array(sorted(set((selected % count).tolist())), np.int64)
 
 
 def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
