@@ -17,6 +17,7 @@ from mcaprl.recorder.columns.message_rows import (
     MESSAGE_HEADER,
     MessageRange,
     are_messages,
+    as_items,
     gather,
     record_dtype,
 )
@@ -266,6 +267,5 @@ def _as_array(value: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
 def _put(column: NDArray[Any], rows: Rows, values: NDArray[Any]) -> None:
     """Set rows of a column; copy each vector as one item, not number by number."""
     if values.ndim == 2 and values.size and values.dtype == column.dtype:
-        row = np.dtype((np.void, values.shape[1] * values.itemsize))
-        column, values = column.view(row)[:, 0], values.view(row)[:, 0]
+        column, values = as_items(column), as_items(values)
     column[rows] = values

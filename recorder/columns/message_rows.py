@@ -141,6 +141,16 @@ class MessageRange:
         return self._count
 
 
+def as_items(column: NDArray[Any]) -> NDArray[Any]:
+    """Return a view of a column of vectors (K, n) as (K,) items; another column as it is.
+
+    Copying items takes less time than copying their numbers one by one.
+    """
+    if column.ndim != 2 or not column.size:
+        return column
+    return column.view(np.dtype((np.void, column.shape[1] * column.itemsize)))[:, 0]
+
+
 def gather(records: memoryview, index: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return the messages at the entries of `index` as one structured array.
 

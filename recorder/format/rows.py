@@ -1,7 +1,4 @@
-"""Preallocated message records of one topic, addressed by field.
-
-A block of rows has the shape (rows,), or (episodes, rows) if several episodes are open at once.
-"""
+"""Preallocated message records of one topic, addressed by field."""
 
 from __future__ import annotations
 
@@ -43,8 +40,6 @@ class TopicRows:
         payload = rows["payload"]
         self.fields = {name: payload[name] for name in payload.dtype.names or ()}
         self._rows, self._write, self._log_time = rows, write, rows["log_time"]
-        # Copying items without fields is as fast as `memcpy`.
-        self._items = rows.view(np.dtype((np.void, rows.itemsize)))
 
     @classmethod
     def of_text(cls, text: str, channel_id: int, most: int, write: Write) -> Self:
@@ -64,8 +59,8 @@ class TopicRows:
         return cls(rows, write)
 
     def __len__(self) -> int:
-        """Return the number of rows of one episode."""
-        return int(self._rows.shape[-1])
+        """Return the number of rows."""
+        return len(self._rows)
 
     @property
     def channel_id(self) -> int:
@@ -77,33 +72,16 @@ class TopicRows:
         """Number of bytes of one row."""
         return self._rows.itemsize
 
-    def blank(self, *shape: int) -> Self:
-        """Return a block of the given shape; all its rows are copies of this block's first row."""
-        block = type(self)(np.empty(shape, self._rows.dtype), self._write)
-        block._items[...] = self._items.flat[0]
-        return block
-
-    def grown(self, length: int) -> Self:
-        """Return a block with `length` rows per episode; its first rows are copies of `self`."""
-        block = type(self)(np.empty((len(self._rows), length), self._rows.dtype), self._write)
-        block._items[:, : len(self)] = self._items
-        block._items[:, len(self) :] = self._items.flat[0]
-        return block
-
-    def copy(self, where: Any, source: Self, rows: Any) -> None:
-        """Copy `rows` of another block of the same topic to the rows `where` of this block."""
-        self._items[where] = source._items[rows]
-
     def put(self, field: str, where: Any, values: Any) -> None:
         """Set values of a field.
 
         Args:
             field: Name in the message.
-            where: Index of K rows of the block.
+            where: Index of K rows.
             values: (K, *shape) values, or one scalar for all K rows.
         """
         column = self.fields[field]
-        if column.ndim > self._rows.ndim:
+        if column.ndim > 1:
             values = np.reshape(values, (-1, column.shape[-1]))
         column[where] = values
 

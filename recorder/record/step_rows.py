@@ -277,7 +277,20 @@ def observation_store(
 
 def converters(space: spaces.Space[Any]) -> list[Converter]:
     """Return one function per leaf, which reads the leaf's value from an observation."""
-    return [_converter(leaf) for leaf in observation_leaves(space)]
+    return [converter(leaf) for leaf in observation_leaves(space)]
+
+
+def converter(leaf: Leaf) -> Converter:
+    """Return the function that reads a leaf's value from an observation, or from an action."""
+    shape, dtype, part = leaf.shape, leaf.dtype, _part(leaf)
+
+    def convert(observation: Any) -> NDArray[Any]:
+        value = part(observation)
+        if type(value) is np.ndarray and value.dtype is dtype and value.shape == shape:
+            return value
+        return as_declared(value, leaf)
+
+    return convert
 
 
 def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
@@ -323,18 +336,6 @@ def reward_number(reward: Any) -> float:
     if array.size != 1 or array.dtype.kind not in "biuf":
         raise SpaceError(f"the reward is {reward!r:.60}: it must be a single number")
     return float(array.item())
-
-
-def _converter(leaf: Leaf) -> Converter:
-    shape, dtype, part = leaf.shape, leaf.dtype, _part(leaf)
-
-    def convert(observation: Any) -> NDArray[Any]:
-        value = part(observation)
-        if type(value) is np.ndarray and value.dtype is dtype and value.shape == shape:
-            return value
-        return as_declared(value, leaf)
-
-    return convert
 
 
 def _part(leaf: Leaf) -> Callable[[Any], Any]:

@@ -30,7 +30,7 @@ from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
 from mcaprl.recorder.record.infos import EpisodeInfos, info_of
 from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
-from mcaprl.recorder.record.step_rows import as_declared, converters
+from mcaprl.recorder.record.step_rows import converter, converters
 from mcaprl.recorder.record.unclosed import FinishesAtExit
 from mcaprl.recorder.record.vector_rows import OpenRows, OpenSteps
 
@@ -123,31 +123,38 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         )
         log, count = self._recording.log, self.num_envs
         self._display = Display(log, None, scene=False, camera=False)
-        self._columns = OpenSteps(log.step_rows(), count)
+        leaves = observation_leaves(self.single_observation_space)
+        fields = [leaf.name for leaf in leaves if not leaf.encoding]
+        self._columns = OpenSteps(
+            log.step_rows(), count, ["action", "reward", "behavior_prob", *fields]
+        )
         self._images = {
-            leaf: OpenRows(log.image_rows(leaf.topic, leaf.shape, leaf.encoding), count)
+            leaf: OpenRows(log.image_rows(leaf.topic, leaf.shape, leaf.encoding), count, ["data"])
             for leaf in log.image_leaves
         }
         self._learner: OpenRows[TopicRows] | None = None
         if policy_version is not None:
-            self._learner = OpenRows(log.learner_rows(), count)
+            self._learner = OpenRows(log.learner_rows(), count, ["epsilon", "policy_version"])
         topics = InfoTopics(log)
         self._infos = [EpisodeInfos(topics, infos) for _ in range(count)] if infos else []
         self._places = [
             (self._images[leaf], "data") if leaf in self._images else (self._columns, leaf.name)
-            for leaf in observation_leaves(self.single_observation_space)
+            for leaf in leaves
         ]
         self._converters = converters(self.observation_space)
         self._converters_of_one = converters(self.single_observation_space)
-        self._action_leaf = action_leaf(self.action_space)
+        self._action_of = converter(action_leaf(self.action_space))
         self._every = np.arange(count)
         self._open = [OpenEpisode("", math.nan) for _ in range(count)]
-        # For each environment: number of transitions in its open episode, and whether an episode is
-        # open.
-        self._steps = np.zeros(count, np.int64)
+        # Row of the latest observations in the buffers, whose transitions are not complete yet.
+        self._row = 0
+        # For each environment: row of the first observation of its open episode, and whether an
+        # episode is open.
+        self._first = np.zeros(count, np.int64)
         self._running = np.zeros(count, np.bool_)
         # For each environment: whether it resets itself in the next step.
         self._due = np.zeros(count, np.bool_)
+        # The buffers need no more room until they contain this row.
         self._full_at = 0
         self._watch()
 
@@ -180,7 +187,8 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         observations, infos = self.env.reset(seed=seed, options=options)
         values = [convert(observations) for convert in self._converters]
         with HoldSignals():
-            self._begin(numbers, values, infos)
+            self._put(self._row, numbers, [value[numbers] for value in values])
+            self._begin(numbers, infos)
             for number in numbers.tolist():
                 self._open[number].seed, self._open[number].options = seeds[number], given or None
         return observations, infos
@@ -206,17 +214,17 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         self._act(actions)
         try:
             observations, rewards, terminated, truncated, infos = self.env.step(actions)
-            self._columns.put("reward", self._every, self._steps, np.asarray(rewards, np.float64))
+            self._columns.put("reward", self._row, np.asarray(rewards, np.float64))
             values = [convert(observations) for convert in self._converters]
             ended = self._running & np.logical_or(terminated, truncated)
             if self._infos:
                 self._add_infos(infos, ended)
-            if ended.any() or self._due.any() or self._steps.max() + 1 >= self._full_at:
-                # A signal must not interrupt the writes and the update of the step counters.
+            if ended.any() or self._due.any() or self._row + 1 >= self._full_at:
+                # A signal must not interrupt the writes and the update of the row.
                 with HoldSignals():
                     self._make_room()
                     self._observe(values)
-                    self._begin(np.flatnonzero(self._due), values, infos)
+                    self._begin(np.flatnonzero(self._due), infos)
                     self._end_some(np.flatnonzero(ended), values, terminated, truncated, infos)
             else:
                 self._observe(values)
@@ -241,38 +249,48 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
 
     def _act(self, actions: Any) -> None:
         """Store the actions before the environments can change them."""
-        every, steps = self._every, self._steps
-        probs = np.asarray(self.behavior_probs, np.float32)
-        if probs.shape not in ((), steps.shape):
-            raise SpaceError(f"behavior_probs has shape {probs.shape}, expected {steps.shape}")
-        # An environment that is reset in this step ignores its action, so its probability is not
-        # checked.
-        for number in np.flatnonzero(is_impossible(probs) & self._running):
-            prob = float(np.broadcast_to(self.behavior_probs, steps.shape)[number])
-            check_probability(prob, f"behavior_probs[{number}]")
-        self._columns.put("action", every, steps, as_declared(actions, self._action_leaf))
-        self._columns.put("behavior_prob", every, steps, probs)
+        row = self._row
+        probs = self._checked_probs() if self.behavior_probs is not math.nan else math.nan
+        self._columns.put("action", row, self._action_of(actions))
+        self._columns.put("behavior_prob", row, probs)
         self.behavior_probs = math.nan
         if self._learner is not None:
             version = -1 if self.policy_version is None else self.policy_version
-            self._learner.put("epsilon", every, steps, self.epsilon)
-            self._learner.put("policy_version", every, steps, version)
+            self._learner.put("epsilon", row, self.epsilon)
+            self._learner.put("policy_version", row, version)
+
+    def _checked_probs(self) -> NDArray[np.float32]:
+        """Return `behavior_probs` as an array, () or (N,)."""
+        probs, shape = np.asarray(self.behavior_probs, np.float32), (self.num_envs,)
+        if probs.shape not in ((), shape):
+            raise SpaceError(f"behavior_probs has shape {probs.shape}, expected {shape}")
+        # An environment that is reset in this step ignores its action, so its probability is not
+        # checked.
+        for number in np.flatnonzero(is_impossible(probs) & self._running):
+            prob = float(np.broadcast_to(self.behavior_probs, shape)[number])
+            check_probability(prob, f"behavior_probs[{number}]")
+        return probs
+
+    def _tables(self) -> list[OpenRows[Any]]:
+        learner = [self._learner] if self._learner is not None else []
+        return [self._columns, *self._images.values(), *learner]
 
     def _make_room(self) -> None:
-        tables: list[OpenRows[Any]] = [self._columns, *self._images.values()]
-        tables += [self._learner] if self._learner else []
-        for table in tables:
-            table.make_room(int(self._steps.max()) + 1)
-        self._full_at = min(table.capacity for table in tables)
+        """Grow the buffers that the next row does not fit into."""
+        first = int(self._first[self._running].min(initial=self._row))
+        for table in self._tables():
+            if self._row + 2 - first > table.capacity:
+                table.make_room(self._row + 2 - first, self._row)
+        self._full_at = first + min(table.capacity for table in self._tables())
 
     def _observe(self, values: list[NDArray[Any]]) -> None:
-        """Store each environment's observation and count the transition that led to it."""
-        self._put(self._every, self._steps + self._running, values)
-        self._steps += self._running
+        """Store each environment's observation in the next row, and go on to this row."""
+        self._put(self._row + 1, ..., values)
+        self._row += 1
 
-    def _put(self, environments: Any, steps: Any, values: list[NDArray[Any]]) -> None:
+    def _put(self, row: int, environments: Any, values: list[NDArray[Any]]) -> None:
         for (table, field), value in zip(self._places, values, strict=True):
-            table.put(field, environments, steps, value)
+            table.put(field, row, value, environments)
 
     def _add_infos(self, infos: dict[str, Any], ended: NDArray[np.bool_]) -> None:
         """Store the infos of the environments that made a step."""
@@ -280,18 +298,16 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         for number in np.flatnonzero(self._running).tolist():
             is_final = same_step and ended[number]
             source = infos.get("final_info", {}) if is_final else infos
-            self._infos[number].add(int(self._steps[number]) + 1, info_of(source, number))
+            step = self._row + 1 - int(self._first[number])
+            self._infos[number].add(step, info_of(source, number))
 
-    def _begin(
-        self, numbers: NDArray[np.int64], values: list[NDArray[Any]], infos: dict[str, Any]
-    ) -> None:
-        """Begin an episode of each of these environments with its first observation."""
+    def _begin(self, numbers: NDArray[np.int64], infos: dict[str, Any]) -> None:
+        """Begin an episode of each of these environments; the row has its first observation."""
         for number in numbers.tolist():
             self._open[number] = OpenEpisode(self.policy, self.epsilon)
             if self._infos:
                 self._infos[number].begin(info_of(infos, number))
-        self._put(numbers, 0, [value[numbers] for value in values])
-        self._steps[numbers] = 0
+        self._first[numbers] = self._row
         self._running[numbers], self._due[numbers] = True, False
 
     def _end_some(
@@ -313,14 +329,15 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             for number in numbers.tolist():
                 if same_step:
                     final = self._final_observation(infos, number)
-                    self._put(number, int(self._steps[number]), final)
+                    self._put(self._row, number, final)
                 is_terminal = bool(terminated[number])
                 reason = reason_of(_of_env(infos_of_ended, "reason", number), is_terminal)
                 ended.append(_Ended(number, is_terminal, bool(truncated[number]), reason))
         finally:
             self._end(ended)
         if same_step:
-            self._begin(numbers, values, infos)
+            self._put(self._row, numbers, [value[numbers] for value in values])
+            self._begin(numbers, infos)
         self._due[numbers] = self._autoreset is AutoresetMode.NEXT_STEP
 
     def _final_observation(self, infos: dict[str, Any], number: int) -> list[NDArray[Any]]:
@@ -337,10 +354,9 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         """Record unfinished episodes as truncated, and drop episodes without a transition."""
         with HoldSignals():
             if not self._recording.closed:
-                unfinished = numbers[self._running[numbers] & (self._steps[numbers] > 0)]
+                unfinished = numbers[self._running[numbers] & (self._first[numbers] < self._row)]
                 self._end([_Ended(each, False, True, INTERRUPTED) for each in unfinished.tolist()])
             self._running[numbers] = self._due[numbers] = False
-            self._steps[numbers] = 0
             self._display.clear()
 
     def _end(self, ended: list[_Ended]) -> None:
@@ -354,7 +370,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         batch: list[_Ended] = []
         rows = 0
         for one in ended:
-            count = int(self._steps[one.number]) + 1
+            count = self._row + 1 - int(self._first[one.number])
             if batch and rows + count > most:
                 self._write(batch)
                 batch, rows = [], 0
@@ -372,11 +388,12 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         """
         recording, step_ns = self._recording, self._recording.step_ns
         numbers = [one.number for one in ended]
-        lengths = self._steps[numbers]
+        firsts = self._first[numbers]
+        lengths = self._row - firsts
         # Set this before writing, so that an error does not cause a second write of the episodes.
-        self._running[numbers], self._steps[numbers] = False, 0
+        self._running[numbers] = False
         recording.begin(self._display)
-        totals = self._columns.total_rewards(numbers, lengths)
+        totals = self._columns.total_rewards(numbers, firsts, lengths)
         summaries: list[EpisodeSummary] = []
         for one, length, total in zip(ended, lengths.tolist(), totals, strict=True):
             episode = self._open[one.number]
@@ -392,14 +409,14 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             summaries.append(summary)
         starts = [summary.start_time_ns for summary in summaries]
         for table in self._images.values():
-            table.write(numbers, lengths + 1, starts, step_ns)
+            table.write(numbers, firsts, lengths + 1, starts, step_ns)
         if self._infos:
             for number, summary in zip(numbers, summaries, strict=True):
                 self._infos[number].end(summary.length, summary.start_time_ns, step_ns)
         recording.log.write_episodes(summaries, log_lines=True)
         if self._learner is not None:
-            self._learner.write(numbers, lengths, starts, step_ns)
-        self._columns.end(numbers, summaries, step_ns)
+            self._learner.write(numbers, firsts, lengths, starts, step_ns)
+        self._columns.end(numbers, firsts, summaries, step_ns)
         recording.advance(summaries[-1])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import mcaprl
 from mcaprl.errors import LogError, NoStepsError, SpaceError, UsageError
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.record import vector_rows
 from mcaprl.recorder.record.vector_rows import OpenSteps
 from mcaprl.recorder.record.vector_wrapper import VectorWrapper
 from mcaprl.recorder.repair.check import check_log
@@ -56,6 +57,14 @@ class Wanderer(gym.Env[Any, Any]):
         ends = (over and self._episode % 2 == 0, over and self._episode % 2 == 1)
         infos = {"reason": f"end {self._episode}"} if over else {}
         return self._draw(), 1000.0 * self._seed + 0.1 * self._drawn, *ends, infos
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_buffers() -> Iterator[None]:
+    """Begin with buffers of four rows, so that they are used several times and must grow."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(vector_rows, "_FIRST_CAPACITY", 4)
+        yield
 
 
 def members(
