@@ -11,12 +11,11 @@ from __future__ import annotations
 import argparse
 import struct
 import tempfile
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import mcaprl
+from benchmarks.measure import cpu_s
 from mcaprl.offline import TransitionBuffer
 from mcaprl.recorder import LogReader
 
@@ -55,12 +54,12 @@ def measure(sim: str) -> Rates:
         path = Path(folder) / "log.mcap"
         # The first episodes compile the sim.
         mcaprl.record(sim, path, episodes=2)
-        record_s = _cpu_s(
+        record_s = cpu_s(
             lambda: mcaprl.record(sim, path, episodes=EPISODES, epsilon=0.1, overwrite=True)
         )
         data = mcaprl.open(path)
-        read_s = min(_cpu_s(lambda: mcaprl.open(path)) for _ in range(5))
-        index_s = min(_cpu_s(lambda: LogReader(path).lengths) for _ in range(5))
+        read_s = min(cpu_s(lambda: mcaprl.open(path)) for _ in range(5))
+        index_s = min(cpu_s(lambda: LogReader(path).lengths) for _ in range(5))
         content = path.read_bytes()
     # The fields from the end of an MCAP file backward: magic (8 bytes), CRC (4), summary offset
     # start (8), summary start (8).
@@ -143,12 +142,6 @@ def main() -> None:
     print(f"| {given.transitions:.0e} transitions of {given.sim} | | from |\n|---|---|---|")
     for row in rows:
         print("|", " | ".join(row).strip(), "|")
-
-
-def _cpu_s(run: Callable[[], object]) -> float:
-    start = time.process_time()
-    run()
-    return time.process_time() - start
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import time
 import warnings
 from typing import Any
 
@@ -16,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.measure import OURS, Side, Table, after, compare
+from benchmarks.measure import OURS, Side, Table, after, compare, cpu_s
 from benchmarks.speed.gl_camera import GlCamera
 from mcaprl.sims import DepthCamera, encode_depth, lens, make_sim, make_sims
 
@@ -143,15 +142,9 @@ def _pose(random: np.random.Generator) -> tuple[tuple[float, float, float], NDAr
 def main() -> None:
     """Print the steps per second of each sim, in the best of a hundred turns."""
     for side in ours():
-        taken_s = min(_cpu_s(side) for _ in range(100))
+        taken_s = min(cpu_s(side.run) for _ in range(100))
         rate, goal = side.share * STEPS / taken_s, GOALS.get(side.name)
         print(f"{side.name}: {rate:,.0f} steps/s" + (f" (goal {goal:,})" if goal else ""))
-
-
-def _cpu_s(side: Side) -> float:
-    start = time.process_time()
-    side.run()
-    return time.process_time() - start
 
 
 def _highway(env_id: str) -> gym.Env[Any, Any]:

@@ -6,7 +6,6 @@ the ratios.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import closing
 from fractions import Fraction
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mcaprl
-from benchmarks.measure import OURS, Side, Table, compare
+from benchmarks.measure import OURS, Side, Table, compare, cpu_s
 from mcaprl.sims import make_pilot, make_sim
 
 SIMS = ("lane", "powerline", "racer")
@@ -49,7 +48,7 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         for name in SIMS:
             for side in _sides(name, Path(folder)):
-                taken_s = min(_cpu_s(side.run) for _ in range(ROUNDS)) / side.share
+                taken_s = min(cpu_s(side.run) for _ in range(ROUNDS)) / side.share
                 print(f"| {name} | {side.name} | {1000 * taken_s:.1f} |", flush=True)
 
 
@@ -141,12 +140,6 @@ def _matplotlib() -> Callable[[], object]:
         return np.asarray(canvas.buffer_rgba())
 
     return run
-
-
-def _cpu_s(run: Callable[[], object]) -> float:
-    start = time.process_time()
-    run()
-    return time.process_time() - start
 
 
 if __name__ == "__main__":

@@ -74,17 +74,19 @@ class Layout:
         return bool(self.matching(payloads).all())
 
     def fits_one(self, message: bytes) -> bool:
-        """Return whether a message of the layout's length has this layout."""
-        # This takes a tenth of the time of `fits` with an array of one message.
+        """Return whether a message has this layout; its length must be that of the dtype.
+
+        This takes a thirtieth of the time of `fits` with an array of one message.
+        """
         code, constants = self._packed
         return code.unpack_from(message) == constants
 
     @cached_property
     def _packed(self) -> tuple[struct.Struct, tuple[bytes, ...]]:
-        """Format that reads the constants as bytes, and these bytes."""
+        """Format that reads the constants of a message as bytes, and their expected bytes."""
         fields: Any = self.dtype.fields
         code, end = "<", 0
-        # The constants are in the order of their positions.
+        # `constants` is in the order of the positions.
         for name in self.constants:
             dtype, start = fields[name][:2]
             code += f"{start - end}x{dtype.itemsize}s"

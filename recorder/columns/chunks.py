@@ -27,9 +27,9 @@ _CHUNK_START = struct.Struct("<BQQQQII")
 # compression, and the end.
 _INDEX_START, _INDEX_MAP_ENTRY = struct.Struct("<QQQQI"), struct.Struct("<HQ")
 _INDEX_MIDDLE, _INDEX_END = struct.Struct("<QI"), struct.Struct("<QQ")
-# A ChunkIndex record, with its header, of a chunk with one channel and zstd compression; and the
-# bytes that are equal in all these records: the header, the length of the map, and the name.
+# A whole ChunkIndex record of a chunk with one channel and zstd compression.
 _INDEX_OF_ONE = struct.Struct("<9sQQQQ4sHQQ8sQQ")
+# The parts of these records that are always equal: header, length of the map, and compression.
 _HEADS_OF_ONE = (
     struct.pack("<BQ", Opcode.CHUNK_INDEX, _INDEX_OF_ONE.size - RECORD_HEADER_BYTES),
     struct.pack("<I", _INDEX_MAP_ENTRY.size),
@@ -224,28 +224,20 @@ def parse_chunk_index(content: memoryview) -> ChunkIndex:
 
 
 def parse_chunk_indexes(summary: memoryview) -> tuple[list[ChunkIndex], int]:
-    """Parse the ChunkIndex records at the start of `summary` that are alike.
+    """Parse ChunkIndex records of chunks with one channel and zstd compression.
 
-    Returns them, and the number of their bytes. Stops before the first record that is not the index
-    of a chunk with a single channel and zstd compression. Compared with `parse_chunk_index`, this
-    takes a third of the time.
+    For each record, this takes a third of the time of `parse_chunk_index`.
+
+    Args:
+        summary: Records of the summary; parsing stops before the first record of another kind.
+
+    Returns:
+        The parsed records, and their total length in bytes.
     """
     size, found = _INDEX_OF_ONE.size, list[ChunkIndex]()
     records = _INDEX_OF_ONE.iter_unpack(summary[: len(summary) // size * size])
-    for (
-        head,
-        start,
-        end,
-        offset,
-        length,
-        ids,
-        channel,
-        place,
-        indexes,
-        name,
-        packed,
-        raw,
-    ) in records:
+    for record in records:
+        head, start, end, offset, length, ids, channel, place, indexes, name, packed, raw = record
         if (head, ids, name) != _HEADS_OF_ONE:
             break
         offsets = {channel: place}

@@ -142,9 +142,9 @@ class MessageRange:
 
 
 def as_items(column: NDArray[Any]) -> NDArray[Any]:
-    """Return a view of a column of vectors (K, n) as (K,) items; another column as it is.
+    """Return a view of vectors (K, n) as (K,) items; other columns are returned unchanged.
 
-    Copying items takes less time than copying their numbers one by one.
+    Copying whole vectors as items is faster than copying their numbers one by one.
     """
     if column.ndim != 2 or not column.size:
         return column

@@ -400,10 +400,10 @@ class McapReader:
                 end = offset + RECORD_HEADER_BYTES + len(content)
                 if opcode == Opcode.CHUNK_INDEX:
                     self.chunks.append(parse_chunk_index(content))
-                    # Most logs have a row of similar chunk indexes.
-                    alike, size = parse_chunk_indexes(view[end:])
-                    self.chunks += alike
-                    end += size
+                    # In most logs, the next records are chunk indexes that can be parsed faster.
+                    following, length = parse_chunk_indexes(view[end:])
+                    self.chunks += following
+                    end += length
                 elif opcode in _SUMMARY:
                     self._parse(opcode, content, offset)
         self.chunks.sort(key=_START_OF)

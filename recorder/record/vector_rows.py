@@ -1,8 +1,8 @@
 """Buffers for the open episodes of a vector environment.
 
 Each field has one array with a row for each step of the vector environment, so that a step writes
-one contiguous row. The array is a ring: row r is at position r modulo its length. An episode is a
-column of the rows since its first observation, and is copied to message records when it ends.
+one contiguous row. The array is a ring buffer: row r is at position r modulo its length. When an
+episode ends, its values in the rows since its first observation are copied to message records.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ class OpenRows(Generic[Rows]):
     """Values of one topic for all open episodes.
 
     Attributes:
-        capacity: Number of rows that are kept, a power of 2.
+        capacity: Number of rows in the arrays, a power of 2.
     """
 
     def __init__(self, chunk: Rows, environments: int, fields: Sequence[str]) -> None:
         """Allocate the arrays.
 
         Args:
-            chunk: Message records whose other fields are set, or which are set by `write`.
+            chunk: Message records of one chunk; their constant fields are set.
             environments: Number of environments.
             fields: Names of the fields that `put` sets.
         """
@@ -55,7 +55,10 @@ class OpenRows(Generic[Rows]):
         return len(self._chunk)
 
     def make_room(self, count: int, row: int) -> None:
-        """Grow the arrays until `count` rows fit, and keep the rows up to `row`."""
+        """Grow the arrays until `count` rows fit.
+
+        The rows up to `row` are kept.
+        """
         kept = np.arange(max(row - self.capacity + 1, 0), row + 1)
         old = kept % self.capacity
         while self.capacity < count:
@@ -115,7 +118,6 @@ class OpenRows(Generic[Rows]):
         for start in range(0, len(which), self.per_chunk):
             part = slice(start, start + self.per_chunk)
             for name, column in self._columns.items():
-                # Each vector is copied as one item, not number by number.
                 items = as_items(column.reshape(-1, *column.shape[2:]))
                 as_items(self._chunk.fields[name])[: len(places[part])] = items[places[part]]
             yield which[part], steps[part]

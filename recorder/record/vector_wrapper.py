@@ -146,7 +146,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         self._action_of = converter(action_leaf(self.action_space))
         self._every = np.arange(count)
         self._open = [OpenEpisode("", math.nan) for _ in range(count)]
-        # Row of the latest observations in the buffers, whose transitions are not complete yet.
+        # Row of the latest observations in the buffers. The next step sets its actions and rewards.
         self._row = 0
         # For each environment: row of the first observation of its open episode, and whether an
         # episode is open.
@@ -154,7 +154,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         self._running = np.zeros(count, np.bool_)
         # For each environment: whether it resets itself in the next step.
         self._due = np.zeros(count, np.bool_)
-        # The buffers need no more room until they contain this row.
+        # First row for which the buffers may have to grow.
         self._full_at = 0
         self._watch()
 
@@ -250,6 +250,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
     def _act(self, actions: Any) -> None:
         """Store the actions before the environments can change them."""
         row = self._row
+        # The checks take longer than storing the values, and most recordings have no probabilities.
         probs = self._checked_probs() if self.behavior_probs is not math.nan else math.nan
         self._columns.put("action", row, self._action_of(actions))
         self._columns.put("behavior_prob", row, probs)
@@ -260,7 +261,12 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             self._learner.put("policy_version", row, version)
 
     def _checked_probs(self) -> NDArray[np.float32]:
-        """Return `behavior_probs` as an array, () or (N,)."""
+        """Return `behavior_probs` as an array, () or (N,).
+
+        Raises:
+            SpaceError: The shape is wrong.
+            UsageError: A probability is not in (0, 1].
+        """
         probs, shape = np.asarray(self.behavior_probs, np.float32), (self.num_envs,)
         if probs.shape not in ((), shape):
             raise SpaceError(f"behavior_probs has shape {probs.shape}, expected {shape}")
@@ -284,7 +290,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         self._full_at = first + min(table.capacity for table in self._tables())
 
     def _observe(self, values: list[NDArray[Any]]) -> None:
-        """Store each environment's observation in the next row, and go on to this row."""
+        """Store each environment's observation in the next row, which becomes the current one."""
         self._put(self._row + 1, ..., values)
         self._row += 1
 
@@ -302,7 +308,10 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             self._infos[number].add(step, info_of(source, number))
 
     def _begin(self, numbers: NDArray[np.int64], infos: dict[str, Any]) -> None:
-        """Begin an episode of each of these environments; the row has its first observation."""
+        """Begin an episode of each of these environments.
+
+        Its first observation is already in the current row.
+        """
         for number in numbers.tolist():
             self._open[number] = OpenEpisode(self.policy, self.epsilon)
             if self._infos:
