@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.recorder.columns.cdr import ENCAPSULATION
-from mcaprl.recorder.columns.message_rows import message_rows
+from mcaprl.recorder.columns.message_rows import as_items, message_rows
 from mcaprl.recorder.format.schema import fill_image_constants, image_dtype, message_dtype
 from mcaprl.recorder.format.topics import BYTES_PER_CHUNK, IMAGE_FRAME, MIN_ROWS
 
@@ -84,6 +84,16 @@ class TopicRows:
         if column.ndim > 1:
             values = np.reshape(values, (-1, column.shape[-1]))
         column[where] = values
+
+    def take(self, field: str, column: NDArray[Any], places: NDArray[np.int64]) -> None:
+        """Set a field of the first rows to rows of a column.
+
+        Args:
+            field: Name in the message.
+            column: (N, *shape) values, of the same dtype as the field.
+            places: (K,) indexes of the rows of the column.
+        """
+        as_items(self.fields[field])[: len(places)] = as_items(column)[places]
 
     def write(self, where: Any, times_ns: Any) -> None:
         """Set the log_time of consecutive rows, and write these rows as one chunk."""

@@ -13,7 +13,6 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.recorder.columns.message_rows import as_items
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up_rows
 from mcaprl.recorder.format.rows import StepRows, TopicRows
 
@@ -118,8 +117,7 @@ class OpenRows(Generic[Rows]):
         for start in range(0, len(which), self.per_chunk):
             part = slice(start, start + self.per_chunk)
             for name, column in self._columns.items():
-                items = as_items(column.reshape(-1, *column.shape[2:]))
-                as_items(self._chunk.fields[name])[: len(places[part])] = items[places[part]]
+                self._chunk.take(name, column.reshape(-1, *column.shape[2:]), places[part])
             yield which[part], steps[part]
 
 
