@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import Any, ClassVar, TypeVar, cast
 
 import numba
-from numba.core import event, pythonapi
+import numpy as np
+from numba.core import cgutils, event, pythonapi, types
 from numba.core.types.containers import NamedTuple, NamedUniTuple
+from numba.extending import intrinsic, overload
+from numpy.typing import DTypeLike, NDArray
 
 AnyFunction = TypeVar("AnyFunction", bound=Callable[..., object])
 Result = TypeVar("Result")
@@ -60,6 +63,68 @@ def ready(
     kinds = tuple(numba.typeof(argument) for argument in (*arguments, *examples))
     function.compile(kinds)
     return partial(function.get_overload(kinds), *arguments)
+
+
+Arrays = Any
+"""Arrays that `ready_at` bound. In a compiled function, this is an address."""
+
+
+def ready_at(
+    function: Callable[..., Result],
+    arrays: Sequence[NDArray[Any]],
+    *constants: Any,
+    examples: tuple[Any, ...] = (),
+) -> Callable[..., Result]:
+    """Bind the first arguments of a compiled function like `ready`, but its arrays as one address.
+
+    For each array that is passed in a call, numba checks its type and counts a reference. For four
+    arrays, this takes half as long as a car's step.
+
+    Args:
+        function: Compiled function. Its first argument is the bound arrays, for `array_at`.
+        arrays: Arrays, contiguous in C order.
+        *constants: Next arguments, numbers.
+        examples: Example values of the arguments that each call passes; only the types matter.
+    """
+    if not isinstance(function, numba.core.dispatcher.Dispatcher):
+        return partial(function, arrays, *constants)
+    addresses = np.array([array.ctypes.data for array in arrays], dtype=np.intp)
+    bound = ready(function, addresses.ctypes.data, *constants, examples=examples)
+    # An address is valid only as long as its array exists.
+    bound.kept = addresses, arrays  # type: ignore[attr-defined]
+    return bound
+
+
+def array_at(arrays: Arrays, k: int, shape: tuple[int, ...], kind: DTypeLike) -> NDArray[Any]:
+    """Return array k of those that `ready_at` bound; for compiled functions.
+
+    Args:
+        arrays: First argument of the compiled function.
+        k: Index of the array.
+        shape: Shape of the array.
+        kind: NumPy type of the array.
+    """
+    # Without compilation, `ready_at` binds the arrays themselves.
+    return cast(NDArray[Any], arrays[k])
+
+
+@overload(array_at, inline="always")  # type: ignore[untyped-decorator]
+def _array_at(arrays: Any, k: Any, shape: Any, kind: Any) -> Any:
+    def array_from(arrays: Any, k: Any, shape: Any, kind: Any) -> Any:
+        addresses = numba.carray(_pointer(arrays), (k + 1,), np.intp)
+        return numba.carray(_pointer(addresses[k]), shape, kind)
+
+    return array_from
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _pointer(context: Any, address: Any) -> Any:
+    """Return the pointer with an integer's value."""
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.inttoptr(values[0], cgutils.voidptr_t)
+
+    return types.voidptr(types.intp), code
 
 
 def _compiled(function: AnyFunction, **options: Any) -> AnyFunction:

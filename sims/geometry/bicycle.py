@@ -34,7 +34,21 @@ def roll(
     wheelbase_m: float,
     duration_s: float,
 ) -> Motion:
-    """Advance a bicycle by one explicit Euler step, which must turn it by at most 90 degrees.
+    """Advance a bicycle by one explicit Euler step, which must turn it by at most 90 degrees."""
+    moved, turn_rad = glide(motion, slip_sine, acceleration_m_s2, wheelbase_m, duration_s)
+    heading = turned(moved.heading, turn_rad)
+    return Motion(moved.x_m, moved.y_m, moved.yaw_rad, moved.speed_m_s, heading)
+
+
+@inlined
+def glide(
+    motion: Motion,
+    slip_sine: float,
+    acceleration_m_s2: float,
+    wheelbase_m: float,
+    duration_s: float,
+) -> tuple[Motion, float]:
+    """Return the motion after the step of `roll`, except for its heading, and the turn in radians.
 
     Let beta be the slip angle, l half the wheelbase and v the speed. Then x' = v cos(yaw + beta),
     y' = v sin(yaw + beta), yaw' = v sin(beta) / l, and v' = acceleration. Polack, Altche,
@@ -46,13 +60,14 @@ def roll(
     slip_cosine = math.sqrt(1.0 - slip_sine * slip_sine)
     distance_m = motion.speed_m_s * duration_s
     turn_rad = distance_m * slip_sine / (0.5 * wheelbase_m)
-    return Motion(
+    moved = Motion(
         motion.x_m + distance_m * (cos * slip_cosine - sin * slip_sine),
         motion.y_m + distance_m * (sin * slip_cosine + cos * slip_sine),
         motion.yaw_rad + turn_rad,
         motion.speed_m_s + acceleration_m_s2 * duration_s,
-        turned(motion.heading, turn_rad),
+        motion.heading,
     )
+    return moved, turn_rad
 
 
 @inlined

@@ -11,29 +11,34 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.compiled import compiled, inlined
-from mcaprl.sims.geometry.bicycle import Motion
-from mcaprl.sims.geometry.paths import Heading, heading_of
+from mcaprl.compiled import Arrays, array_at, compiled, inlined
+from mcaprl.sims.geometry.bicycle import Motion, glide
+from mcaprl.sims.geometry.paths import Heading, heading_of, turned
 from mcaprl.sims.lane.rules import (
     BRAKE,
+    OBSERVATION_NAMES,
+    STARTED_AT,
     STEERING,
+    SUBSTEP_S,
     SUBSTEPS,
+    WHEELBASE_M,
     Car,
+    acceleration,
     arrived,
     car_at,
     drive,
-    driven,
     end_of,
     observe,
     reward_of,
     seen_from,
+    slip,
     store_car,
 )
 
 LANES = 32
 """Number of cars in a block."""
 _STEERING, _COS, _SIN, _BRAKING = 4, 9, 10, 11
-_REWARD, _END, _SEEN, _BLOCK_NUMBERS = 12, 13, 14, 26
+_REWARD, _END, _SEEN, _SLIP, _TURN, _BLOCK_NUMBERS = 12, 13, 14, 26, 27, 28
 """Indices of a car's values in a block, and the number of values. Indices 0 to 8 are the fields
 of `Car`."""
 
@@ -73,37 +78,23 @@ def advance(row: NDArray[np.float64], action: int) -> tuple[Car, float, int]:
 
 
 @compiled
-def step_only_car(
-    cars: NDArray[np.float64],
-    rewards: NDArray[np.float64],
-    ends: NDArray[np.int64],
-    observations: NDArray[np.float32],
-    action: int,
-) -> tuple[float, int, float, float, float, float]:
+def step_only_car(arrays: Arrays, action: int) -> tuple[float, int, float, float, float, float]:
     """Advance a single car like `step_cars`; also return the values for its `info`.
+
+    Args:
+        arrays: Row (10,) of the car, and the outputs: reward (1,), end (1,), observation (12,).
+        action: 0 to 5.
 
     Returns:
         Reward, end, offset, heading error, speed and progress.
     """
-    car, reward, end = advance(cars[0], action)
-    rewards[0], ends[0] = reward, end
-    observe(car, observations[0])
-    progress_m = car.along_m - cars[0, -1]
+    row = array_at(arrays, 0, (STARTED_AT + 1,), np.float64)
+    car, reward, end = advance(row, action)
+    array_at(arrays, 1, (1,), np.float64)[0] = reward
+    array_at(arrays, 2, (1,), np.int64)[0] = end
+    observe(car, array_at(arrays, 3, (len(OBSERVATION_NAMES),), np.float32))
+    progress_m = car.along_m - row[STARTED_AT]
     return reward, end, car.offset_m, car.heading_error_rad, car.speed_m_s, progress_m
-
-
-@compiled
-def car_info(cars: NDArray[np.float64], info: NDArray[np.float64]) -> None:
-    """Compute the values for the `info` of N cars.
-
-    Args:
-        cars: (N, 10) rows: the fields of `Car`, then its distance along the path at the start.
-        info: (4, N) output: offsets, heading errors, speeds and progress.
-    """
-    for i in range(len(cars)):
-        car = car_at(cars[i])
-        info[0, i], info[1, i], info[2, i] = car.offset_m, car.heading_error_rad, car.speed_m_s
-        info[3, i] = car.along_m - cars[i, -1]
 
 
 @compiled
@@ -141,20 +132,28 @@ def _step_blocks(
 @compiled
 def _step_block(block: NDArray[np.float64]) -> None:
     """Advance the cars in a block by one decision; compute rewards, ends and observations."""
-    before = block.copy()
     for lane in range(LANES):
         heading = heading_of(block[2 * LANES + lane])
         block[_COS * LANES + lane], block[_SIN * LANES + lane] = heading.cos, heading.sin
     for _ in range(SUBSTEPS):
+        # This is `driven` in three loops. In a single loop, each car's instructions would be a long
+        # chain, and a processor would have too few of the next cars' to work on meanwhile.
         for lane in range(LANES):
-            is_braking = block[_BRAKING * LANES + lane] > 0.0
-            after = driven(_motion_in(block, lane), block[_STEERING * LANES + lane], is_braking)
+            speed_m_s = block[3 * LANES + lane]
+            block[_SLIP * LANES + lane] = slip(block[_STEERING * LANES + lane], speed_m_s)
+        for lane in range(LANES):
+            before, slip_sine = _motion_in(block, lane), block[_SLIP * LANES + lane]
+            speed_up_m_s2 = acceleration(before.speed_m_s, block[_BRAKING * LANES + lane] > 0.0)
+            after, turn_rad = glide(before, slip_sine, speed_up_m_s2, WHEELBASE_M, SUBSTEP_S)
             block[lane], block[LANES + lane] = after.x_m, after.y_m
             block[2 * LANES + lane], block[3 * LANES + lane] = after.yaw_rad, after.speed_m_s
-            block[_COS * LANES + lane] = after.heading.cos
-            block[_SIN * LANES + lane] = after.heading.sin
+            block[_TURN * LANES + lane] = turn_rad
+        for lane in range(LANES):
+            heading = turned(_motion_in(block, lane).heading, block[_TURN * LANES + lane])
+            block[_COS * LANES + lane], block[_SIN * LANES + lane] = heading.cos, heading.sin
     for lane in range(LANES):
-        was = _car_in(before, lane)
+        # Of the state before the step, `arrived` and `reward_of` use only what is still there.
+        was = _car_in(block, lane)
         steering = block[_STEERING * LANES + lane]
         car = arrived(was, _motion_in(block, lane), steering, SUBSTEPS)
         block[2 * LANES + lane], block[5 * LANES + lane] = car.yaw_rad, car.along_m

@@ -10,41 +10,50 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.compiled import ready
+from mcaprl.compiled import ready, ready_at
 from mcaprl.sims.drawing.depth import encode_depth, encode_nearness
-from mcaprl.sims.lane.block import car_info, step_cars, step_only_car
+from mcaprl.sims.lane.block import step_cars, step_only_car
 from mcaprl.sims.lane.camera import IMAGE_SHAPE, CarCamera
 from mcaprl.sims.lane.classic import CLASSIC_DECISION_S, CLASSIC_SUBSTEPS, step_classic
 from mcaprl.sims.lane.course import COURSE, NEXT_TURN
 from mcaprl.sims.lane.rays import RAY_OBSERVATION_LIMIT, RAY_OBSERVATION_NAMES, observe_all_rays
 from mcaprl.sims.lane.rules import (
     ACTION_MEANINGS,
+    ALONG,
     BRAKE,
     DECISION_S,
     OBSERVATION_LIMIT,
     OBSERVATION_NAMES,
     REASONS,
+    STARTED_AT,
     SUBSTEPS,
     Car,
     drive,
     observe,
     store_car,
 )
-from mcaprl.sims.lane.start import ALONG, STARTED_AT, car_from, start_car, start_cars
+from mcaprl.sims.lane.start import SHARES, car_from, start_cars, start_only_car
 from mcaprl.sims.vehicle.arguments import check_name
 from mcaprl.sims.vehicle.draws import Draws
-from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
+from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
 
 OBSERVATIONS = ("state", "depth", "depth-commands", "dashboard", "rays")
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
-SPEED = Car._fields.index("speed_m_s")
-"""Index of the speed in a car's row; `info` uses the values from this index onward."""
+SPEED, OFFSET = Car._fields.index("speed_m_s"), Car._fields.index("offset_m")
+HEADING_ERROR = Car._fields.index("heading_error_rad")
+"""Indices in a car's row of the values that `info` contains."""
 MOTION = slice(2, 4)
 """Indices of speed and steering in the observed state."""
 STEERING_SEEN = 3
 """Index of the last steering command in the observed state."""
 COMMANDS = 32
 """Number of decisions whose commands are observed with `depth-commands`: 8 s by default."""
+
+OnlyCar = tuple[
+    Callable[[int], tuple[float, int, float, float, float, float]],
+    Callable[[], NDArray[np.float32]],
+]
+"""Compiled functions of a fleet of one car: its step, and its observation as a new array."""
 
 
 class LaneFleet(Fleet):
@@ -79,9 +88,9 @@ class LaneFleet(Fleet):
             CLASSIC_DECISION_S if self._classic else DECISION_S,
         )
         self._cars = np.zeros((count, STARTED_AT + 1))
-        self._draws = Draws(count, 4)
-        # `begin` writes the random numbers for one start into this array.
-        self._shares = np.zeros(4)
+        self._draws = Draws(count, SHARES)
+        # `start_one` writes the random numbers for a start into this array.
+        self._shares = np.zeros(SHARES)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
         # Acceleration and steering of the last decisions, newest first; 0 before the start.
@@ -90,8 +99,9 @@ class LaneFleet(Fleet):
         self._has_commands = observation == "depth-commands"
         self._has_images = observation == "depth" or self._has_commands or self._has_dashboard
         self._seen = self._rays if self.has_rays else self._states
-        self._has_fast_step = observation == "state" and not self._classic
+        self._has_fast_step = observation in ("state", "rays") and not self._classic
         self._encode = encode_nearness if self._classic else encode_depth
+        self._only: OnlyCar | None = None
         self._camera: CarCamera | None = None
         self._depth_m: dict[int, NDArray[np.float32]] = {}
 
@@ -111,31 +121,29 @@ class LaneFleet(Fleet):
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
         """Start car i; see "Starting State" of `LaneKeepingEnv`."""
         self._draws.use_generator(i, random)
-        self._commands[i] = 0.0
-        if options:
-            car, row = car_from(options), self._cars[i]
-            store_car(car, row)
-            row[STARTED_AT] = row[ALONG]
-            observe(car, self._states[i])
-            self.rewards[i], self.ends[i] = 0.0, GOING_ON
-        else:
-            self._draws.one(i, self._shares)
-            self._start_one(i)
+        if not options:
+            self.begin_all(np.array([i]), ())
+            return
+        car, row = car_from(options), self._cars[i]
+        store_car(car, row)
+        row[STARTED_AT] = row[ALONG]
+        observe(car, self._states[i])
         if self.has_rays:
             observe_all_rays(self._cars[i : i + 1], self._rays[i : i + 1], self.has_barriers)
+        self.rewards[i], self.ends[i] = 0.0, GOING_ON
+        self._commands[i] = 0.0
         self._depth_m.pop(i, None)
 
     def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
         """Start episodes of the chosen cars."""
-        draws, kind = self._draws, (self._on_line, self._classic)
-        draws.draw_ahead(chosen)
-        chances = (draws.numbers, draws.used, *kind)
-        start_cars(chosen, *chances, self._cars, self.rewards, self.ends, self._states)
+        self._draws.draw_ahead(chosen)
+        self._start_chosen(chosen)
         if self.has_rays:
             seen = np.empty((len(chosen), self._rays.shape[1]), dtype=np.float32)
             observe_all_rays(self._cars[chosen], seen, self.has_barriers)
             self._rays[chosen] = seen
-        self._commands[chosen] = 0.0
+        if self._has_commands:
+            self._commands[chosen] = 0.0
         if self._depth_m:
             for i in chosen.tolist():
                 self._depth_m.pop(i, None)
@@ -153,10 +161,13 @@ class LaneFleet(Fleet):
             self._depth_m.clear()
 
     def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
-        """Advance the only car of the fleet; use a single compiled call if possible."""
-        if not self._has_fast_step:
-            return super().step_one(action)
-        reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = self._drive_only(action)
+        """Advance the only car of the fleet."""
+        if self._only is None:
+            if not self._has_fast_step:
+                return super().step_one(action)
+            self._only = self._bind_only()
+        drive, seen = self._only
+        reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = drive(action)
         if self._depth_m:
             self._depth_m.clear()
         # A dict display is faster than `dict(zip(CAR_INFO, ...))`.
@@ -166,23 +177,66 @@ class LaneFleet(Fleet):
             "speed_m_s": speed_m_s,
             "progress_m": progress_m,
         }
-        return self._observe_only(), reward, end, info
+        return seen(), reward, end, info
+
+    def start_one(
+        self, random: np.random.Generator, options: dict[str, Any] | None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode of the only car of the fleet."""
+        if options:
+            return super().start_one(random, options)
+        random.random(out=self._shares)
+        offset_m, heading_error_rad, speed_m_s = self._start_only()
+        if self._depth_m:
+            self._depth_m.clear()
+        if self._has_commands:
+            self._commands[0] = 0.0
+        info = {
+            "lateral_offset_m": offset_m,
+            "heading_error_rad": heading_error_rad,
+            "speed_m_s": speed_m_s,
+            "progress_m": 0.0,
+        }
+        return (self.observation(0) if self._has_images else self._seen_only()), info
 
     def _kernel(self) -> tuple[Any, ...]:
         arrays = (self._cars, self.actions, self.rewards, self.ends, self._states)
         return (step_classic, *arrays, self._by_code) if self._classic else (step_cars, *arrays)
 
     @cached_property
-    def _start_one(self) -> Callable[[int], None]:
-        kind, outcome = (self._on_line, self._classic), (self.rewards, self.ends, self._states)
-        return ready(start_car, self._shares, *kind, self._cars, *outcome, examples=(0,))
+    def _start_chosen(self) -> Callable[[NDArray[np.int64]], None]:
+        draws, kind = self._draws, (self._on_line, self._classic)
+        outputs = (self._cars, self.rewards, self.ends, self._states)
+        examples = (np.zeros(0, dtype=np.int64),)
+        return ready(start_cars, draws.numbers, draws.used, *kind, *outputs, examples=examples)
 
-    # Only a fleet of one car uses `_drive_only`.
+    # Only a fleet of one car uses the next functions.
+
+    def _bind_only(self) -> OnlyCar:
+        arrays = (self._cars[0], self.rewards, self.ends, self._states[0])
+        return ready_at(step_only_car, arrays, examples=(0,)), self._seen_only
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for copying or pickling, without the bound functions."""
+        return super().__getstate__() | {"_only": None}
 
     @cached_property
-    def _drive_only(self) -> Callable[[int], tuple[float, int, float, float, float, float]]:
-        arrays = (self._cars, self.rewards, self.ends, self._states)
-        return ready(step_only_car, *arrays, examples=(0,))
+    def _start_only(self) -> Callable[[], tuple[float, float, float]]:
+        arrays = (self._shares, self._cars[0], self.rewards, self.ends, self._states[0])
+        return ready_at(start_only_car, arrays, self._on_line, self._classic)
+
+    @cached_property
+    def _seen_only(self) -> Callable[[], NDArray[np.float32]]:
+        copy = self._observe_only
+        if not self.has_rays:
+            return copy
+        observe_rays = ready(observe_all_rays, self._cars, self._rays, self.has_barriers)
+
+        def see() -> NDArray[np.float32]:
+            observe_rays()
+            return copy()
+
+        return see
 
     def observation(self, i: int) -> Any:
         """Return the observation of car i."""
@@ -230,16 +284,17 @@ class LaneFleet(Fleet):
 
     def info(self, i: int) -> dict[str, Any]:
         """Return the `info` of car i."""
-        car = self._cars[i, SPEED:].tolist()
-        speed_m_s, _, along_m, offset_m, heading_error_rad, _, started_at_m = car
-        values = (offset_m, heading_error_rad, speed_m_s, along_m - started_at_m)
-        return dict(zip(CAR_INFO, values, strict=True))
+        return {key: values.item(i) for key, values in self.infos().items()}
 
     def infos(self) -> dict[str, NDArray[Any]]:
         """Return the `info` of all cars."""
-        values = np.empty((4, self.count))
-        car_info(self._cars, values)
-        return dict(zip(CAR_INFO, values, strict=True))
+        values = self._cars.T
+        return {
+            "lateral_offset_m": values[OFFSET].copy(),
+            "heading_error_rad": values[HEADING_ERROR].copy(),
+            "speed_m_s": values[SPEED].copy(),
+            "progress_m": values[ALONG] - values[STARTED_AT],
+        }
 
 
 def _space(observation: str) -> spaces.Space[Any]:

@@ -94,6 +94,11 @@ class Car(NamedTuple):
     """Time for which the car has been slower than the stall speed."""
 
 
+ALONG, STARTED_AT = Car._fields.index("along_m"), len(Car._fields)
+"""Indices of two values in a car's row: its distance along the path, now and at the start of the
+episode."""
+
+
 @compiled
 def car_at(row: NDArray[np.float64]) -> Car:
     """Read a car from a row of 9 floats."""
@@ -156,11 +161,17 @@ def driven(motion: Motion, steering: float, is_braking: bool) -> Motion:
 
     The function has no branches, so that the compiler can vectorize loops over cars.
     """
-    speed_m_s = motion.speed_m_s
+    slip_sine = slip(steering, motion.speed_m_s)
+    acceleration_m_s2 = acceleration(motion.speed_m_s, is_braking)
+    return roll(motion, slip_sine, acceleration_m_s2, WHEELBASE_M, SUBSTEP_S)
+
+
+@inlined
+def acceleration(speed_m_s: float, is_braking: bool) -> float:
+    """Return the acceleration of a substep, m/s^2. A braking car stops, but does not reverse."""
     throttle_m_s2 = THROTTLE_M_S2 * (1.0 - speed_m_s * (1.0 / MAX_SPEED_M_S))
     brake_m_s2 = -min(BRAKE_M_S2, speed_m_s * (1.0 / SUBSTEP_S))
-    acceleration_m_s2 = brake_m_s2 if is_braking else throttle_m_s2
-    return roll(motion, slip(steering, speed_m_s), acceleration_m_s2, WHEELBASE_M, SUBSTEP_S)
+    return brake_m_s2 if is_braking else throttle_m_s2
 
 
 @inlined

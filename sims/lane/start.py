@@ -7,19 +7,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.compiled import compiled
+from mcaprl.compiled import Arrays, array_at, compiled
 from mcaprl.errors import UsageError
 from mcaprl.sims.geometry.bicycle import moving
-from mcaprl.sims.geometry.paths import leg_at, project
+from mcaprl.sims.geometry.paths import project
 from mcaprl.sims.lane.classic import CLASSIC_SUBSTEPS, STRAIGHT
 from mcaprl.sims.lane.course import COURSE, LANE_HALF_WIDTH_M
-from mcaprl.sims.lane.rules import DRIVING, MAX_SPEED_M_S, Car, drive, located, observe, store_car
+from mcaprl.sims.lane.path import course_leg, course_spot_at
+from mcaprl.sims.lane.rules import (
+    DRIVING,
+    MAX_SPEED_M_S,
+    OBSERVATION_NAMES,
+    STARTED_AT,
+    Car,
+    drive,
+    located,
+    observe,
+    store_car,
+)
 from mcaprl.sims.vehicle.arguments import pose_from
 from mcaprl.sims.vehicle.draws import spread, take
 
-ALONG, STARTED_AT = Car._fields.index("along_m"), len(Car._fields)
-"""Indices of two values in a car's row: its distance along the path, now and at the start of the
-episode."""
 SHARES = 4
 """Number of random numbers for a start; a start on the line uses the first two."""
 LINE_M = 2.0
@@ -48,9 +56,10 @@ def start_on_line(shares: NDArray[np.float64]) -> Car:
 def start_anywhere(shares: NDArray[np.float64]) -> Car:
     """Return a car near the path; four random numbers set position, offset, heading and speed."""
     clear_m = shares[0] * _CLEAR_M[-1]
+    # Comparisons are counted without branches, because a processor could not predict them.
     leg = 0
-    while _CLEAR_M[leg + 1] <= clear_m:
-        leg += 1
+    for corner_m in _CLEAR_M[1:-1]:
+        leg += 1 if corner_m <= clear_m else 0
     along_m = COURSE.along_m[leg] + AFTER_CORNER_M + clear_m - _CLEAR_M[leg]
     offset_m, error_rad = spread(shares[1], 1.5), spread(shares[2], 0.2)
     return beside(along_m, offset_m, error_rad, FASTEST_START_M_S * shares[3])
@@ -59,50 +68,54 @@ def start_anywhere(shares: NDArray[np.float64]) -> Car:
 @compiled
 def beside(along_m: float, offset_m: float, error_rad: float, speed_m_s: float) -> Car:
     """Return a car beside a path point, with an offset and a heading error; left is positive."""
-    leg = leg_at(COURSE, along_m)
-    rest_m = along_m - COURSE.along_m[leg]
-    cos, sin = COURSE.forward[leg]
-    x_m = COURSE.points_m[leg, 0] + rest_m * cos - offset_m * sin
-    y_m = COURSE.points_m[leg, 1] + rest_m * sin + offset_m * cos
-    motion = moving(x_m, y_m, COURSE.yaw_rad[leg] + error_rad, speed_m_s)
+    here = course_spot_at(along_m)
+    leg = course_leg(here.leg)
+    x_m = leg.x_m + here.rest_m * leg.cos - offset_m * leg.sin
+    y_m = leg.y_m + here.rest_m * leg.sin + offset_m * leg.cos
+    motion = moving(x_m, y_m, COURSE.yaw_rad[int(here.leg)] + error_rad, speed_m_s)
     return located(motion, 0.0, along_m, 0.0)
 
 
 @compiled
-def start_car(
-    shares: NDArray[np.float64],
-    on_line: bool,
-    classic: bool,
-    cars: NDArray[np.float64],
-    rewards: NDArray[np.float64],
-    ends: NDArray[np.int64],
-    observations: NDArray[np.float32],
-    i: int,
-) -> None:
-    """Start car i of N at random.
+def start_at_random(shares: NDArray[np.float64], on_line: bool, classic: bool) -> Car:
+    """Return a car at the start of an episode.
 
     Args:
         shares: (4,) random numbers from 0 to 1.
         on_line: Whether to start on the start line instead of anywhere.
         classic: Whether a car on the start line first drives straight ahead for a second.
-        cars: (N, 10) output: the fields of `Car`, then its distance along the path at the start.
-        rewards: (N,) output; set to 0 for car i.
-        ends: (N,) output; set to DRIVING for car i.
-        observations: (N, 12) output.
-        i: Index of the car.
     """
-    car = start_on_line(shares) if on_line else start_anywhere(shares)
-    if on_line and classic:
-        car = drive(car, STRAIGHT, CLASSIC_SUBSTEPS)
-    store_car(car, cars[i])
-    cars[i, STARTED_AT] = car.along_m
-    observe(car, observations[i])
-    rewards[i], ends[i] = 0.0, DRIVING
+    if not on_line:
+        return start_anywhere(shares)
+    car = start_on_line(shares)
+    return drive(car, STRAIGHT, CLASSIC_SUBSTEPS) if classic else car
+
+
+@compiled
+def start_only_car(arrays: Arrays, on_line: bool, classic: bool) -> tuple[float, float, float]:
+    """Start a single car like `start_cars`; also return the values for its `info`.
+
+    Args:
+        arrays: Random numbers (4,) from 0 to 1, and the outputs: row (10,) of the car, reward (1,),
+            end (1,) and observation (12,).
+        on_line: Whether to start on the start line instead of anywhere.
+        classic: Whether a car on the start line first drives straight ahead for a second.
+
+    Returns:
+        Offset, heading error and speed.
+    """
+    car = start_at_random(array_at(arrays, 0, (SHARES,), np.float64), on_line, classic)
+    row = array_at(arrays, 1, (STARTED_AT + 1,), np.float64)
+    store_car(car, row)
+    row[STARTED_AT] = car.along_m
+    array_at(arrays, 2, (1,), np.float64)[0] = 0.0
+    array_at(arrays, 3, (1,), np.int64)[0] = DRIVING
+    observe(car, array_at(arrays, 4, (len(OBSERVATION_NAMES),), np.float32))
+    return car.offset_m, car.heading_error_rad, car.speed_m_s
 
 
 @compiled
 def start_cars(
-    chosen: NDArray[np.int64],
     numbers: NDArray[np.float64],
     used: NDArray[np.int64],
     on_line: bool,
@@ -111,15 +124,27 @@ def start_cars(
     rewards: NDArray[np.float64],
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
+    chosen: NDArray[np.int64],
 ) -> None:
-    """Start the cars with the indices `chosen` (K,).
+    """Start some of N cars.
 
-    `numbers` and `used` are attributes of a `Draws` with 4 numbers per start. The other arguments
-    are the same as in `start_car`.
+    Args:
+        numbers: Attribute of a `Draws` with 4 numbers per start.
+        used: Attribute of the same `Draws`.
+        on_line: Whether to start on the start line instead of anywhere.
+        classic: Whether a car on the start line first drives straight ahead for a second.
+        cars: (N, 10) output: the fields of `Car`, then its distance along the path at the start.
+        rewards: (N,) output; set to 0 for the chosen cars.
+        ends: (N,) output; set to DRIVING for the chosen cars.
+        observations: (N, 12) output.
+        chosen: (K,) indices of the cars to start.
     """
     for i in chosen:
-        shares = take(numbers, used, i)
-        start_car(shares, on_line, classic, cars, rewards, ends, observations, i)
+        car = start_at_random(take(numbers, used, i), on_line, classic)
+        store_car(car, cars[i])
+        cars[i, STARTED_AT] = car.along_m
+        observe(car, observations[i])
+        rewards[i], ends[i] = 0.0, DRIVING
 
 
 def car_from(options: dict[str, Any]) -> Car:

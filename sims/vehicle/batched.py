@@ -78,8 +78,9 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._truncates = np.array(fleet.truncates)
         self._some_truncate = bool(self._truncates.any())
-        # The entry at index `GOING_ON` is None, because a running episode has no end.
-        self._reasons = np.array([None, *fleet.reasons[GOING_ON + 1 :]], dtype=object)
+        self._reasons = np.array(fleet.reasons, dtype=object)
+        self._all = np.ones(num_envs, dtype=np.bool_)
+        self._nothing = np.full(num_envs, None, dtype=object)
         self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._randoms = [seeding.np_random()[0] for _ in range(num_envs)]
@@ -133,14 +134,14 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
                 f"episodes {np.flatnonzero(self._ended).tolist()} have ended and autoreset is"
                 " disabled: call reset(options={'reset_mask': terminated | truncated}) first"
             )
-        # In mode `NextStep`, this step resets the environments whose episodes ended before it.
-        fresh, fleet = self._ended.copy(), self.fleet
+        fleet = self.fleet
         if fleet.noise.size:
-            for i in np.flatnonzero(~fresh).tolist():
+            for i in (~self._ended).nonzero()[0].tolist():
                 fleet.noise[i] = self._randoms[i].standard_normal(fleet.noise.shape[1])
         fleet.advance()
         self._steps += 1
-        self._begin_all(np.flatnonzero(fresh))
+        # In mode `NextStep`, this step resets the environments whose episodes ended before it.
+        self._begin_all(self._ended.nonzero()[0])
         has_reason = fleet.ends != GOING_ON
         terminated, truncated = has_reason, self._steps >= self._max_steps
         if self._some_truncate:
@@ -162,12 +163,12 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
     def _infos(self, has_reason: Bools) -> dict[str, Any]:
         """Return the infos of a step. In mode `SameStep`, first reset the episodes that ended."""
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP or not self._ended.any():
+            return self._infos_of(self._all, has_reason)
         ended = self._ended.copy()
-        if self.autoreset_mode is not AutoresetMode.SAME_STEP or not ended.any():
-            return self._infos_of(np.ones_like(ended), has_reason)
-        last = np.full(self.num_envs, None, dtype=object)
+        last = self._nothing.copy()
         final = self._infos_of(ended, has_reason)
-        chosen = np.flatnonzero(ended)
+        chosen = ended.nonzero()[0]
         for i in chosen.tolist():
             last[i] = self.fleet.observation(i)
         self._begin_all(chosen)
@@ -176,19 +177,20 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
             "_final_obs": ended,
             "final_info": final,
             "_final_info": ended.copy(),
-            **self._infos_of(np.ones_like(ended), np.zeros_like(ended)),
+            **self._infos_of(self._all, ~self._all),
         }
 
     def _infos_of(self, chosen: Bools, has_reason: Bools) -> dict[str, Any]:
         """Return the infos of the chosen vehicles, with the reasons why episodes ended."""
         infos: dict[str, Any] = {}
-        are_all = chosen.all()
         for key, values in self.fleet.infos().items():
-            infos[key] = values if are_all else np.where(chosen, values, 0)
+            infos[key] = values if chosen is self._all else np.where(chosen, values, 0)
             infos[f"_{key}"] = chosen.copy()
-        if has_reason.any():
-            infos["reason"] = self._reasons[self.fleet.ends]
-            infos["_reason"] = has_reason.copy()
+        those = has_reason.nonzero()[0]
+        if len(those):
+            reasons = self._nothing.copy()
+            reasons[those] = self._reasons[self.fleet.ends[those]]
+            infos["reason"], infos["_reason"] = reasons, has_reason.copy()
         return infos
 
 

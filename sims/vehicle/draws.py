@@ -54,13 +54,6 @@ class Draws:
         if self._generators[i] is not generator:
             self._generators[i], self.used[i] = generator, _AHEAD
 
-    def one(self, i: int, numbers: NDArray[np.float64]) -> None:
-        """Write the next numbers of generator i into a (size,) array, without drawing ahead."""
-        if self.used.item(i) == _AHEAD:
-            self._generators[i].random(out=numbers)
-        else:
-            numbers[:] = take(self.numbers, self.used, i)
-
     def draw_ahead(self, chosen: NDArray[np.int64]) -> None:
         """Draw numbers for `take` from each `chosen` generator (K,) whose numbers are all used."""
         for i in chosen[self.used[chosen] == _AHEAD].tolist():

@@ -113,12 +113,12 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         """
         if seed is not None:
             super().reset(seed=seed)
-        self.fleet.begin(0, self.np_random, options)
+        started = self.fleet.start_one(self.np_random, options)
         self._trail.clear()
         self._last_step = None
         if self._is_watched:
             self._watch()
-        return self.fleet.observation(0), self.fleet.info(0)
+        return started
 
     def step(self, action: int | np.integer[Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance the vehicle by one decision.

@@ -92,6 +92,17 @@ class Fleet(ABC):
         self.advance()
         return self.observation(0), self.rewards.item(), self.ends.item(), self.info(0)
 
+    def start_one(
+        self, random: np.random.Generator, options: dict[str, Any] | None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode of the only vehicle of a fleet of one, like `begin`.
+
+        Returns:
+            Observation and `info`.
+        """
+        self.begin(0, random, options)
+        return self.observation(0), self.info(0)
+
     @abstractmethod
     def _kernel(self) -> tuple[Any, ...]:
         """Return the compiled function that advances the vehicles, and its arguments.
@@ -107,7 +118,8 @@ class Fleet(ABC):
     @cached_property
     def _observe_only(self) -> Callable[[], NDArray[np.float32]]:
         """Bound method that copies the first vehicle's observed numbers."""
-        copy: Callable[[], NDArray[np.float32]] = self._seen[0].copy
+        # `flatten` takes half the time of `copy`.
+        copy: Callable[[], NDArray[np.float32]] = self._seen[0].flatten
         return copy
 
     def __getstate__(self) -> dict[str, Any]:
