@@ -64,15 +64,22 @@ def store_car(car: Car, row: NDArray[np.float64]) -> None:
 
 @compiled
 def placed(
-    track: Track, x_px: float, y_px: float, heading_rad: float, speed_px: float, near_m: float
+    track: Track,
+    x_px: float,
+    y_px: float,
+    heading_rad: float,
+    speed_px: float,
+    near_m: float,
+    within_m: float = math.inf,
 ) -> Car:
     """Return a car on a track before its first step. Its next gate is the nearest gate ahead.
 
-    The function searches for the car's position along the path within half a lap of `near_m`.
+    The function searches for the car's position along the path within a distance of `near_m`, at
+    most half a lap.
     """
-    half_lap_m = 0.5 * track.path.length_m
+    reach_m = min(within_m, 0.5 * track.path.length_m)
     x_m, y_m = METERS_PER_PX * x_px, METERS_PER_PX * (IMAGE_HEIGHT_PX - y_px)
-    place = project(track.path, x_m, y_m, near_m - half_lap_m, near_m + half_lap_m)
+    place = project(track.path, x_m, y_m, near_m - reach_m, near_m + reach_m)
     along_m, count = place.along_m % track.path.length_m, len(track.gates_px)
     gate = int(along_m / track.path.length_m * count) % count
     if is_beyond(x_px, y_px, track.gates_px[gate]):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mcaprl.compiled import ready
 from mcaprl.errors import UsageError
+from mcaprl.sims.racer.block import StepResult, car_info, step_cars, step_only_car
 from mcaprl.sims.racer.car import STARTED_AT, Car, store_car
 from mcaprl.sims.racer.course import IMAGE_HEIGHT_PX, METERS_PER_PX, Track, make_track
 from mcaprl.sims.racer.rules import (
@@ -20,14 +21,11 @@ from mcaprl.sims.racer.rules import (
     REASONS,
     STEP_S,
     TRUNCATES,
-    StepResult,
-    car_info,
     observe,
-    step_cars,
-    step_only_car,
 )
-from mcaprl.sims.racer.start import ANYWHERE, EXACTLY, ON_LINE, car_from, start_car
+from mcaprl.sims.racer.start import ANYWHERE, EXACTLY, ON_LINE, car_from, start_car, start_cars
 from mcaprl.sims.vehicle.arguments import check_name
+from mcaprl.sims.vehicle.draws import Draws
 from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
 
 ACTION_SETS = {5: (0, 1, 2, 3, 4), 8: (1, 2, 3, 4, 5, 6, 7, 8), 9: tuple(range(9))}
@@ -74,8 +72,11 @@ class RacerFleet(Fleet):
         self._numbers = ACTION_SETS[actions]
         self.last_actions = np.zeros(count, dtype=np.int64)
         on_line = start == "line" or (self.classic and start is None)
-        # Random numbers for one start; the size of the array selects the kind of start.
-        self._shares = np.zeros(ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE)
+        # The number of random numbers for a start selects the kind of start.
+        kind = ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE
+        self._draws = Draws(count, kind)
+        # `start_one` writes the random numbers for a start into this array.
+        self._shares = np.zeros(kind)
         self._drift = bool(drift)
         self._cars = np.zeros((count, STARTED_AT + 1))
         self._seen = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
@@ -86,15 +87,32 @@ class RacerFleet(Fleet):
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
         """Start car i; see "Starting State" of `RacerEnv`."""
-        if options:
-            car, row = car_from(self.track, options), self._cars[i]
-            store_car(car, row)
-            row[STARTED_AT] = car.along_m
-            observe(self.track, car, self.classic, self._seen[i])
-        else:
-            random.random(out=self._shares)
-            self._start_one(i)
+        self._draws.use_generator(i, random)
+        if not options:
+            self.begin_all(np.array([i]), ())
+            return
+        car, row = car_from(self.track, options), self._cars[i]
+        store_car(car, row)
+        row[STARTED_AT] = car.along_m
+        observe(self.track, car, self.classic, self._seen[i])
         self.rewards[i], self.ends[i], self.last_actions[i] = 0.0, GOING_ON, 0
+
+    def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
+        """Start episodes of the chosen cars."""
+        self._draws.draw_ahead(chosen)
+        self._start_chosen(chosen)
+        self.rewards[chosen], self.ends[chosen], self.last_actions[chosen] = 0.0, GOING_ON, 0
+
+    def start_one(
+        self, random: np.random.Generator, options: dict[str, Any] | None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode of the only car of the fleet."""
+        if options:
+            return super().start_one(random, options)
+        random.random(out=self._shares)
+        self._start_one(0)
+        self.rewards[0], self.ends[0], self.last_actions[0] = 0.0, GOING_ON, 0
+        return self._observe_only(), self.info(0)
 
     def advance(self) -> None:
         """Advance all cars by one step."""
@@ -123,6 +141,13 @@ class RacerFleet(Fleet):
     def _arguments(self) -> tuple[Any, ...]:
         outcome = (self.rewards, self.ends, self._seen)
         return (self.track, self._cars, self.last_actions, *outcome, self.classic, self._drift)
+
+    @cached_property
+    def _start_chosen(self) -> Callable[[NDArray[np.int64]], None]:
+        draws, outputs = self._draws, (self._cars, self._seen)
+        examples = (np.zeros(0, dtype=np.int64),)
+        fixed = (self.track, self.classic, draws.numbers, draws.used, *outputs)
+        return ready(start_cars, *fixed, examples=examples)
 
     @cached_property
     def _start_one(self) -> Callable[[int], None]:

@@ -75,8 +75,12 @@ def walls_hit(track: Track, car: Car) -> int:
     near = 0
     for wall in range(len(track.walls_px)):
         near += 1 if is_near(track.walls_px[wall], car) else 0
-    if near == 0:
-        return 0
+    return edges_hit(track, car) if near > 0 else 0
+
+
+@compiled
+def edges_hit(track: Track, car: Car) -> int:
+    """Return the same as `walls_hit`, without looking first whether any wall is near."""
     count = 0
     front = corner_at(car, 1.0, -1.0), corner_at(car, 1.0, 1.0)
     corners = (*front, corner_at(car, -1.0, 1.0), corner_at(car, -1.0, -1.0))
@@ -163,7 +167,12 @@ def outcome_of(track: Track, before: Car, after: Car, classic: bool) -> tuple[fl
     The reward is +1 for a gate and -1 for a crash. In the classic rules, a crash has the
     reward -1 for each wall that is hit.
     """
-    hits = walls_hit(track, after)
+    return outcome_with(walls_hit(track, after), before, after, classic)
+
+
+@inlined
+def outcome_with(hits: int, before: Car, after: Car, classic: bool) -> tuple[float, int]:
+    """Return the same as `outcome_of`, from the number of walls that the car hits."""
     reward = after.gates - before.gates
     if hits > 0:
         return reward - (hits if classic else 1), CRASH
@@ -203,85 +212,16 @@ def observe_with(
     observation[RAYS] = (-car.speed_px if classic else car.speed_px) / MAX_SPEED_PX
 
 
-@compiled
-def step_cars(
-    track: Track,
-    cars: NDArray[np.float64],
-    actions: NDArray[np.int64],
-    rewards: NDArray[np.float64],
-    ends: NDArray[np.int64],
-    observations: NDArray[np.float32],
-    classic: bool,
-    drift: bool,
-) -> None:
-    """Advance N independent cars by one step each, in place.
-
-    Args:
-        track: Track of all cars.
-        cars: (N, 13) rows: a `Car`, then its distance along the path at the start.
-        actions: (N,) 0 to 8.
-        rewards: (N,) output.
-        ends: (N,) output: DRIVING, CRASH, NO_GATE or TIME_LIMIT.
-        observations: (N, 19) output.
-        classic: Whether the classic rules apply.
-        drift: Whether the direction of travel lags behind the heading.
-    """
-    for i in range(len(cars)):
-        after, rewards[i], ends[i] = advance(track, cars[i], actions[i], classic, drift)
-        observe(track, after, classic, observations[i])
-
-
 @inlined
 def advance(
     track: Track, row: NDArray[np.float64], action: int, classic: bool, drift: bool
 ) -> tuple[Car, float, int]:
-    """Advance the car in a row of `step_cars`; return the car, its reward and its end."""
+    """Advance the car in a row of `block.step_cars`; return the car, its reward and its end."""
     before = car_at(row)
     after = drive(track, before, action, classic, drift)
     store_car(after, row)
     reward, end = outcome_of(track, before, after, classic)
     return after, reward, end
-
-
-StepResult = tuple[float, int, float, float, float, float, int]
-
-
-@compiled
-def step_only_car(
-    track: Track,
-    cars: NDArray[np.float64],
-    actions: NDArray[np.int64],
-    rewards: NDArray[np.float64],
-    ends: NDArray[np.int64],
-    observations: NDArray[np.float32],
-    classic: bool,
-    drift: bool,
-    action: int,
-) -> StepResult:
-    """Advance a single car with `step_cars`; also return the contents of its `info`.
-
-    Returns:
-        Reward, end, offset, heading error, speed, progress, and gates passed.
-    """
-    actions[0] = action
-    step_cars(track, cars, actions, rewards, ends, observations, classic, drift)
-    car = car_at(cars[0])
-    info = (car.offset_m, car.heading_error_rad, speed_of(car), car.along_m - cars[0, -1])
-    return rewards[0], ends[0], *info, int(car.gates)
-
-
-@compiled
-def car_info(cars: NDArray[np.float64], info: NDArray[np.float64]) -> None:
-    """Compute the contents of the `info` of N cars.
-
-    Args:
-        cars: (N, 13) rows: a `Car`, then its distance along the path at the episode's start.
-        info: (5, N) output: offsets, heading errors, speeds, progress and gates.
-    """
-    for i in range(len(cars)):
-        car = car_at(cars[i])
-        info[0, i], info[1, i], info[2, i] = car.offset_m, car.heading_error_rad, speed_of(car)
-        info[3, i], info[4, i] = car.along_m - cars[i, -1], car.gates
 
 
 @compiled

@@ -15,10 +15,12 @@ from mcaprl.sims.racer.car import STARTED_AT, Car, placed, store_car
 from mcaprl.sims.racer.course import HALF_WIDTH_PX, IMAGE_HEIGHT_PX, METERS_PER_PX, Track
 from mcaprl.sims.racer.rules import MAX_SPEED_M_S, STEP_S, observe, walls_hit
 from mcaprl.sims.vehicle.arguments import pose_from
-from mcaprl.sims.vehicle.draws import spread
+from mcaprl.sims.vehicle.draws import spread, take
 
 ANYWHERE, ON_LINE, EXACTLY = 4, 2, 0
 """Number of random numbers for each kind of start."""
+SEARCH_M = 10.0
+"""Search window for the nearest path point: maximum distance from the path point of the start."""
 
 
 @compiled
@@ -28,7 +30,7 @@ def start_on_line(track: Track, shares: NDArray[np.float64]) -> Car:
     left_px, left_rad = spread(shares[0], 3.0), spread(shares[1], 0.05)
     x_px += left_px * math.sin(heading_rad)
     y_px -= left_px * math.cos(heading_rad)
-    return placed(track, x_px, y_px, heading_rad - left_rad, 0.0, 0.0)
+    return placed(track, x_px, y_px, heading_rad - left_rad, 0.0, 0.0, SEARCH_M)
 
 
 @compiled
@@ -40,7 +42,7 @@ def start_anywhere(track: Track, shares: NDArray[np.float64]) -> Car:
     heading_rad = -track.path.yaw_rad[leg_at(track.path, along_m)]
     x_px = x_m / METERS_PER_PX + left_px * math.sin(heading_rad)
     y_px = IMAGE_HEIGHT_PX - y_m / METERS_PER_PX - left_px * math.cos(heading_rad)
-    return placed(track, x_px, y_px, heading_rad - left_rad, speed_px, along_m)
+    return placed(track, x_px, y_px, heading_rad - left_rad, speed_px, along_m, SEARCH_M)
 
 
 @compiled
@@ -69,10 +71,29 @@ def start_car(
     elif len(shares) == ON_LINE:
         car = start_on_line(track, shares)
     else:
-        car = placed(track, *track.start_px, 0.0, 0.0)
+        car = placed(track, *track.start_px, 0.0, 0.0, SEARCH_M)
     store_car(car, cars[i])
     cars[i, STARTED_AT] = car.along_m
     observe(track, car, classic, observations[i])
+
+
+@compiled
+def start_cars(
+    track: Track,
+    classic: bool,
+    numbers: NDArray[np.float64],
+    used: NDArray[np.int64],
+    cars: NDArray[np.float64],
+    observations: NDArray[np.float32],
+    chosen: NDArray[np.int64],
+) -> None:
+    """Start the cars with the indices `chosen` (K,) like `start_car`.
+
+    `numbers` and `used` are attributes of a `Draws` with as many numbers for each start as the kind
+    of start uses.
+    """
+    for i in chosen:
+        start_car(track, classic, take(numbers, used, i), cars, observations, i)
 
 
 def car_from(track: Track, options: dict[str, Any]) -> Car:

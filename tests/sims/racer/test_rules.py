@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mcaprl.sims.racer.block import step_cars
 from mcaprl.sims.racer.car import car_at, is_beyond, placed
 from mcaprl.sims.racer.course import make_track
 from mcaprl.sims.racer.rays import (
@@ -32,7 +33,6 @@ from mcaprl.sims.racer.rules import (
     drive,
     observe,
     outcome_of,
-    step_cars,
     walls_hit,
 )
 from tests.support.racer_tracks import car_in, corridor
