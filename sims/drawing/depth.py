@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.compiled import compiled
+from mcaprl.compiled import compiled, inlined
 from mcaprl.sims.drawing.camera import (
     Lens,
     draw,
     draw_wires,
+    faces_of,
     focal_lengths,
-    fronts,
     lengths,
     ray_lengths,
 )
@@ -34,12 +35,74 @@ def encode_depth(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
 
     Adjacent codes differ by 2.1 % at any distance. Infinity is 255.
     """
+    if depth_m.dtype != np.float32:
+        return _computed_codes(depth_m)
+    codes = np.empty(depth_m.shape, dtype=np.uint8)
+    values = np.ascontiguousarray(depth_m).reshape(-1)
+    _look_up(values, values.view(np.int32), *_code_table(), codes.reshape(-1))
+    return codes
+
+
+def _computed_codes(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Encode by the formula of `encode_depth`."""
     codes = np.asarray(np.clip(depth_m, NEAREST_M, FARTHEST_M))
     codes /= NEAREST_M
     np.log(codes, out=codes)
     codes *= _CODES_PER_E
     np.rint(codes, out=codes)
     return codes.astype(np.uint8)
+
+
+_TABLE_SHIFT = 15
+"""Positive float32 numbers whose bits agree, except for the last 15, differ by at most 0.4 %. The
+code increases at most once among them, because adjacent codes differ by 2.1 %."""
+
+
+@functools.cache
+def _code_table() -> tuple[NDArray[np.uint8], NDArray[np.float32], int]:
+    """Return the codes of all distances, which are faster to look up than to compute.
+
+    The table has an entry for each group of numbers that agree except for the last bits.
+
+    Returns:
+        Code of the first number of each group; the first number of each group with the next code,
+        or NaN if there is none; and the bits that the first group has in common.
+    """
+    nearest, farthest = np.array([NEAREST_M, FARTHEST_M], np.float32).view(np.int32) >> _TABLE_SHIFT
+    starts = np.arange(nearest, farthest + 1, dtype=np.int32) << _TABLE_SHIFT
+    codes = _computed_codes(starts.view(np.float32))
+    # Bisect: the code of `low` is that of the start, and the code of `high` is larger.
+    low, high = starts.copy(), starts + (1 << _TABLE_SHIFT)
+    while (high - low).max() > 1:
+        middle = low + (high - low) // 2
+        is_same = _computed_codes(middle.view(np.float32)) == codes
+        low, high = np.where(is_same, middle, low), np.where(is_same, high, middle)
+    increases = _computed_codes(high.view(np.float32)) > codes
+    return codes, np.where(increases, high.view(np.float32), np.float32(np.nan)), int(nearest)
+
+
+@compiled
+def _look_up(
+    depth_m: NDArray[np.float32],
+    bits: NDArray[np.int32],
+    codes: NDArray[np.uint8],
+    increase_m: NDArray[np.float32],
+    first: int,
+    output: NDArray[np.uint8],
+) -> None:
+    """Write the codes of N distances.
+
+    Args:
+        depth_m: (N,) distances.
+        bits: (N,) the same memory as integers.
+        codes: First part of the result of `_code_table`, like the next two arguments.
+        increase_m: Second part.
+        first: Third part.
+        output: (N,) codes.
+    """
+    for i in range(len(depth_m)):
+        group = np.uint64(min(max((bits[i] >> _TABLE_SHIFT) - first, 0), len(codes) - 1))
+        output[i] = codes[group] + (1 if depth_m[i] >= increase_m[group] else 0)
 
 
 def decode_depth(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -60,10 +123,13 @@ def encode_nearness(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
 class Overlaps(NamedTuple):
     """Weights that downsample a row of old pixels to a shorter row of new pixels."""
 
-    first: NDArray[np.int64]
-    """(new,) index of the first old pixel that overlaps each new pixel."""
+    first: NDArray[np.uint64]
+    """(new,) index of the first old pixel that overlaps each new pixel. Compiled functions do not
+    compare unsigned indices with 0."""
     weights: Floats
     """(new, K) fraction of each new pixel that old pixel `first` + k covers, for k < K."""
+    taps: tuple[int, ...]
+    """Numbers from 0 to K - 1. In compiled functions, the length K of the tuple is a constant."""
 
 
 def overlaps(old_size: int, new_size: int) -> Overlaps:
@@ -77,14 +143,36 @@ def overlaps(old_size: int, new_size: int) -> Overlaps:
     first = np.minimum(edges[:-1].astype(np.int64), old_size - count)
     old = first[:, None] + np.arange(count)
     width = np.minimum(edges[1:, None], old + 1) - np.maximum(edges[:-1, None], old)
-    return Overlaps(first, np.maximum(width, 0.0) * (new_size / old_size))
+    weights = np.maximum(width, 0.0) * (new_size / old_size)
+    return Overlaps(first.astype(np.uint64), weights, tuple(range(count)))
+
+
+class Downsampling(NamedTuple):
+    """Precomputed numbers that downsample images of one size to another."""
+
+    rows: Overlaps
+    columns: Overlaps
+    full: Floats
+    """(h, w) covered part of each new pixel if surfaces cover all old pixels: 1, up to rounding."""
+
+
+def downsampling(old: tuple[int, int], new: tuple[int, int]) -> Downsampling:
+    """Return the numbers that downsample images of the shape `old` to the shape `new`."""
+    rows, columns = overlaps(old[0], new[0]), overlaps(old[1], new[1])
+    # The sums are added up in the same order as in `shrink`, so that the results are the same.
+    covered, full = np.zeros(new[0]), np.zeros(new)
+    for k in rows.taps:
+        covered += rows.weights[:, k]
+    for k in columns.taps:
+        full += np.outer(covered, columns.weights[:, k])
+    return Downsampling(rows, columns, full)
 
 
 @compiled
 def shrink(
-    inverse: Floats, rows: Overlaps, columns: Overlaps, depth_m: NDArray[np.float32]
+    inverse: Floats, nearness: Floats, sizes: Downsampling, depth_m: NDArray[np.float32]
 ) -> None:
-    """Downsample an image of inverse distances to a smaller image of distances.
+    """Downsample an image of inverse depths to a smaller image of distances.
 
     If surfaces cover at least half of a new pixel, its inverse distance is the mean over the
     covered part. Otherwise, its distance is infinite. Thus the sky does not affect distances. On a
@@ -92,30 +180,64 @@ def shrink(
     middle of the covered part.
 
     Args:
-        inverse: (H, W) 1/m, 0 where there is no surface.
-        rows: Result of `overlaps(H, h)`.
-        columns: Result of `overlaps(W, w)`.
+        inverse: (H, W) inverse depths, 1/m, 0 where there is no surface. They are replaced by
+            inverse distances.
+        nearness: (H, W) depth divided by distance.
+        sizes: Result of `downsampling` for both sizes.
         depth_m: (h, w) output, meters.
     """
-    width = inverse.shape[1]
+    rows, columns = sizes.rows, sizes.columns
+    covered = _to_distances(inverse, nearness)
+    width, new_width = inverse.shape[1], depth_m.shape[1]
     sums, hits = np.empty(width), np.empty(width)
+    totals, parts = np.empty(new_width), np.empty(new_width)
     for i in range(len(rows.first)):
-        sums[:], hits[:] = 0.0, 0.0
-        for k in range(rows.weights.shape[1]):
-            line, weight = inverse[rows.first[i] + k], rows.weights[i, k]
+        sums[:], hits[:], is_full = 0.0, 0.0, True
+        for k in range(len(rows.taps)):
             # All output rows have the same number of weights. Rows that overlap fewer input rows
-            # have weights of 0 at the end.
-            if weight > 0.0:
+            # have weights of 0.
+            row, weight = rows.first[i] + np.uint64(k), rows.weights[i, k]
+            is_full &= (weight == 0.0) | (covered[row] == width)
+        for k in range(len(rows.taps)):
+            line, weight = inverse[rows.first[i] + np.uint64(k)], rows.weights[i, k]
+            if weight == 0.0:
+                continue
+            for column in range(width):
+                sums[column] += weight * line[column]
+            if not is_full:
                 for column in range(width):
-                    sums[column] += weight * line[column]
                     hits[column] += weight if line[column] > 0.0 else 0.0
-        for j in range(len(columns.first)):
-            total, hit = 0.0, 0.0
-            first, weights = columns.first[j], columns.weights[j]
-            for k in range(len(weights)):
-                total += weights[k] * sums[first + k]
-                hit += weights[k] * hits[first + k]
-            depth_m[i, j] = hit / total if hit >= 0.5 else math.inf
+        _combine(columns, sums, totals)
+        if is_full:
+            parts[:] = sizes.full[i]
+        else:
+            _combine(columns, hits, parts)
+        for j in range(new_width):
+            depth_m[i, j] = parts[j] / totals[j] if parts[j] >= 0.5 else math.inf
+
+
+@inlined
+def _to_distances(inverse: Floats, nearness: Floats) -> NDArray[np.int64]:
+    """Multiply two images in place; return the number of positive pixels in each row."""
+    covered = np.zeros(len(inverse), dtype=np.int64)
+    for row in range(len(inverse)):
+        count = 0
+        for column in range(inverse.shape[1]):
+            value = inverse[row, column] * nearness[row, column]
+            inverse[row, column] = value
+            count += 1 if value > 0.0 else 0
+        covered[row] = count
+    return covered
+
+
+@inlined
+def _combine(columns: Overlaps, sums: Floats, totals: Floats) -> None:
+    """Downsample a row."""
+    for j in range(len(totals)):
+        total, first = 0.0, columns.first[j]
+        for k in range(len(columns.taps)):
+            total += columns.weights[j, k] * sums[first + np.uint64(k)]
+        totals[j] = total
 
 
 class DepthCamera:
@@ -132,12 +254,11 @@ class DepthCamera:
             small: Size (h, w) of the downsampled images, pixels.
             wires: (S, 2, 3) ends, meters; drawn one pixel wide into the downsampled image.
         """
-        self._mesh, self._planes = mesh, fronts(mesh)
+        self._faces = faces_of(mesh)
         self._wires = wires
         self._view = view
         self._nearness = 1.0 / ray_lengths(view)
-        self._rows = overlaps(view.height_px, small[0])
-        self._columns = overlaps(view.width_px, small[1])
+        self._sizes = downsampling((view.height_px, view.width_px), small)
         self._small = small
         self._small_focal_px = focal_lengths(view, small)
         self._small_lengths = lengths(small, *self._small_focal_px)
@@ -152,11 +273,7 @@ class DepthCamera:
         Returns:
             (height, width) inverse distance along each ray, 1/m, 0 where there is no surface.
         """
-        inverse = np.empty((self._view.height_px, self._view.width_px))
-        eye_m = np.array(position_m)
-        draw(self._mesh, self._planes, eye_m, axes, self._view.focal_px, inverse)
-        inverse *= self._nearness
-        return inverse
+        return self._draw(position_m, axes) * self._nearness
 
     def image_m(self, position_m: tuple[float, float, float], axes: Floats) -> NDArray[np.float32]:
         """Render the downsampled image: the distances (h, w) along the rays in meters.
@@ -164,7 +281,7 @@ class DepthCamera:
         A distance is infinite if the ray hits nothing.
         """
         small = np.empty(self._small, dtype=np.float32)
-        shrink(self.inverse_distance(position_m, axes), self._rows, self._columns, small)
+        shrink(self._draw(position_m, axes), self._nearness, self._sizes, small)
         if len(self._wires):
             wired = np.zeros(self._small)
             eye = np.array(position_m)
@@ -173,3 +290,9 @@ class DepthCamera:
             wires_m = (self._small_lengths[shown] / wired[shown]).astype(np.float32)
             small[shown] = np.minimum(small[shown], wires_m)
         return small
+
+    def _draw(self, position_m: tuple[float, float, float], axes: Floats) -> Floats:
+        """Return the (height, width) inverse depths of the mesh, 1/m."""
+        inverse_z = np.empty((self._view.height_px, self._view.width_px))
+        draw(self._faces, np.array(position_m), axes, self._view.focal_px, inverse_z)
+        return inverse_z

@@ -10,7 +10,7 @@ Vector = tuple[float, float, float]
 # The corners of a unit cube are numbered 4 x + 2 y + z. Each face lists its corners
 # counter-clockwise as seen from outside; its diagonal splits it into two triangles.
 _FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-_TRIANGLES = np.array([(a, b, c) for a, b, c, _ in _FACES] + [(a, c, d) for a, _, c, d in _FACES])
+_TRIANGLES = np.array([half for a, b, c, d in _FACES for half in ((a, b, c), (a, c, d))])
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 

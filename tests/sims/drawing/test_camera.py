@@ -10,12 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.camera import draw, fronts, lens, level_axes, ray_lengths
+from mcaprl.sims.drawing.camera import Faces, draw, faces_of, fronts, lens, level_axes, ray_lengths
 from mcaprl.sims.drawing.depth import (
     FARTHEST_M,
     NEAREST_M,
     DepthCamera,
     decode_depth,
+    downsampling,
     encode_depth,
     overlaps,
     shrink,
@@ -31,7 +32,7 @@ ALL_CODES = np.arange(256, dtype=np.uint8)
 
 
 def draw_mesh(mesh: Floats, eye_m: Floats, axes: Floats, focal_px: float, image: Floats) -> None:
-    draw(mesh, fronts(mesh), eye_m, axes, focal_px, image)
+    draw(faces_of(mesh), eye_m, axes, focal_px, image)
 
 
 def unit_rays(columns: NDArray[np.int64], rows: NDArray[np.int64], yaw_rad: float) -> Floats:
@@ -104,6 +105,50 @@ def test_planes_tell_fronts_from_backs() -> None:
     flat = np.array([[[0.0, 0, 2], [1, 0, 2], [0, 1, 2]]])
     np.testing.assert_allclose(fronts(flat), [[0, 0, 1, 2]])
     np.testing.assert_allclose(fronts(flat[:, ::-1]), [[0, 0, -1, -2]])
+
+
+def test_halves_of_quadrilaterals_are_merged() -> None:
+    box = box_mesh((0.0, 0.0, 0.0), (2.0, 4.0, 6.0))
+    faces = faces_of(box)
+    assert faces.counts.tolist() == [4] * 6
+    np.testing.assert_array_equal(faces.corners[0, :3], box[0])
+    np.testing.assert_array_equal(faces.corners[0, 3], box[1, 2])
+    # The halves of a rectangle, whichever corners they begin with.
+    a, b, c, d = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
+    for first in ([a, b, c], [b, c, a], [c, a, b]):
+        for second in ([a, c, d], [c, d, a], [d, a, c]):
+            merged = faces_of(np.array([first, second]))
+            assert merged.counts.tolist() == [4]
+            around = merged.corners[0].tolist()
+            start = around.index(a.tolist())
+            assert around[start:] + around[:start] == [each.tolist() for each in (a, b, c, d)]
+    # Three triangles are a quadrilateral and a triangle.
+    assert faces_of(np.array([[a, b, c], [a, c, d], [a, b, c]])).counts.tolist() == [4, 3]
+
+
+def test_other_triangles_are_not_merged() -> None:
+    a, b, c, d = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
+    above, beyond = np.array([[0.0, 1, 1e-3], [3, -0.2, 0]])
+    pairs = {
+        "bent": [[a, b, c], [a, c, above]],
+        "concave": [[a, b, d], [d, b, beyond]],
+        "apart": [[a, b, c], [a + 5, c + 5, d + 5]],
+        "seen from the other side": [[a, b, c], [c, a, d]],
+    }
+    for name, pair in pairs.items():
+        assert faces_of(np.array(pair)).counts.tolist() == [3, 3], name
+
+
+def test_merged_triangles_look_like_single_ones() -> None:
+    mesh, axes = lane_mesh(), level_axes(0.3)
+    single = Faces(np.insert(mesh, 3, 0.0, axis=1), np.full(len(mesh), 3), fronts(mesh))
+    merged = faces_of(mesh)
+    assert len(merged.counts) == len(mesh) // 2
+    images = np.empty((2, 144, 256))
+    for x_m, y_m in ((5.0, 0.5), (64.0, 2.0), (130.0, -60.0)):
+        for faces, image in zip((single, merged), images, strict=True):
+            draw(faces, np.array([x_m, y_m, 1.4]), axes, LENS.focal_px, image)
+        np.testing.assert_allclose(images[0], images[1], rtol=1e-12)
 
 
 def test_random_triangles_match_ray_casting() -> None:
@@ -187,6 +232,20 @@ def test_codes_by_hand() -> None:
     assert decode_depth(np.array([0, 255], np.uint8)).tolist() == [0.5, np.inf]
 
 
+def test_codes_of_float32_are_those_of_the_formula() -> None:
+    """The last bits of the formula's logarithm in float32 shift a code by less than 1e-4."""
+    edges_m = NEAREST_M * np.exp(np.arange(0.5, 255) / 255 * math.log(FARTHEST_M / NEAREST_M))
+    random = np.random.default_rng(0)
+    meters = np.concatenate([edges_m * (1 + part * 1e-6) for part in range(-30, 31)])
+    meters = np.concatenate([meters, random.uniform(0.0, 120.0, 20_000)]).astype(np.float32)
+    clipped = np.clip(meters.astype(float), NEAREST_M, FARTHEST_M)
+    exact = 255 * np.log(clipped / NEAREST_M) / math.log(FARTHEST_M / NEAREST_M)
+    assert np.abs(encode_depth(meters) - exact).max() <= 0.5001
+    assert np.all(np.diff(encode_depth(np.sort(meters)).astype(int)) >= 0)
+    outside = np.array([[-1.0, 0.0, 1e-40], [100.0, 1e30, np.inf]], np.float32)
+    assert encode_depth(outside).tolist() == [[0, 0, 0], [255, 255, 255]]
+
+
 def test_codes_survive_decoding() -> None:
     np.testing.assert_array_equal(encode_depth(decode_depth(ALL_CODES)), ALL_CODES)
 
@@ -194,8 +253,8 @@ def test_codes_survive_decoding() -> None:
 def shrunk(inverse: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Downsample an image to a shape."""
     small = np.empty(shape, dtype=np.float32)
-    rows, columns = overlaps(inverse.shape[0], shape[0]), overlaps(inverse.shape[1], shape[1])
-    shrink(inverse, rows, columns, small)
+    height, width = inverse.shape
+    shrink(inverse.copy(), np.ones((height, width)), downsampling((height, width), shape), small)
     return small
 
 
@@ -210,11 +269,24 @@ def test_shrinking_by_hand() -> None:
     assert shrunk(inverse, (1, 2))[0, 1] == np.inf
 
 
+def test_rows_without_sky_are_averaged_like_other_rows() -> None:
+    random = np.random.default_rng(1)
+    inverse = random.uniform(0.01, 2.0, (144, 256))
+    with_sky = inverse.copy()
+    # A pixel of sky in each row makes no difference to the pixels that it does not overlap.
+    with_sky[:, 255] = 0.0
+    np.testing.assert_array_equal(
+        shrunk(inverse, (84, 84))[:, :83], shrunk(with_sky, (84, 84))[:, :83]
+    )
+    mean = inverse.reshape(36, 4, 64, 4).mean(axis=(1, 3))
+    np.testing.assert_allclose(shrunk(inverse, (36, 64)), 1.0 / mean, rtol=1e-6)
+
+
 @given(st.integers(1, 300), st.integers(1, 300))
 def test_each_new_pixel_is_made_of_whole_shares(old: int, new: int) -> None:
     if new > old:
         return
-    first, weights = overlaps(old, new)
+    first, weights, _ = overlaps(old, new)
     np.testing.assert_allclose(weights.sum(axis=1), 1.0, rtol=1e-9)
     used = np.zeros(old)
     for start, row in zip(first, weights, strict=True):
