@@ -14,7 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.sims.vehicle.arguments import check_action, check_name
-from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
+from mcaprl.sims.vehicle.fleet import Fleet
 
 RenderMode = Literal["human", "rgb_array"]
 RENDER_MODES = ("human", "rgb_array")
@@ -114,9 +114,9 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         if seed is not None:
             super().reset(seed=seed)
         started = self.fleet.start_one(self.np_random, options)
-        self._trail.clear()
-        self._last_step = None
         if self._is_watched:
+            self._trail.clear()
+            self._last_step = None
             self._watch()
         return started
 
@@ -139,7 +139,8 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         if self._is_watched:
             self._last_step = (self._now, number)
             self._watch()
-        if end == GOING_ON:
+        # `GOING_ON` is 0.
+        if not end:
             return observation, reward, False, False, info
         info["reason"] = self.fleet.reasons[end]
         truncated = self.fleet.truncates[end]
