@@ -52,14 +52,14 @@ class GlCamera(DepthCamera):
         program["near"].value = NEAR_M
         program["focal"].value = (2 * view.focal_px / size[0], 2 * view.focal_px / size[1])
         corners = context.buffer(mesh.reshape(-1, 3).astype("f4").tobytes())
-        self._faces = context.vertex_array(program, [(corners, "3f", "corner")])
+        self._triangles = context.vertex_array(program, [(corners, "3f", "corner")])
         context.enable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         # The rows of our images run downward, so triangles have the opposite orientation in GL.
         context.front_face = "cw"
         self._program = program
         self._depth = np.empty((view.height_px, view.width_px), np.float32)
 
-    def inverse_distance(
+    def inverse_depth(
         self, position_m: tuple[float, float, float], axes: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Render the image at full size, like the method of our camera."""
@@ -68,6 +68,6 @@ class GlCamera(DepthCamera):
         self._program["axes"].value = tuple(axes.T.ravel())
         self._frame.use()
         self._frame.clear(depth=1.0)
-        self._faces.render()
+        self._triangles.render()
         self._frame.read_into(self._depth, attachment=-1, dtype="f4")
-        return (1.0 - self._depth) * (self._nearness / NEAR_M)
+        return np.divide(1.0 - self._depth, NEAR_M, dtype=np.float64)

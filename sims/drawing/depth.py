@@ -263,7 +263,7 @@ class DepthCamera:
         self._small_focal_px = focal_lengths(view, small)
         self._small_lengths = lengths(small, *self._small_focal_px)
 
-    def inverse_distance(self, position_m: tuple[float, float, float], axes: Floats) -> Floats:
+    def inverse_depth(self, position_m: tuple[float, float, float], axes: Floats) -> Floats:
         """Render the image at full size, without wires.
 
         Args:
@@ -271,9 +271,15 @@ class DepthCamera:
             axes: (3, 3) the camera's x, y and z axes as rows, in the mesh's coordinates.
 
         Returns:
-            (height, width) inverse distance along each ray, 1/m, 0 where there is no surface.
+            (height, width) inverse depth of each pixel, 1/m, 0 where there is no surface.
         """
-        return self._draw(position_m, axes) * self._nearness
+        inverse_z = np.empty((self._view.height_px, self._view.width_px))
+        draw(self._faces, np.array(position_m), axes, self._view.focal_px, inverse_z)
+        return inverse_z
+
+    def inverse_distance(self, position_m: tuple[float, float, float], axes: Floats) -> Floats:
+        """Render like `inverse_depth`; return inverse distances along the rays, 1/m."""
+        return self.inverse_depth(position_m, axes) * self._nearness
 
     def image_m(self, position_m: tuple[float, float, float], axes: Floats) -> NDArray[np.float32]:
         """Render the downsampled image: the distances (h, w) along the rays in meters.
@@ -281,7 +287,7 @@ class DepthCamera:
         A distance is infinite if the ray hits nothing.
         """
         small = np.empty(self._small, dtype=np.float32)
-        shrink(self._draw(position_m, axes), self._nearness, self._sizes, small)
+        shrink(self.inverse_depth(position_m, axes), self._nearness, self._sizes, small)
         if len(self._wires):
             wired = np.zeros(self._small)
             eye = np.array(position_m)
@@ -290,9 +296,3 @@ class DepthCamera:
             wires_m = (self._small_lengths[shown] / wired[shown]).astype(np.float32)
             small[shown] = np.minimum(small[shown], wires_m)
         return small
-
-    def _draw(self, position_m: tuple[float, float, float], axes: Floats) -> Floats:
-        """Return the (height, width) inverse depths of the mesh, 1/m."""
-        inverse_z = np.empty((self._view.height_px, self._view.width_px))
-        draw(self._faces, np.array(position_m), axes, self._view.focal_px, inverse_z)
-        return inverse_z
