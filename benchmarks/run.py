@@ -63,8 +63,9 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
 - Recording one environment: assigning the values to NumPy arrays, without writing them, takes more
   than half of our time.
 - Recording 256 environments: where a step is cheap, as in the lane sim, compressing the records
-  alone takes two thirds of the time of stepping or more. Where episodes are short, the five messages
-  of each episode take most of the time. Ordinary environments with long episodes reach the goal.
+  alone takes two thirds of the time of stepping or more. Where episodes are short, the five
+  messages of each episode take most of the time. Ordinary environments with long episodes reach
+  the goal.
 - A batch of 1,024 cars: half of the time is the compiled step, and half of that the motion, which
   has three divisions and three square roots in each of five substeps. Starting the cars whose
   episodes ended takes a fifth; the rest are about 25 calls of NumPy on arrays of 1,024 values.

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from mcaprl.compiled import Arrays, array_at, compiled
 from mcaprl.errors import UsageError
 from mcaprl.sims.geometry.bicycle import moving
-from mcaprl.sims.geometry.paths import project
+from mcaprl.sims.geometry.paths import leg_at, project
 from mcaprl.sims.lane.classic import CLASSIC_SUBSTEPS, STRAIGHT
 from mcaprl.sims.lane.course import COURSE, LANE_HALF_WIDTH_M
-from mcaprl.sims.lane.path import course_leg, course_spot_at
 from mcaprl.sims.lane.rules import (
     DRIVING,
     MAX_SPEED_M_S,
@@ -56,10 +55,9 @@ def start_on_line(shares: NDArray[np.float64]) -> Car:
 def start_anywhere(shares: NDArray[np.float64]) -> Car:
     """Return a car near the path; four random numbers set position, offset, heading and speed."""
     clear_m = shares[0] * _CLEAR_M[-1]
-    # Comparisons are counted without branches, because a processor could not predict them.
     leg = 0
-    for corner_m in _CLEAR_M[1:-1]:
-        leg += 1 if corner_m <= clear_m else 0
+    while _CLEAR_M[leg + 1] <= clear_m:
+        leg += 1
     along_m = COURSE.along_m[leg] + AFTER_CORNER_M + clear_m - _CLEAR_M[leg]
     offset_m, error_rad = spread(shares[1], 1.5), spread(shares[2], 0.2)
     return beside(along_m, offset_m, error_rad, FASTEST_START_M_S * shares[3])
@@ -68,11 +66,12 @@ def start_anywhere(shares: NDArray[np.float64]) -> Car:
 @compiled
 def beside(along_m: float, offset_m: float, error_rad: float, speed_m_s: float) -> Car:
     """Return a car beside a path point, with an offset and a heading error; left is positive."""
-    here = course_spot_at(along_m)
-    leg = course_leg(here.leg)
-    x_m = leg.x_m + here.rest_m * leg.cos - offset_m * leg.sin
-    y_m = leg.y_m + here.rest_m * leg.sin + offset_m * leg.cos
-    motion = moving(x_m, y_m, COURSE.yaw_rad[int(here.leg)] + error_rad, speed_m_s)
+    leg = leg_at(COURSE, along_m)
+    rest_m = along_m - COURSE.along_m[leg]
+    cos, sin = COURSE.forward[leg]
+    x_m = COURSE.points_m[leg, 0] + rest_m * cos - offset_m * sin
+    y_m = COURSE.points_m[leg, 1] + rest_m * sin + offset_m * cos
+    motion = moving(x_m, y_m, COURSE.yaw_rad[leg] + error_rad, speed_m_s)
     return located(motion, 0.0, along_m, 0.0)
 
 
