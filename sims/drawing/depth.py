@@ -35,11 +35,12 @@ def encode_depth(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
 
     Adjacent codes differ by 2.1 % at any distance. Infinity is 255.
     """
-    if depth_m.dtype != np.float32:
-        return _computed_codes(depth_m)
-    codes = np.empty(depth_m.shape, dtype=np.uint8)
-    values = np.ascontiguousarray(depth_m).reshape(-1)
-    _look_up(values, values.view(np.int32), *_code_table(), codes.reshape(-1))
+    values = np.asarray(depth_m)
+    if values.dtype != np.float32:
+        return _computed_codes(values)
+    codes = np.empty(values.shape, dtype=np.uint8)
+    row = np.ascontiguousarray(values).reshape(-1)
+    _look_up(row, row.view(np.int32), _code_table(), codes.reshape(-1))
     return codes
 
 
@@ -58,16 +59,20 @@ _TABLE_SHIFT = 15
 code increases at most once among them, because adjacent codes differ by 2.1 %."""
 
 
+class _CodeTable(NamedTuple):
+    """Codes of all float32 distances, in groups of numbers that agree except for the last bits."""
+
+    codes: NDArray[np.uint8]
+    """(G,) code of the first number of each group."""
+    increases_m: NDArray[np.float32]
+    """(G,) first number of each group that has the next code; NaN if there is none."""
+    first: int
+    """Bits that the numbers of the first group have in common."""
+
+
 @functools.cache
-def _code_table() -> tuple[NDArray[np.uint8], NDArray[np.float32], int]:
-    """Return the codes of all distances, which are faster to look up than to compute.
-
-    The table has an entry for each group of numbers that agree except for the last bits.
-
-    Returns:
-        Code of the first number of each group; the first number of each group with the next code,
-        or NaN if there is none; and the bits that the first group has in common.
-    """
+def _code_table() -> _CodeTable:
+    """Return the table. Looking up a code takes less than half of the time of computing it."""
     nearest, farthest = np.array([NEAREST_M, FARTHEST_M], np.float32).view(np.int32) >> _TABLE_SHIFT
     starts = np.arange(nearest, farthest + 1, dtype=np.int32) << _TABLE_SHIFT
     codes = _computed_codes(starts.view(np.float32))
@@ -77,32 +82,23 @@ def _code_table() -> tuple[NDArray[np.uint8], NDArray[np.float32], int]:
         middle = low + (high - low) // 2
         is_same = _computed_codes(middle.view(np.float32)) == codes
         low, high = np.where(is_same, middle, low), np.where(is_same, high, middle)
-    increases = _computed_codes(high.view(np.float32)) > codes
-    return codes, np.where(increases, high.view(np.float32), np.float32(np.nan)), int(nearest)
+    increases_m = high.view(np.float32)
+    increases_m[_computed_codes(increases_m) == codes] = np.nan
+    return _CodeTable(codes, increases_m, int(nearest))
 
 
 @compiled
 def _look_up(
     depth_m: NDArray[np.float32],
     bits: NDArray[np.int32],
+    table: _CodeTable,
     codes: NDArray[np.uint8],
-    increase_m: NDArray[np.float32],
-    first: int,
-    output: NDArray[np.uint8],
 ) -> None:
-    """Write the codes of N distances.
-
-    Args:
-        depth_m: (N,) distances.
-        bits: (N,) the same memory as integers.
-        codes: First part of the result of `_code_table`, like the next two arguments.
-        increase_m: Second part.
-        first: Third part.
-        output: (N,) codes.
-    """
+    """Write the codes (N,) of distances (N,). `bits` is the memory of the distances as integers."""
     for i in range(len(depth_m)):
-        group = np.uint64(min(max((bits[i] >> _TABLE_SHIFT) - first, 0), len(codes) - 1))
-        output[i] = codes[group] + (1 if depth_m[i] >= increase_m[group] else 0)
+        near = (bits[i] >> _TABLE_SHIFT) - table.first
+        group = np.uint64(min(max(near, 0), len(table.codes) - 1))
+        codes[i] = table.codes[group] + (1 if depth_m[i] >= table.increases_m[group] else 0)
 
 
 def decode_depth(codes: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -35,20 +35,20 @@ def roll(
     duration_s: float,
 ) -> Motion:
     """Advance a bicycle by one explicit Euler step, which must turn it by at most 90 degrees."""
-    moved, turn_rad = glide(motion, slip_sine, acceleration_m_s2, wheelbase_m, duration_s)
+    moved, turn_rad = roll_pose(motion, slip_sine, acceleration_m_s2, wheelbase_m, duration_s)
     heading = turned(moved.heading, turn_rad)
     return Motion(moved.x_m, moved.y_m, moved.yaw_rad, moved.speed_m_s, heading)
 
 
 @inlined
-def glide(
+def roll_pose(
     motion: Motion,
     slip_sine: float,
     acceleration_m_s2: float,
     wheelbase_m: float,
     duration_s: float,
 ) -> tuple[Motion, float]:
-    """Return the motion after the step of `roll`, except for its heading, and the turn in radians.
+    """Return the motion after the step of `roll`, with the old heading, and the turn in radians.
 
     Let beta be the slip angle, l half the wheelbase and v the speed. Then x' = v cos(yaw + beta),
     y' = v sin(yaw + beta), yaw' = v sin(beta) / l, and v' = acceleration. Polack, Altche,

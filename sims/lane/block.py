@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import Arrays, array_at, compiled, inlined
-from mcaprl.sims.geometry.bicycle import Motion, glide
+from mcaprl.sims.geometry.bicycle import Motion, roll_pose
 from mcaprl.sims.geometry.paths import Heading, heading_of, turned
 from mcaprl.sims.lane.rules import (
     BRAKE,
@@ -136,15 +136,15 @@ def _step_block(block: NDArray[np.float64]) -> None:
         heading = heading_of(block[2 * LANES + lane])
         block[_COS * LANES + lane], block[_SIN * LANES + lane] = heading.cos, heading.sin
     for _ in range(SUBSTEPS):
-        # This is `driven` in three loops. In a single loop, each car's instructions would be a long
-        # chain, and a processor would have too few of the next cars' to work on meanwhile.
+        # These three loops are the function `driven`. In a single loop, the instructions for a car
+        # would be a chain so long that a processor could not work on many cars at a time.
         for lane in range(LANES):
             speed_m_s = block[3 * LANES + lane]
             block[_SLIP * LANES + lane] = slip(block[_STEERING * LANES + lane], speed_m_s)
         for lane in range(LANES):
             before, slip_sine = _motion_in(block, lane), block[_SLIP * LANES + lane]
             speed_up_m_s2 = acceleration(before.speed_m_s, block[_BRAKING * LANES + lane] > 0.0)
-            after, turn_rad = glide(before, slip_sine, speed_up_m_s2, WHEELBASE_M, SUBSTEP_S)
+            after, turn_rad = roll_pose(before, slip_sine, speed_up_m_s2, WHEELBASE_M, SUBSTEP_S)
             block[lane], block[LANES + lane] = after.x_m, after.y_m
             block[2 * LANES + lane], block[3 * LANES + lane] = after.yaw_rad, after.speed_m_s
             block[_TURN * LANES + lane] = turn_rad
@@ -152,7 +152,8 @@ def _step_block(block: NDArray[np.float64]) -> None:
             heading = turned(_motion_in(block, lane).heading, block[_TURN * LANES + lane])
             block[_COS * LANES + lane], block[_SIN * LANES + lane] = heading.cos, heading.sin
     for lane in range(LANES):
-        # Of the state before the step, `arrived` and `reward_of` use only what is still there.
+        # `arrived` and `reward_of` use only those values of the state before the step that the
+        # block still contains.
         was = _car_in(block, lane)
         steering = block[_STEERING * LANES + lane]
         car = arrived(was, _motion_in(block, lane), steering, SUBSTEPS)
