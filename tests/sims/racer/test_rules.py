@@ -242,6 +242,26 @@ def test_many_cars_drive_as_one_does(
         assert seen.tobytes() == observations[i].tobytes()
 
 
+@pytest.mark.parametrize("classic", [False, True])
+def test_many_cars_end_as_one_does_anywhere_on_a_track(classic: bool) -> None:
+    track, random = make_track(), np.random.default_rng(6)
+    middles_m = track.path.points_m[random.integers(len(track.path.points_m), size=300)]
+    x_px, y_px = middles_m[:, 0] / 0.1, 600.0 - middles_m[:, 1] / 0.1
+    # Up to 45 pixels in x and y from the center line; the walls are 41.5 pixels from it.
+    x_px, y_px = x_px + random.uniform(-45, 45, 300), y_px + random.uniform(-45, 45, 300)
+    turns_rad = random.uniform(-math.pi, math.pi, 300)
+    before = [placed(track, *pose, 4.0, 0.0) for pose in zip(x_px, y_px, turns_rad, strict=True)]
+    cars, actions = np.array(before), random.integers(9, size=300)
+    rewards, ends = np.zeros(300), np.zeros(300, dtype=np.int64)
+    step_cars(track, cars, actions, rewards, ends, np.zeros((300, 19), np.float32), classic, False)
+    after = [drive(track, car, actions[i], classic, False) for i, car in enumerate(before)]
+    outcomes = [outcome_of(track, *pair, classic) for pair in zip(before, after, strict=True)]
+    assert list(zip(rewards.tolist(), ends.tolist(), strict=True)) == outcomes
+    crashes = [walls_hit(track, car) > 0 for car in after]
+    assert 50 < sum(crashes) < 250
+    assert [end == CRASH for end in ends] == crashes
+
+
 def test_walls_are_hit_by_any_edge() -> None:
     track = corridor()
     assert walls_hit(track, car_in(track, 500.0, 150.0)) == 0
