@@ -237,9 +237,9 @@ def seen_from(car: Car) -> Numbers:
     far_x, far_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[2])
     last_x, last_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[3])
     return (
-        _within(car.offset_m / LANE_HALF_WIDTH_M, _LIMITS[0]),
-        _within(car.heading_error_rad / (0.5 * math.pi), _LIMITS[1]),
-        _within(car.speed_m_s / MAX_SPEED_M_S, _LIMITS[2]),
+        _within(car.offset_m * (1.0 / LANE_HALF_WIDTH_M), _LIMITS[0]),
+        _within(car.heading_error_rad * (2.0 / math.pi), _LIMITS[1]),
+        _within(car.speed_m_s * (1.0 / MAX_SPEED_M_S), _LIMITS[2]),
         _within(2.0 * car.steering, _LIMITS[3]),
         near_x,
         near_y,
@@ -259,7 +259,7 @@ def _ahead(
     """Return a path point ahead as (forward, left) of the car, divided by `lookahead_m`."""
     x_m, y_m = course_point_ahead(leg, after, rest_m, lookahead_m)
     forward_m, left_m = in_body_frame(x_m - car.x_m, y_m - car.y_m, heading.cos, heading.sin)
-    forward, left = forward_m / lookahead_m, left_m / lookahead_m
+    forward, left = forward_m * (1.0 / lookahead_m), left_m * (1.0 / lookahead_m)
     return _within(forward, _LIMITS[4]), _within(left, _LIMITS[4])
 
 
