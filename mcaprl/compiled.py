@@ -78,7 +78,7 @@ def ready_at(
     """Bind the first arguments of a compiled function like `ready`, but its arrays as one address.
 
     For each array that is passed in a call, numba checks its type and counts a reference. For four
-    arrays, this takes half as long as a car's step.
+    arrays, this takes nearly as long as computing a car's step.
 
     Args:
         function: Compiled function. Its first argument is the bound arrays, for `array_at`.
