@@ -324,8 +324,8 @@ def _fill(
         end = math.ceil(min(float(width), right_u[row] - 0.5))
         at_v = plane.y / focal_px * (row + 0.5 - middle_v) + plane.z
         at_zero = at_v / plane.offset + step * (0.5 - middle_u)
-        # The compiler vectorizes the loop, because `max` is no branch, an unsigned index is not
-        # compared with 0, and columns need no conversion to floats.
+        # The compiler can vectorize this loop: `max` needs no branch, an unsigned index needs no
+        # comparison with 0, and `columns` needs no conversion to floats.
         line = np.uint64(row)
         for k in range(end - start):
             column = np.uint64(start + k)

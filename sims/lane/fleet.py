@@ -35,13 +35,12 @@ from mcaprl.sims.lane.rules import (
 from mcaprl.sims.lane.start import SHARES, car_from, start_cars, start_only_car
 from mcaprl.sims.vehicle.arguments import check_name
 from mcaprl.sims.vehicle.draws import Draws
-from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
+from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
 
 OBSERVATIONS = ("state", "depth", "depth-commands", "dashboard", "rays")
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
-SPEED, OFFSET = Car._fields.index("speed_m_s"), Car._fields.index("offset_m")
-HEADING_ERROR = Car._fields.index("heading_error_rad")
-"""Indices in a car's row of the values that `info` contains."""
+INFO = tuple(map(Car._fields.index, ("offset_m", "heading_error_rad", "speed_m_s")))
+"""Indices in a car's row of the first three values of `info`; the fourth is the progress."""
 MOTION = slice(2, 4)
 """Indices of speed and steering in the observed state."""
 STEERING_SEEN = 3
@@ -185,19 +184,15 @@ class LaneFleet(Fleet):
         """Start an episode of the only car of the fleet."""
         if options:
             return super().start_one(random, options)
+        # Numbers drawn ahead would ignore a generator whose state is restored between episodes.
         random.random(out=self._shares)
-        offset_m, heading_error_rad, speed_m_s = self._start_only()
+        values = (*self._start_only(), 0.0)
         if self._depth_m:
             self._depth_m.clear()
         if self._has_commands:
             self._commands[0] = 0.0
-        info = {
-            "lateral_offset_m": offset_m,
-            "heading_error_rad": heading_error_rad,
-            "speed_m_s": speed_m_s,
-            "progress_m": 0.0,
-        }
-        return (self.observation(0) if self._has_images else self._seen_only()), info
+        seen = self.observation(0) if self._has_images else self._seen_only()
+        return seen, dict(zip(CAR_INFO, values, strict=True))
 
     def _kernel(self) -> tuple[Any, ...]:
         arrays = (self._cars, self.actions, self.rewards, self.ends, self._states)
@@ -210,15 +205,15 @@ class LaneFleet(Fleet):
         examples = (np.zeros(0, dtype=np.int64),)
         return ready(start_cars, draws.numbers, draws.used, *kind, *outputs, examples=examples)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for copying or pickling, without the bound functions."""
+        return super().__getstate__() | {"_only": None}
+
     # Only a fleet of one car uses the next functions.
 
     def _bind_only(self) -> OnlyCar:
         arrays = (self._cars[0], self.rewards, self.ends, self._states[0])
         return ready_at(step_only_car, arrays, examples=(0,)), self._seen_only
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for copying or pickling, without the bound functions."""
-        return super().__getstate__() | {"_only": None}
 
     @cached_property
     def _start_only(self) -> Callable[[], tuple[float, float, float]]:
@@ -288,13 +283,10 @@ class LaneFleet(Fleet):
 
     def infos(self) -> dict[str, NDArray[Any]]:
         """Return the `info` of all cars."""
-        values = self._cars.T
-        return {
-            "lateral_offset_m": values[OFFSET].copy(),
-            "heading_error_rad": values[HEADING_ERROR].copy(),
-            "speed_m_s": values[SPEED].copy(),
-            "progress_m": values[ALONG] - values[STARTED_AT],
-        }
+        offset_m, heading_error_rad, speed_m_s = (self._cars[:, k].copy() for k in INFO)
+        progress_m = self._cars[:, ALONG] - self._cars[:, STARTED_AT]
+        values = (offset_m, heading_error_rad, speed_m_s, progress_m)
+        return dict(zip(CAR_INFO, values, strict=True))
 
 
 def _space(observation: str) -> spaces.Space[Any]:

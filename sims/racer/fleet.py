@@ -109,6 +109,7 @@ class RacerFleet(Fleet):
         """Start an episode of the only car of the fleet."""
         if options:
             return super().start_one(random, options)
+        # As in the lane sim, no numbers are drawn ahead for a single car.
         random.random(out=self._shares)
         self._start_one(0)
         self.rewards[0], self.ends[0], self.last_actions[0] = 0.0, GOING_ON, 0

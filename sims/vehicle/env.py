@@ -14,7 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.sims.vehicle.arguments import check_action, check_name
-from mcaprl.sims.vehicle.fleet import Fleet
+from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
 
 RenderMode = Literal["human", "rgb_array"]
 RENDER_MODES = ("human", "rgb_array")
@@ -139,8 +139,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         if self._is_watched:
             self._last_step = (self._now, number)
             self._watch()
-        # `GOING_ON` is 0.
-        if not end:
+        if end == GOING_ON:
             return observation, reward, False, False, info
         info["reason"] = self.fleet.reasons[end]
         truncated = self.fleet.truncates[end]
