@@ -363,6 +363,9 @@ def parse_json(text: str | bytes) -> Any:
         found = json.loads(text)
     except RecursionError as error:
         raise ValueError(too_deep) from error
+    # Each level takes two brackets, so most texts are too short to be nested too deeply.
+    if len(text) <= 2 * _MAX_JSON_DEPTH:
+        return found
     level = [found] if isinstance(found, dict | list) else []
     for _ in range(_MAX_JSON_DEPTH):
         inner = [part.values() if isinstance(part, dict) else part for part in level]

@@ -379,6 +379,4 @@ def _bounds(plain: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray
         if min(flat) < limits.min or max(flat) > limits.max:
             raise ValueError(f"bounds outside of {dtype}")
     values = np.array([float(v) if isinstance(v, str) else v for v in flat], dtype)
-    return np.broadcast_to(values if len(flat) > 1 else values[0], (math.prod(shape),)).reshape(
-        shape
-    )
+    return values.reshape(shape) if len(flat) > 1 else np.broadcast_to(values[0], shape)
