@@ -32,7 +32,7 @@ from mcaprl.sims.lane.rules import (
     observe,
     store_car,
 )
-from mcaprl.sims.lane.start import SHARES, car_from, start_cars, start_only_car
+from mcaprl.sims.lane.start import car_from, start_cars, start_only_car
 from mcaprl.sims.vehicle.arguments import check_name
 from mcaprl.sims.vehicle.draws import Draws
 from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
@@ -48,11 +48,8 @@ STEERING_SEEN = 3
 COMMANDS = 32
 """Number of decisions whose commands are observed with `depth-commands`: 8 s by default."""
 
-OnlyCar = tuple[
-    Callable[[int], tuple[float, int, float, float, float, float]],
-    Callable[[], NDArray[np.float32]],
-]
-"""Compiled functions of a fleet of one car: its step, and its observation as a new array."""
+Step = Callable[[int], tuple[Any, float, int, dict[str, Any]]]
+"""Step of a fleet of one car; see `Fleet.step_one`."""
 
 
 class LaneFleet(Fleet):
@@ -87,9 +84,7 @@ class LaneFleet(Fleet):
             CLASSIC_DECISION_S if self._classic else DECISION_S,
         )
         self._cars = np.zeros((count, STARTED_AT + 1))
-        self._draws = Draws(count, SHARES)
-        # `start_one` writes the random numbers for a start into this array.
-        self._shares = np.zeros(SHARES)
+        self._draws = Draws(count)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
         # Acceleration and steering of the last decisions, newest first; 0 before the start.
@@ -100,7 +95,6 @@ class LaneFleet(Fleet):
         self._seen = self._rays if self.has_rays else self._states
         self._has_fast_step = observation in ("state", "rays") and not self._classic
         self._encode = encode_nearness if self._classic else encode_depth
-        self._only: OnlyCar | None = None
         self._camera: CarCamera | None = None
         self._depth_m: dict[int, NDArray[np.float32]] = {}
 
@@ -135,7 +129,6 @@ class LaneFleet(Fleet):
 
     def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
         """Start episodes of the chosen cars."""
-        self._draws.draw_ahead(chosen)
         self._start_chosen(chosen)
         if self.has_rays:
             seen = np.empty((len(chosen), self._rays.shape[1]), dtype=np.float32)
@@ -159,24 +152,30 @@ class LaneFleet(Fleet):
         if self._depth_m:
             self._depth_m.clear()
 
-    def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
-        """Advance the only car of the fleet."""
-        if self._only is None:
-            if not self._has_fast_step:
-                return super().step_one(action)
-            self._only = self._bind_only()
-        drive, seen = self._only
-        reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = drive(action)
-        if self._depth_m:
-            self._depth_m.clear()
-        # A dict display is faster than `dict(zip(CAR_INFO, ...))`.
-        info = {
-            "lateral_offset_m": offset_m,
-            "heading_error_rad": heading_error_rad,
-            "speed_m_s": speed_m_s,
-            "progress_m": progress_m,
-        }
-        return seen(), reward, end, info
+    @cached_property
+    def step_one(self) -> Step:
+        """Function that advances the only car of the fleet, compiled on first use."""
+        if not self._has_fast_step:
+            return super().step_one
+        # A function with local variables is faster than a method with attributes.
+        arrays = (self._cars[0], self.rewards, self.ends, self._states[0])
+        drive, seen = ready_at(step_only_car, arrays, examples=(0,)), self._seen_only
+        depth_m = self._depth_m
+
+        def step(action: int) -> tuple[Any, float, int, dict[str, Any]]:
+            reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = drive(action)
+            if depth_m:
+                depth_m.clear()
+            # A dict display is faster than `dict(zip(CAR_INFO, ...))`.
+            info = {
+                "lateral_offset_m": offset_m,
+                "heading_error_rad": heading_error_rad,
+                "speed_m_s": speed_m_s,
+                "progress_m": progress_m,
+            }
+            return seen(), reward, end, info
+
+        return step
 
     def start_one(
         self, random: np.random.Generator, options: dict[str, Any] | None
@@ -184,15 +183,20 @@ class LaneFleet(Fleet):
         """Start an episode of the only car of the fleet."""
         if options:
             return super().start_one(random, options)
-        # Numbers drawn ahead would ignore a generator whose state is restored between episodes.
-        random.random(out=self._shares)
-        values = (*self._start_only(), 0.0)
+        self._draws.use_generator(0, random)
+        offset_m, heading_error_rad, speed_m_s = self._start_only()
         if self._depth_m:
             self._depth_m.clear()
         if self._has_commands:
             self._commands[0] = 0.0
         seen = self.observation(0) if self._has_images else self._seen_only()
-        return seen, dict(zip(CAR_INFO, values, strict=True))
+        info = {
+            "lateral_offset_m": offset_m,
+            "heading_error_rad": heading_error_rad,
+            "speed_m_s": speed_m_s,
+            "progress_m": 0.0,
+        }
+        return seen, info
 
     def _kernel(self) -> tuple[Any, ...]:
         arrays = (self._cars, self.actions, self.rewards, self.ends, self._states)
@@ -200,24 +204,16 @@ class LaneFleet(Fleet):
 
     @cached_property
     def _start_chosen(self) -> Callable[[NDArray[np.int64]], None]:
-        draws, kind = self._draws, (self._on_line, self._classic)
+        kind = (self._on_line, self._classic)
         outputs = (self._cars, self.rewards, self.ends, self._states)
         examples = (np.zeros(0, dtype=np.int64),)
-        return ready(start_cars, draws.numbers, draws.used, *kind, *outputs, examples=examples)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for copying or pickling, without the bound functions."""
-        return super().__getstate__() | {"_only": None}
+        return ready(start_cars, self._draws.addresses, *kind, *outputs, examples=examples)
 
     # Only a fleet of one car uses the next functions.
 
-    def _bind_only(self) -> OnlyCar:
-        arrays = (self._cars[0], self.rewards, self.ends, self._states[0])
-        return ready_at(step_only_car, arrays, examples=(0,)), self._seen_only
-
     @cached_property
     def _start_only(self) -> Callable[[], tuple[float, float, float]]:
-        arrays = (self._shares, self._cars[0], self.rewards, self.ends, self._states[0])
+        arrays = (self._draws.addresses, self._cars[0], self.rewards, self.ends, self._states[0])
         return ready_at(start_only_car, arrays, self._on_line, self._classic)
 
     @cached_property

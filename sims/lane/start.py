@@ -25,7 +25,7 @@ from mcaprl.sims.lane.rules import (
     store_car,
 )
 from mcaprl.sims.vehicle.arguments import pose_from
-from mcaprl.sims.vehicle.draws import spread, take
+from mcaprl.sims.vehicle.draws import draw, spread
 
 SHARES = 4
 """Number of random numbers for a start; a start on the line uses the first two."""
@@ -95,15 +95,17 @@ def start_only_car(arrays: Arrays, on_line: bool, classic: bool) -> tuple[float,
     """Start a single car like `start_cars`; also return the values for its `info`.
 
     Args:
-        arrays: Random numbers (4,) from 0 to 1, and the outputs: row (10,) of the car, reward (1,),
-            end (1,) and observation (12,).
+        arrays: Attribute `addresses` of a `Draws`, and the outputs: row (10,) of the car, reward
+            (1,), end (1,) and observation (12,).
         on_line: Whether to start on the start line instead of anywhere.
         classic: Whether a car on the start line first drives straight ahead for a second.
 
     Returns:
         Offset, heading error and speed.
     """
-    car = start_at_random(array_at(arrays, 0, (SHARES,), np.float64), on_line, classic)
+    shares = np.empty(SHARES)
+    draw(array_at(arrays, 0, (1,), np.intp)[0], shares)
+    car = start_at_random(shares, on_line, classic)
     row = array_at(arrays, 1, (STARTED_AT + 1,), np.float64)
     store_car(car, row)
     row[STARTED_AT] = car.along_m
@@ -115,8 +117,7 @@ def start_only_car(arrays: Arrays, on_line: bool, classic: bool) -> tuple[float,
 
 @compiled
 def start_cars(
-    numbers: NDArray[np.float64],
-    used: NDArray[np.int64],
+    addresses: NDArray[np.intp],
     on_line: bool,
     classic: bool,
     cars: NDArray[np.float64],
@@ -128,8 +129,7 @@ def start_cars(
     """Start some of N cars.
 
     Args:
-        numbers: Attribute of a `Draws` with 4 numbers per start.
-        used: Attribute of the same `Draws`.
+        addresses: Attribute of a `Draws`.
         on_line: Whether to start on the start line instead of anywhere.
         classic: Whether a car on the start line first drives straight ahead for a second.
         cars: (N, 10) output: the fields of `Car`, then its distance along the path at the start.
@@ -138,8 +138,10 @@ def start_cars(
         observations: (N, 12) output.
         chosen: (K,) indices of the cars to start.
     """
+    shares = np.empty(SHARES)
     for i in chosen:
-        car = start_at_random(take(numbers, used, i), on_line, classic)
+        draw(addresses[i], shares)
+        car = start_at_random(shares, on_line, classic)
         store_car(car, cars[i])
         cars[i, STARTED_AT] = car.along_m
         observe(car, observations[i])

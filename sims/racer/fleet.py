@@ -23,13 +23,15 @@ from mcaprl.sims.racer.rules import (
     TRUNCATES,
     observe,
 )
-from mcaprl.sims.racer.start import ANYWHERE, EXACTLY, ON_LINE, car_from, start_car, start_cars
+from mcaprl.sims.racer.start import ANYWHERE, EXACTLY, ON_LINE, car_from, start_cars
 from mcaprl.sims.vehicle.arguments import check_name
 from mcaprl.sims.vehicle.draws import Draws
 from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
 
 ACTION_SETS = {5: (0, 1, 2, 3, 4), 8: (1, 2, 3, 4, 5, 6, 7, 8), 9: tuple(range(9))}
 _INFO = (*CAR_INFO, "gates_passed")
+_ONLY = np.zeros(1, dtype=np.int64)
+"""Index of the only car of a fleet of one, as an array."""
 
 
 class RacerFleet(Fleet):
@@ -72,11 +74,8 @@ class RacerFleet(Fleet):
         self._numbers = ACTION_SETS[actions]
         self.last_actions = np.zeros(count, dtype=np.int64)
         on_line = start == "line" or (self.classic and start is None)
-        # The number of random numbers for a start selects the kind of start.
-        kind = ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE
-        self._draws = Draws(count, kind)
-        # `start_one` writes the random numbers for a start into this array.
-        self._shares = np.zeros(kind)
+        self._start = ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE
+        self._draws = Draws(count)
         self._drift = bool(drift)
         self._cars = np.zeros((count, STARTED_AT + 1))
         self._seen = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
@@ -99,7 +98,6 @@ class RacerFleet(Fleet):
 
     def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
         """Start episodes of the chosen cars."""
-        self._draws.draw_ahead(chosen)
         self._start_chosen(chosen)
         self.rewards[chosen], self.ends[chosen], self.last_actions[chosen] = 0.0, GOING_ON, 0
 
@@ -109,9 +107,8 @@ class RacerFleet(Fleet):
         """Start an episode of the only car of the fleet."""
         if options:
             return super().start_one(random, options)
-        # As in the lane sim, no numbers are drawn ahead for a single car.
-        random.random(out=self._shares)
-        self._start_one(0)
+        self._draws.use_generator(0, random)
+        self._start_chosen(_ONLY)
         self.rewards[0], self.ends[0], self.last_actions[0] = 0.0, GOING_ON, 0
         return self._observe_only(), self.info(0)
 
@@ -145,15 +142,8 @@ class RacerFleet(Fleet):
 
     @cached_property
     def _start_chosen(self) -> Callable[[NDArray[np.int64]], None]:
-        draws, outputs = self._draws, (self._cars, self._seen)
-        examples = (np.zeros(0, dtype=np.int64),)
-        fixed = (self.track, self.classic, draws.numbers, draws.used, *outputs)
-        return ready(start_cars, *fixed, examples=examples)
-
-    @cached_property
-    def _start_one(self) -> Callable[[int], None]:
-        arrays = (self._shares, self._cars, self._seen)
-        return ready(start_car, self.track, self.classic, *arrays, examples=(0,))
+        arrays = (self._draws.addresses, self._cars, self._seen)
+        return ready(start_cars, self.track, self.classic, self._start, *arrays, examples=(_ONLY,))
 
     # Only a fleet of one car uses `_drive_only`.
 

@@ -15,7 +15,7 @@ from mcaprl.sims.racer.car import STARTED_AT, Car, placed, store_car
 from mcaprl.sims.racer.course import HALF_WIDTH_PX, IMAGE_HEIGHT_PX, METERS_PER_PX, Track
 from mcaprl.sims.racer.rules import MAX_SPEED_M_S, STEP_S, observe, walls_hit
 from mcaprl.sims.vehicle.arguments import pose_from
-from mcaprl.sims.vehicle.draws import spread, take
+from mcaprl.sims.vehicle.draws import draw, spread
 
 ANYWHERE, ON_LINE, EXACTLY = 4, 2, 0
 """Number of random numbers for each kind of start."""
@@ -46,54 +46,39 @@ def start_anywhere(track: Track, shares: NDArray[np.float64]) -> Car:
 
 
 @compiled
-def start_car(
-    track: Track,
-    classic: bool,
-    shares: NDArray[np.float64],
-    cars: NDArray[np.float64],
-    observations: NDArray[np.float32],
-    i: int,
-) -> None:
-    """Start car i of N; write its state and observation.
-
-    Args:
-        track: Track of the cars.
-        classic: Whether the classic rules apply.
-        shares: Random numbers from 0 to 1: four for a start anywhere, two for a start near the
-            start line, none for a start exactly on the start line.
-        cars: (N, 13) output. A row contains the fields of a `Car`, then the distance along the path
-            at which the car starts.
-        observations: (N, 19) output.
-        i: Index of the car.
-    """
-    if len(shares) == ANYWHERE:
-        car = start_anywhere(track, shares)
-    elif len(shares) == ON_LINE:
-        car = start_on_line(track, shares)
-    else:
-        car = placed(track, *track.start_px, 0.0, 0.0, SEARCH_M)
-    store_car(car, cars[i])
-    cars[i, STARTED_AT] = car.along_m
-    observe(track, car, classic, observations[i])
-
-
-@compiled
 def start_cars(
     track: Track,
     classic: bool,
-    numbers: NDArray[np.float64],
-    used: NDArray[np.int64],
+    kind: int,
+    addresses: NDArray[np.intp],
     cars: NDArray[np.float64],
     observations: NDArray[np.float32],
     chosen: NDArray[np.int64],
 ) -> None:
-    """Start the cars with the indices `chosen` (K,) like `start_car`.
+    """Start some of N cars; write their states and observations.
 
-    `numbers` and `used` are attributes of a `Draws` with as many numbers for each start as the kind
-    of start uses.
+    Args:
+        track: Track of the cars.
+        classic: Whether the classic rules apply.
+        kind: ANYWHERE, ON_LINE or EXACTLY.
+        addresses: Attribute of a `Draws`.
+        cars: (N, 13) output. A row contains the fields of a `Car`, then the distance along the path
+            at which the car starts.
+        observations: (N, 19) output.
+        chosen: (K,) indices of the cars to start.
     """
+    shares = np.empty(kind)
     for i in chosen:
-        start_car(track, classic, take(numbers, used, i), cars, observations, i)
+        draw(addresses[i], shares)
+        if kind == ANYWHERE:
+            car = start_anywhere(track, shares)
+        elif kind == ON_LINE:
+            car = start_on_line(track, shares)
+        else:
+            car = placed(track, *track.start_px, 0.0, 0.0, SEARCH_M)
+        store_car(car, cars[i])
+        cars[i, STARTED_AT] = car.along_m
+        observe(track, car, classic, observations[i])
 
 
 def car_from(track: Track, options: dict[str, Any]) -> Car:

@@ -94,7 +94,6 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         self.observation_space = fleet.observation_space
         self._noise_size = fleet.noise.shape[1]
         # Copy attributes of the fleet, so that a step needs one attribute lookup instead of two.
-        self._step_one = fleet.step_one
         self._n_actions = len(fleet.action_meanings)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
         self._is_watched = render_mode == "human"
@@ -135,7 +134,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
             number = check_action(action, self._n_actions)
         if self._noise_size:
             self.fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
-        observation, reward, end, info = self._step_one(number)
+        observation, reward, end, info = self.fleet.step_one(number)
         if self._is_watched:
             self._last_step = (self._now, number)
             self._watch()
