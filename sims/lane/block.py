@@ -130,6 +130,24 @@ def _step_blocks(
 
 
 @compiled
+def observe_cars(
+    cars: NDArray[np.float64], observations: NDArray[np.float32], chosen: NDArray[np.int64]
+) -> None:
+    """Write the observations (N, 12) of the cars with the indices `chosen` (K,)."""
+    block = np.zeros(_BLOCK_NUMBERS * LANES)
+    for first in range(0, len(chosen), LANES):
+        # The last block may contain cars of the block before it, whose observations are not used.
+        count = min(LANES, len(chosen) - first)
+        for lane in range(count):
+            for k in range(9):
+                block[k * LANES + lane] = cars[chosen[first + lane], k]
+        _observe_block(block)
+        for lane in range(count):
+            for k in range(12):
+                observations[chosen[first + lane], k] = block[(_SEEN + k) * LANES + lane]
+
+
+@compiled
 def _step_block(block: NDArray[np.float64]) -> None:
     """Advance the cars in a block by one decision; compute rewards, ends and observations."""
     for lane in range(LANES):
@@ -162,6 +180,12 @@ def _step_block(block: NDArray[np.float64]) -> None:
         block[8 * LANES + lane] = car.slow_s
         block[_REWARD * LANES + lane] = reward_of(was, car)
         block[_END * LANES + lane] = float(end_of(car))
+    _observe_block(block)
+
+
+@compiled
+def _observe_block(block: NDArray[np.float64]) -> None:
+    """Compute the observations of the cars in a block."""
     for lane in range(LANES):
         seen = seen_from(_car_in(block, lane))
         block[14 * LANES + lane], block[15 * LANES + lane] = seen[0], seen[1]

@@ -11,6 +11,7 @@ from mcaprl.compiled import Arrays, array_at, compiled
 from mcaprl.errors import UsageError
 from mcaprl.sims.geometry.bicycle import moving
 from mcaprl.sims.geometry.paths import leg_at, project
+from mcaprl.sims.lane.block import observe_cars
 from mcaprl.sims.lane.classic import CLASSIC_SUBSTEPS, STRAIGHT
 from mcaprl.sims.lane.course import COURSE, LANE_HALF_WIDTH_M
 from mcaprl.sims.lane.rules import (
@@ -144,8 +145,8 @@ def start_cars(
         car = start_at_random(shares, on_line, classic)
         store_car(car, cars[i])
         cars[i, STARTED_AT] = car.along_m
-        observe(car, observations[i])
         rewards[i], ends[i] = 0.0, DRIVING
+    observe_cars(cars, observations, chosen)
 
 
 def car_from(options: dict[str, Any]) -> Car:

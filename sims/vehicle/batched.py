@@ -82,7 +82,9 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._all = np.ones(num_envs, dtype=np.bool_)
         self._nothing = np.full(num_envs, None, dtype=object)
         self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
-        self._steps = np.zeros(num_envs, dtype=np.int64)
+        # Number of steps so far, and its value when each vehicle's episode started.
+        self._steps = 0
+        self._started = np.zeros(num_envs, dtype=np.int64)
         self._randoms = [seeding.np_random()[0] for _ in range(num_envs)]
         self._ended = np.ones(num_envs, dtype=np.bool_)
         self._is_started = False
@@ -111,7 +113,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
             if seeds[i] is not None:
                 self._randoms[i] = seeding.np_random(seeds[i])[0]
             self.fleet.begin(i, self._randoms[i], starts[i])
-        self._steps[chosen], self._ended[chosen] = 0, False
+        self._started[chosen], self._ended[chosen] = self._steps, False
         self._is_started = True
         return self.fleet.observations(), self._infos_of(chosen, np.zeros_like(chosen))
 
@@ -143,7 +145,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         # In mode `NextStep`, this step resets the environments whose episodes ended before it.
         self._begin_all(self._ended.nonzero()[0])
         has_reason = fleet.ends != GOING_ON
-        terminated, truncated = has_reason, self._steps >= self._max_steps
+        terminated, truncated = has_reason, self._started <= self._steps - self._max_steps
         if self._some_truncate:
             cut = self._truncates[fleet.ends]
             terminated, truncated = has_reason & ~cut, cut | truncated
@@ -159,7 +161,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def _begin_all(self, chosen: NDArray[np.int64]) -> None:
         if len(chosen):
             self.fleet.begin_all(chosen, self._randoms)
-            self._steps[chosen], self._ended[chosen] = 0, False
+            self._started[chosen], self._ended[chosen] = self._steps, False
 
     def _infos(self, has_reason: Bools) -> dict[str, Any]:
         """Return the infos of a step. In mode `SameStep`, first reset the episodes that ended."""
