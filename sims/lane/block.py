@@ -148,6 +148,20 @@ def observe_cars(
 
 
 @compiled
+def car_info(cars: NDArray[np.float64], info: NDArray[np.float64]) -> None:
+    """Compute the contents of the `info` of N cars.
+
+    Args:
+        cars: (N, 10) rows: a `Car`, then its distance along the path at the episode's start.
+        info: (4, N) output: offsets, heading errors, speeds and progress.
+    """
+    for i in range(len(cars)):
+        car = car_at(cars[i])
+        info[0, i], info[1, i], info[2, i] = car.offset_m, car.heading_error_rad, car.speed_m_s
+        info[3, i] = car.along_m - cars[i, STARTED_AT]
+
+
+@compiled
 def _step_block(block: NDArray[np.float64]) -> None:
     """Advance the cars in a block by one decision; compute rewards, ends and observations."""
     for lane in range(LANES):

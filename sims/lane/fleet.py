@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mcaprl.compiled import ready, ready_at
 from mcaprl.sims.drawing.depth import encode_depth, encode_nearness
-from mcaprl.sims.lane.block import step_cars, step_only_car
+from mcaprl.sims.lane.block import car_info, step_cars, step_only_car
 from mcaprl.sims.lane.camera import IMAGE_SHAPE, CarCamera
 from mcaprl.sims.lane.classic import CLASSIC_DECISION_S, CLASSIC_SUBSTEPS, step_classic
 from mcaprl.sims.lane.course import COURSE, NEXT_TURN
@@ -39,8 +39,6 @@ from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
 
 OBSERVATIONS = ("state", "depth", "depth-commands", "dashboard", "rays")
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
-INFO = tuple(map(Car._fields.index, ("offset_m", "heading_error_rad", "speed_m_s")))
-"""Indices in a car's row of the first three values of `info`; the fourth is the progress."""
 MOTION = slice(2, 4)
 """Indices of speed and steering in the observed state."""
 STEERING_SEEN = 3
@@ -279,9 +277,8 @@ class LaneFleet(Fleet):
 
     def infos(self) -> dict[str, NDArray[Any]]:
         """Return the `info` of all cars."""
-        offset_m, heading_error_rad, speed_m_s = (self._cars[:, k].copy() for k in INFO)
-        progress_m = self._cars[:, ALONG] - self._cars[:, STARTED_AT]
-        values = (offset_m, heading_error_rad, speed_m_s, progress_m)
+        values = np.empty((len(CAR_INFO), self.count))
+        car_info(self._cars, values)
         return dict(zip(CAR_INFO, values, strict=True))
 
 
