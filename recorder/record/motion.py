@@ -13,8 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.recorder.format import messages
-from mcaprl.recorder.record.scene import Frame, stamped_transform
+from mcaprl.recorder.record.scene import Frame, timed_transforms
 
 Moment = tuple[int, Sequence[Frame]]
 """log_time in nanoseconds, and the moving coordinate frames at that time."""
@@ -40,8 +39,7 @@ def motion_transforms(moments: Sequence[Moment], *, thins: bool = True) -> bytes
         for k in knots(times, _scaled(frames)) if thins and len(moments) > 1 else every:
             kept.append((moments[k][0], number, frames[k]))
     kept.sort(key=lambda each: each[:2])
-    stamped = [stamped_transform(frame, time_ns) for time_ns, _, frame in kept]
-    return messages.encode(messages.new("tf2_msgs/msg/TFMessage", transforms=stamped))
+    return timed_transforms([(time_ns, frame) for time_ns, _, frame in kept])
 
 
 def knots(times: NDArray[np.float64], values: NDArray[np.float64]) -> list[int]:

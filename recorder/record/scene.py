@@ -8,9 +8,10 @@ simulator does not need to import this module. Axes follow REP 103: right-handed
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,18 @@ MARKER_TYPES = {
     "triangles": 11,
 }
 _ADD, _DELETE_ALL = 0, 3
+_NO_POINTS = np.empty((0, 3))
+# Fields of a marker: id, type and action; pose and scale; color, lifetime and frame_locked.
+_KIND, _POSE_AND_SCALE, _COLOR_TO_FLAG = (
+    struct.Struct(f"<{code}") for code in ("3i", "10d", "4fiI?")
+)
+_TRANSFORM = struct.Struct("<7d")
+_FLOAT32_BYTES, _FLOAT64_BYTES = 4, 8
+# Fields that are empty in all markers. An empty string consists of its length, 1, and a NUL. First
+# from `colors` to `uv_coordinates`, then from `mesh_resource` to `mesh_use_embedded_materials`.
+_EMPTY, _NONE = b"\1\0\0\0\0\0\0\0", bytes(4)
+_COLORS_TO_TEXTURE = _NONE + _EMPTY + bytes(8) + _EMPTY + _EMPTY + _NONE + _NONE
+_MESH = _EMPTY + _EMPTY + _NONE + b"\0"
 # Values are rounded to binary fractions. This halves their size in a log without visible changes.
 _POINTS_PER_M = 2**6
 _POSITIONS_PER_M = 2**8
@@ -164,28 +177,31 @@ def marker_array(shapes: Iterable[Shape]) -> bytes:
     seeks to this message. Stamps are 0, so that equal shapes encode to equal messages. A stamp of 0
     refers to the latest transform of the frame.
     """
-    markers = [_marker(action=_DELETE_ALL), *map(_shape_marker, shapes)]
-    return messages.encode(messages.new("visualization_msgs/msg/MarkerArray", markers=markers))
+    shapes = list(shapes)
+    message = messages.CdrWriter()
+    message.add_count(1 + len(shapes))
+    message.add(_deletion(), _FLOAT32_BYTES)
+    for shape in shapes:
+        _add_shape(message, shape)
+    return message.to_bytes()
 
 
 def transforms(frames: Iterable[Frame], time_ns: int) -> bytes:
     """Encode coordinate frames as one `tf2_msgs/msg/TFMessage`."""
-    stamped = [stamped_transform(frame, time_ns) for frame in frames]
-    return messages.encode(messages.new("tf2_msgs/msg/TFMessage", transforms=stamped))
+    return timed_transforms([(time_ns, frame) for frame in frames])
 
 
-def stamped_transform(frame: Frame, time_ns: int) -> Any:
-    """Return a coordinate frame as `geometry_msgs/msg/TransformStamped`."""
-    return messages.new(
-        "geometry_msgs/msg/TransformStamped",
-        header=messages.header(time_ns, frame.parent),
-        child_frame_id=frame.name,
-        transform=messages.new(
-            "geometry_msgs/msg/Transform",
-            translation=_vector(_rounded(frame.position, _POSITIONS_PER_M)),
-            rotation=_quaternion(_rounded(frame.rotation, _ROTATIONS_PER_ONE)),
-        ),
-    )
+def timed_transforms(frames: Sequence[tuple[int, Frame]]) -> bytes:
+    """Encode coordinate frames, each with its time in nanoseconds, like `transforms`."""
+    message = messages.CdrWriter()
+    message.add_count(len(frames))
+    for time_ns, frame in frames:
+        message.add_header(time_ns, frame.parent)
+        message.add_text(frame.name)
+        translation = _rounded(frame.position, _POSITIONS_PER_M)
+        rotation = _rounded(frame.rotation, _ROTATIONS_PER_ONE)
+        message.add(_TRANSFORM.pack(*translation, *rotation), _FLOAT64_BYTES)
+    return message.to_bytes()
 
 
 def camera_info(focal_px: tuple[float, float], shape: tuple[int, ...]) -> bytes:
@@ -230,9 +246,20 @@ def depth_millimeters(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     return np.where(millimeters <= np.iinfo(np.uint16).max, millimeters, 0).astype("<u2")
 
 
-def _shape_marker(shape: Shape) -> Any:
+@lru_cache(maxsize=1)
+def _deletion() -> bytes:
+    """Return a marker that deletes all markers, as the first one of an array."""
+    array, start = messages.CdrWriter(), messages.CdrWriter()
+    for message in (array, start):
+        message.add_count(1)
+    _add_marker(array, action=_DELETE_ALL)
+    return array.to_bytes().removeprefix(start.to_bytes())
+
+
+def _add_shape(message: messages.CdrWriter, shape: Shape) -> None:
     half = shape.yaw_rad / 2
-    return _marker(
+    _add_marker(
+        message,
         frame=shape.frame,
         name=shape.name,
         kind=MARKER_TYPES[shape.kind],
@@ -245,7 +272,8 @@ def _shape_marker(shape: Shape) -> Any:
     )
 
 
-def _marker(
+def _add_marker(
+    message: messages.CdrWriter,
     *,
     action: int = _ADD,
     frame: str = "map",
@@ -255,77 +283,25 @@ def _marker(
     rotation: Quad = (0.0, 0.0, 0.0, 1.0),
     size: Vector = (0.0, 0.0, 0.0),
     color: Quad = (0.0, 0.0, 0.0, 0.0),
-    points: NDArray[np.float64] | Sequence[Vector] = (),
+    points: NDArray[np.float64] = _NO_POINTS,
     text: str = "",
-) -> Any:
-    red, green, blue, opacity = color
-    new, point = messages.new, messages.typestore().types["geometry_msgs/msg/Point"]
-    return new(
-        "visualization_msgs/msg/Marker",
-        header=_unstamped(frame),
-        ns=name,
-        id=0,
-        type=kind,
-        action=action,
-        pose=new(
-            "geometry_msgs/msg/Pose",
-            position=_point(position),
-            orientation=_quaternion(rotation),
-        ),
-        scale=_vector(size),
-        color=new("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=opacity),
-        # With this flag, a marker moves with its frame, so static bodies are sent only once.
-        frame_locked=True,
-        points=[point(x=x, y=y, z=z) for x, y, z in _rounded_points(points)],
-        text=text,
-        **_unused_fields(),
-    )
-
-
-@lru_cache
-def _unstamped(frame: str) -> Any:
-    return messages.header(0, frame)
-
-
-@lru_cache(maxsize=1)
-def _unused_fields() -> dict[str, Any]:
-    """Return the marker fields that have the same value in all markers.
-
-    A lifetime of 0 means that a marker never expires.
-    """
-    new, nothing = messages.new, np.empty(0, np.uint8)
-    image = "sensor_msgs/msg/CompressedImage"
-    return {
-        "lifetime": new("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
-        "colors": [],
-        "texture_resource": "",
-        "texture": new(image, header=messages.header(0, ""), format="", data=nothing),
-        "uv_coordinates": [],
-        "mesh_resource": "",
-        "mesh_file": new("visualization_msgs/msg/MeshFile", filename="", data=nothing),
-        "mesh_use_embedded_materials": False,
-    }
-
-
-def _rounded_points(points: NDArray[np.float64] | Sequence[Vector]) -> Any:
-    return (np.rint(np.multiply(points, _POINTS_PER_M)) / _POINTS_PER_M).tolist()
+) -> None:
+    """Add a `visualization_msgs/msg/Marker`."""
+    message.add_header(0, frame)
+    message.add_text(name)
+    message.add(_KIND.pack(0, kind, action), _FLOAT32_BYTES)
+    message.add(_POSE_AND_SCALE.pack(*position, *rotation, *size), _FLOAT64_BYTES)
+    # A lifetime of 0 means that a marker never expires. With the flag, a marker moves with its
+    # frame, so static bodies are sent only once.
+    message.add(_COLOR_TO_FLAG.pack(*color, 0, 0, True), _FLOAT32_BYTES)
+    if len(points):
+        points = np.rint(np.multiply(points, _POINTS_PER_M)) / _POINTS_PER_M
+    message.add_points(points)
+    message.add(_COLORS_TO_TEXTURE, _FLOAT32_BYTES)
+    message.add_text(text)
+    message.add(_MESH, _FLOAT32_BYTES)
 
 
 def _rounded(numbers: Iterable[float], per_one: int) -> list[float]:
     """Round numbers to multiples of 1 / `per_one`."""
     return [round(number * per_one) / per_one for number in numbers]
-
-
-def _point(xyz: Iterable[float]) -> Any:
-    x, y, z = map(float, xyz)
-    return messages.new("geometry_msgs/msg/Point", x=x, y=y, z=z)
-
-
-def _vector(xyz: Iterable[float]) -> Any:
-    x, y, z = map(float, xyz)
-    return messages.new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-
-
-def _quaternion(xyzw: Iterable[float]) -> Any:
-    x, y, z, w = xyzw
-    return messages.new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)

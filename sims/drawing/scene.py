@@ -98,7 +98,9 @@ def path(points: Sequence[tuple[float, ...]]) -> NDArray[np.float64]:
 def raised(points_m: NDArray[np.float64], z_m: float) -> NDArray[np.float64]:
     """Add a height to points (..., 2); return (N, 3) points."""
     flat = points_m.reshape(-1, 2)
-    return np.column_stack([flat, np.full(len(flat), z_m)])
+    points = np.empty((len(flat), 3))
+    points[:, :2], points[:, 2] = flat, z_m
+    return points
 
 
 def coarse(points_m: NDArray[np.float64]) -> NDArray[np.float64]:
