@@ -34,8 +34,8 @@ from mcaprl.sims.lane.rules import (
 )
 from mcaprl.sims.lane.start import car_from, start_cars, start_only_car
 from mcaprl.sims.vehicle.arguments import check_name
-from mcaprl.sims.vehicle.draws import Draws
 from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
+from mcaprl.sims.vehicle.randoms import Generators
 
 OBSERVATIONS = ("state", "depth", "depth-commands", "dashboard", "rays")
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
@@ -82,7 +82,7 @@ class LaneFleet(Fleet):
             CLASSIC_DECISION_S if self._classic else DECISION_S,
         )
         self._cars = np.zeros((count, STARTED_AT + 1))
-        self._draws = Draws(count)
+        self._randoms = Generators(count)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
         # Acceleration and steering of the last decisions, newest first; 0 before the start.
@@ -111,7 +111,7 @@ class LaneFleet(Fleet):
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
         """Start car i; see "Starting State" of `LaneKeepingEnv`."""
-        self._draws.use_generator(i, random)
+        self._randoms.use(i, random)
         if not options:
             self.begin_all(np.array([i]), ())
             return
@@ -181,7 +181,7 @@ class LaneFleet(Fleet):
         """Start an episode of the only car of the fleet."""
         if options:
             return super().start_one(random, options)
-        self._draws.use_generator(0, random)
+        self._randoms.use(0, random)
         offset_m, heading_error_rad, speed_m_s = self._start_only()
         if self._depth_m:
             self._depth_m.clear()
@@ -205,13 +205,13 @@ class LaneFleet(Fleet):
         kind = (self._on_line, self._classic)
         outputs = (self._cars, self.rewards, self.ends, self._states)
         examples = (np.zeros(0, dtype=np.int64),)
-        return ready(start_cars, self._draws.addresses, *kind, *outputs, examples=examples)
+        return ready(start_cars, self._randoms.addresses, *kind, *outputs, examples=examples)
 
     # Only a fleet of one car uses the next functions.
 
     @cached_property
     def _start_only(self) -> Callable[[], tuple[float, float, float]]:
-        arrays = (self._draws.addresses, self._cars[0], self.rewards, self.ends, self._states[0])
+        arrays = (self._randoms.addresses, self._cars[0], self.rewards, self.ends, self._states[0])
         return ready_at(start_only_car, arrays, self._on_line, self._classic)
 
     @cached_property

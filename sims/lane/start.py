@@ -26,7 +26,7 @@ from mcaprl.sims.lane.rules import (
     store_car,
 )
 from mcaprl.sims.vehicle.arguments import pose_from
-from mcaprl.sims.vehicle.draws import draw, spread
+from mcaprl.sims.vehicle.randoms import draw, spread
 
 SHARES = 4
 """Number of random numbers for a start; a start on the line uses the first two."""
@@ -96,7 +96,7 @@ def start_only_car(arrays: Arrays, on_line: bool, classic: bool) -> tuple[float,
     """Start a single car like `start_cars`; also return the values for its `info`.
 
     Args:
-        arrays: Attribute `addresses` of a `Draws`, and the outputs: row (10,) of the car, reward
+        arrays: Attribute `addresses` of `Generators`, and the outputs: row (10,) of the car, reward
             (1,), end (1,) and observation (12,).
         on_line: Whether to start on the start line instead of anywhere.
         classic: Whether a car on the start line first drives straight ahead for a second.
@@ -130,7 +130,7 @@ def start_cars(
     """Start some of N cars.
 
     Args:
-        addresses: Attribute of a `Draws`.
+        addresses: Attribute of `Generators`.
         on_line: Whether to start on the start line instead of anywhere.
         classic: Whether a car on the start line first drives straight ahead for a second.
         cars: (N, 10) output: the fields of `Car`, then its distance along the path at the start.

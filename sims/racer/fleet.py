@@ -25,8 +25,8 @@ from mcaprl.sims.racer.rules import (
 )
 from mcaprl.sims.racer.start import ANYWHERE, EXACTLY, ON_LINE, car_from, start_cars
 from mcaprl.sims.vehicle.arguments import check_name
-from mcaprl.sims.vehicle.draws import Draws
 from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
+from mcaprl.sims.vehicle.randoms import Generators
 
 ACTION_SETS = {5: (0, 1, 2, 3, 4), 8: (1, 2, 3, 4, 5, 6, 7, 8), 9: tuple(range(9))}
 _INFO = (*CAR_INFO, "gates_passed")
@@ -75,7 +75,7 @@ class RacerFleet(Fleet):
         self.last_actions = np.zeros(count, dtype=np.int64)
         on_line = start == "line" or (self.classic and start is None)
         self._start = ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE
-        self._draws = Draws(count)
+        self._randoms = Generators(count)
         self._drift = bool(drift)
         self._cars = np.zeros((count, STARTED_AT + 1))
         self._seen = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
@@ -86,7 +86,7 @@ class RacerFleet(Fleet):
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
         """Start car i; see "Starting State" of `RacerEnv`."""
-        self._draws.use_generator(i, random)
+        self._randoms.use(i, random)
         if not options:
             self.begin_all(np.array([i]), ())
             return
@@ -107,7 +107,7 @@ class RacerFleet(Fleet):
         """Start an episode of the only car of the fleet."""
         if options:
             return super().start_one(random, options)
-        self._draws.use_generator(0, random)
+        self._randoms.use(0, random)
         self._start_chosen(_ONLY)
         self.rewards[0], self.ends[0], self.last_actions[0] = 0.0, GOING_ON, 0
         return self._observe_only(), self.info(0)
@@ -142,7 +142,7 @@ class RacerFleet(Fleet):
 
     @cached_property
     def _start_chosen(self) -> Callable[[NDArray[np.int64]], None]:
-        arrays = (self._draws.addresses, self._cars, self._seen)
+        arrays = (self._randoms.addresses, self._cars, self._seen)
         return ready(start_cars, self.track, self.classic, self._start, *arrays, examples=(_ONLY,))
 
     # Only a fleet of one car uses `_drive_only`.

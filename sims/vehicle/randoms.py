@@ -32,14 +32,14 @@ _capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c
 )
 
 
-class Draws:
+class Generators:
     """Generators of N vehicles, from which compiled code draws numbers.
 
     A call of a generator takes half a microsecond in Python even for a few numbers, and a tenth in
     compiled code. The numbers are the same.
 
     Attributes:
-        addresses: (N,) addresses of the generators, for `draw`; 0 before `use_generator`.
+        addresses: (N,) addresses of the generators, for `draw`; 0 before `use`.
     """
 
     def __init__(self, count: int) -> None:
@@ -47,7 +47,7 @@ class Draws:
         self._generators: list[np.random.Generator | None] = [None] * count
         self.addresses = np.zeros(count, dtype=np.intp)
 
-    def use_generator(self, i: int, generator: np.random.Generator) -> None:
+    def use(self, i: int, generator: np.random.Generator) -> None:
         """Assign a generator to vehicle i."""
         # The address is valid only as long as the generator exists.
         if self._generators[i] is not generator:
@@ -59,10 +59,10 @@ class Draws:
 
     def __setstate__(self, generators: list[np.random.Generator | None]) -> None:
         """Look up the addresses of the copied generators."""
-        Draws.__init__(self, len(generators))
+        Generators.__init__(self, len(generators))
         for i, generator in enumerate(generators):
             if generator is not None:
-                self.use_generator(i, generator)
+                self.use(i, generator)
 
 
 @compiled
@@ -70,7 +70,7 @@ def draw(address: int, shares: NDArray[np.float64]) -> None:
     """Fill an array with the next numbers of a generator, like `Generator.random`.
 
     Args:
-        address: Element of `Draws.addresses`.
+        address: Element of `Generators.addresses`.
         shares: (K,) output: numbers of at least 0 and below 1.
     """
     for k in range(len(shares)):
