@@ -113,7 +113,7 @@ class LaneFleet(Fleet):
         """Start car i; see "Starting State" of `LaneKeepingEnv`."""
         self._randoms.use(i, random)
         if not options:
-            self.begin_all(np.array([i]), ())
+            self._begin_chosen(np.array([i]))
             return
         car, row = car_from(options), self._cars[i]
         store_car(car, row)
@@ -127,6 +127,11 @@ class LaneFleet(Fleet):
 
     def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
         """Start episodes of the chosen cars."""
+        self._randoms.complete(chosen, randoms)
+        self._begin_chosen(chosen)
+
+    def _begin_chosen(self, chosen: NDArray[np.int64]) -> None:
+        """Start episodes of the chosen cars, which all have a generator."""
         self._start_chosen(chosen)
         if self.has_rays:
             seen = np.empty((len(chosen), self._rays.shape[1]), dtype=np.float32)

@@ -74,7 +74,7 @@ class RacerFleet(Fleet):
         self._numbers = ACTION_SETS[actions]
         self.last_actions = np.zeros(count, dtype=np.int64)
         on_line = start == "line" or (self.classic and start is None)
-        self._start = ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE
+        self._kind = ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE
         self._randoms = Generators(count)
         self._drift = bool(drift)
         self._cars = np.zeros((count, STARTED_AT + 1))
@@ -88,7 +88,7 @@ class RacerFleet(Fleet):
         """Start car i; see "Starting State" of `RacerEnv`."""
         self._randoms.use(i, random)
         if not options:
-            self.begin_all(np.array([i]), ())
+            self._begin_chosen(np.array([i]))
             return
         car, row = car_from(self.track, options), self._cars[i]
         store_car(car, row)
@@ -98,6 +98,11 @@ class RacerFleet(Fleet):
 
     def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
         """Start episodes of the chosen cars."""
+        self._randoms.complete(chosen, randoms)
+        self._begin_chosen(chosen)
+
+    def _begin_chosen(self, chosen: NDArray[np.int64]) -> None:
+        """Start episodes of the chosen cars, which all have a generator."""
         self._start_chosen(chosen)
         self.rewards[chosen], self.ends[chosen], self.last_actions[chosen] = 0.0, GOING_ON, 0
 
@@ -143,7 +148,7 @@ class RacerFleet(Fleet):
     @cached_property
     def _start_chosen(self) -> Callable[[NDArray[np.int64]], None]:
         arrays = (self._randoms.addresses, self._cars, self._seen)
-        return ready(start_cars, self.track, self.classic, self._start, *arrays, examples=(_ONLY,))
+        return ready(start_cars, self.track, self.classic, self._kind, *arrays, examples=(_ONLY,))
 
     # Only a fleet of one car uses `_drive_only`.
 

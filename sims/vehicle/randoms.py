@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -45,13 +46,27 @@ class Generators:
     def __init__(self, count: int) -> None:
         """Prepare to draw from `count` generators."""
         self._generators: list[np.random.Generator | None] = [None] * count
+        self._missing = count
         self.addresses = np.zeros(count, dtype=np.intp)
 
     def use(self, i: int, generator: np.random.Generator) -> None:
         """Assign a generator to vehicle i."""
         # The address is valid only as long as the generator exists.
         if self._generators[i] is not generator:
+            self._missing -= self._generators[i] is None
             self._generators[i], self.addresses[i] = generator, _address_of(generator)
+
+    def complete(
+        self, chosen: NDArray[np.int64], generators: Sequence[np.random.Generator]
+    ) -> None:
+        """Assign a generator to each of the chosen vehicles (K,) that has none.
+
+        `generators` has one generator for each of the N vehicles.
+        """
+        if self._missing:
+            for i in chosen.tolist():
+                if self._generators[i] is None:
+                    self.use(i, generators[i])
 
     def __getstate__(self) -> list[np.random.Generator | None]:
         """Return the generators for copying or pickling."""
@@ -70,7 +85,7 @@ def draw(address: int, shares: NDArray[np.float64]) -> None:
     """Fill an array with the next numbers of a generator, like `Generator.random`.
 
     Args:
-        address: Element of `Generators.addresses`.
+        address: Element of `Generators.addresses`, not 0.
         shares: (K,) output: numbers of at least 0 and below 1.
     """
     for k in range(len(shares)):

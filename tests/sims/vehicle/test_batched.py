@@ -187,6 +187,17 @@ def test_a_mask_resets_only_what_it_names_and_is_left_as_it_was() -> None:
     check_same(env.step(np.array([2, 2, 2]))[0][1], single.step(2)[0], "the one of seed 8")
 
 
+@pytest.mark.parametrize("name", ["lane", "racer", "powerline"])
+def test_vehicles_that_the_first_mask_omits_start_in_the_first_step(name: str) -> None:
+    env: Any = make_sims(name, 3)
+    env.reset(seed=4, options={"reset_mask": np.array([True, False, True])})
+    seen, *_ = env.step(np.zeros(3, dtype=np.int64))
+    assert seen[1].any(), "an observation of zeros"
+    seen, _, terminated, *_ = env.step(np.zeros(3, dtype=np.int64))
+    assert np.isfinite(seen).all()
+    assert not terminated[1]
+
+
 def test_each_drone_has_gusts_of_its_own() -> None:
     env: Any = make_sims("powerline", 4, gust_m_s=2.0, start="line")
     env.reset(seed=[5, 5, 6, 6])

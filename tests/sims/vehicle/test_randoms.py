@@ -70,6 +70,15 @@ def test_another_generator_replaces_the_first() -> None:
     assert _some(randoms, 0, 2) == np.random.default_rng(2).random(2).tolist()
 
 
+def test_only_missing_generators_are_completed() -> None:
+    randoms = Generators(3)
+    randoms.use(0, np.random.default_rng(8))
+    randoms.complete(np.array([0, 2]), [np.random.default_rng(i) for i in range(3)])
+    assert _some(randoms, 0, 2) == np.random.default_rng(8).random(2).tolist()
+    assert _some(randoms, 2, 2) == np.random.default_rng(2).random(2).tolist()
+    assert randoms.addresses[1] == 0
+
+
 @pytest.mark.parametrize(
     "copied", [copy.deepcopy, lambda randoms: pickle.loads(pickle.dumps(randoms))]
 )
