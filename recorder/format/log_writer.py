@@ -50,12 +50,14 @@ whole episodes, and episode numbers and times continue from one file to the next
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
+from mcaprl.recorder.columns.signals import HoldSignals
 from mcaprl.recorder.columns.writer import McapWriter
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, begin_line
@@ -258,15 +260,25 @@ class LogWriter(LogTopics):
         strings = metadata.to_strings()
         # Raise SpaceError before a file is created.
         plain_name, _ = step_schema(metadata.observation_space, metadata.action_space)
-        self.mcap = McapWriter(
-            path, compression=compression, overwrite=overwrite, append=append, source=source
-        )
-        if self.mcap.untouched:
-            self._check_same(strings)
-        # The schemas of older logs do not contain the action names. Such logs are continued without
-        # these names.
-        is_plain = plain_name in {schema.name for schema in self.mcap.schemas.values()}
-        super().__init__(metadata, self.mcap, names_actions=not is_plain)
+        with ExitStack() as at_error:
+            # An interruption must not leave a file without topics, which readers refuse. With
+            # `source`, signals are not delayed, because copying it may take long.
+            with HoldSignals() if source is None else nullcontext():
+                self.mcap = McapWriter(
+                    path,
+                    compression=compression,
+                    overwrite=overwrite,
+                    append=append,
+                    source=source,
+                )
+                at_error.callback(self.mcap.close)
+                if self.mcap.untouched:
+                    self._check_same(strings)
+                # The schemas of older logs do not contain the action names. Such logs are continued
+                # without these names.
+                is_plain = plain_name in {schema.name for schema in self.mcap.schemas.values()}
+                super().__init__(metadata, self.mcap, names_actions=not is_plain)
+            at_error.pop_all()
 
     def _check_same(self, strings: dict[str, str]) -> None:
         """Raise LogError if the existing log was recorded from another environment."""

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
-from io import BytesIO
+from io import BytesIO, FileIO
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,15 @@ import pytest
 from gymnasium import spaces
 
 import mcaprl
-from mcaprl.errors import LogError, NoStepsError, OutputExistsError, SpaceError, UsageError
+from mcaprl.errors import (
+    LogError,
+    NoEpisodesError,
+    NoStepsError,
+    OutputExistsError,
+    SpaceError,
+    UsageError,
+)
+from mcaprl.recorder.columns.file_lock import create
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.signals import HoldSignals
 from mcaprl.recorder.repair.check import check_log
@@ -543,6 +551,26 @@ def test_killed_recorder_loses_only_the_open_episode(log_path: Path) -> None:
     assert len(data.episodes) > 3
     assert all(episode.terminated[-1] for episode in data.episodes)
     assert math.isclose(data.episodes[0].total_reward, data.episodes[0].length)
+
+
+def test_an_interruption_while_a_log_is_created_leaves_a_log_without_episodes(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def create_and_interrupt(path: Path, *, overwrite: bool) -> FileIO:
+        file = create(path, overwrite=overwrite)
+        signal.raise_signal(signal.SIGINT)
+        return file
+
+    monkeypatch.setattr("mcaprl.recorder.columns.writer.create", create_and_interrupt)
+    usual = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            mcaprl.RecordMcap(scripted(ONE), log_path)
+    finally:
+        signal.signal(signal.SIGINT, usual)
+    assert McapReader(log_path).complete
+    with pytest.raises(NoEpisodesError):
+        mcaprl.open(log_path)
 
 
 def test_a_deferred_signal_keeps_no_references() -> None:
