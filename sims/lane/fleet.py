@@ -34,8 +34,8 @@ from mcaprl.sims.lane.rules import (
 )
 from mcaprl.sims.lane.start import car_from, start_cars, start_only_car
 from mcaprl.sims.vehicle.arguments import check_name
+from mcaprl.sims.vehicle.draws import Generators
 from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
-from mcaprl.sims.vehicle.randoms import Generators
 
 OBSERVATIONS = ("state", "depth", "depth-commands", "dashboard", "rays")
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}

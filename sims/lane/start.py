@@ -26,7 +26,7 @@ from mcaprl.sims.lane.rules import (
     store_car,
 )
 from mcaprl.sims.vehicle.arguments import pose_from
-from mcaprl.sims.vehicle.randoms import draw, spread
+from mcaprl.sims.vehicle.draws import draw, spread
 
 SHARES = 4
 """Number of random numbers for a start; a start on the line uses the first two."""

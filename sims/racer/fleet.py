@@ -25,8 +25,8 @@ from mcaprl.sims.racer.rules import (
 )
 from mcaprl.sims.racer.start import ANYWHERE, EXACTLY, ON_LINE, car_from, start_cars
 from mcaprl.sims.vehicle.arguments import check_name
+from mcaprl.sims.vehicle.draws import Generators
 from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
-from mcaprl.sims.vehicle.randoms import Generators
 
 ACTION_SETS = {5: (0, 1, 2, 3, 4), 8: (1, 2, 3, 4, 5, 6, 7, 8), 9: tuple(range(9))}
 _INFO = (*CAR_INFO, "gates_passed")

@@ -15,7 +15,7 @@ from mcaprl.sims.racer.car import STARTED_AT, Car, placed, store_car
 from mcaprl.sims.racer.course import HALF_WIDTH_PX, IMAGE_HEIGHT_PX, METERS_PER_PX, Track
 from mcaprl.sims.racer.rules import MAX_SPEED_M_S, STEP_S, observe, walls_hit
 from mcaprl.sims.vehicle.arguments import pose_from
-from mcaprl.sims.vehicle.randoms import draw, spread
+from mcaprl.sims.vehicle.draws import draw, spread
 
 ANYWHERE, ON_LINE, EXACTLY = 4, 2, 0
 """Number of random numbers for each kind of start."""
