@@ -70,11 +70,10 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
   alone takes two thirds of the time of stepping or more. Where episodes are short, the five
   messages of each episode take most of the time. Ordinary environments with long episodes reach
   the goal.
-- A batch of 1,024 cars: three fifths of the time is the compiled step. Half of that is the motion:
-  three divisions and three square roots in each of five substeps, which take as long as the
-  processor's divider needs for them. The infos take a seventh, half of it the array of reasons, and
-  starting the cars whose episodes ended an eighth. The rest are about 20 calls of NumPy on arrays
-  of 1,024 values.
+- A batch of 1,024 cars: three fifths of the time is the compiled step. Half of that is the motion,
+  which has three divisions and three square roots in each of five substeps. The infos take a
+  seventh, half of it the array of reasons, and starting the cars whose episodes ended an eighth.
+  The rest are about 20 calls of NumPy on arrays of 1,024 values.
 - Depth images: drawing takes half of the time, downsampling two fifths, and encoding a twelfth.
   Drawing is limited by its short rows of pixels, 15 in the median; sums over columns are near the
   throughput of scalar instructions.

@@ -56,9 +56,9 @@ _NUL, _REPLACEMENT = b"\0", "\ufffd".encode()
 _EPISODE_START, _LOG_START = struct.Struct("<dqqqdII??"), struct.Struct("<IIB")
 # Number of bytes to which a string is aligned.
 _ALIGNMENT = 4
+# The end of a log line: two empty strings, and the field `line`, 0.
+_LOG_END = 2 * b"\1\0\0\0\0\0\0\0" + bytes(4)
 _COUNT, _STAMP, _FLOAT64_BYTES = struct.Struct("<I"), struct.Struct("<II"), 8
-# The name in a log line, aligned. After the text: two empty strings, and the field `line`, 0.
-_LOG_NAME, _LOG_END = b"\0\0\0\7\0\0\0mcaprl\0\0", 2 * b"\1\0\0\0\0\0\0\0" + bytes(4)
 
 
 @lru_cache(maxsize=1)
@@ -120,7 +120,11 @@ def episode_message(
     """Encode the fields of `EPISODE_TEXT` as CDR bytes."""
     times, counts = (start_time_ns, end_time_ns, stored_seed(seed)), (episode, length)
     start = _EPISODE_START.pack(total_reward, *times, epsilon, *counts, terminated, truncated)
-    return _ENCAPSULATION + start + _strings(len(start), reason, policy, options)
+    message = CdrWriter()
+    message.add(start, _FLOAT64_BYTES)
+    for text in (reason, policy, options):
+        message.add_text(text)
+    return message.to_bytes()
 
 
 def stored_seed(seed: int | None) -> int:
@@ -141,19 +145,12 @@ def text_message(text: str) -> bytes:
 
 def log_message(time_ns: int, text: str, level: int = INFO) -> bytes:
     """Encode an `rcl_interfaces/msg/Log` as CDR bytes."""
-    start, line = _LOG_START.pack(*_seconds(time_ns), level), _string(text)
-    return b"".join(
-        (_ENCAPSULATION, start, _LOG_NAME, line, bytes(-len(line) % _ALIGNMENT), _LOG_END)
-    )
-
-
-@lru_cache(maxsize=64)
-def _strings(at: int, *texts: str) -> bytes:
-    """Encode CDR strings that begin at the byte `at`, each aligned to four bytes."""
-    data = b""
-    for text in texts:
-        data += bytes(-(at + len(data)) % _ALIGNMENT) + _string(text)
-    return data
+    message = CdrWriter()
+    message.add(_LOG_START.pack(*_seconds(time_ns), level), _COUNT.size)
+    message.add_text("mcaprl")
+    message.add_text(text)
+    message.add(_LOG_END, _ALIGNMENT)
+    return message.to_bytes()
 
 
 def _string(text: str) -> bytes:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterable, Mapping, Sequence
-from functools import lru_cache
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -180,7 +179,7 @@ def marker_array(shapes: Iterable[Shape]) -> bytes:
     shapes = list(shapes)
     message = messages.CdrWriter()
     message.add_count(1 + len(shapes))
-    message.add(_deletion(), _FLOAT32_BYTES)
+    _add_marker(message, action=_DELETE_ALL)
     for shape in shapes:
         _add_shape(message, shape)
     return message.to_bytes()
@@ -246,16 +245,6 @@ def depth_millimeters(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     return np.where(millimeters <= np.iinfo(np.uint16).max, millimeters, 0).astype("<u2")
 
 
-@lru_cache(maxsize=1)
-def _deletion() -> bytes:
-    """Return a marker that deletes all markers, as the first one of an array."""
-    array, start = messages.CdrWriter(), messages.CdrWriter()
-    for message in (array, start):
-        message.add_count(1)
-    _add_marker(array, action=_DELETE_ALL)
-    return array.to_bytes().removeprefix(start.to_bytes())
-
-
 def _add_shape(message: messages.CdrWriter, shape: Shape) -> None:
     half = shape.yaw_rad / 2
     _add_marker(
@@ -291,8 +280,8 @@ def _add_marker(
     message.add_text(name)
     message.add(_KIND.pack(0, kind, action), _FLOAT32_BYTES)
     message.add(_POSE_AND_SCALE.pack(*position, *rotation, *size), _FLOAT64_BYTES)
-    # A lifetime of 0 means that a marker never expires. With the flag, a marker moves with its
-    # frame, so static bodies are sent only once.
+    # A lifetime of 0 means that a marker never expires. With `frame_locked`, a marker moves with
+    # its frame, so static bodies are sent only once.
     message.add(_COLOR_TO_FLAG.pack(*color, 0, 0, True), _FLOAT32_BYTES)
     if len(points):
         points = np.rint(np.multiply(points, _POINTS_PER_M)) / _POINTS_PER_M
