@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.errors import SpaceError
+from mcaprl.masks import MASK_KEY, allowed_actions
 from mcaprl.networks import ImageInput
 from mcaprl.offline.batches.share import ALONE, Share
 from mcaprl.recorder.dataset.mapped import Frames, MappedImages
@@ -27,7 +28,6 @@ from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, observation_leav
 
 MIN_CONVOLUTION_EDGE = 36
 """Smallest image edge in pixels for which the output of the convolutions is not empty."""
-MASK_KEY = "action_mask"
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,9 @@ class ObservationEncoder:
         self.image_inputs = [ImageInput((*leaf.shape, 1)[:3]) for leaf in self.images]
         widths = [_width(part) for _, part in self.numbers]
         self.width = sum(widths)
-        bytes_ = [part.dtype == np.uint8 for _, part in self.numbers]
+        bytes_ = [
+            isinstance(part, spaces.Box) and part.dtype == np.uint8 for _, part in self.numbers
+        ]
         self.shift = np.zeros(self.width, np.float32)
         self.scale = np.repeat(np.where(bytes_, 255, 1), widths).astype(np.float32)
 
@@ -243,12 +245,8 @@ class ObservationEncoder:
         return vector / self.scale if (self.scale != 1).any() else vector
 
     def _allowed(self, observations: Any) -> Tensor | None:
-        if self.mask is None:
-            return None
-        allowed = np.asarray(self.mask.of(observations)).astype(bool)
-        # After an episode's end, a mask may allow no action. Then allow all actions, because the
-        # values of that state are never used.
-        return torch.from_numpy(allowed | ~allowed.any(1, keepdims=True))
+        allowed = allowed_actions(observations)
+        return None if allowed is None else torch.from_numpy(allowed)
 
 
 def _is_image(space: spaces.Space[Any]) -> bool:

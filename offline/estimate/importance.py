@@ -39,7 +39,7 @@ class EpisodeTable:
         ratios: (E, T) pi(a|s) / mu(a|s) of step t; 1 past the end.
         q: (E, T) Q(s, a) of the model for the action taken; 0 past the end.
         v: (E, T) V(s) = sum_a pi(a|s) Q(s, a) of the model; 0 past the end, except for the last
-            next state of a truncated episode.
+            next state of an episode that is truncated and not terminated.
         gamma: Discount per step.
     """
 
@@ -150,11 +150,13 @@ def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
     sizes = effective_sample_sizes(episodes)
     if estimator in WHOLE_EPISODE:
         return float(sizes[-1])
-    discounts = episodes.discounts
+    # With gamma = 0, only the first step counts.
+    counts = episodes.discounts > 0
+    discounts, sizes = episodes.discounts[counts], sizes[counts]
     with np.errstate(divide="ignore"):
         size = float(discounts.sum() / (discounts @ (1 / sizes)))
     if estimator in UNBIASED:
-        size = min(size, float(_kish(episodes.rho @ discounts)))
+        size = min(size, float(_kish(episodes.rho[:, counts] @ discounts)))
     return size
 
 

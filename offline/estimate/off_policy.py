@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError, UsageError
+from mcaprl.masks import allowed_actions
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.estimate.fqe import FQE, FQEConfig
 from mcaprl.offline.estimate.importance import (
@@ -24,7 +25,7 @@ from mcaprl.offline.estimate.importance import (
     mean_weight,
 )
 from mcaprl.offline.estimate.self_normalized import Floats, RatioEstimate
-from mcaprl.offline.estimate.values import by_rows
+from mcaprl.offline.estimate.values import by_rows, policy_inputs
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.format.probability import is_impossible
 
@@ -164,10 +165,7 @@ class OffPolicyEvaluator:
             PolicyError: The observations do not fit the policy.
             SpaceError: The policy has another number of actions.
         """
-        pi, pi_next = (
-            self._probabilities(policy, observations, epsilon)
-            for observations in (self._dataset.observations, self._dataset.next_observations)
-        )
+        pi, pi_next = self._probabilities(policy, epsilon)
         q, v, v_last = self._model(pi, pi_next, on_update)
         own = pi[np.arange(len(pi)), self._buffer.actions.numpy()]
         behavior = self._dataset.behavior_probs.astype(np.float64)
@@ -191,17 +189,41 @@ class OffPolicyEvaluator:
         return FOLDS * self._config.updates
 
     def _probabilities(
-        self, policy: StochasticPolicy | None, observations: Any, epsilon: float
-    ) -> Floats:
-        """Return the action probabilities (N, A) of a policy that explores with `epsilon`."""
-        actions = int(self._buffer.action_space.n)
-        uniform = np.full((len(self._buffer), actions), 1 / actions)
+        self, policy: StochasticPolicy | None, epsilon: float
+    ) -> tuple[Floats, Floats]:
+        """Return a policy's action probabilities (N, A) at the observations and the next ones.
+
+        With probability `epsilon`, the policy takes a random action.
+        """
+        both = (self._dataset.observations, self._dataset.next_observations)
+        pi, pi_next = (self._uniform(observations) for observations in both)
         if policy is None:
-            return uniform
-        own = by_rows(policy.action_probabilities, observations).astype(np.float64)
-        if own.shape != uniform.shape:
-            raise SpaceError(f"the policy has {own.shape[1]} actions, but the log has {actions}")
-        return (1 - epsilon) * own + epsilon * uniform
+            return pi, pi_next
+        if getattr(policy, "frame_stack", 1) == 1:
+            own, own_next = (by_rows(policy.action_probabilities, part) for part in both)
+        else:
+            each = [
+                by_rows(policy.action_probabilities, policy_inputs(policy, episode))
+                for episode in self._dataset.episodes
+            ]
+            own = np.concatenate([one[:-1] for one in each])
+            own_next = np.concatenate([one[1:] for one in each])
+        if own.shape != pi.shape:
+            raise SpaceError(
+                f"the policy has {own.shape[1]} actions, but the log has {pi.shape[1]}"
+            )
+        return (
+            (1 - epsilon) * own.astype(np.float64) + epsilon * pi,
+            (1 - epsilon) * own_next.astype(np.float64) + epsilon * pi_next,
+        )
+
+    def _uniform(self, observations: Any) -> Floats:
+        """Return equal probabilities (N, A) of the allowed actions."""
+        allowed = allowed_actions(observations)
+        if allowed is None:
+            allowed = np.ones((len(self._buffer), int(self._buffer.action_space.n)), bool)
+        uniform: Floats = allowed / allowed.sum(axis=1, keepdims=True)
+        return uniform
 
     def _model(
         self, pi: Floats, pi_next: Floats, on_update: Callable[[], None]
@@ -236,7 +258,8 @@ class OffPolicyEvaluator:
     def _table(self, ratios: Floats, q: Floats, v: Floats, v_next: Floats) -> EpisodeTable:
         values = self._padded(v, 0.0)
         lasts = np.cumsum(self._lengths) - 1
-        cut = self._dataset.truncated[lasts]
+        # The model adds no value to an episode with both flags, because its last state is terminal.
+        cut = self._dataset.truncated[lasts] & ~self._dataset.terminated[lasts]
         values[np.flatnonzero(cut), self._lengths[cut]] = v_next[lasts][cut]
         return EpisodeTable(
             self._padded(self._dataset.rewards, 0.0),

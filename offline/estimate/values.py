@@ -57,17 +57,18 @@ def value_columns(
     """
     if not isinstance(action_space, spaces.Discrete):
         raise UsageError(f"values need discrete actions, got {action_space}")
-    frames = _with_last(episode.observations, episode.next_observations)
-    observations = _stacked(frames, getattr(policy, "frame_stack", 1))
+    observations = policy_inputs(policy, episode)
     taken = episode.actions - int(action_space.start)
+    preference = probabilities = policy.action_probabilities(observations)
+    best = probabilities[:-1].argmax(1)
     try:
         q = policy.q_values(observations)
     except PolicyError:
-        preference = policy.action_probabilities(observations)
-        q = np.full_like(preference, np.nan)
+        q = np.full_like(probabilities, np.nan)
     else:
-        preference = softmax(q)
-    best = preference[:-1].argmax(1)
+        # The probabilities of a greedy policy show only which action is the best.
+        is_greedy = bool(((probabilities == 0) | (probabilities == 1)).all())
+        preference = softmax(q) if is_greedy else probabilities
     value = q[:-1].max(1)
     return {
         "q": q[:-1],
@@ -79,6 +80,15 @@ def value_columns(
         "policy_action": best + int(action_space.start),
         "agrees": best == taken,
     }
+
+
+def policy_inputs(policy: object, episode: Episode) -> Any:
+    """Return an episode's observations (T + 1, ...), including the last next observation.
+
+    For a policy with a frame stack of k > 1, they are stacks (T + 1, k, ...), oldest frame first.
+    """
+    frames = _with_last(episode.observations, episode.next_observations)
+    return _stacked(frames, getattr(policy, "frame_stack", 1))
 
 
 def td_errors(

@@ -142,7 +142,7 @@ def values_schema(actions: int, action_names: Mapping[int, str] | None = None) -
     """Return the type name and definition of `/rl/values`, a policy's evaluation of a step.
 
     float32[A] q            value of each action; NaN if the policy has none
-    float32[A] preference   probability of each action, or softmax of the values
+    float32[A] preference   probability of each action; softmax of q if the policy is greedy
     float32 value           value of the state: maximum of q
     float32 advantage       q of the logged action minus `value`
     float32 td_error        r + gamma max q(next) - q of the logged action

@@ -55,6 +55,12 @@ def test_uint8_vectors_are_scaled_to_one() -> None:
     torch.testing.assert_close(seen.vector, torch.tensor([[0.0, 0.2, 1.0]]))
 
 
+def test_one_hot_codes_of_bytes_are_not_scaled() -> None:
+    encoder = ObservationEncoder(spaces.MultiDiscrete([3, 2], dtype=np.uint8), 2)
+    seen = encoder.encode(np.array([[2, 0]], np.uint8))
+    assert seen.vector.tolist() == [[0, 0, 1, 1, 0]]
+
+
 def test_images_stay_bytes_and_get_a_channel_axis() -> None:
     space = spaces.Box(0, 255, (36, 40), np.uint8)
     images = batch(space, 2)

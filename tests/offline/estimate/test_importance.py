@@ -29,6 +29,14 @@ BY_HAND = EpisodeTable(
 ONCE = np.ones((1, 2))
 
 
+@pytest.mark.parametrize("estimator", ["PDIS", "WPDIS", "DR", "WDR"])
+def test_without_later_rewards_later_weights_do_not_count(estimator: str) -> None:
+    """With gamma 0, the sizes are (1 + 3)^2 / (1 + 9), although no weight is left at step 1."""
+    ratios = np.array([[1.0, 0.0], [3.0, 0.0]])
+    table = EpisodeTable(np.ones((2, 2)), ratios, np.zeros((2, 2)), np.zeros((2, 2)), gamma=0.0)
+    assert effective_sample_size(estimator, table) == pytest.approx(1.6)
+
+
 @pytest.mark.parametrize(
     ("estimator", "value"),
     [

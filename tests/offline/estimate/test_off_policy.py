@@ -40,8 +40,17 @@ class Table:
         return rows
 
 
-def log(episodes: int, seed: int = 0, acting: NDArray[np.float64] = task.BEHAVIOR) -> Dataset:
-    """Return episodes of the task as a dataset with one-hot observations."""
+def log(
+    episodes: int,
+    seed: int = 0,
+    acting: NDArray[np.float64] = task.BEHAVIOR,
+    *,
+    also_truncated: bool = False,
+) -> Dataset:
+    """Return episodes of the task as a dataset with one-hot observations.
+
+    If `also_truncated`, the last step of each episode has both end flags.
+    """
     random = np.random.default_rng(seed)
     columns: list[tuple[int, int, int, float, bool, float]] = []
     for _ in range(episodes):
@@ -60,7 +69,7 @@ def log(episodes: int, seed: int = 0, acting: NDArray[np.float64] = task.BEHAVIO
         actions=actions,
         rewards=paid_,
         terminated=ends,
-        truncated=np.zeros_like(ends),
+        truncated=ends & also_truncated,
         next_observations=eye[afters],
         behavior_probs=probs,
         observation_space=spaces.Box(0, 1, (2,), np.float32),
@@ -238,6 +247,62 @@ def test_weights_that_overflow_are_refused() -> None:
     found = by_name(OffPolicyEvaluator(data, NO_MODEL).evaluate(Follows(), "follows"))
     for name in ESTIMATORS:
         assert found[name].verdict == "refused: an importance weight is inf, above 1e+100"
+
+
+def test_the_model_adds_no_value_after_a_terminal_state() -> None:
+    config = FQEConfig(updates=200, hidden=(4,), gamma=0.9)
+    found = [
+        OffPolicyEvaluator(log(100, also_truncated=both), config).evaluate(
+            Table(task.EVALUATED), "evaluated"
+        )
+        for both in (False, True)
+    ]
+    assert [one.value for one in found[0].estimates] == [one.value for one in found[1].estimates]
+
+
+def test_random_actions_are_uniform_over_the_allowed_ones() -> None:
+    """Of four actions, a state allows two, and the log is uniform over these."""
+    steps, random = 200, np.random.default_rng(0)
+    mask: NDArray[np.int8] = np.tile(np.array([[1, 1, 0, 0], [0, 0, 1, 1]], np.int8), (100, 1))
+    seen: dict[str, NDArray[Any]] = {"action_mask": mask, "x": np.zeros((steps, 1), np.float32)}
+    data = Dataset.from_arrays(
+        observations=seen,
+        actions=2 * (np.arange(steps) % 2) + random.integers(2, size=steps),
+        rewards=np.ones(steps),
+        terminated=np.arange(steps) % 10 == 9,
+        truncated=np.zeros(steps, np.bool_),
+        next_observations={key: np.roll(part, -1, axis=0) for key, part in seen.items()},
+        behavior_probs=np.full(steps, 0.5),
+        observation_space=spaces.Dict(
+            {"action_mask": spaces.MultiBinary(4), "x": spaces.Box(-1, 1, (1,))}
+        ),
+        action_space=spaces.Discrete(4),
+    )
+    found = by_name(OffPolicyEvaluator(data, NO_MODEL).evaluate(None, "random"))
+    value = (1 - NO_MODEL.gamma**10) / (1 - NO_MODEL.gamma)
+    for name in ("TIS", "WIS", "PDIS", "WPDIS"):
+        assert found[name].value == pytest.approx(value)
+
+
+def test_a_policy_with_a_frame_stack_sees_the_frames_before() -> None:
+    """The policy takes the action of the state before, which a stack of two frames contains."""
+
+    class Repeats:
+        """Policy that takes action k after state k."""
+
+        frame_stack = 2
+
+        def action_probabilities(self, observations: Any) -> NDArray[np.float64]:
+            assert observations.shape[1:] == (2, 2)
+            return np.asarray(observations[:, 0], np.float64)
+
+    data = log(100)
+    states = data.observations.argmax(1)
+    starts = np.cumsum(data.episode_lengths) - data.episode_lengths
+    before = np.concatenate([[0], states[:-1]])
+    before[starts] = states[starts]
+    found = OffPolicyEvaluator(data, NO_MODEL).evaluate(Repeats(), "repeats")
+    assert found.coverage == pytest.approx((data.actions == before).mean())
 
 
 def test_too_few_target_syncs_refuse_the_verdict() -> None:

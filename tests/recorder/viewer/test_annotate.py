@@ -35,12 +35,12 @@ FIELDS = ("q", "value", "advantage", "td_error", "entropy", "policy_action", "ag
 
 
 class Table:
-    """Policy with Q-values for an episode's four observations, or only with probabilities."""
+    """Policy with Q-values for an episode's four observations, with probabilities, or both."""
 
     name = "table"
 
-    def __init__(self, has_values: bool = True) -> None:
-        self._has_values = has_values
+    def __init__(self, has_values: bool = True, is_greedy: bool = True) -> None:
+        self._has_values, self._is_greedy = has_values, has_values and is_greedy
 
     def q_values(self, observations: Any) -> Any:
         if not self._has_values:
@@ -48,6 +48,8 @@ class Table:
         return VALUES[observations[:, 0].astype(int)]
 
     def action_probabilities(self, observations: Any) -> Any:
+        if self._is_greedy:
+            return np.eye(2, dtype=np.float32)[VALUES.argmax(1)]
         return np.array([[0.75, 0.25], [0.0, 1.0], [0.5, 0.5], [1.0, 0.0]], np.float32)
 
 
@@ -115,6 +117,15 @@ def test_a_policy_without_values_has_an_entropy(episode: Any) -> None:
     certain = -(0.75 * math.log2(0.75) + 0.25 * math.log2(0.25))
     assert found["entropy"].tolist() == pytest.approx([certain, 0.0, 1.0])
     assert found["policy_action"].tolist() == [0, 1, 0]
+
+
+def test_a_policy_that_does_not_act_by_its_values_keeps_its_actions(episode: Any) -> None:
+    """IQL, for example, has Q-values, but selects actions by its probabilities."""
+    found = value_columns(Table(is_greedy=False), episode, spaces.Discrete(2), 0.5)
+    assert found["q"].tolist() == VALUES[:3].tolist()
+    assert found["policy_action"].tolist() == [0, 1, 0]
+    assert found["agrees"].tolist() == [True, False, False]
+    assert found["preference"].tolist() == [[0.75, 0.25], [0, 1], [0.5, 0.5]]
 
 
 def test_actions_with_an_offset_and_single_actions(episode: Any) -> None:
