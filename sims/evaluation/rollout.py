@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from mcaprl.errors import PolicyError
+from mcaprl.masks import allowed_actions
 
 
 class Policy(Protocol):
@@ -81,20 +82,23 @@ class EpsilonGreedy:
     def choose(self, observation: Any) -> tuple[Any, float]:
         """Return the action for one observation, and the probability of that action.
 
-        Each of the A actions has the probability epsilon / A; the policy's greedy action has an
-        additional 1 - epsilon. If actions are not discrete, the returned probability is NaN.
+        Each of the A allowed actions has the probability epsilon / A; the policy's greedy action
+        has an additional 1 - epsilon. Without an action mask, all actions are allowed. If actions
+        are not discrete, the returned probability is NaN.
         """
         greedy = None if self.policy is None else self.policy.act(_batch(observation))[0]
         explores = self.epsilon > 0 and self._random.random() < self.epsilon
         if not self._count:
             return (self._space.sample() if explores else greedy), math.nan
-        start = int(getattr(self._space, "start", 0))
+        start, mask = int(getattr(self._space, "start", 0)), allowed_actions(observation)
+        allowed = range(self._count) if mask is None else np.flatnonzero(mask).tolist()
         if explores or greedy is None:
-            action = int(self._random.integers(self._count)) + start
+            action = allowed[int(self._random.integers(len(allowed)))] + start
         else:
             action = int(greedy)
         own = greedy is not None and action == int(greedy)
-        return action, self.epsilon / self._count + (1 - self.epsilon) * own
+        by_chance = self.epsilon / len(allowed) if action - start in allowed else 0.0
+        return action, by_chance + (1 - self.epsilon) * own
 
 
 def episode_seed(seed: int, episode: int) -> int:

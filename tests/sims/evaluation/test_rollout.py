@@ -48,6 +48,18 @@ def test_random_policy_has_equal_probabilities(env: gym.Env[Any, Any]) -> None:
     assert {behavior.choose(np.zeros(4))[1] for _ in range(50)} == {0.5}
 
 
+def test_random_actions_are_allowed_ones() -> None:
+    behavior = EpsilonGreedy(AlwaysLeft(), 0.4, spaces.Discrete(4, start=0))
+    behavior.begin(0)
+    for mask, chances in (
+        ([1, 0, 1, 0], {0: 0.8, 2: 0.2}),
+        ([0, 1, 1, 0], {0: 0.6, 1: 0.2, 2: 0.2}),
+    ):
+        seen = {"action_mask": np.array(mask, np.int8), "x": np.zeros(4, np.float32)}
+        drawn = dict(behavior.choose(seen) for _ in range(200))
+        assert drawn == pytest.approx(chances)
+
+
 def test_box_actions_have_no_known_probability() -> None:
     env = gym.make("Pendulum-v1")
     behavior = EpsilonGreedy(None, 0.0, env.action_space)
