@@ -183,6 +183,8 @@ class Policy:
         """
         if self._seen and len(self._seen[-1]) != len(now):
             self.begin()
+        # The environment may use the memory of its observations again.
+        now = now.like([part.clone() for part in now.parts()])
         self._seen.extend([now] * (1 if self._seen else self.frame_stack))
         while len(self._seen) > self.frame_stack:
             self._seen.popleft()

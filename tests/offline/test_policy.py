@@ -221,6 +221,18 @@ def test_a_policy_keeps_the_frames_of_its_stack(tmp_path: Path) -> None:
             assert policy.act(stack).tolist() == expected.tolist()
 
 
+def test_an_environment_may_reuse_the_memory_of_its_observations(tmp_path: Path) -> None:
+    policy, memory = walk_policy(tmp_path, 2), np.zeros((500, 1), np.float32)
+    frames = np.random.default_rng(0).normal(0, 5, (2, 500, 1)).astype(np.float32)
+    for frame in frames:
+        memory[:] = frame
+        actions = policy.act(memory)
+    expected, wrong = (
+        policy.q_values(pair.swapaxes(0, 1)).argmax(1) for pair in (frames, frames[[1, 1]])
+    )
+    assert actions.tolist() == expected.tolist() != wrong.tolist()
+
+
 def test_values_of_single_frames_are_refused_by_a_stacking_policy(tmp_path: Path) -> None:
     with pytest.raises(PolicyError, match="has a frame stack of 3"):
         walk_policy(tmp_path, 3).q_values(np.zeros((4, 1), np.float32))
