@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 NONE = -1
 """Value in `Matches.rows` of a step without a message."""
-_NS_PER_S = 1e9
+NS_PER_S = 1e9
 
 
 class Matches(NamedTuple):
@@ -100,10 +100,10 @@ def interpolated(
         span = np.maximum(times_ns[high] - times_ns[low], 1)
         share = (before_s / span).reshape(-1, *[1] * (values.ndim - 1))
         found = values[low] + share * (values[high] - values[low])
-        age_s = np.where(before_s <= after_s, before_s, -after_s) / _NS_PER_S
+        age_s = np.where(before_s <= after_s, before_s, -after_s) / NS_PER_S
         is_late = np.zeros(len(age_s), bool)
         if tolerance_s is not None:
-            is_late = np.maximum(before_s, after_s) / _NS_PER_S > tolerance_s
+            is_late = np.maximum(before_s, after_s) / NS_PER_S > tolerance_s
         has_both &= ~is_late
         found[~has_both] = np.nan
     else:
@@ -121,7 +121,7 @@ def _within(
     has_one = rows >= 0
     age_s = np.full(len(steps_ns), np.nan)
     if len(times_ns):
-        age_s = np.where(has_one, (steps_ns - times_ns[np.maximum(rows, 0)]) / _NS_PER_S, np.nan)
+        age_s = np.where(has_one, (steps_ns - times_ns[np.maximum(rows, 0)]) / NS_PER_S, np.nan)
     if tolerance_s is not None:
         has_one = has_one & (np.abs(age_s) <= tolerance_s)
     return Matches(np.where(has_one, rows, NONE), np.where(has_one, age_s, np.nan))

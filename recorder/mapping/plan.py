@@ -17,6 +17,7 @@ from mcaprl.recorder.mapping.expression import Expression
 from mcaprl.recorder.mapping.observe import Source, source_of
 from mcaprl.recorder.mapping.paths import topic_of
 from mcaprl.recorder.mapping.streams import TopicStream
+from mcaprl.recorder.mapping.transforms import TF, TF_STATIC
 
 Columns = MappingOf[str, NDArray[Any]]
 Reward = Callable[[Columns, NDArray[np.int64]], NDArray[np.float64]]
@@ -116,7 +117,7 @@ class Plan:
                 self.bag,
                 topic,
                 wanted,
-                "log_time" if topic.startswith("/tf") else self.mapping.time,
+                "log_time" if topic in (TF, TF_STATIC) else self.mapping.time,
                 gap_s,
             )
             for topic, wanted in fields.items()

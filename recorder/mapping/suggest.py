@@ -9,8 +9,8 @@ import numpy as np
 
 from mcaprl.errors import LogError
 from mcaprl.recorder.bags.bag import Bag, TopicInfo
+from mcaprl.recorder.mapping.align import NS_PER_S
 
-_NS_PER_S = 1e9
 # If the name of a topic or type contains one of these words, the topic is likely to have commands.
 _COMMAND_WORDS = ("cmd", "command", "action", "target", "setpoint", "ackermann", "control")
 _MAX_RATE_HZ, _MIN_RATE_HZ = 20.0, 1.0
@@ -172,7 +172,7 @@ def _rate(topics: Iterable[TopicInfo]) -> float:
 
 
 def _rate_of(info: TopicInfo) -> float:
-    span_s = (info.last_ns - info.first_ns) / _NS_PER_S
+    span_s = (info.last_ns - info.first_ns) / NS_PER_S
     return (info.count - 1) / span_s if span_s > 0 else 0.0
 
 

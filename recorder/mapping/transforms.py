@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
-from mcaprl.recorder.mapping.align import NONE, last, nearest
+from mcaprl.recorder.mapping.align import NONE, NS_PER_S, last, nearest
 
 Floats = NDArray[np.float64]
 
@@ -158,7 +158,11 @@ def _at(
         after = np.minimum(rows + 1, len(edge.times_ns) - 1)
         span = np.maximum(edge.times_ns[after] - edge.times_ns[rows], 1)
         share = np.clip((steps_ns - edge.times_ns[rows]) / span, 0.0, 1.0)[:, np.newaxis]
-        is_none |= (after == rows) & (edge.times_ns[rows] != steps_ns)
+        is_between = edge.times_ns[rows] != steps_ns
+        is_none |= is_between & (after == rows)
+        if tolerance_s is not None:
+            wait_s = (edge.times_ns[after] - steps_ns) / NS_PER_S
+            is_none |= is_between & (wait_s > tolerance_s)
         positions = positions + share * (edge.positions[after] - positions)
         turns = _interpolated(turns, edge.quaternions[after], share)
     positions, turns = positions.copy(), turns.copy()

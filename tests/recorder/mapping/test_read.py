@@ -279,13 +279,17 @@ def test_jitter_is_sorted_and_a_reset_of_the_clock_divides_the_bag() -> None:
 
 def test_headers_and_publish_times_are_times() -> None:
     stamps = np.array([0, 1, 2, 3], np.int64) * SECOND_NS
-    bag = MemoryBag(
-        {
-            "/odom": ([5, 6, 7, 8], {"speed": [0, 1, 2, 3.0], "header.stamp": stamps}),
-            "/mode": ([9, 9, 9, 9], {"data": [0, 1, 0, 1.0], "header.stamp": stamps + 10}),
-        }
-    )
-    assert read(bag, time="header").dataset.actions.tolist() == [0, 1, 0]
+    # Only `/tf` and `/tf_static` have no header, not each topic whose name begins with `/tf`.
+    for topic in ("/odom", "/tf_mini"):
+        bag = MemoryBag(
+            {
+                topic: ([5, 6, 7, 8], {"speed": [0, 1, 2, 3.0], "header.stamp": stamps}),
+                "/mode": ([9, 9, 9, 9], {"data": [0, 1, 0, 1.0], "header.stamp": stamps + 10}),
+            }
+        )
+        found = read(bag, time="header", observation={"speed": {"field": f"{topic}.speed"}})
+        assert found.dataset.actions.tolist() == [0, 1, 0]
+        assert found.dataset.episodes[0].log_time_ns[0] == 0
     with pytest.raises(UsageError, match=r"/odom \(memory\) has no header.stamp: use `time: log_t"):
         read(drive(), time="header")
 

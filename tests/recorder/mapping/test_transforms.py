@@ -75,6 +75,14 @@ def test_chains_of_moving_and_static_frames() -> None:
     assert np.isnan(late[2]).all()
 
 
+def test_a_pose_between_is_missing_if_one_of_two_messages_is_too_far() -> None:
+    moving = [(time, [transform("map", "base", time, 0.0)]) for time in (0.0, 1.0, 100.0)]
+    steps_ns = (np.array([0.4, 1.4, 99.8, 100.0]) * SECOND_NS).astype(np.int64)
+    found, age_s = Transforms(bag(moving, [])).planar("base", "map", steps_ns, "linear", 0.7)
+    np.testing.assert_allclose(found[:, 0], [0.4, np.nan, np.nan, 100.0])
+    assert np.isnan(age_s).tolist() == [False, True, True, False]
+
+
 def test_wrong_trees_are_clear_errors() -> None:
     two = [(0.0, [transform("a", "base", 0, 0)]), (1.0, [transform("b", "base", 0, 0)])]
     with pytest.raises(UsageError, match="gives frame 'base' several parents: a, b"):
