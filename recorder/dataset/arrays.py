@@ -35,11 +35,12 @@ def description_of(
     action_space: spaces.Space[Any] | None,
 ) -> LogMetadata:
     """Return the metadata for `Dataset.from_arrays`; infer the spaces that are None."""
-    if observation_space is None and action_space is None:
-        observation_space, action_space = _registered_spaces(env_id, observations)
+    registered: tuple[spaces.Space[Any] | None, spaces.Space[Any] | None] = (None, None)
+    if observation_space is None or action_space is None:
+        registered = _registered_spaces(env_id, observations)
     return LogMetadata(
-        observation_space=observation_space or _space_of(observations),
-        action_space=action_space or action_space_of(np.asarray(actions)),
+        observation_space=observation_space or registered[0] or _space_of(observations),
+        action_space=action_space or registered[1] or action_space_of(np.asarray(actions)),
         env_id=env_id,
         versions=installed_versions(),
     )

@@ -139,7 +139,7 @@ def _rewards(dataset: Dataset) -> Iterator[Problem]:
             "training propagates final rewards to early steps slowly: n-step returns help",
         )
         return
-    cut, others = rewards[dataset.truncated], rewards[~last]
+    cut, others = rewards[dataset.truncated & ~dataset.terminated], rewards[~last]
     if len(cut) and len(others):
         beyond = (cut < others.min()) | (cut > others.max())
         if beyond.any():

@@ -250,6 +250,13 @@ def test_arrays_of_a_registered_environment_have_its_spaces() -> None:
     data = mcaprl.Dataset.from_arrays(**arrays, env_id="CartPole-v1")
     assert data.observation_space == env.observation_space
     assert data.action_space == env.action_space
+    for chosen in (
+        {"observation_space": spaces.Box(-9, 9, (4,))},
+        {"action_space": spaces.Discrete(5)},
+    ):
+        mixed = mcaprl.Dataset.from_arrays(**arrays, env_id="CartPole-v1", **chosen)
+        expected = {name: getattr(env, name) for name in ("observation_space", "action_space")}
+        assert {name: getattr(mixed, name) for name in expected} == expected | chosen
     other = mcaprl.Dataset.from_arrays(**arrays, env_id="Pendulum-v1")
     assert other.observation_space == spaces.Box(-np.inf, np.inf, (4,), np.float64)
     assert other.action_space == spaces.Discrete(1)

@@ -45,6 +45,12 @@ def test_a_valid_dataset_has_no_findings() -> None:
     assert lint(dataset()) == []
 
 
+def test_the_reward_of_a_terminal_step_may_be_special() -> None:
+    """An episode with both end flags has reached a terminal state."""
+    both = dataset(**changed("terminated", 5, True), rewards=np.array([1.0, 3, 3, 1, 2, -10]))
+    assert not [one for one in lint(both) if "truncated episode" in str(one)]
+
+
 @pytest.mark.parametrize(
     ("changes", "severity", "text"),
     [
