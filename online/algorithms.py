@@ -74,6 +74,11 @@ def check_spaces(
     find_algorithm(algo)
     if not isinstance(action_space, spaces.Discrete):
         raise SpaceError(f"{algo} needs discrete actions, got {action_space}")
+    if action_space.start != 0:
+        raise SpaceError(
+            f"{algo} needs actions that start at 0, got {action_space}:"
+            " wrap the environment in gymnasium.wrappers.TransformAction"
+        )
     for space in parts_of_space(observation_space).values():
         if not isinstance(space, spaces.Box):
             raise SpaceError(f"{algo} needs Box observations, or a Dict of them, got {space}")

@@ -13,7 +13,6 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3 import DQN
@@ -44,7 +43,6 @@ TRAINING_LABELS = {
     "updates": "updates of the network",
 }
 """Labels of the metrics in `/rl/training`, by name, the most important first."""
-TRAINING_NAMES = tuple(TRAINING_LABELS)
 """Names of the metrics in `/rl/training`."""
 WATCHED = 0
 """Index of the environment in the live view."""
@@ -254,7 +252,6 @@ def _values(model: BaseAlgorithm, action: NDArray[Any]) -> dict[str, Any]:
     """Return the learner's values for the watched environment, as fields of `values_schema`."""
     observation = _row(model._last_obs, slice(WATCHED, WATCHED + 1))
     tensor: Any = model.policy.obs_to_tensor(observation)[0]
-    start = int(cast(spaces.Discrete, model.action_space).start)
     with torch.inference_mode():
         if isinstance(model, DQN):
             q = model.q_net(tensor)[0]
@@ -263,7 +260,7 @@ def _values(model: BaseAlgorithm, action: NDArray[Any]) -> dict[str, Any]:
             policy = cast(ActorCriticPolicy, model.policy)
             preference = cast(Any, policy.get_distribution(tensor).distribution).probs[0]
             q, value = torch.full_like(preference, torch.nan), float(policy.predict_values(tensor))
-    best, taken = int(preference.argmax()), int(action[0]) - start
+    best, taken = int(preference.argmax()), int(action[0])
     entropy = torch.special.entr(preference).sum() / math.log(max(len(preference), 2))
     return {
         "q": q.cpu().numpy(),
@@ -272,7 +269,7 @@ def _values(model: BaseAlgorithm, action: NDArray[Any]) -> dict[str, Any]:
         "advantage": float(q[taken]) - value,
         "td_error": math.nan,
         "entropy": float(entropy),
-        "policy_action": best + start,
+        "policy_action": best,
         "agrees": best == taken,
     }
 

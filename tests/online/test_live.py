@@ -16,7 +16,7 @@ import pytest
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import UsageError
-from mcaprl.online.live import TRAINING_LABELS, TRAINING_NAMES, LiveTraining
+from mcaprl.online.live import TRAINING_LABELS, LiveTraining
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
 from mcaprl.progress import TrainingProgress
@@ -164,7 +164,7 @@ def test_values_and_metrics_are_those_of_the_learner(viewed: tuple[Any, Path]) -
     np.testing.assert_allclose(values["value"], values["q"].max(1), rtol=1e-6)
     assert (values["q"][0] != values["q"][-1]).all(), "it learns"
     training = decoded(seen, "/rl/training")
-    assert training.dtype.names == ("encapsulation", *TRAINING_NAMES)
+    assert training.dtype.names == ("encapsulation", *TRAINING_LABELS)
     assert training["steps"].tolist() == list(range(0, 400, 4))
     assert np.isnan(training["loss"][:10]).all()
     assert (training["loss"][30:] > 0).all()

@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from stable_baselines3 import DQN
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from mcaprl.api.policies import load_policies
 from mcaprl.cli import run
 from mcaprl.errors import OutputExistsError, SpaceError, TrainingError, UnknownNameError, UsageError
+from mcaprl.online.algorithms import check_spaces
 from mcaprl.online.task import Task
 from mcaprl.online.train import OnlineSummary, train
 from mcaprl.progress import TrainingProgress
@@ -198,6 +200,9 @@ def test_mistakes_leave_no_folder(tmp_path: Path) -> None:
         train(Task.for_sim("Pendulum-v1", "dqn", **SHORT), out)
     with pytest.raises(UsageError, match="seeds must be at least 1"):
         train(lane(), out, seeds=0)
+    for algo in ("dqn", "ppo"):
+        with pytest.raises(SpaceError, match=f"{algo} needs actions that start at 0, got"):
+            check_spaces(algo, spaces.Box(-1, 1), spaces.Discrete(3, start=1))
     assert not out.exists()
     out.touch()
     with pytest.raises(TrainingError, match="cannot write"):
