@@ -19,7 +19,7 @@ from mcaprl.lazy import lazy_attributes
 if TYPE_CHECKING:
     from mcaprl.online.agent import Agent
     from mcaprl.online.curves import VALUES, CurvePoint, curve_figure, draw_curves, read_run
-    from mcaprl.online.evaluation import FRESH_SEED, SELECTION_SEED, Scale, measure_scale
+    from mcaprl.online.evaluation import FRESH_SEED, SELECTION_SEED, measure_scale
     from mcaprl.online.live import LiveTraining
     from mcaprl.online.policy import OnlinePolicy, describe_run, read_policy, save_policy
     from mcaprl.online.presets import SIM_SETTINGS
@@ -38,7 +38,6 @@ __all__ = [
     "CurvePoint",
     "LiveTraining",
     "OnlinePolicy",
-    "Scale",
     "Task",
     "curve_figure",
     "describe_run",
@@ -55,7 +54,7 @@ __getattr__ = lazy_attributes(
     {
         "mcaprl.online.agent": ("Agent",),
         "mcaprl.online.curves": ("VALUES", "CurvePoint", "curve_figure", "draw_curves", "read_run"),
-        "mcaprl.online.evaluation": ("FRESH_SEED", "SELECTION_SEED", "Scale", "measure_scale"),
+        "mcaprl.online.evaluation": ("FRESH_SEED", "SELECTION_SEED", "measure_scale"),
         "mcaprl.online.live": ("LiveTraining",),
         "mcaprl.online.policy": ("OnlinePolicy", "describe_run", "read_policy", "save_policy"),
         "mcaprl.online.presets": ("SIM_SETTINGS",),

@@ -26,7 +26,7 @@ from mcaprl.online.algorithms import make_model, own_architecture
 from mcaprl.online.checkpoint import load_checkpoint, save_checkpoint
 from mcaprl.online.config import DQNConfig
 from mcaprl.online.curves import CurvePoint, write_curve
-from mcaprl.online.evaluation import Evaluation, FirstEpisodes, Scale
+from mcaprl.online.evaluation import Evaluation, FirstEpisodes
 from mcaprl.online.features import normalize_images
 from mcaprl.online.frames import StackedVecEnv, parts_of, parts_of_space
 from mcaprl.online.live import LiveTraining
@@ -38,6 +38,7 @@ from mcaprl.online.warm_start import fill_buffer, take_weights
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import BEST_NAME, CHECKPOINT_NAME, CURVE_NAME, writing
+from mcaprl.sims.evaluation.evaluate import Scale
 from mcaprl.sims.evaluation.rollout import episode_seed
 
 LOG_INTERVAL = 1_000

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
@@ -16,38 +15,16 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import ConvertCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from mcaprl.errors import UnknownNameError
 from mcaprl.online.curves import CurvePoint
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.vector_wrapper import VectorWrapper
-from mcaprl.sims.evaluation.evaluate import evaluate
-from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.evaluation.evaluate import Scale, evaluate
+from mcaprl.sims.evaluation.pilots import has_pilot, make_pilot
 
 SELECTION_SEED: Final = 3_000_000
 """Seed of the episodes that select the best checkpoint and form the curve."""
 FRESH_SEED: Final = 1_000_000
 """Seed of the episodes of the final score, and the default seed of `mcaprl evaluate`."""
-
-
-@dataclass(frozen=True)
-class Scale:
-    """Mean returns of random actions and of the sim's pilot on the same episodes.
-
-    Attributes:
-        random: Mean return of random actions.
-        pilot: Mean return of the pilot; NaN if the sim has no pilot.
-    """
-
-    random: float
-    pilot: float
-
-    def score(self, mean_return: float) -> float:
-        """Return the score of a mean return: 0 for random, 1 for the pilot.
-
-        Without a pilot, it is NaN.
-        """
-        span = self.pilot - self.random
-        return (mean_return - self.random) / span if span else math.nan
 
 
 def measure_scale(env: gym.Env[Any, Any], *, episodes: int, seed: int) -> Scale:
@@ -57,10 +34,7 @@ def measure_scale(env: gym.Env[Any, Any], *, episodes: int, seed: int) -> Scale:
         score = evaluate(env, [policy], name="", episodes=episodes, seed=seed)
         return score.mean_return
 
-    try:
-        pilot = mean_return(make_pilot(env))
-    except UnknownNameError:
-        pilot = math.nan
+    pilot = mean_return(make_pilot(env)) if has_pilot(env) else math.nan
     return Scale(mean_return(None), pilot)
 
 

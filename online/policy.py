@@ -133,7 +133,7 @@ class OnlinePolicy:
         probabilities[np.arange(len(outputs)), outputs.argmax(1)] = 1.0
         return probabilities
 
-    def _predicted(self, observations: Any, deterministic: bool) -> Any:
+    def _predicted(self, observations: Any) -> Any:
         """Return the network's actions; stack the observations with earlier ones if needed."""
         memory = self._memory
         if memory is not None:
@@ -142,9 +142,9 @@ class OnlinePolicy:
             )
             continues = len(seen) == len(now)
             observations = memory.see(observations) if continues else memory.begin(observations)
-        return self.network.predict(observations, deterministic=deterministic)
+        return self.network.predict(observations, deterministic=True)
 
-    def _outputs(self, observations: Any, deterministic: bool) -> NDArray[np.float32]:
+    def _outputs(self, observations: Any) -> NDArray[np.float32]:
         """Return the Q-values or probabilities of all actions."""
         if self._memory is not None:
             observations = joined(observations, self._memory.space)
@@ -159,7 +159,7 @@ class OnlinePolicy:
 
     def _tried(self, forward: Callable[..., Any], observations: Any) -> Any:
         try:
-            return forward(observations, deterministic=True)
+            return forward(observations)
         except (ValueError, RuntimeError, KeyError, AttributeError) as error:
             raise PolicyError(f"{self.name} does not accept these observations: {error}") from error
 

@@ -26,7 +26,7 @@ from mcaprl.files import write_json
 from mcaprl.online.agent import Agent
 from mcaprl.online.algorithms import check_spaces
 from mcaprl.online.curves import IMAGE_NAME, SCORES_NAME, draw_curves, read_run
-from mcaprl.online.evaluation import FRESH_SEED, SELECTION_SEED, Scale, measure_scale
+from mcaprl.online.evaluation import FRESH_SEED, SELECTION_SEED, measure_scale
 from mcaprl.online.live import LiveTraining
 from mcaprl.online.policy import read_policy
 from mcaprl.online.recording import log_paths
@@ -36,7 +36,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.runs import BEST_NAME, RunSummary, locked_run, open_run, seed_folder, writing
 from mcaprl.sims import make_sim
-from mcaprl.sims.evaluation.evaluate import evaluate
+from mcaprl.sims.evaluation.evaluate import Scale, evaluate
 
 
 @dataclass(frozen=True)

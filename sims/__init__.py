@@ -26,7 +26,7 @@ from mcaprl.sims.spec import SimCatalog, SimSpec
 if TYPE_CHECKING:
     from mcaprl.sims.drawing.camera import lens
     from mcaprl.sims.drawing.depth import DepthCamera, encode_depth
-    from mcaprl.sims.evaluation.evaluate import PolicyScore, evaluate, normalize
+    from mcaprl.sims.evaluation.evaluate import PolicyScore, Scale, evaluate, normalize
     from mcaprl.sims.evaluation.pilots import make_pilot
     from mcaprl.sims.evaluation.rollout import EpsilonGreedy, Policy, episode_seed, rollout
     from mcaprl.sims.lane.camera import CarCamera
@@ -173,6 +173,7 @@ __all__ = [
     "LaneKeepingEnv",
     "Policy",
     "PolicyScore",
+    "Scale",
     "SimSpec",
     "encode_depth",
     "episode_seed",
@@ -192,7 +193,7 @@ __getattr__ = lazy_attributes(
     {
         "mcaprl.sims.drawing.camera": ("lens",),
         "mcaprl.sims.drawing.depth": ("DepthCamera", "encode_depth"),
-        "mcaprl.sims.evaluation.evaluate": ("PolicyScore", "evaluate", "normalize"),
+        "mcaprl.sims.evaluation.evaluate": ("PolicyScore", "Scale", "evaluate", "normalize"),
         "mcaprl.sims.evaluation.pilots": ("make_pilot",),
         "mcaprl.sims.evaluation.rollout": ("EpsilonGreedy", "Policy", "episode_seed", "rollout"),
         "mcaprl.sims.lane.camera": ("CarCamera",),

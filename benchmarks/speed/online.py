@@ -19,8 +19,9 @@ from pathlib import Path
 
 import torch
 
-from mcaprl.online import SIM_SETTINGS, Agent, LiveTraining, Scale, Task
+from mcaprl.online import SIM_SETTINGS, Agent, LiveTraining, Task
 from mcaprl.progress import TrainingProgress
+from mcaprl.sims import Scale
 
 KINDS = ("plain", "recorded", "watched")
 _VIEWER = Path(__file__).parent.parent.parent / "tests" / "node" / "watch.mjs"

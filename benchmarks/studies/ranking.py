@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 import mcaprl
 from mcaprl.files import write_json
 from mcaprl.offline import FQEConfig, OffPolicyEvaluator
-from mcaprl.online import Agent, OnlinePolicy, Scale, Task, describe_run, read_policy, save_policy
+from mcaprl.online import Agent, OnlinePolicy, Task, describe_run, read_policy, save_policy
 from mcaprl.progress import TrainingProgress
-from mcaprl.sims import episode_seed, make_sims
+from mcaprl.sims import Scale, episode_seed, make_sims
 
 SEEDS: Final = 4
 CHECKPOINTS: Final = 8

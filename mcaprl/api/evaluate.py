@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,11 +28,13 @@ from mcaprl.sims import make_sim, make_sims
 from mcaprl.sims.evaluation.evaluate import (
     Improvement,
     PolicyScore,
+    Scale,
     improvements,
     normalize,
     score_of,
 )
 from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
+from mcaprl.sims.evaluation.pilots import has_pilot
 from mcaprl.sims.evaluation.rollout import Policy
 from mcaprl.sims.evaluation.statistics import mean_interval
 
@@ -191,7 +193,8 @@ def evaluate(
     random, pilot = scores["random"], scores.get("pilot")
     normalized = [normalize(score, random, pilot) for score in scores.values()]
     if logged is not None:
-        logged = replace(logged, normalized_score=_normalized(logged.mean_return, normalized))
+        score = Scale.of(random, pilot).score(logged.mean_return)
+        logged = replace(logged, normalized_score=None if math.isnan(score) else score)
     result = Evaluation(sim, seed, logged, tuple(normalized), tuple(improvements(normalized)))
     if folder is not None:
         _write_report(folder, result, world, log, names)
@@ -200,13 +203,8 @@ def evaluate(
 
 def _policies(names: Sequence[str], env: gym.Env[Any, Any]) -> dict[str, list[Policy | None]]:
     """Return a dict from names to policies; it includes `random` and, if there is one, `pilot`."""
-    found = {name: policies_of(name, env) for name in dict.fromkeys(names)}
-    for name in SCRIPTED:
-        if name not in found:
-            # Some sims have no pilot.
-            with suppress(UsageError):
-                found[name] = policies_of(name, env)
-    return found
+    scripted = SCRIPTED if has_pilot(env) else ("random",)
+    return {name: policies_of(name, env) for name in dict.fromkeys([*names, *scripted])}
 
 
 def _set_policy(recorder: RecordMcap | None, name: str) -> None:
@@ -231,14 +229,6 @@ def _behavior(data: str, env: gym.Env[Any, Any], record: Path | None) -> LoggedR
     returns = dataset.statistics.returns
     interval = mean_interval(returns[None])
     return LoggedReturns(data, len(returns), float(returns.mean()), interval)
-
-
-def _normalized(mean_return: float, scores: Sequence[PolicyScore]) -> float | None:
-    """Scale a mean return so that random is 0 and the pilot is 1."""
-    random = next((s.mean_return for s in scores if s.policy == "random"), math.nan)
-    pilot = next((s.mean_return for s in scores if s.policy == "pilot"), math.nan)
-    score = (mean_return - random) / (pilot - random or math.nan)
-    return None if math.isnan(score) else score
 
 
 def _write_report(

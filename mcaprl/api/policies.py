@@ -141,15 +141,14 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
     if name == "random":
         return [None]
     if name == "pilot":
-        from mcaprl.sims.evaluation.pilots import make_pilot
+        from mcaprl.sims.evaluation.pilots import has_pilot, make_pilot
 
-        try:
-            return [make_pilot(env)]
-        except UnknownNameError as error:
+        if not has_pilot(env):
             sim = env.spec.id if env.spec else "the environment"
             raise UsageError(
                 f"{sim} has no pilot: pass --policy random, or the path of a trained run"
-            ) from error
+            )
+        return [make_pilot(env)]
     policies = load_policies(_existing(name, SCRIPTED))
     for policy in policies:
         check_fit(policy, env)

@@ -26,14 +26,14 @@ from mcaprl.offline.batches.observations import Observations
 from mcaprl.offline.policy import read_policy, save_policy
 from mcaprl.offline.training.metrics import MetricsWriter
 from mcaprl.online.config import DoubleDQNConfig
-from mcaprl.online.evaluation import FRESH_SEED, Scale, measure_scale
+from mcaprl.online.evaluation import FRESH_SEED, measure_scale
 from mcaprl.online.task import Task
 from mcaprl.online.train import OnlineSummary, write_scores
 from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
 from mcaprl.runs import locked_run, open_run, seed_folder
 from mcaprl.settings import flag
 from mcaprl.sims import DeviceSims, make_device_sims, make_sim
-from mcaprl.sims.evaluation.evaluate import evaluate
+from mcaprl.sims.evaluation.evaluate import Scale, evaluate
 from mcaprl.sims.vehicle.device import Batch
 
 SETTINGS: Final[dict[str, Any]] = {
@@ -269,7 +269,7 @@ def _train(
                 raise TrainingError(
                     f"update {error.update} of {folder}: {error}; lower the learning rate"
                 ) from error
-            rate = learner.config.learning_rate_at(learner.step)
+            rate = learner.config.learning_rate_at(max(learner.step - 1, 0))
             for seed, writer, mean in zip(seeds, writers, means, strict=True):
                 values = {"mean_reward": mean, "epsilon": agents.epsilon, "steps": agents.steps}
                 writer.write(learner.step, rate, values)

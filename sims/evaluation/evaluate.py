@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -167,21 +168,40 @@ def score_of(
     )
 
 
+@dataclass(frozen=True)
+class Scale:
+    """Mean returns of random actions and of the sim's pilot on the same episodes.
+
+    Attributes:
+        random: Mean return of random actions.
+        pilot: Mean return of the pilot; NaN if the sim has no pilot.
+    """
+
+    random: float
+    pilot: float
+
+    @classmethod
+    def of(cls, random: PolicyScore, pilot: PolicyScore | None) -> Scale:
+        """Return the scale of two scores."""
+        return cls(random.mean_return, math.nan if pilot is None else pilot.mean_return)
+
+    def score(self, mean_return: float) -> float:
+        """Return the normalized score of a mean return: 0 for random, 1 for the pilot.
+
+        Without a pilot, or if the pilot's return is that of random actions, it is NaN.
+        """
+        span = self.pilot - self.random
+        return (mean_return - self.random) / span if span else math.nan
+
+
 def normalize(score: PolicyScore, random: PolicyScore, pilot: PolicyScore | None) -> PolicyScore:
     """Add the normalized score (random = 0, pilot = 1) to a score, if there is a pilot."""
-    if pilot is None or pilot.mean_return == random.mean_return:
+    scale = Scale.of(random, pilot)
+    mean, *ends = map(scale.score, (score.mean_return, *score.interval))
+    if math.isnan(mean):
         return score
-    span = pilot.mean_return - random.mean_return
-
-    def scaled(value: float) -> float:
-        return (value - random.mean_return) / span
-
-    low, high = score.interval
-    return replace(
-        score,
-        normalized_score=scaled(score.mean_return),
-        normalized_interval=(scaled(low), scaled(high)),
-    )
+    # If the pilot is worse than random actions, the scale is reversed.
+    return replace(score, normalized_score=mean, normalized_interval=(min(ends), max(ends)))
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,18 @@ def make_pilot(env: gym.Env[Any, Any]) -> Policy:
     Raises:
         UnknownNameError: The environment has no pilot.
     """
-    sim = env.unwrapped
-    env_id = sim.spec.id if sim.spec else type(sim).__name__
-    spec = SIMS.find(env_id)
+    spec = SIMS.find(_id_of(env))
     if spec is None or spec.pilot is None:
-        raise UnknownNameError("environment with a pilot", env_id, SIMS)
-    return cast(Policy, spec.make_pilot(sim))
+        raise UnknownNameError("environment with a pilot", _id_of(env), SIMS)
+    return cast(Policy, spec.make_pilot(env.unwrapped))
+
+
+def has_pilot(env: gym.Env[Any, Any]) -> bool:
+    """Return whether the sim in `env`, which may be wrapped, has a pilot."""
+    spec = SIMS.find(_id_of(env))
+    return spec is not None and spec.pilot is not None
+
+
+def _id_of(env: gym.Env[Any, Any]) -> str:
+    sim = env.unwrapped
+    return sim.spec.id if sim.spec else type(sim).__name__

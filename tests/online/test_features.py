@@ -19,7 +19,6 @@ from mcaprl.architecture import Architecture
 from mcaprl.errors import PolicyError, UsageError
 from mcaprl.online.agent import CENTERING_STEPS, Agent
 from mcaprl.online.config import DoubleDQNConfig, PPOConfig
-from mcaprl.online.evaluation import Scale
 from mcaprl.online.features import (
     NetworkDQNPolicy,
     NetworkFeatures,
@@ -28,6 +27,7 @@ from mcaprl.online.features import (
 )
 from mcaprl.online.policy import describe_run, read_policy, save_policy
 from mcaprl.online.task import Task
+from mcaprl.sims.evaluation.evaluate import Scale
 
 SHORT: dict[str, Any] = {
     "steps": 100,

@@ -18,12 +18,12 @@ from mcaprl.errors import PolicyError
 from mcaprl.offline.algorithms.config import CQLConfig
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.agent import Agent
-from mcaprl.online.evaluation import Scale
 from mcaprl.online.frames import FrameMemory, StackedVecEnv, joined, stacked_space
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
 from mcaprl.online.vec_env import BatchedVecEnv
 from mcaprl.progress import TrainingProgress
+from mcaprl.sims.evaluation.evaluate import Scale
 from mcaprl.sims.evaluation.rollout import EpsilonGreedy, rollout
 
 SHORT: dict[str, Any] = {

@@ -19,7 +19,7 @@ from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.offline.algorithms.config import CQLConfig
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.agent import Agent
-from mcaprl.online.evaluation import FirstEpisodes, Scale
+from mcaprl.online.evaluation import FirstEpisodes
 from mcaprl.online.policy import read_policy
 from mcaprl.online.recording import behavior_probabilities, log_paths, recorded
 from mcaprl.online.task import Task
@@ -29,6 +29,7 @@ from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import read_curve
 from mcaprl.sims import make_sim
+from mcaprl.sims.evaluation.evaluate import Scale
 from mcaprl.sims.lane.rules import STEERING
 from tests.support.learner_topic import read_learner
 

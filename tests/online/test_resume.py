@@ -23,11 +23,11 @@ from mcaprl.cli import run
 from mcaprl.errors import TrainingError
 from mcaprl.offline.training.follow import GrowingLogs
 from mcaprl.online.agent import Agent
-from mcaprl.online.evaluation import Scale
 from mcaprl.online.task import Task
 from mcaprl.online.train import OnlineSummary, train
 from mcaprl.progress import TrainingProgress
 from mcaprl.runs import read_curve
+from mcaprl.sims.evaluation.evaluate import Scale
 
 SHORT: dict[str, Any] = {
     "steps": 2_000,

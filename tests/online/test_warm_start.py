@@ -21,12 +21,12 @@ from mcaprl.errors import PolicyError, SpaceError, UsageError
 from mcaprl.offline.algorithms.config import CQLConfig, DQNConfig
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.agent import Agent
-from mcaprl.online.evaluation import Scale
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
 from mcaprl.online.warm_start import fill_buffer
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.sims.evaluation.evaluate import Scale
 from mcaprl.sims.evaluation.rollout import EpsilonGreedy, rollout
 
 SHORT: dict[str, Any] = {
