@@ -23,6 +23,7 @@ from mcaprl.cli.progress import keeping, working
 from mcaprl.cli.show import echo, print_json, print_table
 from mcaprl.errors import UsageError
 from mcaprl.page import PAGE_NAME
+from mcaprl.settings import flag
 from mcaprl.texts import counted
 
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ def evaluate(
 def _refuse_unused(given: dict[str, Any], names: Sequence[str], needed: str) -> None:
     for name in names:
         if name in given:
-            raise UsageError(f"--{name} requires --{needed}")
+            raise UsageError(f"{flag(name)} requires --{needed}")
 
 
 def _print_scores(found: Evaluation, episodes: int) -> None:

@@ -128,7 +128,7 @@ def _print_choice(choice: Choice, report: Path | None) -> None:
 
     title = f"{choice.chosen}, chosen by the log"
     print_table(title, list(COLUMNS), [list(row) for row in choice.rows])
-    for text in (choice.reason, choice.sureness, *choice.advice):
+    for text in (choice.reason, choice.confidence, *choice.advice):
         echo(text)
     if report is not None:
         echo(f"report: {report / PAGE_NAME}")

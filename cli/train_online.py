@@ -96,7 +96,7 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
 
     An omitted setting has the value of the preset, else the value tuned for SIM, else the default
     of Stable-Baselines3. With --resume, it has the value of the run. Settings are tuned only for
-    dqn and double-dqn with default rules and without images. The best checkpoint is kept. It is
+    dqn and double-dqn with default rules. The best checkpoint is kept. It is
     selected on one set of episodes and scored on another set.
     """
     given = {name: value for name, value in request.items() if value is not None}
@@ -127,5 +127,6 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
         ["run", "steps", "saved at", "mean return", "random 0, pilot 1", "ends"],
         rows,
     )
-    curves = "" if on_device else f"{out / 'curve.png'}, or "
+    image = out / "curve.png"
+    curves = f"{image}, or " if image.exists() else ""
     hint(f"curves: {curves}tensorboard --logdir {out}")

@@ -5,9 +5,10 @@
     mcaprl.train(data, "runs/cql")                                            # trained policy
     policy = mcaprl.load_policy("runs/cql")                                   # loaded policy
 
-Each command of the program has a function of the same name, with three exceptions: `train-offline`
-is `train`, `evaluate --data` is `estimate`, and `replay` is split into `replay`, `verify` and
-`render`. Importing this package does not import torch or numba; functions import them when called.
+Most commands of the program have a function of the same name. `train-offline` is `train` or
+`sweep`, `evaluate --data` is `estimate`, `convert --suggest` is `suggest_mapping`, and `replay` is
+`replay`, `browse`, `save_page`, `verify` or `render`; `completion` has no function. Importing this
+package does not import torch or numba; functions import them when called.
 """
 
 from typing import TYPE_CHECKING

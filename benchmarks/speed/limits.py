@@ -22,9 +22,9 @@ def plain(path: Path, *topics: str, **times: int) -> Callable[[], None]:
     return lambda: plain_zstd(chunks)
 
 
-def least(path: Path, *topics: str) -> Callable[[], object]:
+def least(path: Path, *topics: str, **times: int) -> Callable[[], object]:
     """Return a function that does the minimum work of a reader of columns."""
-    headers = chunk_headers(path, topics or (STEP_TOPIC,))
+    headers = chunk_headers(path, topics or (STEP_TOPIC,), **times)
     return lambda: least_work(path, headers)
 
 
@@ -34,19 +34,10 @@ def plain_level_1(path: Path) -> Callable[[], None]:
     return lambda: plain_zstd(chunks)
 
 
-def compressed_chunks(
-    path: Path, topics: tuple[str, ...], start_ns: int = 0, stop_ns: int = 2**63
-) -> list[memoryview]:
-    """Return the compressed bytes of the chunks that contain a topic in a time range."""
-    reader = McapReader(path)
-    ids = {channel.id for channel in reader.channels.values() if channel.topic in topics}
-    found = []
-    for chunk in reader.chunks:
-        is_then = chunk.message_start_time < stop_ns and chunk.message_end_time >= start_ns
-        if ids & set(chunk.message_index_offsets) and is_then:
-            start = chunk.chunk_start_offset + chunk.chunk_length - chunk.compressed_size
-            found.append(reader.view[start : start + chunk.compressed_size])
-    return found
+def compressed_chunks(path: Path, topics: tuple[str, ...], **times: int) -> list[memoryview]:
+    """Return the compressed bytes of the chunks that `chunk_headers` finds."""
+    view = map_file(path)
+    return [view[header.data] for header in chunk_headers(path, topics, **times)]
 
 
 def plain_zstd(chunks: Sequence[bytes | memoryview]) -> None:
@@ -57,12 +48,19 @@ def plain_zstd(chunks: Sequence[bytes | memoryview]) -> None:
         zstandard.decompress(data)
 
 
-def chunk_headers(path: Path, topics: tuple[str, ...]) -> list[ChunkHeader]:
-    """Return the headers of the chunks that contain a topic."""
+def chunk_headers(
+    path: Path, topics: tuple[str, ...], start_ns: int = 0, stop_ns: int = 2**63
+) -> list[ChunkHeader]:
+    """Return the headers of the chunks that contain a topic in a time range."""
     reader = McapReader(path)
     ids = {channel.id for channel in reader.channels.values() if channel.topic in topics}
-    found = [chunk for chunk in reader.chunks if ids & set(chunk.message_index_offsets)]
-    return [chunk_header(reader.view, chunk.chunk_start_offset) for chunk in found]
+    return [
+        chunk_header(reader.view, chunk.chunk_start_offset)
+        for chunk in reader.chunks
+        if ids & set(chunk.message_index_offsets)
+        and chunk.message_start_time < stop_ns
+        and chunk.message_end_time >= start_ns
+    ]
 
 
 def least_work(path: Path, headers: Sequence[ChunkHeader]) -> None:

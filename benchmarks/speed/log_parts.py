@@ -63,15 +63,13 @@ def _episode(folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.Minar
     table, part = folder / "table.h5", vectors(int(len(data) * SLOW_SHARE))
     fewer = folder / "fewer.mcap"
     part.save(fewer)
-    one = data.episodes[number].observations
+    one, times = data.episodes[number].observations, {"start_ns": start, "stop_ns": stop}
     return compare(
         f"Reading one episode of {len(episodes)}",
         [
             Side(OURS, lambda: mcaprl.open(log, episodes=number)),
-            Side(
-                "plain zstd of the episode's chunks",
-                limits.plain(log, start_ns=start, stop_ns=stop),
-            ),
+            Side("plain zstd of the episode's chunks", limits.plain(log, **times)),
+            Side(f"{LEAST_WORK}, the episode's chunks", limits.least(log, **times)),
             Side("memcpy of the episode's observations", lambda: [one.copy()]),
             Side(
                 "mcap + mcap-ros2-support, by time",

@@ -196,7 +196,7 @@ def _replaceable(folder: Path, *, overwrite: bool) -> list[Path]:
 
 
 def _shares(total: int, parts: int) -> list[tuple[int, int]]:
-    """Split range(count) into half-open ranges whose lengths differ by at most one.
+    """Split range(total) into half-open ranges whose lengths differ by at most one.
 
     >>> _shares(5, 2)
     [(0, 2), (2, 5)]

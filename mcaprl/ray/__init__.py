@@ -3,8 +3,8 @@
 rows = mcaprl.ray.read("logs/", columns=["observation", "action"])    # a ray.data.Dataset
 mcaprl.ray.write(rows.filter(...), "selected/")                      # logs, and their manifest
 
-`mcaprl.record` and `mcaprl.evaluate` use Ray with `ray=True`. Importing this module does not import
-Ray.
+`mcaprl.record`, `train`, `sweep` and `evaluate` use Ray with `ray=True`. Importing this
+module does not import Ray.
 """
 
 from typing import TYPE_CHECKING

@@ -68,7 +68,7 @@ class BootstrapConfig(TrainingConfig):
     n_steps: int = 1
     """number of rewards in a target before the bootstrap value"""
     target_interval: int = 500
-    """updates between two updates of the target network"""
+    """updates between two syncs of the target network"""
     scale_rewards: bool = False
     """divide rewards by the standard deviation of the discounted returns of the log"""
 

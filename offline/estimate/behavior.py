@@ -241,8 +241,7 @@ def _fitted(
             if score > best_score:
                 best, best_score, best_fit = raw, score, (fit[0], fit[1])
     probabilities = _probabilities(best, *best_fit)
-    trained = ~held_out & ~validated
-    frequencies = np.bincount(actions[trained | validated], minlength=best.shape[1]) + 1.0
+    frequencies = np.bincount(actions[~held_out], minlength=best.shape[1]) + 1.0
     marginal = np.log(frequencies / frequencies.sum())[actions[held_out]]
     own = probabilities[held_out, actions[held_out]]
     return probabilities, FoldScore(

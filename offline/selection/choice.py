@@ -85,8 +85,8 @@ class Choice:
     Attributes:
         chosen: Name of the candidate.
         reason: Why it was chosen, in words.
-        sureness: How sure the choice is, in words.
-        advice: What data would make the choice surer, in words.
+        confidence: Confidence in the choice, in words.
+        advice: What data would raise this confidence, in words.
         complete: Whether all planned training and evaluation was done within the budget.
         traits: Properties of the log.
         tried: What is known of each candidate, by name, from the best to the worst.
@@ -94,7 +94,7 @@ class Choice:
 
     chosen: str
     reason: str
-    sureness: str
+    confidence: str
     advice: tuple[str, ...]
     complete: bool
     traits: LogTraits
@@ -114,7 +114,7 @@ class Choice:
         found = {
             "chosen": self.chosen,
             "reason": self.reason,
-            "sureness": self.sureness,
+            "confidence": self.confidence,
             "advice": list(self.advice),
             "complete": self.complete,
             "traits": self.traits.to_json(),
@@ -131,10 +131,10 @@ class Choice:
         """
         log = [(name.replace("_", " "), _shown(value)) for name, value in _shown_traits(self)]
         sections = [
-            Section("How sure", self.sureness),
+            Section("Confidence", self.confidence),
             Section("Candidates", EXPLANATION, table=Table(COLUMNS, self.rows)),
             Section("The log", table=Table(("", ""), log)),
-            Section("What would make it surer", " ".join(self.advice)),
+            Section("How to raise the confidence", " ".join(self.advice)),
         ]
         path = folder / "index.html"
         write_page(path, title, self.reason, sections)
@@ -155,7 +155,7 @@ def read_choice(run: Path) -> Choice:
         return Choice(
             found["chosen"],
             found["reason"],
-            found["sureness"],
+            found["confidence"],
             tuple(found["advice"]),
             found["complete"],
             traits,
@@ -181,10 +181,10 @@ def reason_of(chosen: str, ratings: Mapping[str, Rating], traits: LogTraits) -> 
     return f"{chosen} has the largest estimated value of {count}: {_with_interval(mine)}."
 
 
-def sureness_of(chosen: str, ratings: Mapping[str, Rating]) -> str:
-    """Return how sure a choice is, in words."""
+def confidence_of(chosen: str, ratings: Mapping[str, Rating]) -> str:
+    """Return the confidence in a choice, in words."""
     if chosen not in ratings:
-        return "Not sure at all: no candidate was evaluated."
+        return "There is no evidence: no candidate was evaluated."
     chance = ratings[chosen].best_chance
     return (
         f"In {chance:.0%} of the resamplings of episodes, networks and models, {chosen}"
@@ -194,7 +194,7 @@ def sureness_of(chosen: str, ratings: Mapping[str, Rating]) -> str:
 
 
 def advice_for(traits: LogTraits, tried: Mapping[str, Tried], complete: bool) -> tuple[str, ...]:
-    """Return what data, or which budget, would make the choice surer."""
+    """Return what data, or which budget, would raise the confidence in the choice."""
     advice = []
     if not complete:
         advice.append("Resume with a larger --budget-minutes: the budget ended early.")

@@ -127,7 +127,7 @@ PORTFOLIO: Final = (
 """All candidates, in the order of their training; the first is used if none can be evaluated."""
 
 
-def candidates_for(traits: LogTraits) -> dict[str, str]:
+def skipped_candidates(traits: LogTraits) -> dict[str, str]:
     """Return a dict from the name of each candidate that is not tried on a log to the reason."""
     skipped = {}
     if traits.coverage <= LEAST_COVERAGE:

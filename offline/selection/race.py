@@ -41,16 +41,16 @@ from mcaprl.offline.selection.choice import (
     Choice,
     Tried,
     advice_for,
+    confidence_of,
     reason_of,
-    sureness_of,
 )
 from mcaprl.offline.selection.config import AUTO, AutoConfig
 from mcaprl.offline.selection.portfolio import (
     Candidate,
     LogTraits,
-    candidates_for,
     check_finalists,
     eligible,
+    skipped_candidates,
     traits_of,
     tried,
 )
@@ -229,7 +229,7 @@ class _Race:
     def run(self) -> tuple[Choice, list[OfflineSummary]]:
         """Run both stages. Return the choice, and a summary for each seed."""
         clone, traits = self._look()
-        skipped = candidates_for(traits)
+        skipped = skipped_candidates(traits)
         trying = tried(skipped)
         short, full = self._config.short_updates, self._config.updates
         self._eligible = eligible(self._config, trying)
@@ -465,7 +465,7 @@ class _Race:
         return Choice(
             chosen,
             reason_of(chosen, ratings, traits),
-            sureness_of(chosen, ratings),
+            confidence_of(chosen, ratings),
             advice_for(traits, table, self._in_time),
             self._in_time,
             traits,

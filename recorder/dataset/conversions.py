@@ -208,6 +208,8 @@ class Conversions:
 
         Raises:
             SpaceError: A log cannot hold a space or dtype of the data.
+            LogError: There are no transitions.
+            UsageError: `buffer` is not a replay buffer of d3rlpy.
         """
         from mcaprl.recorder.dataset.formats.d3rlpy import from_buffer
 
@@ -264,6 +266,7 @@ class Conversions:
         Raises:
             SpaceError: A log cannot hold a space or dtype of the data.
             LogError: The buffer is empty, or has lost information and `lossy` is not set.
+            UsageError: `buffer` is not a replay buffer of SB3.
         """
         from mcaprl.recorder.dataset.formats.sb3 import from_buffer
 

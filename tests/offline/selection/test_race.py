@@ -229,7 +229,7 @@ def test_auto_in_the_api_with_a_report(data: Dataset, tmp_path: Path) -> None:
     choice = read_choice(run)
     assert summary.folder == run / "seed-0"
     page = (report / "index.html").read_text()
-    for text in (choice.reason, choice.sureness, *choice.tried):
+    for text in (choice.reason, choice.confidence, *choice.tried):
         assert text in page
     assert choice.tried[choice.chosen].weighted is not None
     mcaprl.train(data, run, resume=True)
