@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mcaprl.sims.drawing.canvas import Canvas
 from mcaprl.sims.drawing.painter import NEAR_M, RIM, Eye, Faces, Painter, joined
 from mcaprl.sims.drawing.scene import Color, Frame, Shape
-from mcaprl.sims.geometry.mesh import box_mesh
+from mcaprl.sims.geometry.mesh import box_faces
 
 Floats = NDArray[np.float64]
 
@@ -243,8 +243,7 @@ def _outlines(shape: Shape) -> tuple[Sequence[Floats] | Floats, float]:
     points, size = shape.points, shape.size
     match shape.kind:
         case "box":
-            faces = box_mesh((0.0, 0.0, 0.0), size).reshape(2, 6, 3, 3)
-            return np.concatenate([faces[0], faces[1, :, 2:]], axis=1), 0.0
+            return box_faces((0.0, 0.0, 0.0), size), 0.0
         case "cylinder":
             return _cylinder(size), 0.0
         case "sphere":

@@ -1,4 +1,4 @@
-"""Triangle meshes of solids, for the depth camera."""
+"""Meshes of solids, as triangles for the depth camera or as faces for images of scenes."""
 
 from __future__ import annotations
 
@@ -12,6 +12,16 @@ Vector = tuple[float, float, float]
 _FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 _TRIANGLES = np.array([half for a, b, c, d in _FACES for half in ((a, b, c), (a, c, d))])
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+
+
+def box_faces(middle_m: Vector, size_m: Vector) -> NDArray[np.float64]:
+    """Return the faces of an axis-aligned box, (6 faces, 4 corners, xyz), meters.
+
+    Seen from outside, the corners of each face run counter-clockwise.
+    """
+    corners: NDArray[np.float64] = np.array(middle_m) + _CORNERS * np.array(size_m)
+    faces: NDArray[np.float64] = corners[np.array(_FACES)]
+    return faces
 
 
 def box_mesh(middle_m: Vector, size_m: Vector) -> NDArray[np.float64]:

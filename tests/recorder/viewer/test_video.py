@@ -25,6 +25,7 @@ from mcaprl.recorder.viewer.video import (
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.chase_view import HEIGHT_PX, ChaseView, chase_eye, poses_of
 from mcaprl.sims.drawing.scene import Frame, Kind, Shape, yaw_rotation
+from mcaprl.sims.geometry.mesh import box_mesh
 from mcaprl.sims.lane.scene import static_shapes
 from tests.conftest import need
 
@@ -104,6 +105,18 @@ def test_nearer_shapes_hide_farther_ones(view: ChaseView) -> None:
         assert share(image, 1) > 0.2
     assert share(view.draw([box(RED, -100.0)], [], car_at(0.0), "car", []), 0) == 0.0
     assert share(view.draw([box(RED, 900.0)], [], car_at(0.0), "car", []), 0) == 0.0
+
+
+def test_a_box_looks_like_its_triangles(view: ChaseView) -> None:
+    size, position, turn_rad = (3.0, 1.0, 2.0), (0.5, 0.25, 1.0), 0.6
+    mesh = box_mesh((0.0, 0.0, 0.0), size).reshape(-1, 3)
+    place: Any = {"position": position, "yaw_rad": turn_rad}
+    whole = view.draw([Shape("it", "box", RED, size=size, **place)], [], [], "", [])
+    parts = view.draw([Shape("it", "triangles", RED, points=mesh, **place)], [], [], "", [])
+    differs = (abs(whole.astype(int) - parts) > 8).any(-1)
+    assert share(whole, 0) > 5e-3
+    # Only at the diagonals of the faces, the background shines through the triangles' edges.
+    assert differs.mean() < 0.1 * share(whole, 0)
 
 
 def test_every_kind_of_shape_is_visible(view: ChaseView) -> None:
