@@ -12,6 +12,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import stat
 import sys
@@ -28,6 +29,7 @@ if sys.platform != "win32":
 
 _MAX_NAME_BYTES = 255
 _MAX_JSON_DEPTH = 100
+_DIGITS = re.compile(r"\d+")
 _TAKEN = "{} is being written by another process; wait until it ends, or choose another path"
 
 
@@ -282,8 +284,9 @@ def replacing_folder(
         overwrite: Whether an existing folder is replaced.
 
     Raises:
-        OutputExistsError: The folder exists and is not to be replaced, or is not a folder.
-        LogError: Another process is writing the folder.
+        OutputExistsError: The folder exists and is not to be replaced, has files with other names
+            than the new one, apart from their numbers, or is not a folder.
+        LogError: Another process is writing the folder, or a file in it.
         McaprlError: A file cannot be written.
     """
     _check_folder(path, overwrite=overwrite)
@@ -297,6 +300,7 @@ def replacing_folder(
                     os.fsync(opened.fileno())
             _check_folder(path, overwrite=overwrite)
             if path.exists():
+                _check_contents(path, unfinished)
                 # Between these two moves, nothing is at `path`, but both folders are complete.
                 os.rename(path, work / f"{path.name}.old")
             os.rename(unfinished, path)
@@ -320,6 +324,32 @@ def _check_folder(path: Path, *, overwrite: bool) -> None:
         raise OutputExistsError(
             f"{path} exists: choose another path, or pass --overwrite (overwrite=True in Python)"
         )
+
+
+def _check_contents(path: Path, replacement: Path) -> None:
+    """Check that a folder has only files that an earlier run of the same command wrote.
+
+    Raises:
+        OutputExistsError: A file has another name than all files of the replacement, apart from
+            its numbers.
+        LogError: Another writer has locked a file.
+    """
+    new, old = (
+        {entry: _DIGITS.sub("0", str(entry.relative_to(folder))) for entry in _files_in(folder)}
+        for folder in (replacement, path)
+    )
+    names = set(new.values())
+    for entry, name in sorted(old.items()):
+        if name not in names:
+            raise OutputExistsError(
+                f"{path} has other files ({entry.relative_to(path)}), which would be deleted:"
+                " choose another folder"
+            )
+        check_target(entry, overwrite=True)
+
+
+def _files_in(folder: Path) -> list[Path]:
+    return [entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir()]
 
 
 def _move(source: Path, path: Path, *, overwrite: bool) -> None:

@@ -13,7 +13,7 @@ from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.message_rows import RECORD_HEADER_BYTES
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import MAGIC, parse_record
+from mcaprl.recorder.columns.records import MAGIC, is_intact_attachment, parse_record
 from mcaprl.recorder.columns.summary import Summary
 
 TopLevelRecord = Metadata | Schema | Channel | Attachment
@@ -63,7 +63,11 @@ def finished_state(reader: McapReader) -> WrittenState:
     end = reader.summary_start - _DATA_END.size
     if end <= 0 or _DATA_END.unpack_from(reader.view, end)[:2] != (Opcode.DATA_END, 4):
         raise CorruptLogError("the file is not finished")
-    (_, _, crc) = _DATA_END.unpack_from(reader.view, end)
+    (_, _, listed) = _DATA_END.unpack_from(reader.view, end)
+    # Only this CRC covers metadata. A copy of damaged data would get valid CRCs.
+    crc = crc32(reader.view[:end])
+    if listed and crc != listed:
+        raise CorruptLogError("the data section does not match its CRC")
     summary = Summary(chunks=list(reader.chunks))
     top_level: list[TopLevelRecord] = [*reader.schemas.values(), *reader.channels.values()]
     for topic in top_level:
@@ -75,9 +79,11 @@ def finished_state(reader: McapReader) -> WrittenState:
         summary.counts[channel.id] = sum(map(len, ranges))
     for offset, opcode, content in reader.records(len(MAGIC)):
         if opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+            if opcode == Opcode.ATTACHMENT and not is_intact_attachment(content):
+                raise CorruptLogError(f"the attachment at byte {offset} does not match its CRC")
             record: TopLevelRecord = parse_record(opcode, content)
             summary.add(record, offset, RECORD_HEADER_BYTES + len(content))
             top_level.append(record)
         elif opcode == Opcode.DATA_END:
             break
-    return WrittenState(summary, end, crc or crc32(reader.view[:end]), top_level)
+    return WrittenState(summary, end, crc, top_level)

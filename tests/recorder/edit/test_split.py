@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -268,6 +269,28 @@ def test_existing_output_is_kept(log: Path, tmp_path: Path) -> None:
     mcaprl.filter("terminated", log, tmp_path / "out.mcap", overwrite=True)
     mcaprl.split(log, tmp_path / "parts", episodes=2, overwrite=True)
     assert len(list((tmp_path / "parts").iterdir())) == 2
+
+
+def test_a_folder_with_other_files_is_not_replaced(log: Path, tmp_path: Path) -> None:
+    """Only parts that an earlier run wrote are replaced: not the log, and not the user's notes."""
+    before = log.read_bytes()
+    with pytest.raises(OutputExistsError, match=r"other files \(log.mcap\), which would be deleted"):
+        mcaprl.split(log, tmp_path, episodes=2, overwrite=True)
+    with pytest.raises(OutputExistsError, match=r"other files \(log.mcap\)"):
+        mcaprl.convert(log, tmp_path, to="parquet", overwrite=True)
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [(log.name, before)]
+    parts = tmp_path / "parts"
+    mcaprl.split(log, parts, episodes=1)
+    mcaprl.split(log, parts, episodes=2, overwrite=True)
+    assert sorted(path.name for path in parts.iterdir()) == ["log-00000.mcap", "log-00001.mcap"]
+    recorder = mcaprl.RecordMcap(gym.make("CartPole-v1"), parts / "log-00002.mcap")
+    with closing(recorder), pytest.raises(LogError, match=r"log-00002.mcap is being written"):
+        mcaprl.split(log, parts, episodes=2, overwrite=True)
+    (parts / "notes").mkdir()
+    (parts / "notes" / "day.txt").write_text("mine")
+    with pytest.raises(OutputExistsError, match=r"other files \(notes/day.txt\)"):
+        mcaprl.split(log, parts, episodes=2, overwrite=True)
+    assert (parts / "notes" / "day.txt").read_text() == "mine"
 
 
 def test_log_can_be_replaced_by_its_part(log: Path) -> None:
