@@ -166,7 +166,7 @@ def work_folder(path: Path, *, concurrent: bool = False) -> Iterator[Path]:
         concurrent: Whether several processes may write files for the target at the same time.
 
     Raises:
-        LogError: Another process is writing the target.
+        LogError: Another process is writing the target, or a log in the folder cannot be written.
         OSError: The folder cannot be created.
     """
     folder = _work_path(path, f".{os.getpid()}.part" if concurrent else ".part")
@@ -185,6 +185,12 @@ def work_folder(path: Path, *, concurrent: bool = False) -> Iterator[Path]:
             _empty(folder)
             try:
                 yield folder
+            except LogError as error:
+                # The message names the target, because the user does not know the work folder.
+                cause = error.__cause__
+                if isinstance(cause, OSError) and str(folder) in str(error):
+                    raise LogError(f"cannot write {path}: {cause.strerror or cause}") from error
+                raise
             finally:
                 shutil.rmtree(folder, ignore_errors=True)
             return
@@ -249,7 +255,6 @@ def replacing(
         OSError: The file cannot be written, and `error_type` is None.
     """
     check_target(path, overwrite=overwrite)
-    folder = path
     try:
         with work_folder(path, concurrent=concurrent) as folder:
             unfinished = folder / path.name
@@ -261,12 +266,6 @@ def replacing(
         if error_type is None:
             raise
         raise error_type(f"cannot write {path}: {_reason(path, error)}") from error
-    except LogError as error:
-        # The message names the target, because the user does not know the work folder.
-        cause = error.__cause__
-        if isinstance(cause, OSError) and str(folder) in str(error):
-            raise LogError(f"cannot write {path}: {cause.strerror or cause}") from error
-        raise
 
 
 @contextmanager

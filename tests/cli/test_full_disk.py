@@ -65,6 +65,12 @@ def limited(limit: int, command: Sequence[str], folder: Path, errors: Connection
         (20_000, ["annotate", LOG, "--policy", POLICY], "x.mcap"),
         (2_000, ["recover", LOG], "x.mcap"),
         (10, ["layout", LOG], "x.json"),
+        (20_000, ["split", LOG, "x", "--episodes", "60"], "x"),
+        (20_000, ["convert", LOG, "x.npz"], "x.npz"),
+        (20_000, ["convert", LOG, "x.hdf5"], "x.hdf5"),
+        (20_000, ["convert", LOG, "x.h5", "--to", "d3rlpy", "--lossy"], "x.h5"),
+        (20_000, ["convert", LOG, "x-v0", "--to", "minari", "--lossy"], "x-v0"),
+        (2_000, ["convert", LOG, "x", "--to", "parquet"], "x"),
         (2_000, ["info", LOG, "--report"], "x"),
         (2_000, ["train-offline", LOG, *SMALL], "x/seed-0/"),
         (900, ["train-offline", LOG, *SMALL, *OFTEN], "x/seed-0/metrics.csv"),
@@ -85,7 +91,7 @@ def test_a_full_disk_is_one_line(
     out = path.split("/")[0]
     if command[0] in ("recover", "info"):
         command = [*command, out]
-    elif "run" not in command:
+    elif command[0] not in ("convert", "split") and "run" not in command:
         command = [*command, "--out", out]
     # A fork of a process that has imported everything starts sooner than a new process.
     context = multiprocessing.get_context("forkserver")
@@ -105,6 +111,7 @@ def test_a_full_disk_is_one_line(
     assert path in lines[0]
     assert "File too large" in lines[0]
     assert ".part" not in lines[0], "the path of the user, not that of a temporary file"
+    assert not list(Path().glob(".*.part")), "temporary files are removed"
     if command[0] == "record":
         found = sorted(Path().glob("x*/*.mcap")) or [Path("x.mcap")]
         # One shard reaches its limit first. The other is interrupted, perhaps before the end of its

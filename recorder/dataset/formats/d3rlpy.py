@@ -123,7 +123,6 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
             `lossy` is not set.
         MissingExtraError: h5py is not installed.
     """
-    h5py = import_extra("h5py", nodes.EXTRA)
     infos, lost = stored_infos(infos_of(dataset))
     if lost and not lossy:
         raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the dataset")
@@ -135,7 +134,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
                 f"{error}; pass --lossy (lossy=True in Python) to write the actions unchanged"
             ) from error
         lost.append(f"{error}; the actions are written unchanged")
-    with h5py.File(path, "w") as file:
+    with nodes.created(path) as file:
         for index, part in enumerate(_episodes_of(dataset)):
             for name, values in part.items():
                 several = isinstance(values, list)

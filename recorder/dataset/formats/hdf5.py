@@ -64,7 +64,6 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
         SpaceError: `lossy` is not set, and observations are a Dict or HDF5 cannot store an info.
         MissingExtraError: h5py is not installed.
     """
-    h5py = import_extra("h5py", nodes.EXTRA)
     infos, lost = stored_infos(infos_of(dataset))
     info_names, lost_names = nested_names(infos)
     lost += lost_names
@@ -82,7 +81,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
         lost.append(f"{episodes} without an end flag: a timeout is written at the end")
     space, _ = nodes.with_names_for_hdf5(dataset.observation_space)
     names = ["".join(f"/{key}" for key in leaf.path) for leaf in observation_leaves(space)]
-    with h5py.File(path, "w") as file:
+    with nodes.created(path) as file:
         for leaf, name in zip(leaves_of(dataset.observation_space), names, strict=True):
             column, is_image = leaf.of(dataset.frames), leaf.encoding is not None
             _put(file, f"observations{name}", column, dataset.frame_of_step, is_image)

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,57 @@ def opened(path: Path) -> Iterator[Any]:
     # h5py raises errors of many types for damaged structures.
     except (OSError, RuntimeError, TypeError, ValueError) as error:
         raise LogError(f"{path}: not a readable HDF5 file: {error}") from error
+
+
+@contextmanager
+def created(path: Path, **options: Any) -> Iterator[Any]:
+    """Create a file, and yield it as a `h5py.File`.
+
+    Args:
+        path: File to create or replace.
+        options: Arguments of `h5py.File`.
+
+    Raises:
+        OSError: The file cannot be written.
+        MissingExtraError: h5py is not installed.
+    """
+    h5py = import_extra("h5py", EXTRA)
+    with _Output(path) as output:
+        try:
+            with h5py.File(output, "w", **options) as file:
+                yield file
+        finally:
+            # HDF5 continues after an error, and then raises others.
+            if output.error is not None:
+                raise output.error
+
+
+class _Output(FileIO):
+    """File that raises the first error of writing, and ignores what is written afterwards.
+
+    If HDF5 cannot write its metadata at the end, because the disk is full, the process crashes.
+
+    Attributes:
+        error: First error.
+    """
+
+    error: OSError | None = None
+
+    def __init__(self, path: Path) -> None:
+        """Create or replace the file."""
+        super().__init__(path, "w+")
+
+    def write(self, data: Any) -> int:
+        """Write all bytes and return their number."""
+        rest = memoryview(data).cast("B")
+        count = len(rest)
+        try:
+            while rest and self.error is None:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self.error = error
+            raise
+        return count
 
 
 def image_settings(shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:

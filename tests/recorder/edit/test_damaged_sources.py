@@ -56,7 +56,7 @@ def test_damage_is_refused(log: Path, tmp_path: Path, edit: str, part: bytes) ->
     log.write_bytes(content)
     assert mcaprl.check(log).problems
     (tmp_path / "out").mkdir()
-    with pytest.raises(LogError, match=r"does not match its CRC; run `mcaprl recover .*log.mcap OUT"):
+    with pytest.raises(LogError, match=r"does not match its CRC; run `mcaprl recover "):
         EDITS[edit](log, tmp_path / "out")
     assert log.read_bytes() == content
     assert not list((tmp_path / "out").iterdir())

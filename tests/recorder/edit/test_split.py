@@ -274,7 +274,7 @@ def test_existing_output_is_kept(log: Path, tmp_path: Path) -> None:
 def test_a_folder_with_other_files_is_not_replaced(log: Path, tmp_path: Path) -> None:
     """Only parts that an earlier run wrote are replaced: not the log, and not the user's notes."""
     before = log.read_bytes()
-    with pytest.raises(OutputExistsError, match=r"other files \(log.mcap\), which would be deleted"):
+    with pytest.raises(OutputExistsError, match=r"files \(log.mcap\), which would be deleted"):
         mcaprl.split(log, tmp_path, episodes=2, overwrite=True)
     with pytest.raises(OutputExistsError, match=r"other files \(log.mcap\)"):
         mcaprl.convert(log, tmp_path, to="parquet", overwrite=True)

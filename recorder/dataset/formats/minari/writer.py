@@ -19,7 +19,12 @@ from mcaprl.errors import SpaceError, import_extra
 from mcaprl.files import parse_json
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.columns import episode_slices
-from mcaprl.recorder.dataset.formats.hdf5_nodes import EXTRA, image_settings, with_names_for_hdf5
+from mcaprl.recorder.dataset.formats.hdf5_nodes import (
+    EXTRA,
+    created,
+    image_settings,
+    with_names_for_hdf5,
+)
 from mcaprl.recorder.dataset.formats.infos import (
     StoredInfo,
     infos_of,
@@ -58,7 +63,6 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
         SpaceError: `lossy` is not set, and Minari cannot store an option or a key of a space.
         MissingExtraError: h5py is not installed.
     """
-    h5py = import_extra("h5py", EXTRA)
     metadata = LogMetadata.from_strings(dataset.metadata)
     space, renamed = with_names_for_hdf5(dataset.observation_space)
     lost = [f"the key '{key}' is renamed, because it is not a valid HDF5 name" for key in renamed]
@@ -72,7 +76,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
     columns = [leaf.of(dataset.frames) for leaf in leaves]
     data = path / DATA
     data.mkdir()
-    with h5py.File(data / MAIN, "w", track_order=True) as file:
+    with created(data / MAIN, track_order=True) as file:
         for index, (steps, frames) in enumerate(episode_slices(dataset)):
             group = file.create_group(f"episode_{index}")
             episode = dataset.episodes[index]
