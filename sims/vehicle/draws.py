@@ -36,8 +36,7 @@ _capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c
 class Generators:
     """Generators of N vehicles, from which compiled code draws numbers.
 
-    A call of a generator in Python takes half a microsecond even for a few numbers. Compiled code
-    draws the same numbers in a small part of this time.
+    Compiled code draws the same numbers in a small part of the time of a call in Python.
 
     Attributes:
         addresses: (N,) addresses of the generators, for `draw`; 0 before `use`.
