@@ -24,6 +24,9 @@ from mcaprl.recorder.record.display import Display
 from mcaprl.recorder.record.layout import LAYOUT_NAME, layout_bytes, layout_of
 from mcaprl.texts import encodable
 
+_END_OF_TIME_NS = 2**63
+"""First time that an int64 in nanoseconds cannot represent, in the year 2262."""
+
 
 @dataclass
 class OpenEpisode:
@@ -69,10 +72,10 @@ class EpisodeLog:
         self._folder = Path.cwd()
         self.step_ns = description.step_duration_ns
         first_ns = time.time_ns() if start_time_ns is None else start_time_ns
-        if self.step_ns < 1 or first_ns < 0:
+        if self.step_ns < 1 or not 0 <= first_ns < _END_OF_TIME_NS:
             raise UsageError(
                 f"step of {self.step_ns} ns, start at {first_ns} ns: the step must be positive and"
-                " the start 0 or later; set step_duration_s and start_time_ns"
+                " the start between the years 1970 and 2262; set step_duration_s and start_time_ns"
             )
         if append and overwrite:
             raise UsageError("append and overwrite are mutually exclusive: pass only one")

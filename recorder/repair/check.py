@@ -19,7 +19,7 @@ from pathlib import Path
 
 from mcap.records import ChunkIndex
 
-from mcaprl.errors import CorruptLogError, LogError, SpaceError
+from mcaprl.errors import CorruptLogError, LogError, NotMcapError, SpaceError
 from mcaprl.problem import Problem, Shortlist
 from mcaprl.recorder.format.metadata import METADATA_NAME
 from mcaprl.recorder.format.reading import (
@@ -49,8 +49,12 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
     try:
         reader = McapReader(path)
     except LogError as error:
-        action = _recover(path) if isinstance(error, CorruptLogError) else "restore a backup copy"
-        what = _without_path(error, path)
+        what, action = _without_path(error, path), "check the path and its permissions"
+        if isinstance(error, NotMcapError):
+            what = f"the file {what}"
+            action = "restore a backup copy, or read another tool's dataset with `mcaprl info`"
+        elif isinstance(error, CorruptLogError):
+            action = _recover(path)
         return [Problem(what, "opening the file", next=action, file=str(path))]
     found = Shortlist(check_file(reader))
     action = _recover(path)

@@ -60,6 +60,8 @@ def test_a_converted_bag_is_an_equal_log(bag: Path, tmp_path: Path) -> None:
     assert not mcaprl.check(out).problems
     with pytest.raises(OutputExistsError):
         mcaprl.convert(bag, out, mapping=tmp_path / "robot.yaml")
+    with pytest.raises(UsageError, match=r"x.mcap has the suffix of logs: .* for --to npz"):
+        mcaprl.convert(out, tmp_path / "x.mcap", to="npz")
     with pytest.raises(UsageError, match="the format is not clear from the name"):
         mcaprl.convert(bag, tmp_path / "robot.unknown", mapping=tmp_path / "robot.yaml")
 

@@ -95,10 +95,17 @@ def target_format(path: str | Path, name: str | None) -> Format:
 
     Raises:
         UnknownNameError: There is no format with this name.
-        UsageError: The name is not given, and no format or more than one format has this suffix.
+        UsageError: The path has the suffix of logs, or the name is not given, and no format or more
+            than one format has this suffix.
     """
     if name is not None:
-        return format_named(name)
+        form = format_named(name)
+        if Path(path).suffix == ".mcap":
+            raise UsageError(
+                f"{path} has the suffix of logs: choose another name for --to {name}, or omit --to"
+                " to write a log"
+            )
+        return form
     start, colon, _ = str(path).partition(":")
     if colon and start in FORMATS:
         return FORMATS[start]
