@@ -17,7 +17,7 @@ from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.format.probability import is_impossible
-from mcaprl.recorder.format.spaces import Leaf, observation_leaves, outside
+from mcaprl.recorder.format.spaces import Leaf, bounds_of, observation_leaves, outside
 
 GAP: Final = 1.5
 """Shortest reported gap between two steps, as a multiple of the median time between steps."""
@@ -49,11 +49,11 @@ def _not_finite(dataset: Dataset) -> Iterator[Problem]:
 
 def _out_of_range(dataset: Dataset) -> Iterator[Problem]:
     for leaf in _leaves(dataset):
-        space = leaf.of(dataset.observation_space)
-        if not isinstance(space, spaces.Box) or leaf.encoding is not None:
+        bounds = bounds_of(leaf.of(dataset.observation_space))
+        if bounds is None or leaf.encoding is not None:
             continue
         column = dataset.statistics.observations[leaf.name]
-        low, high = space.low.reshape(-1), space.high.reshape(-1)
+        low, high = (bound.reshape(-1) for bound in bounds)
         wrong = np.flatnonzero((column.low < low) | (column.high > high))
         if len(wrong):
             first = int(wrong[0])
@@ -61,7 +61,8 @@ def _out_of_range(dataset: Dataset) -> Iterator[Problem]:
                 f"values of {_count(len(wrong), 'element')} of {leaf.name} are outside its space",
                 f"{_name(dataset, leaf, first)} has values from {column.low[first]:.4g} to"
                 f" {column.high[first]:.4g}, but bounds {low[first]:.4g} to {high[first]:.4g}",
-                "observations that are scaled by the bounds of the space are out of range",
+                "training rejects values outside of discrete spaces, and observations that are"
+                " scaled by the bounds of the space are out of range",
             )
 
 

@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -120,19 +120,28 @@ def select(leaves: Sequence[Leaf], keys: Sequence[str] | None) -> list[Leaf]:
 
 def outside(space: spaces.Space[Any], values: NDArray[Any]) -> NDArray[np.bool_]:
     """Return an (N,) mask of the values (N, *shape) outside a space; all False for a Dict."""
+    bounds = bounds_of(space)
+    if bounds is None:
+        return np.zeros(len(values), np.bool_)
+    low, high = bounds
+    wrong = ~((values >= low) & (values <= high))
+    return cast(NDArray[np.bool_], wrong.reshape(len(values), -1).any(1))
+
+
+def bounds_of(space: spaces.Space[Any]) -> tuple[NDArray[Any], NDArray[Any]] | None:
+    """Return the smallest and largest values (*shape) of a space; None for other spaces."""
     match space:
         case spaces.Discrete():
-            wrong = (values < space.start) | (values >= space.start + space.n)
+            bounds = space.start, space.start + space.n - 1
         case spaces.MultiDiscrete():
-            wrong = (values < space.start) | (values >= space.start + space.nvec)
+            bounds = space.start, space.start + space.nvec - 1
         case spaces.MultiBinary():
-            wrong = (values != 0) & (values != 1)
+            bounds = np.zeros(space.shape, np.int8), np.ones(space.shape, np.int8)
         case spaces.Box():
-            wrong = ~((values >= space.low) & (values <= space.high))
+            bounds = space.low, space.high
         case _:
-            wrong = np.zeros(len(values), np.bool_)
-    found: NDArray[np.bool_] = wrong.reshape(len(values), -1).any(1)
-    return found
+            return None
+    return np.asarray(bounds[0]), np.asarray(bounds[1])
 
 
 def restricted(space: spaces.Space[Any], leaves: Sequence[Leaf]) -> spaces.Dict:

@@ -120,6 +120,27 @@ def test_findings(changes: dict[str, Any], severity: str, text: str) -> None:
     assert found[0].effect
 
 
+@pytest.mark.parametrize(
+    ("space", "wrong"),
+    [
+        (spaces.Discrete(3, start=1), [4]),
+        (spaces.MultiDiscrete([3, 2]), [0, 2]),
+        (spaces.MultiBinary(2), [2, 0]),
+    ],
+    ids=str,
+)
+def test_discrete_observations_outside_their_space_are_named(space: Any, wrong: list[int]) -> None:
+    space.seed(0)
+    samples = np.array([space.sample() for _ in range(7)])
+    samples[2] = wrong if samples.ndim == 2 else wrong[0]
+    seen: dict[str, Any] = {"observations": samples[:6], "next_observations": samples[1:]}
+    found = lint(dataset(**seen, observation_space=space))
+    assert [str(one) for one in found if "outside its space" in one.what], found
+    samples[2] = samples[1]
+    found = lint(dataset(**seen, observation_space=space))
+    assert not [one for one in found if "outside its space" in one.what]
+
+
 def test_repeated_episodes_are_named() -> None:
     twice = Dataset.concatenate([dataset(), dataset()])
     [finding] = lint(twice)
