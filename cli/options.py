@@ -58,6 +58,19 @@ def integer_option(
     return click.option(name, default=default, show_default=True, type=kind, help=help)
 
 
+def seed_options(learner: str) -> Callable[[F], F]:
+    """Return the options for the seeds of a training; `learner` is what each seed trains."""
+    default = "; with --resume: that of the run]"
+    seeds = f"Number of {learner}s to train.  [default: 1{default}"
+    seed = f"Seed of the first {learner}; {learner} k uses seed + k.  [default: 0{default}"
+
+    def add(command: F) -> F:
+        first = click.option("--seed", type=click.IntRange(0), help=seed)
+        return click.option("--seeds", type=click.IntRange(1), help=seeds)(first(command))
+
+    return add
+
+
 def ray_options(command: F) -> F:
     """Add the options that run a command on a Ray cluster."""
     flag = click.option("--ray", is_flag=True, help="Run on Ray workers; see docs/ray.md.")

@@ -11,7 +11,7 @@ from click.core import ParameterSource
 import mcaprl
 from mcaprl.cli.completion import Name
 from mcaprl.cli.help import Command
-from mcaprl.cli.options import PATH, integer_option, mapping_options, ray_options
+from mcaprl.cli.options import PATH, integer_option, mapping_options, ray_options, seed_options
 from mcaprl.cli.progress import checkpoints_kept, hint, training_progress, working
 from mcaprl.cli.settings import SettingsCommand
 from mcaprl.cli.show import echo, print_table
@@ -40,8 +40,7 @@ def _configs() -> dict[str, Settings]:
     help="dqn, double-dqn, cql, bc, bcq, iql, one from another package, or auto, which chooses by"
     " the log.  [default: cql]",
 )
-@integer_option("--seeds", "Number of networks to train.", least=1)
-@integer_option("--seed", "Seed of the first network; network k uses seed + k.", least=0)
+@seed_options("network")
 @integer_option(
     "--threads",
     "Number of threads of PyTorch and of the reader; useful for large batches on an idle machine.",

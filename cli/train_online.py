@@ -12,7 +12,7 @@ import click
 
 import mcaprl
 from mcaprl.cli.completion import Name, sims
-from mcaprl.cli.options import integer_option, origin_option, sim_options
+from mcaprl.cli.options import integer_option, origin_option, seed_options, sim_options
 from mcaprl.cli.progress import checkpoints_kept, hint, training_progress
 from mcaprl.cli.settings import SettingsCommand
 from mcaprl.cli.show import print_address, print_table
@@ -48,8 +48,7 @@ def _tuned() -> dict[str, dict[str, Any]]:
     type=Name(_presets),
     help="Published settings: autonomysim-car, autonomysim-drone, ddqn-racer.",
 )
-@integer_option("--seeds", "Number of agents to train.", least=1)
-@integer_option("--seed", "Seed of the first agent; agent k uses seed + k.", least=0)
+@seed_options("agent")
 @integer_option(
     "--threads", "Number of threads of PyTorch; useful only for images on an idle machine.", least=1
 )

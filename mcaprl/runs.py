@@ -1,6 +1,6 @@
 """Run folders and summaries of offline and online training.
 
-RUN/config.json                         algorithm, settings, and the data or sim
+RUN/config.json                         algorithm, settings, seeds, and the data or sim
 RUN/seed-K/checkpoint.safetensors       state to resume from
 RUN/seed-K/metrics.csv                  loss terms of an offline run
 RUN/seed-K/policy.json, .safetensors    policy of an offline run
@@ -21,8 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import OutputExistsError, TrainingError
+from mcaprl.errors import OutputExistsError, TrainingError, UsageError
 from mcaprl.files import locked_folder, parse_json, write_json
+from mcaprl.texts import counted
 
 CONFIG_NAME = "config.json"
 CHECKPOINT_NAME = "checkpoint.safetensors"
@@ -124,7 +125,9 @@ def writing(path: Path) -> Iterator[None]:
         raise TrainingError(f"cannot write {path}: {error.strerror or error}") from error
 
 
-def open_run(folder: Path, identity: RunIdentity, resume: bool, **source: Any) -> None:
+def open_run(
+    folder: Path, identity: RunIdentity, resume: bool, seeds: range, **source: Any
+) -> None:
     """Create a run folder, or check that it belongs to this run, and write `config.json`.
 
     Files of a run that ended before its first checkpoint are removed.
@@ -133,6 +136,7 @@ def open_run(folder: Path, identity: RunIdentity, resume: bool, **source: Any) -
         folder: Folder of the run.
         identity: Identity of the run.
         resume: Whether to continue the run in the folder, even if it has not written a file yet.
+        seeds: Seeds of the run.
         **source: Further entries of `config.json`.
 
     Raises:
@@ -151,7 +155,47 @@ def open_run(folder: Path, identity: RunIdentity, resume: bool, **source: Any) -
         for path in leftovers or ():
             shutil.rmtree(path) if path.is_dir() else path.unlink()
         folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / CONFIG_NAME, {**identity.parts, **source}, TrainingError)
+    trained = {"seeds": len(seeds), "seed": seeds.start}
+    write_json(folder / CONFIG_NAME, {**identity.parts, **trained, **source}, TrainingError)
+
+
+def choose_seeds(folder: Path, seeds: int | None, seed: int | None, resume: bool) -> range:
+    """Return the seeds to train.
+
+    Args:
+        folder: Folder of the run.
+        seeds: Number of seeds; None selects that of the resumed run, or else 1.
+        seed: First seed; None selects that of the resumed run, or else 0.
+        resume: Whether to resume the run in the folder.
+
+    Raises:
+        UsageError: A number is out of range, or the run has other seeds.
+        TrainingError: There is no run to resume.
+    """
+    if (seeds is not None and seeds < 1) or (seed is not None and seed < 0):
+        raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
+    earlier, is_complete = _seeds_of_run(folder) if resume else (range(0), False)
+    first = earlier.start if seed is None else seed
+    chosen = range(first, first + (seeds or len(earlier) or 1))
+    if chosen != earlier if is_complete else not set(earlier) <= set(chosen):
+        raise UsageError(
+            f"{folder} is a run of {counted(len(earlier), 'seed')}, the first of which is"
+            f" {earlier.start}: resume it without --seeds and --seed, or choose another folder"
+        )
+    return chosen
+
+
+def _seeds_of_run(folder: Path) -> tuple[range, bool]:
+    """Return the known seeds of a run, and whether these are all of its seeds.
+
+    Earlier versions did not write the seeds into the config. The run then has at least the seeds
+    that have a folder.
+    """
+    match run_to_resume(folder):
+        case {"seeds": int(count), "seed": int(first)}:
+            return range(first, first + count), True
+    started = _seed_folders(folder)
+    return range(min(started), max(started) + 1) if started else range(0), False
 
 
 def seed_folder(run: Path, seed: int) -> Path:
@@ -208,14 +252,19 @@ def policy_files(path: Path) -> list[Path]:
     """
     if path.is_file():
         return [path]
-    numbered = {
-        int(number): folder
-        for folder in path.glob("seed-*")
-        if (number := folder.name.removeprefix("seed-")).isdigit()
-    }
+    numbered = _seed_folders(path)
     folders = [path, *(numbered[number] for number in sorted(numbered))]
     files = [folder / name for folder in folders for name in (POLICY_NAME, BEST_NAME)]
     return [file for file in files if file.exists()]
+
+
+def _seed_folders(run: Path) -> dict[int, Path]:
+    """Return the folders of a run by seed."""
+    return {
+        int(number): folder
+        for folder in run.glob("seed-*")
+        if (number := folder.name.removeprefix("seed-")).isdigit()
+    }
 
 
 def saved_updates(run: Path, seeds: int) -> int:

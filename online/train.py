@@ -21,7 +21,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from mcaprl.errors import TrainingError, UsageError
+from mcaprl.errors import TrainingError
 from mcaprl.files import write_json
 from mcaprl.online.agent import Agent
 from mcaprl.online.algorithms import check_spaces
@@ -34,7 +34,15 @@ from mcaprl.online.task import Task
 from mcaprl.progress import ProgressCallback, terminal_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.layout import LAYOUT_NAME
-from mcaprl.runs import BEST_NAME, RunSummary, locked_run, open_run, seed_folder, writing
+from mcaprl.runs import (
+    BEST_NAME,
+    RunSummary,
+    choose_seeds,
+    locked_run,
+    open_run,
+    seed_folder,
+    writing,
+)
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.evaluate import Scale, evaluate
 
@@ -61,8 +69,8 @@ def train(
     task: Task,
     out: str | Path,
     *,
-    seeds: int = 1,
-    seed: int = 0,
+    seeds: int | None = None,
+    seed: int | None = None,
     record: str | Path | None = None,
     data: Dataset | None = None,
     policy: Any = None,
@@ -75,8 +83,10 @@ def train(
     Args:
         task: Task such as `Task.for_sim("lane")`.
         out: Folder of the run; it must be empty or not exist.
-        seeds: Number of agents to train, one after the other.
-        seed: Seed of the first agent; agent k uses seed + k.
+        seeds: Number of agents to train, one after the other. None selects 1; with `resume`, that
+            of the run.
+        seed: Seed of the first agent; agent k uses seed + k. None selects 0; with `resume`, that of
+            the run.
         record: Path of a log of every transition, written during training. With several seeds, this
             is a folder with one log for each seed.
         data: Logged transitions that initialize the replay buffer.
@@ -91,21 +101,20 @@ def train(
 
     Raises:
         UnknownNameError: There is no such sim.
+        UsageError: The run to resume has other seeds.
         OutputExistsError: `out` or `record` exists.
         SpaceError: The algorithm does not support these observations or actions.
         PolicyError: The networks of `policy` and the agent differ.
         TrainingError: `out` cannot be written, another training process uses it, or it contains a
             run of another task. Or there is no run to resume.
     """
-    if seeds < 1 or seed < 0:
-        raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
-    numbers = range(seed, seed + seeds)
+    folder = Path(out)
+    numbers = choose_seeds(folder, seeds, seed, resume)
     logs = log_paths(Path(record), numbers, resume) if record is not None else {}
     config = task.config
-    folder = Path(out)
     with locked_run(folder, resume), closing(make_sim(task.sim, **task.sim_options)) as env:
         check_spaces(task.algo, env.observation_space, env.action_space)
-        run = _Run(folder, task, env, logs, data, policy, live, seed)
+        run = _Run(folder, task, env, logs, data, policy, live, numbers)
         run.open(resume)
         selection = measure_scale(env, episodes=config.eval_episodes, seed=SELECTION_SEED)
         fresh = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
@@ -129,11 +138,11 @@ class _Run:
     data: Dataset | None
     policy: Any
     live: LiveTraining | None
-    first_seed: int
+    seeds: range
 
     def open(self, resume: bool) -> None:
         """Create the run folder, or check that it belongs to this run; create the log folders."""
-        open_run(self.folder, self.task.identity, resume)
+        open_run(self.folder, self.task.identity, resume, self.seeds)
         for path in self.logs.values():
             with writing(path.parent):
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -183,7 +192,7 @@ class _Run:
     def _policy_of(self, seed: int) -> Any:
         if not isinstance(self.policy, Sequence):
             return self.policy
-        return self.policy[(seed - self.first_seed) % len(self.policy)]
+        return self.policy[self.seeds.index(seed) % len(self.policy)]
 
     def conclude(self, summaries: Sequence[OnlineSummary], fresh: Scale) -> None:
         """Write the scores of all seeds, and the image of their curves."""

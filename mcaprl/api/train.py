@@ -22,7 +22,7 @@ from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.live_stream import DEFAULT_SPEED
 from mcaprl.remote import check_upload, upload_all
-from mcaprl.runs import run_to_resume
+from mcaprl.runs import choose_seeds, run_to_resume
 from mcaprl.settings import check_settings, flag, settings_from_json
 
 if TYPE_CHECKING:
@@ -35,8 +35,8 @@ def train(
     out: str | Path,
     *,
     algo: str | None = None,
-    seeds: int = 1,
-    seed: int = 0,
+    seeds: int | None = None,
+    seed: int | None = None,
     threads: int = 1,
     device: str = "cpu",
     resume: bool = False,
@@ -65,8 +65,10 @@ def train(
         algo: `dqn`, `double-dqn`, `cql`, `bc`, `bcq` or `iql`, or `auto`, which chooses among
             them by the log. None selects `cql`; with `resume`, None selects the algorithm of
             the run.
-        seeds: Number of networks, which are trained in parallel.
-        seed: Seed of the first network; network k uses seed + k.
+        seeds: Number of networks, which are trained in parallel. None selects 1; with `resume`,
+            that of the run.
+        seed: Seed of the first network; network k uses seed + k. None selects 0; with `resume`,
+            that of the run.
         threads: Number of threads of PyTorch and of the reader.
         device: `cpu` or `cuda`.
         resume: Whether training continues from the checkpoints in `out`.
@@ -95,8 +97,8 @@ def train(
 
     Raises:
         UnknownNameError: There is no such algorithm.
-        UsageError: The algorithm has no such setting, there is no such device, or a number is out
-            of range.
+        UsageError: The algorithm has no such setting, there is no such device, a number is out of
+            range, or the run to resume has other seeds.
         OutputExistsError: `out` contains a run.
         LogError: The logs cannot be read.
         SpaceError: The algorithm does not support the observations or actions.
@@ -127,6 +129,7 @@ def train(
             )
         algo = was
         settings = {**settings_from_json(earlier.get("config")), **settings}
+    numbers = choose_seeds(out, seeds, seed, resume)
     algo = algo or "cql"
     defaults = AutoConfig() if algo == AUTO else choose_algorithm(algo)[1]
     check_settings(algo, defaults, settings)
@@ -143,7 +146,7 @@ def train(
         job = TrainingRequest(
             config,
             out.absolute(),
-            range(seed, seed + seeds),
+            numbers,
             threads,
             device,
             resume,
@@ -172,8 +175,8 @@ def train(
         discrete_actions(dataset.action_space)
         on_data(algo, dataset)
         request: dict[str, Any] = {
-            "seeds": seeds,
-            "seed": seed,
+            "seeds": len(numbers),
+            "seed": numbers.start,
             "weights": weights,
             "resume": resume,
             "device": device,
@@ -225,8 +228,8 @@ def train_online(
     *,
     algo: str | None = None,
     preset: str | None = None,
-    seeds: int = 1,
-    seed: int = 0,
+    seeds: int | None = None,
+    seed: int | None = None,
     threads: int = 1,
     record: str | Path | None = None,
     upload: str | None = None,
@@ -253,8 +256,10 @@ def train_online(
         algo: `dqn`, `double-dqn`, `ppo` or `a2c`. None selects the default of the preset, run or
             sim.
         preset: Name of published settings.
-        seeds: Number of agents, which are trained one after the other.
-        seed: Seed of the first agent; agent k uses seed + k.
+        seeds: Number of agents, which are trained one after the other. None selects 1; with
+            `resume`, that of the run.
+        seed: Seed of the first agent; agent k uses seed + k. None selects 0; with `resume`, that of
+            the run.
         threads: Number of threads of PyTorch.
         record: Output log of all transitions; with several seeds, a folder.
         upload: URL to which the log of `record` is copied at the end of the training; with several
@@ -284,8 +289,8 @@ def train_online(
 
     Raises:
         UnknownNameError: There is no such sim, algorithm or preset.
-        UsageError: No sim is given, the arguments contradict the preset, or a number is out of
-            range.
+        UsageError: No sim is given, the arguments contradict the preset, a number is out of range,
+            or the run to resume has other seeds.
         OutputExistsError: `out` or `record` exists.
         SpaceError: The algorithm does not support the observations or actions.
         PolicyError: The policy in `sources` has another network than the agent.
@@ -316,7 +321,8 @@ def train_online(
             resume=resume,
             live=live,
         )
-        return _train_on_device(sim, out, device, seeds, seed, threads, options, settings, progress)
+        numbers = choose_seeds(out, seeds, seed, resume)
+        return _train_on_device(sim, out, device, numbers, threads, options, settings, progress)
     task = choose_task(sim, algo, options, settings, preset=preset, resumed=out if resume else None)
     data, policy = _experience(as_names(sources))
     with ExitStack() as stack:
@@ -358,8 +364,7 @@ def _train_on_device(
     sim: str | None,
     out: Path,
     device: str,
-    seeds: int,
-    seed: int,
+    seeds: range,
     threads: int,
     options: dict[str, Any],
     settings: dict[str, Any],
@@ -372,7 +377,9 @@ def _train_on_device(
         raise UsageError("--device needs a SIM: lane or racer")
     task = device_task(sim, options, **settings)
     with torch_threads(threads):
-        return train_agents(task, out, device=device, seeds=seeds, seed=seed, progress=progress)
+        return train_agents(
+            task, out, device=device, seeds=len(seeds), seed=seeds.start, progress=progress
+        )
 
 
 def _experience(sources: list[str]) -> tuple[Dataset | None, list[TrainedPolicy] | None]:

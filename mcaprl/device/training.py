@@ -119,8 +119,9 @@ def train(
         task.sim, seeds * config.envs, device=device, seed=seed, **task.sim_options
     )
     with locked_run(folder, False), closing(make_sim(task.sim, **task.sim_options)) as env:
-        open_run(folder, task.identity, False, device=device, seeds=seeds)
-        agents = Agents(sims, config, range(seed, seed + seeds), place)
+        numbers = range(seed, seed + seeds)
+        open_run(folder, task.identity, False, numbers, device=device)
+        agents = Agents(sims, config, numbers, place)
         began_s = time.perf_counter()
         env_id = env.spec.id if env.spec else task.sim
 

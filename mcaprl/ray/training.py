@@ -139,6 +139,7 @@ def train_on_ray(
             request.out,
             identity,
             request.resume,
+            request.seeds,
             env_id=logs.description.env_id,
             transitions=transitions,
         )

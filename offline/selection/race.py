@@ -62,6 +62,7 @@ from mcaprl.runs import (
     METRICS_NAME,
     POLICY_NAME,
     RunIdentity,
+    choose_seeds,
     locked_run,
     open_run,
     policy_files,
@@ -124,8 +125,8 @@ def select(
     config: AutoConfig,
     out: Path,
     *,
-    seeds: int = 1,
-    seed: int = 0,
+    seeds: int | None = None,
+    seed: int | None = None,
     weights: NDArray[np.float64] | None = None,
     resume: bool = False,
     device: str = "cpu",
@@ -138,8 +139,9 @@ def select(
         dataset: Dataset with discrete actions.
         config: Settings.
         out: Folder of the run; it must be empty or not exist.
-        seeds: Number of networks of each candidate; its estimates are averages over them.
-        seed: Seed of the first network.
+        seeds: Number of networks of each candidate; its estimates are averages over them. None
+            selects 1; with `resume`, that of the run.
+        seed: Seed of the first network. None selects 0; with `resume`, that of the run.
         weights: (E,) relative sampling weight of a transition of each episode; default: all equal.
         resume: Whether to resume the run in `out`.
         device: `cpu` or `cuda`.
@@ -155,19 +157,21 @@ def select(
         TrainingError: A loss is not finite; `out` cannot be written, or contains a run with other
             data or settings; or the budget ended before any policy was trained.
         UnknownNameError: A finalist is not a candidate.
-        UsageError: There are too few episodes.
+        UsageError: There are too few episodes, or the run to resume has other seeds.
     """
     check_finalists(config)
     if len(dataset.episodes) < FOLDS:
         raise UsageError(f"--algo {AUTO} needs {FOLDS} episodes or more in the log")
     weights = np.ones(len(dataset.episodes)) if weights is None else weights
-    parts: dict[str, Any] = {"algo": AUTO, "config": config.to_json(), "seeds": seeds, "seed": seed}
-    parts["data"] = fingerprint(dataset, weights)
+    numbers = choose_seeds(out, seeds, seed, resume)
+    data = fingerprint(dataset, weights)
+    identity = RunIdentity({"algo": AUTO, "config": config.to_json(), "data": data})
     with locked_run(out, resume):
         open_run(
             out,
-            RunIdentity(parts),
+            identity,
             resume,
+            numbers,
             env_id=dataset.env_id,
             transitions=len(dataset),
         )
@@ -175,7 +179,7 @@ def select(
             dataset,
             config,
             out,
-            range(seed, seed + seeds),
+            numbers,
             weights,
             device,
             _Clock(budget_minutes),

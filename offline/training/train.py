@@ -39,6 +39,7 @@ from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progres
 from mcaprl.runs import (
     CHECKPOINT_NAME,
     RunIdentity,
+    choose_seeds,
     locked_run,
     open_run,
     policy_files,
@@ -54,8 +55,8 @@ def train(
     algo: str | TrainingConfig,
     out: str | Path,
     *,
-    seeds: int = 1,
-    seed: int = 0,
+    seeds: int | None = None,
+    seed: int | None = None,
     weights: NDArray[np.float64] | None = None,
     resume: bool = False,
     other_data: bool = False,
@@ -69,8 +70,10 @@ def train(
         dataset: Dataset with discrete actions.
         algo: Name such as `cql`, for default settings, or a config such as `CQLConfig(alpha=0.5)`.
         out: Folder of the run; it must be empty or not exist.
-        seeds: Number of networks to train in parallel; they are independent of each other.
-        seed: Seed of the first network; network k uses seed + k.
+        seeds: Number of networks to train in parallel; they are independent of each other. None
+            selects 1; with `resume`, that of the run.
+        seed: Seed of the first network; network k uses seed + k. None selects 0; with `resume`,
+            that of the run.
         weights: (E,) relative sampling weight of each transition of an episode; default: all equal.
         resume: Whether to resume from the checkpoints in `out`. Seeds without a checkpoint
             start from update 0.
@@ -85,22 +88,21 @@ def train(
 
     Raises:
         UnknownNameError: There is no such algorithm.
-        UsageError: There is no such device.
+        UsageError: There is no such device, or the run to resume has other seeds.
         OutputExistsError: `out` exists and is not empty.
         SpaceError: The algorithm does not support these observations or actions.
         TrainingError: The loss is NaN or infinite. Or `out` cannot be written, another training
             writes to it, or it contains a run with other data or settings. Or there is no run to
             resume.
     """
-    if seeds < 1 or seed < 0:
-        raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
+    folder = Path(out)
+    numbers = choose_seeds(folder, seeds, seed, resume)
     place = choose_device(device)
     learner_type, config = choose_algorithm(algo)
     weights = np.ones(len(dataset.episodes)) if weights is None else weights
     check_weights(weights, len(dataset.episodes))
     data = fingerprint(dataset, weights)
     identity = RunIdentity(identity_parts(config, data), other_data)
-    folder = Path(out)
     with locked_run(folder, resume):
         held_out = choose_held_out(len(weights), config.held_out)
         encoder, reward_scale = earlier_scales(folder) if resume and other_data else (None, None)
@@ -111,12 +113,13 @@ def train(
             reward_scale=reward_scale,
             weights=without(weights, held_out),
         ).to(place)
-        open_run(folder, identity, resume, env_id=dataset.env_id, transitions=len(dataset))
+        size = len(dataset)
+        open_run(folder, identity, resume, numbers, env_id=dataset.env_id, transitions=size)
         if message := horizon_warning(config):
             warnings.warn(message, stacklevel=2)
         run = _run(folder, identity, dataset, buffer, held_out, follow)
         with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
-            return run.train(learner_type, config, range(seed, seed + seeds), report)
+            return run.train(learner_type, config, numbers, report)
 
 
 def train_share(

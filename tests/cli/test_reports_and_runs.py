@@ -47,6 +47,22 @@ def test_resuming_a_finished_run_says_so(data: Path, capsys: pytest.CaptureFixtu
     assert f"{run / 'seed-0'}: finished before, with 3 updates" in capsys.readouterr().out
 
 
+def test_a_resumed_run_trains_the_seeds_that_it_had(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = data.parent / "run"
+    command = ["train-offline", str(data), "--out", str(run)]
+    assert cli.run([*command, *SMALL, "--seeds", "2", "--seed", "3"]) == 0
+    (run / "seed-4" / "checkpoint.safetensors").unlink()
+    capsys.readouterr()
+    assert cli.run([*command, "--resume"]) == 0
+    printed = capsys.readouterr().out
+    assert f"{run / 'seed-3'}: finished before, with 3 updates" in printed
+    assert f"{run / 'seed-4'}: 3 updates" in printed
+    assert cli.run([*command, "--resume", "--seeds", "1"]) == 2
+    assert f"{run} is a run of 2 seeds, the first of which is 3" in capsys.readouterr().err
+
+
 def test_resuming_with_another_algorithm_is_refused(
     data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -57,7 +57,8 @@ def test_a_run_has_the_policies_metrics_and_scores_of_all_seeds(tmp_path: Path) 
     assert all(summary.steps == 4_000 and summary.algo == "double-dqn" for summary in found)
     scores = json.loads((folder / "scores.json").read_text())
     assert scores["seeds"]["seed-6"]["mean_return"] == found[1].mean_return
-    assert json.loads((folder / "config.json").read_text())["device"] == "cpu"
+    config = json.loads((folder / "config.json").read_text())
+    assert (config["device"], config["seeds"], config["seed"]) == ("cpu", 2, 5)
     curves = read_curves(folder, "metrics.csv")
     assert [curve["steps"][-1] for curve in curves] == [4_000, 4_000]
     # 3,600 steps after the random ones, 32 steps for each update.

@@ -20,7 +20,7 @@ from stable_baselines3 import DQN
 
 import mcaprl
 from mcaprl.cli import run
-from mcaprl.errors import TrainingError
+from mcaprl.errors import TrainingError, UsageError
 from mcaprl.offline.training.follow import GrowingLogs
 from mcaprl.online.agent import Agent
 from mcaprl.online.task import Task
@@ -191,11 +191,31 @@ def test_epsilon_and_learning_rate_continue_to_decay(resumed: OnlineSummary) -> 
 def test_a_finished_run_is_not_repeated(finished: Path) -> None:
     task = Task.for_sim("lane", "dqn", **SHORTER)
     before = {name: (finished / name).read_text() for name in ("scores.json", "seed-0/curve.csv")}
-    again, more = train(task, finished, seeds=2, resume=True, progress=silent)
+    (again,) = train(task, finished, resume=True, progress=silent)
     score = json.loads(before["scores.json"])["seeds"]["seed-0"]["score"]
     assert (again.resumed_at, again.steps, again.score) == (200, 200, score)
     assert (finished / "seed-0" / "curve.csv").read_text() == before["seed-0/curve.csv"]
-    assert (more.resumed_at, more.steps) == (0, 200)
+
+
+def test_resuming_trains_all_seeds_of_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    task, out = Task.for_sim("lane", "dqn", **SHORTER), tmp_path / "run"
+    with pytest.raises(Stopped):
+        train(task, out, seeds=2, seed=5, progress=stop_at(200))
+    others: list[dict[str, Any]] = [{"seeds": 1}, {"seed": 0}]
+    for given in others:
+        with pytest.raises(UsageError, match="a run of 2 seeds, the first of which is 5"):
+            mcaprl.train_online(None, out, resume=True, **given)
+    assert [one.seed for one in mcaprl.train_online(None, out, resume=True)] == [5, 6]
+    scores = (out / "scores.json").read_text()
+    assert sorted(json.loads(scores)["seeds"]) == ["seed-5", "seed-6"]
+    assert run(["train-online", "--resume", "--out", str(out)]) == 0
+    assert (out / "scores.json").read_text() == scores
+    assert sorted(path.name for path in out.glob("seed-*")) == ["seed-5", "seed-6"]
+    capsys.readouterr()
+    assert run(["train-online", "--resume", "--out", str(out), "--seeds", "3"]) == 2
+    assert "resume it without --seeds and --seed" in capsys.readouterr().err
 
 
 def test_a_killed_run_continues(tmp_path: Path) -> None:

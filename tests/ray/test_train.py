@@ -131,7 +131,7 @@ def test_a_run_is_resumed_by_another_number_of_workers_with_the_same_data(
     shutil.copytree(trained.found[0].folder.parent, out)
     # Seed 1 continues from the beginning, and seed 0 is finished.
     (out / "seed-1" / "checkpoint.safetensors").unlink()
-    resumed = ["--out", str(out), "--seeds", "2", "--resume", "--ray", "--workers", "1"]
+    resumed = ["--out", str(out), "--resume", "--ray", "--workers", "1"]
     assert run(["train-offline", *trained.data, *resumed]) == 0
     printed = capsys.readouterr().out
     assert f"{out / 'seed-0'}: finished before, with {UPDATES} updates" in printed

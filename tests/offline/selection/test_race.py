@@ -173,6 +173,14 @@ def test_a_finished_run_resumes_without_an_update(data: Dataset, finished: Path)
     assert [summary.steps for summary in summaries] == [40, 40]
 
 
+def test_a_resumed_run_has_its_own_seeds(data: Dataset, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    mcaprl.train(data, out, algo="auto", seeds=2, seed=4, **TINY)
+    assert [one.seed for one in mcaprl.train(data, out, resume=True)] == [4, 5]
+    with pytest.raises(UsageError, match="a run of 2 seeds, the first of which is 4"):
+        mcaprl.train(data, out, resume=True, seeds=1)
+
+
 def test_progress_is_that_of_one_training(data: Dataset, tmp_path: Path) -> None:
     reported: list[TrainingProgress] = []
     select(data, CONFIG, tmp_path / "run", progress=reported.append)

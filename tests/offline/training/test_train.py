@@ -272,10 +272,42 @@ def test_the_checkpoint_is_written_after_the_policy(whole: OfflineSummary) -> No
     assert max(times_ns) == times_ns[-1]
 
 
-def test_resuming_adds_missing_seeds(copied: Path) -> None:
-    summaries = train(corridor(), SHORT_CQL, copied, seeds=2, resume=True, progress=silent)
-    assert [(summary.seed, summary.resumed_at) for summary in summaries] == [(0, 100), (1, 0)]
-    assert summaries[0].terms == {}
+@pytest.fixture
+def stopped(tmp_path: Path) -> Path:
+    """Return the folder of a run of the seeds 5 and 6 that was stopped after a checkpoint."""
+    with pytest.raises(Stopped):
+        train(corridor(), SHORT_CQL, tmp_path / "run", seeds=2, seed=5, progress=StopAt(50))
+    return tmp_path / "run"
+
+
+@pytest.mark.parametrize("given", [{}, {"seeds": 2}, {"seed": 5}])
+def test_resuming_trains_all_seeds_of_the_run(stopped: Path, given: dict[str, Any]) -> None:
+    (stopped / "seed-6" / "checkpoint.safetensors").unlink()
+    summaries = train(corridor(), SHORT_CQL, stopped, **given, resume=True, progress=silent)
+    assert [(one.seed, one.resumed_at, one.steps) for one in summaries] == [
+        (5, 40, 100),
+        (6, 0, 100),
+    ]
+
+
+@pytest.mark.parametrize("given", [{"seeds": 1}, {"seeds": 3}, {"seed": 0}, {"seed": 6}])
+def test_a_run_resumes_only_with_its_own_seeds(stopped: Path, given: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match="a run of 2 seeds, the first of which is 5: resume it"):
+        train(corridor(), SHORT_CQL, stopped, **given, resume=True, progress=silent)
+
+
+def test_the_seeds_of_a_run_without_them_in_its_config_are_its_folders(stopped: Path) -> None:
+    config = json.loads((stopped / "config.json").read_text())
+    older = {name: value for name, value in config.items() if name not in ("seeds", "seed")}
+    (stopped / "config.json").write_text(json.dumps(older))
+    with pytest.raises(UsageError, match="a run of 2 seeds"):
+        train(corridor(), SHORT_CQL, stopped, seed=0, resume=True, progress=silent)
+    summaries = train(corridor(), SHORT_CQL, stopped, resume=True, progress=silent)
+    assert [one.seed for one in summaries] == [5, 6]
+    assert json.loads((stopped / "config.json").read_text()) == config
+    (stopped / "config.json").write_text(json.dumps(older))
+    more = train(corridor(), SHORT_CQL, stopped, seeds=3, resume=True, progress=silent)
+    assert [one.seed for one in more] == [5, 6, 7]
 
 
 def test_a_run_resumes_only_with_its_own_data(copied: Path) -> None:
