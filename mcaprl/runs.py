@@ -237,6 +237,22 @@ def read_config(folder: Path) -> dict[str, Any]:
     return found
 
 
+def check_kind(folder: Path, config: Mapping[str, Any], kind: str) -> None:
+    """Check that a run is of the kind that a command trains.
+
+    Args:
+        folder: Folder of the run.
+        config: Contents of its `config.json`.
+        kind: `online` or `offline`.
+
+    Raises:
+        TrainingError: The run is of the other kind.
+    """
+    other, source = ("offline", "data") if kind == "online" else ("online", "sim")
+    if source in config:
+        raise TrainingError(f"{folder} is an {other} run: resume it with mcaprl train-{other}")
+
+
 def broken_checkpoint(path: Path, error: Exception) -> TrainingError:
     """Return the error for an unreadable checkpoint."""
     return TrainingError(

@@ -13,7 +13,7 @@ from mcaprl.errors import TrainingError, UsageError
 from mcaprl.online.algorithms import find_algorithm
 from mcaprl.online.config import OnlineConfig
 from mcaprl.online.presets import find_preset, settings_for
-from mcaprl.runs import CONFIG_NAME, RunIdentity, read_config, run_to_resume
+from mcaprl.runs import CONFIG_NAME, RunIdentity, check_kind, read_config, run_to_resume
 from mcaprl.settings import check_settings, settings_from_json
 from mcaprl.sims import make_sims
 
@@ -86,6 +86,7 @@ class Task:
             TrainingError: The folder has no online run, or a run on a device.
         """
         found = read_config(folder)
+        check_kind(folder, found, "online")
         if "device" in found:
             raise TrainingError(
                 f"cannot resume: {folder} was trained with --device; train into another folder"

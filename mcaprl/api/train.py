@@ -22,7 +22,7 @@ from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.live_stream import DEFAULT_SPEED
 from mcaprl.remote import check_upload, upload_all
-from mcaprl.runs import choose_seeds, run_to_resume
+from mcaprl.runs import check_kind, choose_seeds, run_to_resume
 from mcaprl.settings import check_settings, flag, settings_from_json
 
 if TYPE_CHECKING:
@@ -122,6 +122,7 @@ def train(
     out = Path(out)
     if resume:
         earlier = run_to_resume(out)
+        check_kind(out, earlier, "offline")
         was = earlier.get("algo", algo)
         if algo not in (None, was):
             raise UsageError(

@@ -28,6 +28,7 @@ from mcaprl.online.train import OnlineSummary, train
 from mcaprl.progress import TrainingProgress
 from mcaprl.runs import read_curve
 from mcaprl.sims.evaluation.evaluate import Scale
+from tests.support.offline_tasks import corridor
 
 SHORT: dict[str, Any] = {
     "steps": 2_000,
@@ -280,6 +281,20 @@ def test_another_task_is_refused(finished: Path, capsys: pytest.CaptureFixture[s
     out = ["--out", str(finished), "--resume"]
     assert run(["train-online", "racer", *out]) == 1
     assert "has sim 'lane', not 'racer'" in capsys.readouterr().err
+
+
+def test_a_run_of_the_other_kind_is_refused(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, offline = tmp_path / "corridor.mcap", tmp_path / "offline"
+    corridor().save(log)
+    mcaprl.train(log, offline, algo="bc", updates=1, hidden=(4,))
+    assert run(["train-offline", str(log), "--resume", "--out", str(finished)]) == 1
+    says = f"mcaprl: {finished} is an online run: resume it with mcaprl train-online\n"
+    assert capsys.readouterr().err == says
+    assert run(["train-online", "lane", "--resume", "--out", str(offline)]) == 1
+    says = f"mcaprl: {offline} is an offline run: resume it with mcaprl train-offline\n"
+    assert capsys.readouterr().err == says
 
 
 def test_the_command_resumes_with_the_runs_settings(
