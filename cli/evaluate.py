@@ -45,8 +45,10 @@ _OF_DATA = ("gamma", "epsilon", "updates", "estimate_behavior", "threads", "mapp
     "--sim", type=Name(sims), help="lane, powerline, racer, highway-lane, or any Gymnasium id."
 )
 @click.option("--data", help="Logs to estimate returns from, instead of --sim.")
-@integer_option(
-    "--episodes", "Number of episodes for each policy and training seed.", least=1, default=30
+@click.option(
+    "--episodes",
+    type=click.IntRange(1),
+    help="Number of episodes for each policy and training seed.  [default: 30]",
 )
 @integer_option(
     "--seed",
@@ -88,7 +90,6 @@ def evaluate(
     policies: tuple[str, ...],
     sim: str | None,
     data: str | None,
-    episodes: int,
     seed: int,
     as_json: bool,
     **others: Any,
@@ -112,13 +113,11 @@ def evaluate(
         _refuse_unused(given, _OF_DATA, "data")
         kept = nullcontext() if others["record"] is None else keeping("finished episodes are kept")
         with kept, working("loading the sim and the policies") as bar:
-            found = mcaprl.evaluate(
-                policies, sim, episodes=episodes, seed=seed, progress=bar, **given
-            )
+            found = mcaprl.evaluate(policies, sim, seed=seed, progress=bar, **given)
         if as_json:
             print_json(found.to_json())
             return
-        _print_scores(found, episodes)
+        _print_scores(found)
         if others["report"] is not None:
             echo(f"report: {others['report'] / PAGE_NAME}")
         if others["record"] is not None:
@@ -133,7 +132,7 @@ def _refuse_unused(given: dict[str, Any], names: Sequence[str], needed: str) -> 
             raise UsageError(f"{flag(name)} requires --{needed}")
 
 
-def _print_scores(found: Evaluation, episodes: int) -> None:
+def _print_scores(found: Evaluation) -> None:
     from mcaprl.sims.evaluation.statistics import interquartile_mean
 
     rows = []
@@ -161,6 +160,7 @@ def _print_scores(found: Evaluation, episodes: int) -> None:
         ]
         for score in found.policies
     ]
+    episodes = found.policies[0].returns.shape[1]
     print_table(
         f"{found.sim}: {counted(episodes, 'episode')} for each policy and training seed",
         ["policy", "mean return", "95 % interval", "IQM", "random 0, pilot 1", "success", "ends"],

@@ -378,6 +378,7 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         (["evaluate", "pilot", "--sim", "lane", "--data", "taken"], 2, "either --sim SIM"),
         (["evaluate", "pilot", "--sim", "lane", "--gamma", ".9"], 2, "--gamma requires --data"),
         (["evaluate", "pilot", "--data", "lane.mcap", "--record", "x"], 2, "--record requires"),
+        (["evaluate", "random", "--data", "l.mcap", "--episodes", "3"], 2, "--episodes requires"),
         (["evaluate", "random", "--data", "nothing"], 1, "no such file"),
         (["layout", "lane"], 2, "--out"),
         (["record", "lane", "--steps", "5", "--out=x.mcap", "--epsilon", "nan"], 2, "0 to 1"),
