@@ -145,9 +145,7 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
 
         if not has_pilot(env):
             sim = env.spec.id if env.spec else "the environment"
-            raise UsageError(
-                f"{sim} has no pilot: pass --policy random, or the path of a trained run"
-            )
+            raise UsageError(f"{sim} has no pilot: use random, or the path of a trained run")
         return [make_pilot(env)]
     policies = load_policies(_existing(name, SCRIPTED))
     for policy in policies:

@@ -371,6 +371,7 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         ),
         (["train-offline", str(LANE_LOG), "--out", "r", "--hidden", "a,b"], 2, "256,256"),
         (["evaluate", "pilot", "--sim", "line"], 2, "did you mean lane"),
+        (["evaluate", "pilot", "--sim", "CartPole-v1"], 2, "CartPole-v1 has no pilot: use random,"),
         (["evaluate", "taken", "--sim", "lane"], 1, "taken"),
         (["evaluate", "nowhere", "--sim", "lane"], 2, "unknown policy 'nowhere'"),
         (["evaluate", "runs/no", "--sim", "lane"], 2, "runs/no: no such file or folder"),
