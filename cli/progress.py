@@ -47,9 +47,9 @@ def working(text: str) -> AbstractContextManager[ProgressBar]:
     return nullcontext(no_progress) if _is_quiet() else terminal_wait(text)
 
 
-def training_progress(unit: str, term: str) -> AbstractContextManager[ProgressCallback]:
+def training_progress(unit: str, *terms: str) -> AbstractContextManager[ProgressCallback]:
     """Show progress bars of training; see `mcaprl.progress.terminal_progress`."""
-    return nullcontext(lambda _: None) if _is_quiet() else terminal_progress(unit, term)
+    return nullcontext(lambda _: None) if _is_quiet() else terminal_progress(unit, *terms)
 
 
 @contextmanager

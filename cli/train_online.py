@@ -100,9 +100,8 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
     """
     given = {name: value for name, value in request.items() if value is not None}
     on_device = request["device"] is not None
-    term = "mean_reward" if on_device else "score"
     with (
-        training_progress("steps", term) as progress,
+        training_progress("steps", "score", "mean_return", "mean_reward") as progress,
         nullcontext() if on_device else checkpoints_kept(out),
     ):
         found = mcaprl.train_online(sim, out, on_live=print_address, progress=progress, **given)

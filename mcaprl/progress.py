@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -151,17 +151,17 @@ ProgressCallback = Callable[[TrainingProgress], None]
 
 
 @contextmanager
-def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
+def terminal_progress(unit: str, *terms: str) -> Iterator[ProgressCallback]:
     """Show a progress bar for each seed on a terminal: rate, one term and remaining time.
 
     If stderr is not a terminal, print a line about one seed at long intervals.
 
     Args:
         unit: Unit of the total, such as `updates`.
-        term: Name of the term that is shown, such as `loss`.
+        *terms: Names of terms, such as `loss`; the first one that has a value is shown.
     """
     if not _stderr_is_terminal():
-        yield _training_lines(unit, term)
+        yield _training_lines(unit, terms)
         return
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
@@ -169,7 +169,7 @@ def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
         TextColumn("seed {task.fields[seed]}"),
         BarColumn(),
         TextColumn(f"{{task.completed}}/{{task.total}} {unit}, {{task.fields[rate]:.0f}}/s"),
-        TextColumn(f"{term} {{task.fields[shown]:.4g}}"),
+        TextColumn("{task.fields[shown]}"),
         TimeRemainingColumn(),
     )
     # For each seed: its bar, and the time and the progress at its first report.
@@ -182,17 +182,16 @@ def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
                 waiting.close()
                 shown.enter_context(bars)
             if now.seed not in started:
-                bar = bars.add_task("", total=now.total, seed=now.seed, rate=0.0, shown=math.nan)
+                bar = bars.add_task("", total=now.total, seed=now.seed, rate=0.0, shown="")
                 started[now.seed] = bar, time.perf_counter(), now.done
             bar, began, first = started[now.seed]
             rate = (now.done - first) / max(time.perf_counter() - began, 1e-9)
-            value = now.terms.get(term, math.nan)
-            bars.update(bar, completed=now.done, rate=rate, shown=value)
+            bars.update(bar, completed=now.done, rate=rate, shown=_shown_term(now, terms))
 
         yield show
 
 
-def _training_lines(unit: str, term: str) -> ProgressCallback:
+def _training_lines(unit: str, terms: Sequence[str]) -> ProgressCallback:
     """Return a callback that prints lines to stderr."""
     lines = _LineTimes()
     # Time and progress at the first report of each seed.
@@ -203,11 +202,19 @@ def _training_lines(unit: str, term: str) -> ProgressCallback:
         if not lines.is_due():
             return
         text = f"seed {now.seed}: {now.done} of {now.total} {unit}"
-        if term in now.terms:
-            text += f", {term} {now.terms[term]:.4g}"
+        if shown := _shown_term(now, terms):
+            text += f", {shown}"
         if now.done > first:
             left_s = _time_left(time.monotonic() - began, now.done - first, now.total - first)
             text += f", about {left_s:.0f} s left"
         print(text, file=sys.stderr, flush=True)
 
     return show
+
+
+def _shown_term(now: TrainingProgress, terms: Sequence[str]) -> str:
+    """Return the first of the terms that has a value, as text; empty if none has."""
+    for term in terms:
+        if not math.isnan(value := now.terms.get(term, math.nan)):
+            return f"{term.replace('_', ' ')} {value:.4g}"
+    return ""

@@ -256,9 +256,12 @@ class Agent:
         model: Any = self.model
         with writing(self._folder):
             model.dump_logs()
-        score = self.points[-1].score if self.points else math.nan
+        terms = {"score": math.nan, "mean_return": math.nan}
+        if self.points:
+            last = self.points[-1]
+            terms = {"score": last.score, "mean_return": last.mean_return}
         steps = self._task.config.steps
-        report(TrainingProgress(self._seed, model.num_timesteps, steps, {"score": score}))
+        report(TrainingProgress(self._seed, model.num_timesteps, steps, terms))
 
 
 class _EveryInterval(BaseCallback):

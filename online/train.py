@@ -118,7 +118,7 @@ def train(
         run.open(resume)
         selection = measure_scale(env, episodes=config.eval_episodes, seed=SELECTION_SEED)
         fresh = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
-        bar = terminal_progress("steps", "score")
+        bar = terminal_progress("steps", "score", "mean_return")
         with nullcontext(progress) if progress else bar as report:
             summaries = [
                 run.train_seed(number, selection, fresh, report, resume) for number in numbers

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from math import nan
 
 import pytest
 
@@ -75,6 +76,23 @@ def test_training_prints_lines_about_a_seed(
     assert capsys.readouterr().err.splitlines() == [
         "seed 0: 300 of 1000 updates, loss 0.003333, about 14 s left",
         "seed 0: 800 of 1000 updates, loss 0.00125, about 4 s left",
+    ]
+
+
+def test_a_line_about_training_has_the_first_known_term(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr(time, "monotonic", clock.monotonic)
+    with terminal_progress("steps", "score", "mean_return") as report:
+        for score, mean_return in ((nan, nan), (nan, 21.5), (0.25, 21.5)):
+            clock.now_s += 11
+            terms = {"score": score, "mean_return": mean_return}
+            report(TrainingProgress(0, 100, 200, terms))
+    assert capsys.readouterr().err.splitlines() == [
+        "seed 0: 100 of 200 steps",
+        "seed 0: 100 of 200 steps, mean return 21.5",
+        "seed 0: 100 of 200 steps, score 0.25",
     ]
 
 

@@ -71,6 +71,16 @@ def test_a_run_writes_these_files(trained: OnlineSummary) -> None:
     assert (config["algo"], config["sim"], config["config"]["steps"]) == ("double-dqn", "lane", 600)
 
 
+def test_progress_has_the_results_of_the_last_evaluation(tmp_path: Path) -> None:
+    reported: list[TrainingProgress] = []
+    task = Task.for_sim("CartPole-v1", **{**SHORT_DQN, "steps": 1_200, "eval_interval": 1_100})
+    train(task, tmp_path / "run", progress=reported.append)
+    curve = read_curve(tmp_path / "run" / "seed-0" / "curve.csv")
+    assert np.isnan(reported[0].terms["mean_return"])
+    assert reported[-1].terms["mean_return"] in curve["mean_return"]
+    assert np.isnan(reported[-1].terms["score"]), "CartPole has no pilot"
+
+
 def test_the_curve_has_a_row_for_each_evaluation(trained: OnlineSummary) -> None:
     curve = read_curve(trained.folder / "curve.csv")
     assert curve["step"].tolist() == [200, 400, 600]
