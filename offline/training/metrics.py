@@ -90,15 +90,14 @@ def describe_seeds(summaries: Sequence[OfflineSummary]) -> list[str]:
     """Return a line for each seed, and a line with means and 95 % intervals over seeds."""
     lines = []
     for summary in summaries:
-        done = summary.steps - summary.resumed_at
+        done, total = summary.steps - summary.resumed_at, counted(summary.steps, "update")
         if not done:
-            lines.append(
-                f"{summary.folder}: finished before, with {counted(summary.steps, 'update')}"
-            )
+            lines.append(f"{summary.folder}: finished before, with {total}")
             continue
+        session = f" ({done} in this session)" if summary.resumed_at else ""
         rate = done / summary.seconds if summary.seconds else 0.0
         terms = ", ".join(f"{name} {value:.4g}" for name, value in summary.terms.items())
-        lines.append(f"{summary.folder}: {counted(done, 'update')}, {rate:.0f} per second; {terms}")
+        lines.append(f"{summary.folder}: {total}{session}, {rate:.0f} per second; {terms}")
     finished = [summary.terms for summary in summaries if summary.terms]
     if len(finished) > 1:
         means = []

@@ -537,6 +537,14 @@ def test_seeds_are_described_with_mean_and_interval(tmp_path: Path) -> None:
     assert f"loss {np.mean(losses):.4g} [" in mean
 
 
+def test_a_resumed_seed_is_described_with_all_its_updates(stopped: Path) -> None:
+    (stopped / "seed-6" / "checkpoint.safetensors").unlink()
+    summaries = train(corridor(), SHORT_CQL, stopped, resume=True, progress=silent)
+    resumed, restarted, _ = describe_seeds(summaries)
+    assert f"{stopped / 'seed-5'}: 100 updates (60 in this session), " in resumed
+    assert f"{stopped / 'seed-6'}: 100 updates, " in restarted
+
+
 def test_curves_are_plotted_from_all_seeds(tmp_path: Path) -> None:
     train(corridor(), SHORT_CQL, tmp_path / "run", seeds=2, progress=silent)
     path = draw_curves(tmp_path / "run")
