@@ -28,11 +28,14 @@ COLUMNS: Final = (
 )
 EXPLANATION: Final = (
     "Estimates are discounted returns from the first states of the logged episodes, by pessimistic"
-    " FQE. best: fraction of the resamplings in which the candidate is the best of all candidates"
-    " that were evaluated at the same time. as logged: fraction of the states in which the"
-    " candidate takes the logged action. WPDIS: estimate by weighted importance sampling, or the"
-    " effective number of episodes if there are too few."
+    " FQE; those of candidates that were stopped early are from the first evaluation. best:"
+    " fraction of the resamplings in which the candidate is the best in the last evaluation. as"
+    " logged: fraction of the states in which the candidate takes the logged action. WPDIS:"
+    " estimate by weighted importance sampling, or the effective number of episodes if there are"
+    " too few."
 )
+STOPPED_EARLY: Final = "stopped early"
+"""Outcome of a candidate that was not trained with all updates, or cannot be chosen."""
 _FEW_EPISODES: Final = 50
 _LOW_COVERAGE: Final = 0.5
 _NO_VALUE: Final = "-"
@@ -217,11 +220,13 @@ def advice_for(traits: LogTraits, tried: Mapping[str, Tried], complete: bool) ->
 
 def _row(name: str, one: Tried) -> tuple[str, ...]:
     rating = one.rating
+    # Candidates that were stopped early do not take part in the last evaluation.
+    chance = rating.best_chance if rating and one.outcome != STOPPED_EARLY else None
     return (
         name,
         str(one.updates),
         _with_interval(rating) if rating else _NO_VALUE,
-        f"{rating.best_chance:.0%}" if rating else _NO_VALUE,
+        _NO_VALUE if chance is None else f"{chance:.0%}",
         f"{rating.agreement:.0%}" if rating else _NO_VALUE,
         _NO_VALUE if one.bellman_error is None else f"{one.bellman_error:.2f}",
         _weighted(one.weighted),

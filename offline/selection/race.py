@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 import shutil
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -38,6 +39,7 @@ from mcaprl.offline.estimate.evidence import (
 )
 from mcaprl.offline.policy import Policy, read_policy
 from mcaprl.offline.selection.choice import (
+    STOPPED_EARLY,
     Choice,
     Tried,
     advice_for,
@@ -57,6 +59,7 @@ from mcaprl.offline.selection.portfolio import (
 from mcaprl.offline.selection.rule import Rating, ranked, rate
 from mcaprl.offline.training.metrics import OfflineSummary
 from mcaprl.offline.training.train import fingerprint, train
+from mcaprl.offline.training.watch import SHORT_HORIZON, horizon_warning
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.runs import (
     METRICS_NAME,
@@ -240,6 +243,7 @@ class _Race:
         count = min(len(self._eligible), self._config.survivors)
         total = len(trying) * short + count * (full - short)
         bar = _Bar(self._progress, total)
+        self._warn_of_short_horizons(trying)
         stages = self._read_stages()
         for k, candidate in enumerate(trying):
             share_s = self._clock.left_s(SHARES[0]) / (len(trying) - k)
@@ -275,6 +279,15 @@ class _Race:
         self._publish(choice.chosen)
         choice.write(self._out)
         return choice, self._summaries(choice.chosen)
+
+    def _warn_of_short_horizons(self, candidates: Sequence[Candidate]) -> None:
+        """Warn once about all candidates that have the same short horizon."""
+        found: dict[str, list[str]] = {}
+        for one in candidates:
+            if message := horizon_warning(one.config(self._config)):
+                found.setdefault(message, []).append(one.name)
+        for message, names in found.items():
+            warnings.warn(f"{', '.join(names)}: {message}", stacklevel=2)
 
     def _finalists(self, names: Sequence[str]) -> list[str]:
         """Return the finalists among the candidates; all candidates if none is a finalist."""
@@ -327,7 +340,9 @@ class _Race:
     ) -> None:
         """Start or resume a run. Return when it ends, or when the callback pauses it."""
         folder.parent.mkdir(exist_ok=True)
-        with suppress(_Pause):
+        with suppress(_Pause), warnings.catch_warnings():
+            # `_warn_of_short_horizons` names the candidates, once for both stages.
+            warnings.filterwarnings("ignore", SHORT_HORIZON)
             train(
                 self._dataset,
                 config,
@@ -452,7 +467,7 @@ class _Race:
         chosen = (order or self._finalists(names))[0]
         rest = [name for name in ranked(first.ratings) if name not in order] if first else []
         known = {name: Tried(self._updates(name), outcome="not evaluated") for name in names}
-        for stage, outcome in ((first, "stopped early"), (second, "")):
+        for stage, outcome in ((first, STOPPED_EARLY), (second, "")):
             for name, one in stage.tried.items() if stage else ():
                 known[name] = replace(one, outcome=outcome)
         runners = [name for name in order if name != chosen][:1]

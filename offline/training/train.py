@@ -337,7 +337,7 @@ class _Run:
             if "mean_q" not in earlier:
                 continue
             if message := divergence_warning(earlier["mean_q"], later["mean_q"], self.limit):
-                warnings.warn(message, stacklevel=2)
+                warnings.warn(f"{self.folder}: {message}", stacklevel=2)
                 return True
         return False
 

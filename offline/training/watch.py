@@ -25,6 +25,8 @@ MAX_ROWS = 256
 """Number of transitions per validation, spread evenly over the held-out episodes."""
 MIN_HORIZON_FRACTION = 0.3
 """Below this `horizon_fraction`, the values of good and bad actions hardly differ."""
+SHORT_HORIZON = ".* of the horizon of gamma "
+"""Regular expression that matches every `horizon_warning`."""
 MAX_EXCESS = 2.0
 """Values diverge if their mean is more than this multiple of the largest possible return."""
 _CUT_OFF = 0.05

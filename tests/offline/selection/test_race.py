@@ -13,7 +13,7 @@ import pytest
 import mcaprl
 from mcaprl.errors import OutputExistsError, TrainingError, UsageError
 from mcaprl.offline.policy import read_policy
-from mcaprl.offline.selection.choice import read_choice
+from mcaprl.offline.selection.choice import COLUMNS, read_choice
 from mcaprl.offline.selection.config import AutoConfig
 from mcaprl.offline.selection.portfolio import PORTFOLIO, eligible
 from mcaprl.offline.selection.race import select
@@ -77,6 +77,24 @@ def test_two_candidates_make_all_updates_and_the_others_a_quarter(finished: Path
     assert choice.chosen in choice.reason
     finalists = [name for name, one in choice.tried.items() if one.outcome != "stopped early"]
     assert sorted(finalists) == ["cql-alpha-0.1", "iql"]
+
+
+def test_only_candidates_of_the_last_evaluation_have_a_chance(finished: Path) -> None:
+    choice = read_choice(finished)
+    column = COLUMNS.index("best")
+    chances = {row[0]: row[column] for row in choice.rows if row[column] != "-"}
+    assert set(chances) == {"iql", "cql-alpha-0.1"}
+    assert sum(float(chance.rstrip("%")) for chance in chances.values()) == pytest.approx(
+        100, abs=1
+    )
+
+
+def test_a_short_horizon_is_reported_with_the_candidates(data: Dataset, tmp_path: Path) -> None:
+    config = replace(CONFIG, gamma=0.999, target_interval=10)
+    with pytest.warns(UserWarning, match="of the horizon") as warned:
+        select(data, config, tmp_path / "run")
+    (message,) = {str(one.message) for one in warned}
+    assert message.startswith("iql, cql-alpha-0.1, bcq, cql, cql-scaled, double-dqn: 4 updates of")
 
 
 def test_with_all_finalists_the_best_candidates_make_all_updates(
