@@ -166,6 +166,8 @@ def _print_scores(found: Evaluation) -> None:
         ["policy", "mean return", "95 % interval", "IQM", "random 0, pilot 1", "success", "ends"],
         rows,
     )
+    if not found.improvements:
+        return
     print_table(
         "probability that an episode of one policy has a higher return than an episode of another",
         ["policy", "than", "probability", "95 % interval"],

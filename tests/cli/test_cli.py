@@ -82,6 +82,13 @@ def test_info_report_and_strict(cartpole: Path, capsys: pytest.CaptureFixture[st
     assert "was cut off" in facts["problems"][0]
 
 
+def test_a_single_policy_is_not_compared(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["evaluate", "random", "--sim", "CartPole-v1", "--episodes", "2"]) == 0
+    printed = capsys.readouterr().out
+    assert "2 episodes for each policy" in printed
+    assert "probability" not in printed
+
+
 def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:
     few = ["--updates", "30", "--batch-size", "16", "--hidden", "8", "--seeds", "2"]
     assert run(["train-offline", str(cartpole), "--algo", "bc", "--out", "bc", *few]) == 0
