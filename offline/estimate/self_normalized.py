@@ -28,6 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, t
 
+from mcaprl.sims.evaluation.statistics import LEAST_RESAMPLED
+
 Floats = NDArray[np.float64]
 
 CONFIDENCE: Final = 0.95
@@ -79,13 +81,20 @@ class RatioEstimate:
         """Return the 95 % bootstrap-t interval, widened for few degrees of freedom.
 
         A resampling in which all episodes are equal has no standard error and is excluded. If most
-        resamplings are excluded, the method returns the percentile interval.
+        resamplings are excluded, the method returns the percentile interval. With fewer than
+        `LEAST_RESAMPLED` episodes, it returns the interval of Student's t; see
+        `mcaprl.sims.evaluation.statistics`.
 
         Args:
             counts: Number of times (B, E) that each resampling contains each episode.
         """
         once = np.ones((1, counts.shape[1]))
         value, error = float(self.values(once)[0]), float(self.errors(once)[0])
+        if (episodes := counts.shape[1]) < LEAST_RESAMPLED:
+            # The delta method divides by the number of episodes, not by the degrees of freedom.
+            error *= np.sqrt(episodes / max(episodes - 1, 1))
+            half = float(t.ppf(0.5 + CONFIDENCE / 2, self.degrees_of_freedom())) * error
+            return value - half, value + half
         tails = np.array([50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE)])
         resampled, errors = self.values(counts), self.errors(counts)
         # Ignore standard errors that are only rounding errors.

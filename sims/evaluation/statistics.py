@@ -13,6 +13,14 @@ means of the seeds:
     Zou and Donner, "Construction of confidence limits about effect measures: a general approach",
     Statistics in Medicine 27, 2008
 
+Of fewer than 10 values, many bootstrap samples contain almost only equal values. Their standard
+errors are almost 0, so bootstrap-t intervals are long and vary much, even without bound:
+
+    Owen, "Better bootstrap t confidence intervals for the mean", 2025,
+    https://arxiv.org/abs/2508.10083
+
+The interval is then that of Student's t, which is exact for normally distributed values.
+
 Intervals of other statistics are percentiles of bootstrap samples. A sample draws seeds with
 replacement, and then episodes within each drawn seed.
 """
@@ -31,6 +39,8 @@ Floats = NDArray[np.float64]
 
 RESAMPLES: Final = 2000
 CONFIDENCE: Final = 0.95
+LEAST_RESAMPLED: Final = 10
+"""Number of values below which the interval of a mean is that of Student's t."""
 _PAIRS_AT_ONCE = _VALUES_AT_ONCE = 1 << 22
 _STUDENT: Final = {
     1: 12.7062,
@@ -74,7 +84,8 @@ def mean_interval(returns: Floats, *, seed: int = 0) -> tuple[float, float]:
 
     With several seeds, the result combines two intervals. The interval of Student's t for the means
     of the seeds covers the variation between seeds. The bootstrap-t interval for the means of the
-    start states covers the variation between start states. If the lower limits of these intervals
+    start states covers the variation between start states; it is Student's t, too, if there are
+    fewer than `LEAST_RESAMPLED` start states. If the lower limits of these intervals
     are a and b below the mean, the lower limit of the result is sqrt(a^2 + b^2) below the mean. The
     upper limit is computed in the same way.
 
@@ -152,8 +163,11 @@ def _bootstrap_t_interval(values: Floats, *, seed: int) -> tuple[float, float]:
 
     If there are few values, or if many values are equal, the bootstrap samples vary little.
     Therefore, the interval is at least as wide on each side as the interval of Student's t. Samples
-    whose standard error is almost 0 are excluded.
+    whose standard error is almost 0 are excluded. With fewer than `LEAST_RESAMPLED` values, the
+    interval is that of Student's t.
     """
+    if len(values) < LEAST_RESAMPLED:
+        return _student_interval(values)
     random = np.random.default_rng(seed)
     count, mean, error = len(values), values.mean(), _standard_errors(values)
     studentized = []

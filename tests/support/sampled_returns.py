@@ -51,6 +51,8 @@ class Returns:
 
 
 CASES: Final = {
+    "1 seed, 5 episodes, normal": Returns(1, 5),
+    "1 seed, 5 episodes, lognormal": Returns(1, 5, skewed=True),
     "1 seed, 30 episodes, normal": Returns(1, 30),
     "1 seed, 30 episodes, lognormal": Returns(1, 30, skewed=True),
     "1 seed, 100 episodes, normal": Returns(1, 100),

@@ -97,6 +97,23 @@ def test_intervals_have_their_nominal_coverage() -> None:
         assert abs(times / logs - 0.95) <= margin, name
 
 
+def test_the_interval_of_a_few_episodes_is_students() -> None:
+    # All deviations from the mean are equal, so there are E - 1 degrees of freedom.
+    values = np.array([0.0, 0, 0, 1, 1, 1])
+    expected = scipy.stats.t.interval(0.95, 5, values.mean(), scipy.stats.sem(values))
+    assert RatioEstimate.mean(values).interval(resamplings(6, 200, 0)) == pytest.approx(expected)
+
+
+def test_intervals_of_a_few_episodes_have_their_nominal_coverage() -> None:
+    random, trials = np.random.default_rng(0), 2_000
+    counts, held = resamplings(5, 1, 0), 0
+    for _ in range(trials):
+        low, high = RatioEstimate.mean(random.normal(size=5)).interval(counts)
+        held += low <= 0 <= high
+    # Few degrees of freedom widen the interval, so that it is not too short for skewed returns.
+    assert 0.94 <= held / trials <= 0.99
+
+
 def test_degrees_of_freedom_by_hand() -> None:
     # For deviations d from the mean, the result is (sum of d^2)^2 / (sum of d^4) - 1, at least 1.
     # The deviations of 0 and 2 are equal: 4 / 2 - 1 = 1. The deviations of 0, 0, 0 and 4 are 1, 1,

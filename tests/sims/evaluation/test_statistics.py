@@ -73,6 +73,11 @@ def test_the_interval_of_an_improvement_holds_it() -> None:
 @pytest.mark.parametrize(
     ("of", "least", "most"),
     [
+        (Returns(1, 3), 0.94, 0.96),
+        (Returns(1, 5), 0.94, 0.96),
+        (Returns(1, 9), 0.94, 0.96),
+        # A few episodes do not show that returns are skewed.
+        (Returns(1, 5, skewed=True), 0.80, 0.86),
         (Returns(1, 30), 0.94, 0.97),
         (Returns(1, 30, skewed=True), 0.93, 0.97),
         (Returns(1, 100, skewed=True), 0.93, 0.97),
@@ -123,6 +128,16 @@ def test_an_interval_of_the_mean_holds_it_and_shifts_and_scales(
     assert numbers.mean() - 1e-9 <= high
     moved = mean_interval(3 * numbers + 5, seed=abs(seed))
     assert moved == pytest.approx((3 * low + 5, 3 * high + 5), rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "returns", [[37.0, 61.0, 61.5, 62.0, 157.0], [0.0, 0.01, 9.99, 10.0], [500.0] * 7 + [499.0, 9]]
+)
+def test_the_interval_of_a_few_episodes_is_students(returns: list[float]) -> None:
+    expected = scipy.stats.t.interval(
+        0.95, len(returns) - 1, np.mean(returns), scipy.stats.sem(returns)
+    )
+    assert mean_interval(np.array([returns])) == pytest.approx(expected, rel=2e-3)
 
 
 def test_a_skewed_interval_is_longer_on_the_side_of_the_tail() -> None:
