@@ -132,7 +132,7 @@ def train(
         settings = {**settings_from_json(earlier.get("config")), **settings}
     numbers = choose_seeds(out, seeds, seed, resume)
     algo = algo or "cql"
-    defaults = AutoConfig() if algo == AUTO else choose_algorithm(algo)[1]
+    defaults = AutoConfig() if algo == AUTO else choose_algorithm(algo, [AUTO])[1]
     check_settings(algo, defaults, settings)
     config = type(defaults)(**settings)
     _check_choice(algo, budget_minutes, report, follow, other_data)

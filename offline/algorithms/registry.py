@@ -6,6 +6,7 @@ the algorithm's name to its `Learner` subclass, `module:Class`.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from importlib.metadata import EntryPoint, entry_points
 
 from mcaprl.errors import UnknownNameError, UsageError
@@ -32,11 +33,14 @@ def all_algorithms() -> dict[str, type[Learner]]:
     return ALGORITHMS | {name: _load(entry) for name, entry in _entry_points().items()}
 
 
-def choose_algorithm(algo: str | TrainingConfig) -> tuple[type[Learner], TrainingConfig]:
+def choose_algorithm(
+    algo: str | TrainingConfig, others: Iterable[str] = ()
+) -> tuple[type[Learner], TrainingConfig]:
     """Return an algorithm and its settings.
 
     Args:
         algo: Name of an algorithm, for default settings; or an algorithm's config.
+        others: More names that the caller accepts, for the message about an unknown name.
 
     Raises:
         UnknownNameError: No algorithm has that name.
@@ -47,7 +51,7 @@ def choose_algorithm(algo: str | TrainingConfig) -> tuple[type[Learner], Trainin
             return ALGORITHMS[algo], ALGORITHMS[algo].config_type()
         entries = _entry_points()
         if algo not in entries:
-            raise UnknownNameError("algorithm", algo, [*ALGORITHMS, *entries])
+            raise UnknownNameError("algorithm", algo, [*ALGORITHMS, *entries, *others])
         learner = _load(entries[algo])
         return learner, learner.config_type()
     algorithms = ALGORITHMS

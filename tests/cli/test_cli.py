@@ -371,6 +371,7 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         (["evaluate", "pilot", "--sim", "lane", "--episodes=1", "--report", "taken"], 1, "cann"),
         (["info", str(LANE_LOG), "--report", "taken"], 1, "dataset.json: taken is not a folder"),
         (["train-offline", str(LANE_LOG), "--out", "r", "--algo", "cqk"], 2, "did you mean cql"),
+        (["train-offline", str(LANE_LOG), "--out", "r", "--algo", "cqk"], 2, "known: auto, bc,"),
         (
             ["train-offline", str(LANE_LOG), "--out", "r", "--algo", "bc", "--alpha", "1"],
             2,
