@@ -88,7 +88,7 @@ def load_policy(path: str | Path) -> TrainedPolicy:
             file of Stable-Baselines3.
 
     Raises:
-        PolicyError: The path contains no policy, or a file is broken.
+        PolicyError: The path does not exist or contains no policy, or a file is broken.
         MissingExtraError: The packages of the `offline` or `online` extra are not installed.
     """
     return _load(_found_files(Path(path))[0])
@@ -207,6 +207,8 @@ def _existing(name: str, others: Sequence[str]) -> Path:
 
 
 def _found_files(path: Path) -> list[Path]:
+    if not path.exists():
+        raise PolicyError(f"{path}: no such file or folder")
     if path.suffix == ".mcap":
         raise PolicyError(f"{path} is a log: pass the path of a trained run, or a .zip file of SB3")
     files = policy_files(path)

@@ -296,8 +296,10 @@ def test_seeds_are_ordered_as_numbers(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("load", [load_policy, load_policies])
 def test_a_path_without_a_policy_is_named(tmp_path: Path, load: Any) -> None:
-    with pytest.raises(PolicyError, match=f"{tmp_path / 'nowhere'} has no policy"):
+    with pytest.raises(PolicyError, match=f"{tmp_path / 'nowhere'}: no such file or folder"):
         load(tmp_path / "nowhere")
+    with pytest.raises(PolicyError, match=f"{tmp_path} has no policy"):
+        load(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["policy.json", "policy.safetensors"])
