@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mcaprl.errors import NotMcapError, UsageError, import_extra
+from mcaprl.errors import NotMcapError, UnknownNameError, UsageError, import_extra
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.image_cache import Storage
+from mcaprl.recorder.dataset.image_cache import STORAGES, Storage
 from mcaprl.recorder.dataset.open import Episodes, open_logs
 
 if TYPE_CHECKING:
@@ -66,9 +66,12 @@ def open_data(
     Raises:
         LogError: A file is missing, not an MCAP file, damaged, or has no finished episode.
         SpaceError: The logs' spaces differ.
+        UnknownNameError: There is no such format or storage of images.
         UsageError: A column or an episode does not exist, or the mapping does not fit the bag.
         MissingExtraError: A mapping needs the packages of the `bags` extra.
     """
+    if images not in STORAGES:
+        raise UnknownNameError("storage of images", str(images), STORAGES)
     other = None if mapping is not None else _other_format(data, format)
     if mapping is None and other is None:
         try:

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, SpaceError, UnknownNameError
+from mcaprl.errors import LogError, SpaceError, UnknownNameError, UsageError
 from mcaprl.recorder.dataset.conversions import Conversions
 from mcaprl.recorder.dataset.episode import Episode, shapes
 from mcaprl.recorder.dataset.mapped import MappedImages, rows_of
@@ -332,10 +332,10 @@ class Dataset(Conversions):
             seed: Seed of the random split.
 
         Raises:
-            ValueError: `fraction` is not between 0 and 1.
+            UsageError: `fraction` is not between 0 and 1.
         """
         if not 0 < fraction < 1:
-            raise ValueError(f"fraction is {fraction}, expected a number between 0 and 1")
+            raise UsageError(f"fraction {fraction}: give a number between 0 and 1")
         count = len(self.episodes)
         first_count = min(max(round(count * fraction), 1), max(count - 1, 1))
         order = np.random.default_rng(seed).permutation(count)

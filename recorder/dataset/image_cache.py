@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterator
-from typing import Literal
+from typing import Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ Storage = Literal["auto", "memory", "mapped"]
 `auto` is `mapped` if the images exceed `MEMORY_SHARE` of the free memory, otherwise `memory`.
 """
 
+STORAGES: Final[tuple[str, ...]] = get_args(Storage)
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 CACHE_METADATA = "mcaprl.images"
 MEMORY_SHARE = 0.5

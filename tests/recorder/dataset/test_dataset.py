@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import mcaprl
-from mcaprl.errors import LogError, SpaceError
+from mcaprl.errors import LogError, SpaceError, UsageError
 from tests.support.recordings import MIXED_SPACE, record
 
 
@@ -83,7 +83,7 @@ def test_filter_and_split_take_whole_episodes() -> None:
     assert len(first.episodes) == 2
     assert len(second.episodes) == 1
     assert sorted([*first.rewards, *second.rewards]) == sorted(data.rewards)
-    with pytest.raises(ValueError, match="between 0 and 1"):
+    with pytest.raises(UsageError, match=r"fraction 1\.5: give a number between 0 and 1"):
         data.split(1.5)
 
 

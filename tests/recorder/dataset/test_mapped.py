@@ -12,7 +12,7 @@ import pytest
 from gymnasium import spaces
 
 import mcaprl
-from mcaprl.errors import CorruptLogError
+from mcaprl.errors import CorruptLogError, UnknownNameError
 from mcaprl.recorder.dataset import image_cache as storage
 from mcaprl.recorder.dataset import mapped as mapped_images
 from mcaprl.recorder.dataset.mapped import MappedImages
@@ -57,6 +57,12 @@ def test_mapped_images_equal_those_in_memory(log: Path) -> None:
 
 
 @in_every_way
+def test_an_unknown_storage_is_refused(log: Path) -> None:
+    storage: Any = "map"
+    with pytest.raises(UnknownNameError, match="did you mean mapped"):
+        mcaprl.open(log, images=storage)
+
+
 def test_batches(log: Path) -> None:
     memory, mapped = mcaprl.open(log, images="memory"), mcaprl.open(log, images="mapped")
     steps = np.random.default_rng(0).integers(len(memory), size=256)
