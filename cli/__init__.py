@@ -1,8 +1,8 @@
 """Command-line interface; `mcaprl --help` lists the commands.
 
-Every command exits 0 on success, 1 on failure, 2 on invalid usage, 130 if it is interrupted. User
-errors are printed as one line on stderr. Each command calls the functions of the public API
-that `mcaprl` lists. Torch and numba are imported only by the commands that need them.
+User errors are printed as one line on stderr; `mcaprl.cli.exit_codes` lists the exit codes. Each
+command calls the functions of the public API that `mcaprl` lists. Torch and numba are imported only
+by the commands that need them.
 """
 
 from __future__ import annotations

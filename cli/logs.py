@@ -9,15 +9,13 @@ import click
 
 import mcaprl
 from mcaprl.cli.completion import Name, sims
+from mcaprl.cli.exit_codes import WITH_LOSSES
 from mcaprl.cli.help import Command
 from mcaprl.cli.options import PATH, integer_option, json_option, mapping_options, trust_option
 from mcaprl.cli.progress import hint, working
 from mcaprl.cli.show import echo, print_facts, print_json, print_problems
 from mcaprl.page import PAGE_NAME
 from mcaprl.texts import counted
-
-# Exit code of `recover` if data is lost.
-_WITH_LOSSES = 3
 
 
 @click.command(cls=Command)
@@ -96,7 +94,7 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
         episodes = counted(found.episodes, "episode")
         echo(f"{out}: {episodes}{ended}, {counted(found.messages, 'message')}")
         print_problems(found.problems)
-    return _WITH_LOSSES if found.has_losses else 0
+    return WITH_LOSSES if found.has_losses else 0
 
 
 @click.command(cls=Command)

@@ -28,6 +28,7 @@ from pydantic import BaseModel
 import mcaprl
 from mcaprl.api import SCRIPTED
 from mcaprl.cli import cli
+from mcaprl.cli.exit_codes import EXIT_CODES
 from mcaprl.recorder import MAPPING_SECTIONS
 from mcaprl.sims import make_pilot, make_sim
 
@@ -79,6 +80,8 @@ def command_reference() -> str:
             assert command is not None
             with click.Context(command, info_name=name, parent=top) as inner:
                 parts.append(_section(f"mcaprl {name}", command.get_help(inner)))
+    rows = [f"| {code} | {meaning} |" for code, meaning in EXIT_CODES.items()]
+    parts.append("\n".join(["## Exit codes", "", "| Code | Meaning |", "|---|---|", *rows, ""]))
     return "\n".join(parts)
 
 

@@ -10,7 +10,11 @@ from types import ModuleType
 import click
 import pytest
 
+import mcaprl
+import mcaprl.errors
+from mcaprl._interrupt import INTERRUPTED
 from mcaprl.cli import cli
+from mcaprl.cli.exit_codes import WITH_LOSSES
 
 ROOT = Path(__file__).parent.parent
 PAGES = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"]
@@ -51,6 +55,14 @@ def test_links_and_files_exist(name: str) -> None:
         r"`((?:recorder|sims|offline|online|cli|tests|docs)/[\w./]+\.\w+)`", page.read_text()
     ):
         assert (ROOT / path).exists(), f"{name} names {path}"
+
+
+def test_every_exit_code_is_documented() -> None:
+    errors = [one for one in vars(mcaprl.errors).values() if isinstance(one, type)]
+    used = {one.exit_code for one in errors if issubclass(one, mcaprl.McaprlError)}
+    used |= {0, WITH_LOSSES, INTERRUPTED}
+    section = (ROOT / "docs" / "cli.md").read_text().split("## Exit codes")[1]
+    assert {int(code) for code in re.findall(r"^\| (\d+) \|", section, re.MULTILINE)} == used
 
 
 def test_every_option_has_help() -> None:
