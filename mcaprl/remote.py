@@ -15,7 +15,7 @@ import threading
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -288,9 +288,22 @@ class _Errors:
         if not isinstance(error, Exception) or isinstance(error, LogError | UsageError):
             return
         if isinstance(error, FileNotFoundError):
-            raise LogError(f"{self._text}: no such file") from error
+            if not _is_failed_request(error.__cause__):
+                raise LogError(f"{self._text}: no such file") from error
+            error = error.__cause__
         what = str(error).strip().splitlines()
         raise LogError(f"{self._text}: {what[0] if what else type(error).__name__}") from error
+
+
+def _is_failed_request(cause: BaseException | None) -> TypeGuard[Exception]:
+    """Return whether a FileNotFoundError with this cause does not mean that the file is missing.
+
+    fsspec raises a FileNotFoundError for every HTTP request that fails: without a connection, or
+    with a status such as 403.
+    """
+    if isinstance(cause, OSError):
+        return not isinstance(cause, FileNotFoundError)
+    return getattr(cause, "status", 404) != 404
 
 
 def _divided(start: int, stop: int) -> list[Range]:

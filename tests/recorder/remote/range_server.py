@@ -21,6 +21,7 @@ class RangeServer:
         sent: Number of bytes of each answer to a GET request.
         knows_ranges: Whether the server supports range requests.
         cuts: Whether the server closes the connection in the middle of an answer.
+        refusal: Status of the answer to a request for a missing file.
     """
 
     url: str
@@ -28,6 +29,7 @@ class RangeServer:
     sent: list[int] = field(default_factory=list)
     knows_ranges: bool = True
     cuts: bool = False
+    refusal: int = 404
 
 
 @contextmanager
@@ -46,7 +48,7 @@ def range_server(folder: Path) -> Iterator[RangeServer]:
         def _answer(self, *, send: bool) -> None:
             path = folder / self.path.lstrip("/")
             if not path.is_file():
-                self.send_error(404)
+                self.send_error(state.refusal)
                 return
             content = path.read_bytes()
             wanted = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -124,6 +125,15 @@ def test_errors_are_one_clear_line(server: RangeServer, tmp_path: Path) -> None:
         mcaprl.open("memory://nothing")
     with pytest.raises(LogError, match=r"cannot open nonsense://a.mcap: Protocol not known"):
         mcaprl.open("nonsense://a.mcap")
+    server.refusal = 403
+    with pytest.raises(LogError, match=r"cannot read http.*/none.mcap: 403"):
+        mcaprl.open(f"{server.url}/none.mcap")
+    with socket.socket() as unused:
+        # The port is bound, but nothing listens to it.
+        unused.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{unused.getsockname()[1]}/a.mcap"
+        with pytest.raises(LogError, match=rf"cannot read {url}: Cannot connect to host"):
+            mcaprl.open(url)
     (server.folder / "text.mcap").write_text("no log" * 100)
     with pytest.raises(LogError, match=r"http.*/text.mcap is not an MCAP file"):
         mcaprl.open(f"{server.url}/text.mcap")
