@@ -22,6 +22,7 @@ from mcaprl.cli.completion import completion
 from mcaprl.cli.convert import convert
 from mcaprl.cli.edit import filter_, merge, slice_, split
 from mcaprl.cli.evaluate import evaluate
+from mcaprl.cli.exit_codes import EXIT_CODES
 from mcaprl.cli.help import Program
 from mcaprl.cli.logs import annotate, check, info, layout, recover
 from mcaprl.cli.record import record
@@ -30,6 +31,8 @@ from mcaprl.cli.show import echo
 from mcaprl.cli.train_offline import export, train_offline
 from mcaprl.cli.train_online import train_online
 from mcaprl.errors import McaprlError
+
+__all__ = ["EXIT_CODES", "cli", "main", "run"]
 
 
 @click.group(

@@ -27,8 +27,7 @@ from pydantic import BaseModel
 
 import mcaprl
 from mcaprl.api import SCRIPTED
-from mcaprl.cli import cli
-from mcaprl.cli.exit_codes import EXIT_CODES
+from mcaprl.cli import EXIT_CODES, cli
 from mcaprl.recorder import MAPPING_SECTIONS
 from mcaprl.sims import make_pilot, make_sim
 

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 
 from mcaprl.errors import UsageError
-from mcaprl.online import Agent, Scale, Task
+from mcaprl.online import Agent, Task
 from mcaprl.online.frame_buffer import FrameReplayBuffer, shifted
 from mcaprl.online.frames import FrameMemory, stacked_space
+from mcaprl.sims import Scale
 
 IMAGE = spaces.Box(0, 255, (1, 6, 6), np.uint8)
 DICT = spaces.Dict({"image": IMAGE, "vector": spaces.Box(-1, 1, (3,))})
