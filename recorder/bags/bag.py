@@ -13,11 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, UnknownNameError, UsageError
-from mcaprl.recorder.bags.decoders import MessageDecoder, column_of, decoder_of, value_at
+from mcaprl.recorder.bags.decoders import (
+    MessageDecoder,
+    column_of,
+    decoder_of,
+    merged,
+    value_at,
+)
 from mcaprl.recorder.bags.files import find_bags, open_files
 from mcaprl.recorder.bags.mcap_file import McapFile
 from mcaprl.recorder.bags.rosbag_file import RosbagFile
-from mcaprl.recorder.bags.source import TopicSource
+from mcaprl.recorder.bags.source import Definition, TopicSource
 
 _PUBLISH_TIME = "publish_time"
 
@@ -77,7 +83,13 @@ class Bag(Protocol):
         """Description of each topic by name."""
 
     def times(self, topic: str) -> NDArray[np.int64]:
-        """Return the (N,) log_times of a topic, in file order."""
+        """Return the (N,) log_times of a topic, in the order of recording."""
+
+    def places(self, topic: str) -> NDArray[np.int64]:
+        """Return the (N, 2) places of a topic's messages: index of the file, position in the file.
+
+        The places are ascending, and those of different topics can be compared.
+        """
 
     def read(
         self, topic: str, fields: Sequence[str], rows: NDArray[np.int64] | None = None
@@ -100,45 +112,71 @@ class Bag(Protocol):
 
 
 class _Topic:
-    """One topic of a bag, joined from all files."""
+    """One topic of a bag, joined from all files and channels in the order of recording."""
 
-    def __init__(self, name: str, sources: Sequence[TopicSource]) -> None:
+    def __init__(self, name: str, sources: Sequence[tuple[int, TopicSource]]) -> None:
+        """Store the sources, each with the index of its file."""
         self.name = name
         self._given = sources
-        self._decoder: MessageDecoder | None = None
 
     @cached_property
-    def _sources(self) -> list[TopicSource]:
+    def _used(self) -> list[tuple[int, TopicSource]]:
+        """Sources with messages, each with the index of its file."""
         if len(self._given) == 1:
             return list(self._given)
-        used = [each for each in self._given if len(each.times_ns)] or list(self._given[:1])
-        # The files of a split bag cover successive time ranges, so they are sorted by their first
-        # messages.
-        return sorted(used, key=lambda each: each.times_ns[0] if len(each.times_ns) else 0)
+        return [each for each in self._given if len(each[1].times_ns)] or list(self._given[:1])
+
+    @cached_property
+    def _order(self) -> NDArray[np.int64]:
+        """(N, 4) file, position in the file, source and row in the source of each message."""
+        parts = [
+            np.column_stack(np.broadcast_arrays(file, source.positions, k, np.arange(count)))
+            for k, (file, source) in enumerate(self._used)
+            for count in [len(source.times_ns)]
+        ]
+        rows = np.concatenate(parts).astype(np.int64)
+        # A single source is already in the order of recording. `columns` reads it in this order.
+        return rows if len(parts) == 1 else rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+
+    @property
+    def places(self) -> NDArray[np.int64]:
+        return self._order[:, :2]
 
     @cached_property
     def times_ns(self) -> NDArray[np.int64]:
-        return np.concatenate([each.times_ns for each in self._sources])
+        times_ns = np.empty(len(self._order), np.int64)
+        for k, (_, source) in enumerate(self._used):
+            mine = self._order[:, 2] == k
+            times_ns[mine] = source.times_ns[self._order[mine, 3]]
+        return times_ns
+
+    @cached_property
+    def _decoders(self) -> dict[Definition, MessageDecoder]:
+        """Decoder of each definition: files and channels may define the type differently."""
+        found = dict.fromkeys(source.definition for _, source in self._used)
+        kinds = sorted({each.type_name for each in found})
+        if len(kinds) > 1:
+            raise LogError(f"the topic has messages of several types: {', '.join(kinds)}")
+        return {
+            each: decoder_of(
+                each.encoding,
+                each.type_name,
+                each.schema_encoding,
+                each.schema,
+                distribution=each.distribution,
+            )
+            for each in found
+        }
 
     @cached_property
     def info(self) -> TopicInfo:
-        found, problem = self._sources[0].definition, ""
-        kinds = {each.definition.type_name for each in self._sources}
+        found, problem = self._used[0][1].definition, ""
+        fields, constants = dict[str, str](), dict[str, int]()
         try:
-            if len(kinds) > 1:
-                raise LogError(
-                    f"the topic has messages of several types: {', '.join(sorted(kinds))}"
-                )
-            self._decoder = decoder_of(
-                found.encoding,
-                found.type_name,
-                found.schema_encoding,
-                found.schema,
-                distribution=found.distribution,
-            )
+            fields, constants = merged(list(self._decoders.values()))
         except (LogError, UsageError) as error:
             problem = str(error)
-        times_ns, decoder = self.times_ns, self._decoder
+        times_ns = self.times_ns
         return TopicInfo(
             name=self.name,
             type_name=found.type_name,
@@ -146,49 +184,42 @@ class _Topic:
             count=len(times_ns),
             first_ns=int(times_ns.min()) if len(times_ns) else 0,
             last_ns=int(times_ns.max()) if len(times_ns) else 0,
-            fields={} if decoder is None else decoder.fields,
-            constants={} if decoder is None else decoder.constants,
+            fields=fields,
+            constants=constants,
             problem=problem,
         )
 
     def read(self, fields: Sequence[str], rows: NDArray[np.int64] | None) -> Stream:
         times_ns = self.times_ns if rows is None else self.times_ns[rows]
-        if len(self._sources) == 1 and _PUBLISH_TIME not in fields:
-            columns = self._sources[0].columns(fields, rows)
+        if len(self._used) == 1 and _PUBLISH_TIME not in fields:
+            columns = self._used[0][1].columns(fields, rows)
             if columns is not None:
                 return Stream(times_ns, {name: columns[name] for name in fields})
-        values: dict[str, list[Any]] = {name: [] for name in fields}
-        for publish_ns, message in self._messages(rows):
-            for name, column in values.items():
-                is_time = name == _PUBLISH_TIME
-                column.append(publish_ns if is_time else value_at(message, name))
-        kinds = {**self.info.fields, _PUBLISH_TIME: "time"}
-        columns = {name: column_of(column, kinds.get(name, "")) for name, column in values.items()}
+        wanted, places = np.arange(len(self.times_ns)), None
+        if rows is not None:
+            wanted, places = np.unique(rows, return_inverse=True)
+        kinds, columns = {**self.info.fields, _PUBLISH_TIME: "time"}, {}
+        for name, values in self._values(fields, wanted).items():
+            used = values if places is None else [values[place] for place in places.tolist()]
+            columns[name] = column_of(used, kinds.get(name, ""))
         return Stream(times_ns, columns)
 
-    def _messages(self, rows: NDArray[np.int64] | None) -> Iterator[tuple[int, Any]]:
-        """Yield publication time and decoded message of each row, in the order of `rows`."""
-        assert self._decoder is not None, "`read` refuses a topic with a problem"
-        if rows is None:
-            yield from self._rising(np.arange(len(self.times_ns)), self._decoder)
-            return
-        wanted, places = np.unique(rows, return_inverse=True)
-        found = list(self._rising(wanted, self._decoder))
-        yield from (found[place] for place in places.tolist())
-
-    def _rising(
-        self, rows: NDArray[np.int64], decoder: MessageDecoder
-    ) -> Iterator[tuple[int, Any]]:
-        first = 0
-        for source in self._sources:
-            stop = first + len(source.times_ns)
-            mine = rows[(first <= rows) & (rows < stop)] - first
-            for raw in source.raw(mine):
+    def _values(self, fields: Sequence[str], rows: NDArray[np.int64]) -> dict[str, list[Any]]:
+        """Return the values of fields in the messages `rows`, which are distinct and ascending."""
+        values: dict[str, list[Any]] = {name: [None] * len(rows) for name in fields}
+        chosen = self._order[rows]
+        for k, (_, source) in enumerate(self._used):
+            decoder = self._decoders[source.definition]
+            mine = np.flatnonzero(chosen[:, 2] == k)
+            for row, raw in zip(mine.tolist(), source.raw(chosen[mine, 3]), strict=True):
                 try:
-                    yield raw.publish_ns, decoder.decode(raw.data)
+                    message = decoder.decode(raw.data)
                 except LogError as error:
                     raise LogError(f"{self.name}: {error}") from error
-            first = stop
+                for name, column in values.items():
+                    is_time = name == _PUBLISH_TIME
+                    column[row] = raw.publish_ns if is_time else value_at(message, name)
+        return values
 
 
 class _Infos(Mapping[str, TopicInfo]):
@@ -212,16 +243,25 @@ class _FileBag:
 
     def __init__(self, files: Sequence[McapFile | RosbagFile], opened: ExitStack) -> None:
         self._opened = opened
+        if len(files) > 1:
+            # The files of a split bag cover successive time ranges.
+            files = sorted(files, key=lambda file: file.first_ns)
         self.paths = tuple(file.path for file in files)
         names = dict.fromkeys(name for file in files for name in file.topics)
         self._topics = {
-            name: _Topic(name, [each for file in files for each in file.topics.get(name, [])])
+            name: _Topic(
+                name,
+                [(k, each) for k, file in enumerate(files) for each in file.topics.get(name, [])],
+            )
             for name in sorted(names)
         }
         self.topics: Mapping[str, TopicInfo] = _Infos(self._topics)
 
     def times(self, topic: str) -> NDArray[np.int64]:
         return self._topic(topic).times_ns
+
+    def places(self, topic: str) -> NDArray[np.int64]:
+        return self._topic(topic).places
 
     def read(
         self, topic: str, fields: Sequence[str], rows: NDArray[np.int64] | None = None
@@ -251,8 +291,8 @@ def open_bag(data: str | Path | Sequence[str | Path]) -> Bag:
     cannot be read, its `problem` is not empty; all other topics can still be read.
 
     Args:
-        data: A file, a folder, a glob, or a sequence of these. If several files have the same
-            topic, the messages of the file with the earliest first message come first.
+        data: A file, a folder, a glob, or a sequence of these. Files are read in the order of
+            their first messages.
 
     Raises:
         LogError: A file is missing, damaged, or not a bag.

@@ -86,6 +86,41 @@ def decoder_of(
             )
 
 
+def merged(decoders: Sequence[MessageDecoder]) -> tuple[dict[str, str], dict[str, int]]:
+    """Return the fields and constants of a type that has one or more definitions.
+
+    A field may be missing in some definitions. Constants with several values are omitted.
+
+    Raises:
+        LogError: A field is a number in one definition, and something else in another.
+    """
+    fields, values = dict[str, str](), dict[str, set[int]]()
+    for decoder in decoders:
+        for path, kind in decoder.fields.items():
+            known = fields.setdefault(path, kind)
+            if _shape(known) != _shape(kind):
+                raise LogError(
+                    f"the type has several definitions: {path} is {known} in one and {kind} in"
+                    " another: read the files one by one"
+                )
+        for name, value in decoder.constants.items():
+            values.setdefault(name, set()).add(value)
+    if not all(decoder.fields for decoder in decoders):
+        fields = {}
+    return fields, {name: min(found) for name, found in values.items() if len(found) == 1}
+
+
+def _shape(kind: str) -> tuple[str, bool]:
+    """Return what decides how `column_of` reads a kind: numbers of all sizes are equal."""
+    element, bracket, _ = kind.partition("[")
+    is_number = element.rstrip("0123456789") in _NUMBERS and not _are_bytes(kind)
+    return "number" if is_number else element, bool(bracket)
+
+
+def _are_bytes(kind: str) -> bool:
+    return kind == "bytes" or kind.startswith(("uint8[", "byte[", "octet["))
+
+
 class ProtobufDecoder:
     """Decoder of a protobuf type, from a serialized FileDescriptorSet."""
 
@@ -216,7 +251,7 @@ def column_of(values: Sequence[Any], kind: str) -> NDArray[Any]:
         values: Value of the field in each message; None if a message lacks the field.
         kind: Kind of the field as in `bag.TopicInfo`; empty if unknown.
     """
-    if kind == "bytes" or kind.startswith(("uint8[", "byte[", "octet[")):
+    if _are_bytes(kind):
         return _objects([_bytes_of(value) for value in values])
     if kind == "time":
         return np.array([0 if value is None else value for value in values], np.int64)

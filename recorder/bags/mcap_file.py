@@ -49,6 +49,12 @@ class McapFile:
             sources = self.topics.setdefault(channel.topic, [])
             sources.append(_McapTopic(reader, channel, distribution))
 
+    @property
+    def first_ns(self) -> int:
+        """Lowest log_time of all messages; 0 if there are none."""
+        every = [each.times_ns for sources in self.topics.values() for each in sources]
+        return min((int(times_ns.min()) for times_ns in every if len(times_ns)), default=0)
+
     def close(self) -> None:
         """Do nothing: a file that is mapped into memory need not be closed."""
 
@@ -71,6 +77,19 @@ class _McapTopic:
     @cached_property
     def times_ns(self) -> NDArray[np.int64]:
         parts = [part.index["log_time"].astype(np.int64) for part in self._ranges]
+        return np.concatenate(parts) if parts else np.empty(0, np.int64)
+
+    @property
+    def positions(self) -> NDArray[np.int64]:
+        # Unchunked messages come after all chunks, as in `_ranges`. A chunk has fewer than 2^32
+        # bytes.
+        chunks = self._reader.chunks
+        number = {chunk.chunk_start_offset: k for k, chunk in enumerate(chunks)}
+        parts = [
+            (number[part.chunk.chunk_start_offset] if part.chunk else len(chunks)) * 2**32
+            + part.index["offset"].astype(np.int64)
+            for part in self._ranges
+        ]
         return np.concatenate(parts) if parts else np.empty(0, np.int64)
 
     def raw(self, rows: NDArray[np.int64]) -> Iterator[RawMessage]:

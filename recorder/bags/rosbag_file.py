@@ -48,6 +48,11 @@ class RosbagFile:
                 _RosbagTopic(self._reader, path, connection, distribution, is_ros1=is_ros1)
             )
 
+    @property
+    def first_ns(self) -> int:
+        """Lowest log_time of all messages; 2^63 - 1 if there are none."""
+        return int(self._reader.start_time)
+
     def close(self) -> None:
         """Close the files."""
         self._reader.close()
@@ -78,6 +83,11 @@ class _RosbagTopic:
     @cached_property
     def times_ns(self) -> NDArray[np.int64]:
         return np.array([time_ns for _, time_ns, _ in self._messages()], np.int64)
+
+    @property
+    def positions(self) -> NDArray[np.int64]:
+        # rosbags reads the messages of a bag in the order of time.
+        return self.times_ns
 
     def raw(self, rows: NDArray[np.int64]) -> Iterator[RawMessage]:
         if len(rows) and (int(rows[0]) < self._next or self._next == 0):

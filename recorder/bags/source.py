@@ -42,6 +42,8 @@ class TopicSource(Protocol):
     Attributes:
         definition: Type of the messages.
         times_ns: (N,) log_times in file order.
+        positions: (N,) positions in the file, which can be compared with those of other sources of
+            the file.
     """
 
     definition: Definition
@@ -49,6 +51,10 @@ class TopicSource(Protocol):
     @property
     def times_ns(self) -> NDArray[np.int64]:
         """(N,) log_times in file order."""
+
+    @property
+    def positions(self) -> NDArray[np.int64]:
+        """(N,) positions in the file."""
 
     def raw(self, rows: NDArray[np.int64]) -> Iterator[RawMessage]:
         """Yield the messages at the positions `rows` (K,), which are distinct and ascending."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import struct
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from mcap.writer import Writer
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -136,3 +138,50 @@ def write_rosbag1(path: Path) -> Path:
                 connections[topic] = writer.add_connection(topic, kind, typestore=STORE1)
             writer.write(connections[topic], time_ns, STORE1.serialize_ros1(message, kind))
     return path
+
+
+class Channel(NamedTuple):
+    """A channel: topic, type, definition, and its messages as times in seconds and CDR payloads."""
+
+    topic: str
+    kind: str
+    text: str
+    messages: list[tuple[float, bytes]]
+
+
+def write_channels(path: Path, channels: list[Channel], start_ns: int = START_NS) -> Path:
+    """Write an MCAP file with the messages of all channels in the order of time."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        rows = []
+        for topic, kind, text, messages in channels:
+            schema = writer.register_schema(kind, "ros2msg", text.encode())
+            channel = writer.register_channel(topic, "cdr", schema)
+            rows += [(start_ns + round(time_s * 1e9), channel, data) for time_s, data in messages]
+        for time_ns, channel, data in sorted(rows, key=lambda row: row[0]):
+            writer.add_message(channel, time_ns, b"\0\1\0\0" + data, time_ns)
+        writer.finish()
+    return path
+
+
+def number(value: float) -> bytes:
+    """Return the payload of a Float64."""
+    return struct.pack("<d", value)
+
+
+def integer(value: int) -> bytes:
+    """Return the payload of an Int32."""
+    return struct.pack("<i", value)
+
+
+def numbers(topic: str, values: Sequence[tuple[float, float]]) -> Channel:
+    """Return a channel of Float64 messages, given as times in seconds and values."""
+    messages = [(time_s, number(value)) for time_s, value in values]
+    return Channel(topic, "std_msgs/msg/Float64", "float64 data", messages)
+
+
+def integers(topic: str, values: Sequence[tuple[float, int]]) -> Channel:
+    """Return a channel of Int32 messages, given as times in seconds and values."""
+    messages = [(time_s, integer(value)) for time_s, value in values]
+    return Channel(topic, "std_msgs/msg/Int32", "int32 data", messages)

@@ -44,6 +44,10 @@ class MemoryBag:
     def times(self, topic: str) -> NDArray[np.int64]:
         return self._times[topic]
 
+    def places(self, topic: str) -> NDArray[np.int64]:
+        rows = np.arange(len(self._times[topic]))
+        return np.column_stack([np.zeros_like(rows), rows])
+
     def read(
         self, topic: str, fields: Sequence[str], rows: NDArray[np.int64] | None = None
     ) -> Stream:

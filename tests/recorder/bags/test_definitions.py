@@ -7,13 +7,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.writer import Writer
 
 from mcaprl.errors import LogError
 from mcaprl.recorder.bags.bag import open_bag
 from mcaprl.recorder.bags.ros import RosDecoder
-from tests.support.bags import START_NS, STORE1, STORE2
+from tests.support.bags import START_NS, STORE1, STORE2, Channel, numbers, write_channels
 
 IDL = """\
 ================================================================================
@@ -105,6 +106,54 @@ def test_a_topic_of_several_types_costs_only_itself(tmp_path: Path) -> None:
         assert "messages of several types" in bag.topics["/mixed"].problem
         assert bag.topics["/mixed"].count == 2
         assert bag.read("/one", ["x"]).columns["x"].tolist() == [1.0]
+
+
+POINT = "acme_msgs/msg/Point"
+XY, YX = "float64 x\nfloat64 y", "float64 y\nfloat64 x"
+
+
+def test_each_message_is_decoded_by_its_own_definition(tmp_path: Path) -> None:
+    data = struct.pack("<2d", 1.0, 2.0)
+    one = write_channels(tmp_path / "one.mcap", [Channel("/p", POINT, XY, [(0, data)])])
+    two = write_channels(
+        tmp_path / "two.mcap",
+        [Channel("/p", POINT, YX, [(1, data)]), Channel("/p", POINT, XY, [(2, data)])],
+    )
+    with closing(open_bag([two, one])) as bag:
+        found = bag.read("/p", ["x", "y"]).columns
+        assert found["x"].tolist() == [1, 2, 1]
+        assert found["y"].tolist() == [2, 1, 2]
+        assert bag.read("/p", ["x"], np.array([1, 0, 1])).columns["x"].tolist() == [2, 1, 2]
+
+
+def test_fields_and_constants_of_several_definitions(tmp_path: Path) -> None:
+    old, new = "float32 x\nint32 A=1\nint32 B=2", "float64 x\nfloat64 y\nint32 A=1\nint32 B=3"
+    channels = [
+        Channel("/p", POINT, old, [(0, struct.pack("<f", 1.5))]),
+        Channel("/p", POINT, new, [(1, struct.pack("<2d", 2.5, 3.5))]),
+    ]
+    with closing(open_bag(write_channels(tmp_path / "new.mcap", channels))) as bag:
+        assert bag.topics["/p"].constants == {"A": 1}
+        found = bag.read("/p", ["x", "y"]).columns
+        assert found["x"].tolist() == [1.5, 2.5]
+        # The older definition has no `y`.
+        np.testing.assert_array_equal(found["y"], [np.nan, 3.5])
+    channels[0] = Channel("/p", POINT, "string x", [(0, struct.pack("<I2s", 2, b"a\0"))])
+    with closing(open_bag(write_channels(tmp_path / "text.mcap", channels))) as bag:
+        problem = bag.topics["/p"].problem
+        assert "several definitions: x is string in one and float64 in another" in problem
+
+
+def test_channels_of_a_topic_are_merged_in_the_order_of_recording(tmp_path: Path) -> None:
+    channels = [numbers("/odom", [(k, k) for k in range(first, 6, 3)]) for first in range(3)]
+    with closing(open_bag(write_channels(tmp_path / "three.mcap", channels))) as bag:
+        np.testing.assert_array_equal(bag.times("/odom"), START_NS + np.arange(6) * 10**9)
+        assert bag.read("/odom", ["data"]).columns["data"].tolist() == [0, 1, 2, 3, 4, 5]
+        rows = np.array([4, 0, 4])
+        assert bag.read("/odom", ["data"], rows).columns["data"].tolist() == [4, 0, 4]
+        places = bag.places("/odom")
+        assert set(places[:, 0]) == {0}
+        assert (np.diff(places[:, 1]) > 0).all()
 
 
 def test_damaged_messages_name_their_topic(tmp_path: Path) -> None:
