@@ -110,7 +110,6 @@ class Plan:
         if self.mapping.clock.topic is not None:
             with self.place.named("clock", "topic"):
                 fields.setdefault(topic_of(self.bag, self.mapping.clock.topic), set())
-        gap_s = self.mapping.episodes.gap_s
         return {
             # A TFMessage has no header: each of its transforms has its own stamp.
             topic: TopicStream(
@@ -118,7 +117,6 @@ class Plan:
                 topic,
                 wanted,
                 "log_time" if topic in (TF, TF_STATIC) else self.mapping.time,
-                gap_s,
             )
             for topic, wanted in fields.items()
         }

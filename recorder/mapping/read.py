@@ -21,7 +21,6 @@ from mcaprl.recorder.mapping.config import Mapping, Place, load_mapping
 from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.segments import Segment
 from mcaprl.recorder.mapping.steps import StepReader, Steps
-from mcaprl.recorder.mapping.streams import run_count
 from mcaprl.recorder.mapping.summary import FieldReport, MappingReport
 
 
@@ -68,7 +67,7 @@ def read_open_bag(
     """Read an open bag; see `read_bag`. In errors, `place` locates the keys of the mapping."""
     plan = Plan(bag, mapping, place or Place(), trust_code=trust_code)
     reader = StepReader(plan)
-    runs = [reader.read(number) for number in range(run_count(plan.streams))]
+    runs = [reader.read(number) for number in range(reader.count)]
     least = mapping.episodes.min_steps
     kept = [[each for each in run.episodes if each.length >= least] for run in runs]
     report = _report(plan, runs, kept)

@@ -13,7 +13,7 @@ from mcaprl.recorder.mapping.expression import Expression
 from mcaprl.recorder.mapping.observe import Values, values_of
 from mcaprl.recorder.mapping.plan import Plan, Wanted
 from mcaprl.recorder.mapping.segments import Marks, Segment, segments
-from mcaprl.recorder.mapping.streams import Run, TopicStream
+from mcaprl.recorder.mapping.streams import runs_of
 from mcaprl.recorder.mapping.transforms import Transforms
 
 NS_PER_S = 10**9
@@ -46,11 +46,21 @@ class StepReader:
     """Reader that returns the steps of a bag run by run; a run is the time between clock resets."""
 
     def __init__(self, plan: Plan) -> None:
-        """Read the transforms, if the mapping uses them."""
+        """Find the runs, and read the transforms if the mapping uses them.
+
+        Raises:
+            UsageError: The clocks of two topics were not reset together.
+        """
         self._plan, self._mapping = plan, plan.mapping
+        self._runs = runs_of(plan.streams, plan.mapping.episodes.gap_s, plan.bag.paths)
         uses_transforms = any(each.quantity.transform for each in plan.quantities.values())
         by_header = plan.mapping.time == "header"
         self._transforms = Transforms(plan.bag, by_header=by_header) if uses_transforms else None
+
+    @property
+    def count(self) -> int:
+        """Number of runs."""
+        return len(self._runs)
 
     def read(self, number: int) -> Steps:
         """Return the steps of one run; `number` is its index.
@@ -102,16 +112,15 @@ class StepReader:
 
     def _times(self, number: int) -> NDArray[np.int64]:
         """Return the times of the steps of a run."""
-        clock, streams = self._mapping.clock, self._plan.streams
+        clock, topics = self._mapping.clock, self._runs[number]
         if clock.topic is not None:
-            found: NDArray[np.int64] = np.unique(_run(streams[clock.topic], number).times_ns)
+            found: NDArray[np.int64] = np.unique(topics[clock.topic].times_ns)
             return found
         assert clock.rate_hz is not None, "the mapping was validated"
-        runs = [_run(each, number).times_ns for each in streams.values()]
-        runs = [times_ns for times_ns in runs if len(times_ns)]
-        if not runs:
+        found_ns = [run.times_ns for run in topics.values() if len(run.times_ns)]
+        if not found_ns:
             return np.empty(0, np.int64)
-        first, last = min(int(t[0]) for t in runs), max(int(t[-1]) for t in runs)
+        first, last = min(int(t[0]) for t in found_ns), max(int(t[-1]) for t in found_ns)
         # If the duration is a whole number of periods, rounding must not remove the last step.
         count = int((last - first) * clock.rate_hz / NS_PER_S + 1e-6) + 1
         if count > _MAX_STEPS:
@@ -133,7 +142,7 @@ class StepReader:
         ends_ns: NDArray[np.int64] | None = None,
     ) -> Values:
         stream = self._plan.streams[wanted.source.topic]
-        run = _run(stream, number)
+        run = self._runs[number][wanted.source.topic]
         with self._plan.place.named(*wanted.keys):
             return values_of(
                 wanted.quantity, wanted.source, stream, run, times_ns, self._transforms, ends_ns
@@ -174,11 +183,6 @@ class StepReader:
                     is_stale = np.abs(values.age_s) > self._mapping.episodes.gap_s
                 usable &= ~values.missing & ~is_stale
         return usable
-
-
-def _run(stream: TopicStream, number: int) -> Run:
-    """Return a run of a topic, which is empty if the topic has no messages."""
-    return stream.runs[min(number, len(stream.runs) - 1)]
 
 
 def _ends(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
