@@ -71,16 +71,24 @@ def source_of(bag: Bag, quantity: Quantity) -> Source:
     return Source(path.topic, (path.field,), path)
 
 
+def pose_of(quantity: Quantity, transforms: Transforms, steps_ns: NDArray[np.int64]) -> Values:
+    """Return the pose of a frame at the times of steps."""
+    assert quantity.transform is not None, "the quantity is a transform"
+    found, age_s = transforms.planar(
+        quantity.transform, quantity.in_, steps_ns, quantity.align, quantity.tolerance_s
+    )
+    return _shaped(quantity, found, np.isnan(age_s), age_s)
+
+
 def values_of(
     quantity: Quantity,
     source: Source,
     stream: TopicStream,
     run: Run,
     steps_ns: NDArray[np.int64],
-    transforms: Transforms | None = None,
     ends_ns: NDArray[np.int64] | None = None,
 ) -> Values:
-    """Return a quantity at the times of steps.
+    """Return a field or an image at the times of steps.
 
     Args:
         quantity: Quantity of the mapping.
@@ -88,19 +96,12 @@ def values_of(
         stream: Messages of the topic.
         run: Messages of the topic between two resets of the clock.
         steps_ns: (N,) times of the steps.
-        transforms: Tree of coordinate frames; required if the quantity is a transform.
         ends_ns: (N,) ends of the steps. If given, each step uses the last message before its end;
             if None, `quantity.align` applies.
 
     Raises:
         UsageError: A field is not a number.
     """
-    if quantity.transform is not None:
-        assert transforms is not None, "there are transforms"
-        found, age_s = transforms.planar(
-            quantity.transform, quantity.in_, steps_ns, quantity.align, quantity.tolerance_s
-        )
-        return _shaped(quantity, found, np.isnan(age_s), age_s)
     if quantity.as_ == "count":
         counts = np.searchsorted(run.times_ns, steps_ns, side="right").astype(np.float64)
         nothing = np.zeros(len(counts), bool)

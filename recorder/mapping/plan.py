@@ -17,7 +17,6 @@ from mcaprl.recorder.mapping.expression import Expression
 from mcaprl.recorder.mapping.observe import Source, source_of
 from mcaprl.recorder.mapping.paths import topic_of
 from mcaprl.recorder.mapping.streams import TopicStream
-from mcaprl.recorder.mapping.transforms import TF, TF_STATIC
 
 Columns = MappingOf[str, NDArray[Any]]
 Reward = Callable[[Columns, NDArray[np.int64]], NDArray[np.float64]]
@@ -45,7 +44,7 @@ class Plan:
         conditions: Conditions of the episodes: `begin`, `end`, `terminated`, `truncated`.
         reasons: Conditions of the end reasons, by reason.
         reward: Function that computes the rewards.
-        streams: Messages of the used topics.
+        streams: Messages of the used topics, without those of transforms.
         constants: Constants of the message types, by name; names with several values are omitted.
     """
 
@@ -106,18 +105,13 @@ class Plan:
         fields: dict[str, set[str]] = {}
         prob = [] if self.behavior_prob is None else [self.behavior_prob]
         for wanted in (*self.quantities.values(), *self.commands, *prob):
-            fields.setdefault(wanted.source.topic, set()).update(wanted.source.fields)
+            if wanted.quantity.transform is None:
+                fields.setdefault(wanted.source.topic, set()).update(wanted.source.fields)
         if self.mapping.clock.topic is not None:
             with self.place.named("clock", "topic"):
                 fields.setdefault(topic_of(self.bag, self.mapping.clock.topic), set())
         return {
-            # A TFMessage has no header: each of its transforms has its own stamp.
-            topic: TopicStream(
-                self.bag,
-                topic,
-                wanted,
-                "log_time" if topic in (TF, TF_STATIC) else self.mapping.time,
-            )
+            topic: TopicStream(self.bag, topic, wanted, self.mapping.time)
             for topic, wanted in fields.items()
         }
 

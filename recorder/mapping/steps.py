@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from mcaprl.errors import UsageError
 from mcaprl.recorder.mapping.actions import Actions, actions_of
 from mcaprl.recorder.mapping.expression import Expression
-from mcaprl.recorder.mapping.observe import Values, values_of
+from mcaprl.recorder.mapping.observe import Values, pose_of, values_of
 from mcaprl.recorder.mapping.plan import Plan, Wanted
 from mcaprl.recorder.mapping.segments import Marks, Segment, segments
-from mcaprl.recorder.mapping.streams import runs_of
+from mcaprl.recorder.mapping.streams import Recorded, last_file, runs_of
 from mcaprl.recorder.mapping.transforms import Transforms
 
 NS_PER_S = 10**9
@@ -52,10 +52,14 @@ class StepReader:
             UsageError: The clocks of two topics were not reset together.
         """
         self._plan, self._mapping = plan, plan.mapping
-        self._runs = runs_of(plan.streams, plan.mapping.episodes.gap_s, plan.bag.paths)
-        uses_transforms = any(each.quantity.transform for each in plan.quantities.values())
-        by_header = plan.mapping.time == "header"
-        self._transforms = Transforms(plan.bag, by_header=by_header) if uses_transforms else None
+        self._transforms: Transforms | None = None
+        self._streams: dict[str, Recorded] = dict(plan.streams)
+        for keys, quantity, _ in plan.quantities.values():
+            if quantity.transform is not None:
+                self._transforms = self._transforms or Transforms(plan.bag, plan.mapping.time)
+                with plan.place.named(*keys):
+                    self._streams |= self._transforms.streams(quantity.transform, quantity.in_)
+        self._runs = runs_of(self._streams, plan.mapping.episodes.gap_s, plan.bag.paths)
 
     @property
     def count(self) -> int:
@@ -141,12 +145,15 @@ class StepReader:
         times_ns: NDArray[np.int64],
         ends_ns: NDArray[np.int64] | None = None,
     ) -> Values:
-        stream = self._plan.streams[wanted.source.topic]
-        run = self._runs[number][wanted.source.topic]
-        with self._plan.place.named(*wanted.keys):
-            return values_of(
-                wanted.quantity, wanted.source, stream, run, times_ns, self._transforms, ends_ns
-            )
+        keys, quantity, source = wanted
+        runs = self._runs[number]
+        with self._plan.place.named(*keys):
+            if quantity.transform is not None:
+                assert self._transforms is not None, "they are read if a quantity uses them"
+                transforms = self._transforms.within(runs, last_file(self._streams, runs))
+                return pose_of(quantity, transforms, times_ns)
+            stream, run = self._plan.streams[source.topic], runs[source.topic]
+            return values_of(quantity, source, stream, run, times_ns, ends_ns)
 
     def _actions(
         self, number: int, times_ns: NDArray[np.int64], ends_ns: NDArray[np.int64]

@@ -153,6 +153,12 @@ def runs_of(
     return runs
 
 
+def last_file(streams: Mapping[str, Recorded], run: Mapping[str, Run]) -> int:
+    """Return the index of the last file with messages of a run; 0 if there are none."""
+    found = [streams[name].places[part.rows, 0] for name, part in run.items()]
+    return max((int(files.max()) for files in found if len(files)), default=0)
+
+
 def _resets(clocks: Mapping[str, _Clock], gap_s: float, path: Path) -> int:
     """Return how often the clock of a file was reset.
 

@@ -2,47 +2,108 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping
+from copy import copy
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
-from mcaprl.recorder.mapping.align import NONE, NS_PER_S, last, nearest
+from mcaprl.recorder.mapping.align import NONE, NS_PER_S, last, nearest, time_order
+from mcaprl.recorder.mapping.config import TimeSource
+from mcaprl.recorder.mapping.streams import Recorded, Run
 
 Floats = NDArray[np.float64]
 
 TF, TF_STATIC = "/tf", "/tf_static"
 
 
+class _Pose(NamedTuple):
+    """Pose of a frame in its parent: position, and quaternion x y z w."""
+
+    parent: str
+    time_ns: int
+    place: list[int]
+    position: list[float]
+    quaternion: list[float]
+    is_static: bool
+
+
 class _Edge(NamedTuple):
-    """Poses of a frame in its parent: times (M,), positions (M, 3), quaternions (M, 4) x y z w."""
+    """Poses of a frame in its parent: times (M,), positions (M, 3), quaternions (M, 4) x y z w.
+
+    The (M, 2) places are those of the messages; see `Bag.places`.
+    """
 
     parent: str
     times_ns: NDArray[np.int64]
+    places: NDArray[np.int64]
     positions: Floats
     quaternions: Floats
     is_static: bool
+
+    def at(self, rows: NDArray[np.int64]) -> _Edge:
+        """Return the poses `rows`."""
+        return self._replace(
+            times_ns=self.times_ns[rows],
+            places=self.places[rows],
+            positions=self.positions[rows],
+            quaternions=self.quaternions[rows],
+        )
 
 
 class Transforms:
     """Tree of the coordinate frames of a bag."""
 
-    def __init__(self, bag: Bag, *, by_header: bool = False) -> None:
+    def __init__(self, bag: Bag, time: TimeSource = "log_time") -> None:
         """Read all transforms.
 
         Args:
             bag: Bag with `/tf`, `/tf_static` or both.
-            by_header: Whether to use the stamp of each transform instead of the log_time.
+            time: Time of a transform; `header` is the stamp of each transform.
         """
-        found: dict[str, list[tuple[str, int, list[float], list[float], bool]]] = {}
+        found: dict[str, list[_Pose]] = {}
         for topic in (TF, TF_STATIC):
             if topic in bag.topics and bag.topics[topic].count:
-                for child, *pose in _messages(bag, topic, by_header=by_header):
-                    found.setdefault(child, []).append((*pose, topic == TF_STATIC))
-        self._edges = {child: _edge(child, rows) for child, rows in found.items()}
+                for child, pose in _poses(bag, topic, time):
+                    found.setdefault(child, []).append(pose)
+        self._recorded = {child: _edge(child, poses) for child, poses in found.items()}
+        self._edges = {
+            child: edge.at(time_order(edge.times_ns)) for child, edge in self._recorded.items()
+        }
+
+    def streams(self, frame: str, fixed: str) -> dict[str, Recorded]:
+        """Return the moving transforms between two frames, in the order of recording, by name.
+
+        Raises:
+            UsageError: No transforms connect the frames.
+        """
+        return {
+            _name(child): self._recorded[child]
+            for part in self._path(frame, fixed)
+            for child in part
+            if not self._recorded[child].is_static
+        }
+
+    def within(self, run: Mapping[str, Run], last_file: int) -> Transforms:
+        """Return the transforms of a run.
+
+        Args:
+            run: Messages of each stream, by the names of `streams`.
+            last_file: Index of the last file of the run. A static transform is the last one up to
+                this file.
+        """
+        found = copy(self)
+        found._edges = {}
+        for child, edge in self._recorded.items():
+            if _name(child) in run:
+                found._edges[child] = edge.at(run[_name(child)].rows)
+            else:
+                known = np.flatnonzero(edge.places[:, 0] <= last_file)
+                found._edges[child] = edge.at(known[-1:] if len(known) else np.zeros(1, np.int64))
+        return found
 
     def planar(
         self,
@@ -65,11 +126,30 @@ class Transforms:
             tolerance_s: Maximum age of a transform in seconds; older transforms count as missing.
 
         Returns:
-            (N, 3) x, y and yaw, NaN where missing; and (N,) age of the oldest transform, seconds.
+            (N, 3) x, y and yaw, NaN where missing; and (N,) age in seconds of the transform that is
+            farthest in time, negative if that transform is later than the step.
 
         Raises:
             UsageError: No transforms connect the frames.
         """
+        count = len(steps_ns)
+        age_s = np.zeros(count)
+        poses = []
+        for part in self._path(frame, fixed):
+            position, turn = np.zeros((count, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
+            for name in part:
+                at, rotation, age = _at(self._edges[name], steps_ns, align, tolerance_s)
+                position, turn = at + _rotated(rotation, position), _product(rotation, turn)
+                is_older = np.isnan(age) | (np.abs(age) > np.abs(age_s))
+                age_s = np.where(is_older, age, age_s)
+            poses.append((position, turn))
+        (at, turn), (origin, back) = poses
+        inverse = back * [-1.0, -1.0, -1.0, 1.0]
+        position, rotation = _rotated(inverse, at - origin), _product(inverse, turn)
+        return np.column_stack([position[:, :2], yaw_of(rotation)]), age_s
+
+    def _path(self, frame: str, fixed: str) -> tuple[list[str], list[str]]:
+        """Return the frames from each of two frames up to their common ancestor, without it."""
         above, below = self._chain(frame), self._chain(fixed)
         common = next((each for each in above if each in below), None)
         if common is None:
@@ -78,20 +158,7 @@ class Transforms:
                 f"/tf has no path from frame '{frame}' to '{fixed}'; frames:"
                 f" {', '.join(known[:12])}"
             )
-        count = len(steps_ns)
-        age_s = np.zeros(count)
-        poses = []
-        for start in (above[: above.index(common)], below[: below.index(common)]):
-            position, turn = np.zeros((count, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
-            for name in start:
-                at, rotation, age = _at(self._edges[name], steps_ns, align, tolerance_s)
-                position, turn = at + _rotated(rotation, position), _product(rotation, turn)
-                age_s = np.fmax(age_s, age) + np.where(np.isnan(age), np.nan, 0.0)
-            poses.append((position, turn))
-        (at, turn), (origin, back) = poses
-        inverse = back * [-1.0, -1.0, -1.0, 1.0]
-        position, rotation = _rotated(inverse, at - origin), _product(inverse, turn)
-        return np.column_stack([position[:, :2], yaw_of(rotation)]), age_s
+        return above[: above.index(common)], below[: below.index(common)]
 
     def _chain(self, frame: str) -> list[str]:
         """Return a frame and its ancestors."""
@@ -112,34 +179,45 @@ def yaw_of(quaternions: Floats) -> Floats:
     return np.where(is_none, np.nan, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
-def _messages(bag: Bag, topic: str, *, by_header: bool) -> Iterator[tuple[Any, ...]]:
-    """Yield child, parent, time, position and quaternion of each transform."""
-    stream = bag.read(topic, ["transforms"])
-    for time_ns, transforms in zip(
-        stream.log_time_ns.tolist(), stream.columns["transforms"], strict=True
+def _name(child: str) -> str:
+    return f"frame '{child}' in {TF}"
+
+
+def _poses(bag: Bag, topic: str, time: TimeSource) -> Iterator[tuple[str, _Pose]]:
+    """Yield each frame and its pose, in the order of recording."""
+    fields = ["transforms", *(["publish_time"] if time == "publish_time" else [])]
+    stream, places = bag.read(topic, fields), bag.places(topic)
+    times_ns = stream.columns.get("publish_time", stream.log_time_ns)
+    is_static = topic == TF_STATIC
+    for time_ns, place, transforms in zip(
+        times_ns.tolist(), places.tolist(), stream.columns["transforms"], strict=True
     ):
         for each in transforms:
             stamp, pose = each.header.stamp, each.transform
-            if by_header and topic != TF_STATIC:
-                time_ns = stamp.sec * 10**9 + stamp.nanosec
+            own_ns = stamp.sec * 10**9 + stamp.nanosec if time == "header" else time_ns
             at, turn = pose.translation, pose.rotation
             parent, child = (
                 name.removeprefix("/") for name in (each.header.frame_id, each.child_frame_id)
             )
-            yield child, parent, time_ns, [at.x, at.y, at.z], [turn.x, turn.y, turn.z, turn.w]
+            position, quaternion = [at.x, at.y, at.z], [turn.x, turn.y, turn.z, turn.w]
+            yield child, _Pose(parent, own_ns, place, position, quaternion, is_static)
 
 
-def _edge(child: str, rows: list[tuple[str, int, list[float], list[float], bool]]) -> _Edge:
-    parents = sorted({row[0] for row in rows})
+def _edge(child: str, poses: list[_Pose]) -> _Edge:
+    parents = sorted({pose.parent for pose in poses})
     if len(parents) > 1:
         raise UsageError(f"/tf gives frame '{child}' several parents: {', '.join(parents)}")
-    rows = sorted(rows, key=lambda row: row[1])
-    _, times_ns, positions, quaternions, static = zip(*rows, strict=True)
-    turns = np.array(quaternions, np.float64)
+    poses = sorted(poses, key=lambda pose: pose.place)
+    turns = np.array([pose.quaternion for pose in poses], np.float64)
     sizes = np.linalg.norm(turns, axis=1, keepdims=True)
-    turns = np.divide(turns, sizes, out=np.full_like(turns, np.nan), where=sizes > 0)
-    times = np.array(times_ns, np.int64)
-    return _Edge(rows[-1][0], times, np.array(positions, np.float64), turns, all(static))
+    return _Edge(
+        parent=parents[0],
+        times_ns=np.array([pose.time_ns for pose in poses], np.int64),
+        places=np.array([pose.place for pose in poses], np.int64),
+        positions=np.array([pose.position for pose in poses], np.float64),
+        quaternions=np.divide(turns, sizes, out=np.full_like(turns, np.nan), where=sizes > 0),
+        is_static=all(pose.is_static for pose in poses),
+    )
 
 
 def _at(
@@ -150,6 +228,9 @@ def _at(
         count = len(steps_ns)
         still = (np.tile(each[-1], (count, 1)) for each in (edge.positions, edge.quaternions))
         return (*still, np.zeros(count))  # type: ignore[return-value]
+    if not len(edge.times_ns):
+        nothing = np.full((len(steps_ns), 4), np.nan)
+        return nothing[:, :3], nothing, nothing[:, 0]
     match = (nearest if align == "nearest" else last)(edge.times_ns, steps_ns, tolerance_s)
     rows, is_none = np.maximum(match.rows, 0), match.rows == NONE
     positions, turns = edge.positions[rows], edge.quaternions[rows]
@@ -160,9 +241,11 @@ def _at(
         share = np.clip((steps_ns - edge.times_ns[rows]) / span, 0.0, 1.0)[:, np.newaxis]
         is_between = edge.times_ns[rows] != steps_ns
         is_none |= is_between & (after == rows)
+        wait_s = (edge.times_ns[after] - steps_ns) / NS_PER_S
         if tolerance_s is not None:
-            wait_s = (edge.times_ns[after] - steps_ns) / NS_PER_S
             is_none |= is_between & (wait_s > tolerance_s)
+        # As for fields, the age is that of the nearer one of the two poses.
+        age_s = np.where(is_between & (wait_s < age_s), -wait_s, age_s)
         positions = positions + share * (edge.positions[after] - positions)
         turns = _interpolated(turns, edge.quaternions[after], share)
     positions, turns = positions.copy(), turns.copy()
