@@ -39,7 +39,7 @@ def assembled(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> Datas
     """Return the dataset of the kept episodes of all runs; `kept` must not be empty.
 
     Raises:
-        UsageError: A reward is not a number, or an observation is a text.
+        UsageError: A reward or probability is impossible, or an observation is a text.
         LogError: An image cannot be read.
     """
     summaries: list[EpisodeSummary] = []
@@ -96,6 +96,16 @@ def _summary(
             f"{plan.place.of('reward')}: the reward is {rewards[wrong[0]]} at"
             f" {run.times_ns[segment.first + wrong[0]]} ns; it is not finite in {len(wrong)} of"
             f" {len(rewards)} steps of this episode: set `missing` for the quantities in `reward`"
+        )
+    probs = run.probs[segment.first : segment.last]
+    # Unknown probabilities are NaN.
+    wrong = np.flatnonzero((probs <= 0) | (probs > 1))
+    if len(wrong):
+        raise UsageError(
+            f"{plan.place.of('behavior_prob')}: the probability is {probs[wrong[0]]:g} at"
+            f" {run.times_ns[segment.first + wrong[0]]} ns; it is not above 0 and at most 1 in"
+            f" {len(wrong)} of {len(probs)} steps of this episode: use another field, `scale` or"
+            " `clip`, or remove behavior_prob"
         )
     named = (name for name, holds in run.reasons.items() if holds[segment.last])
     kind = "terminated" if segment.terminated else "truncated"

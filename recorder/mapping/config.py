@@ -225,7 +225,9 @@ class Mapping(_Part):
     )
     episodes: Episodes = Field(default=Episodes(), description="Begin and end of the episodes.")
     behavior_prob: Quantity | None = Field(
-        default=None, description="Probability of the action under the policy that acted."
+        default=None,
+        description="Probability of the action under the policy that acted, above 0 and at most 1."
+        " Its `align` is that of the action by default.",
     )
     meta: Meta = Field(default=Meta(), description="Facts that the bag does not contain.")
 
@@ -239,6 +241,8 @@ class Mapping(_Part):
         both = set(self.observation) & set(self.fields)
         if both:
             raise ValueError(f"'{min(both)}' is both in observation and in fields")
+        if self.behavior_prob is not None and self.behavior_prob.field is None:
+            raise ValueError("behavior_prob must be a field")
         return self
 
     @property

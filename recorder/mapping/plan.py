@@ -24,11 +24,19 @@ Reward = Callable[[Columns, NDArray[np.int64]], NDArray[np.float64]]
 
 
 class Wanted(NamedTuple):
-    """A quantity, its keys in the mapping, and its source."""
+    """A quantity that is read from the bag.
+
+    Attributes:
+        keys: Keys of the quantity in the mapping.
+        quantity: Quantity of the mapping.
+        source: Topic and fields of the quantity.
+        is_during: Whether each step uses the last message before the next step.
+    """
 
     keys: tuple[str, ...]
     quantity: Quantity
     source: Source
+    is_during: bool = False
 
 
 class Plan:
@@ -60,17 +68,26 @@ class Plan:
             for section in ("observation", "fields")
             for name, quantity in getattr(mapping, section).items()
         }
-        prob = mapping.behavior_prob
-        self.behavior_prob = None if prob is None else self._wanted(("behavior_prob",), prob)
         action = mapping.action
+        is_during = action.align == "during"
         align = action.align if action.align != "during" else "last"
         paths = [action.field] if action.field is not None else action.fields
         self.commands = [
             self._wanted(
-                ("action",), Quantity(field=path, align=align, tolerance_s=action.tolerance_s)
+                ("action",),
+                Quantity(field=path, align=align, tolerance_s=action.tolerance_s),
+                is_during=is_during,
             )
             for path in paths
         ]
+        self.behavior_prob = None
+        if (prob := mapping.behavior_prob) is not None:
+            has_align = "align" in prob.model_fields_set
+            self.behavior_prob = self._wanted(
+                ("behavior_prob",),
+                prob if has_align else prob.model_copy(update={"align": align}),
+                is_during=is_during and not has_align,
+            )
         episodes = mapping.episodes
         self.conditions = {
             name: self._expression(("episodes", name), getattr(episodes, name))
@@ -86,9 +103,11 @@ class Plan:
         self.streams = self._opened()
         self.constants = self._constants()
 
-    def _wanted(self, keys: tuple[str, ...], quantity: Quantity) -> Wanted:
+    def _wanted(
+        self, keys: tuple[str, ...], quantity: Quantity, *, is_during: bool = False
+    ) -> Wanted:
         with self.place.named(*keys):
-            return Wanted(keys, quantity, source_of(self.bag, quantity))
+            return Wanted(keys, quantity, source_of(self.bag, quantity), is_during)
 
     def _expression(self, keys: tuple[str, ...], text: str) -> Expression:
         with self.place.named(*keys):

@@ -11,6 +11,7 @@ from mcaprl.errors import UsageError
 from mcaprl.recorder.mapping.actions import Actions, actions_of
 from mcaprl.recorder.mapping.expression import Expression
 from mcaprl.recorder.mapping.observe import Values, pose_of, values_of
+from mcaprl.recorder.mapping.paths import as_numbers
 from mcaprl.recorder.mapping.plan import Plan, Wanted
 from mcaprl.recorder.mapping.segments import Marks, Segment, segments
 from mcaprl.recorder.mapping.streams import Recorded, last_file, runs_of
@@ -54,7 +55,7 @@ class StepReader:
         self._plan, self._mapping = plan, plan.mapping
         self._transforms: Transforms | None = None
         self._streams: dict[str, Recorded] = dict(plan.streams)
-        for keys, quantity, _ in plan.quantities.values():
+        for keys, quantity, *_ in plan.quantities.values():
             if quantity.transform is not None:
                 self._transforms = self._transforms or Transforms(plan.bag, plan.mapping.time)
                 with plan.place.named(*keys):
@@ -73,15 +74,14 @@ class StepReader:
             UsageError: The mapping does not fit the messages.
         """
         plan, times_ns = self._plan, self._times(number)
-        ends_ns = _ends(times_ns)
         quantities = {
             name: self._values(wanted, number, times_ns) for name, wanted in plan.quantities.items()
         }
-        actions = self._actions(number, times_ns, ends_ns)
+        actions = self._actions(number, times_ns)
         probs = np.full(len(times_ns), np.nan, np.float32)
         if plan.behavior_prob is not None:
-            found = self._values(plan.behavior_prob, number, times_ns, ends_ns)
-            probs = found.values.astype(np.float32)
+            found = self._values(plan.behavior_prob, number, times_ns)
+            probs = self._scalars(plan.behavior_prob, found).astype(np.float32)
         columns = {
             **plan.constants,
             **{
@@ -138,14 +138,8 @@ class StepReader:
         since_ns += first
         return since_ns
 
-    def _values(
-        self,
-        wanted: Wanted,
-        number: int,
-        times_ns: NDArray[np.int64],
-        ends_ns: NDArray[np.int64] | None = None,
-    ) -> Values:
-        keys, quantity, source = wanted
+    def _values(self, wanted: Wanted, number: int, times_ns: NDArray[np.int64]) -> Values:
+        keys, quantity, source, is_during = wanted
         runs = self._runs[number]
         with self._plan.place.named(*keys):
             if quantity.transform is not None:
@@ -153,14 +147,27 @@ class StepReader:
                 transforms = self._transforms.within(runs, last_file(self._streams, runs))
                 return pose_of(quantity, transforms, times_ns)
             stream, run = self._plan.streams[source.topic], runs[source.topic]
+            ends_ns = _ends(times_ns) if is_during else None
             return values_of(quantity, source, stream, run, times_ns, ends_ns)
 
-    def _actions(
-        self, number: int, times_ns: NDArray[np.int64], ends_ns: NDArray[np.int64]
-    ) -> Actions:
+    def _scalars(self, wanted: Wanted, found: Values) -> NDArray[np.float64]:
+        """Return values as numbers, one for each step.
+
+        Raises:
+            UsageError: The values are texts or arrays.
+        """
+        with self._plan.place.named(*wanted.keys):
+            numbers = as_numbers(found.values, str(wanted.source.path))
+            if numbers.ndim > 1:
+                raise UsageError(
+                    f"{wanted.source.path} has {numbers.shape[1]} elements; choose one of them,"
+                    f" such as {wanted.source.path}[0]"
+                )
+            return numbers
+
+    def _actions(self, number: int, times_ns: NDArray[np.int64]) -> Actions:
         action = self._mapping.action
-        ends = ends_ns if action.align == "during" else None
-        found = [self._values(wanted, number, times_ns, ends) for wanted in self._plan.commands]
+        found = [self._values(wanted, number, times_ns) for wanted in self._plan.commands]
         missing = np.logical_or.reduce([each.missing for each in found])
         with self._plan.place.named("action"):
             return actions_of(action, [each.values for each in found], missing)

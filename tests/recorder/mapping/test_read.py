@@ -306,6 +306,36 @@ def test_behavior_probabilities_are_those_of_the_actions() -> None:
     assert data.behavior_probs.tolist() == [0.5, 0.25, 1.0]
 
 
+def test_behavior_probabilities_are_aligned_as_the_action() -> None:
+    late = [t + 0.5 for t in range(5)]
+    bag = drive(
+        5,
+        **{
+            "/mode": (late, {"data": [0.0, 1.0, 2.0, 3.0, 4.0]}),
+            "/prob": (late, {"p": [0.1, 0.2, 0.3, 0.4, 0.5]}),
+        },
+    )
+    last = {"field": "/mode.data", "align": "last"}
+    prob = {"field": "/prob.p"}
+    data = read(bag, clock={"topic": "/odom"}, action=last, behavior_prob=prob).dataset
+    # The last command up to 1 s is that of 0.5 s.
+    assert data.actions.tolist() == [0, 1, 2]
+    np.testing.assert_allclose(data.behavior_probs, [0.1, 0.2, 0.3])
+    data = read(bag, clock={"topic": "/odom"}, behavior_prob={**prob, "align": "last"}).dataset
+    assert data.actions.tolist() == [0, 1, 2, 3]
+    np.testing.assert_allclose(data.behavior_probs, [np.nan, 0.1, 0.2, 0.3])
+
+
+@pytest.mark.parametrize("wrong", [2.0, -0.5, 0.0, math.inf])
+def test_impossible_probabilities_are_refused(wrong: float) -> None:
+    bag = drive(4, **{"/prob": ([0.1, 1.1, 2.1], {"p": [0.5, wrong, math.nan]})})
+    expected = rf"behavior_prob: the probability is {wrong:g} at 1000000000 ns; .* in 1 of 3 steps"
+    with pytest.raises(UsageError, match=expected):
+        read(bag, behavior_prob={"field": "/prob.p"})
+    with pytest.raises(UsageError, match="behavior_prob must be a field"):
+        read(bag, behavior_prob={"transform": "base"})
+
+
 def test_missing_topics_and_empty_bags_are_clear_errors() -> None:
     with pytest.raises(
         UsageError, match=r"mapping: observation.speed: no topic /odo.?; nearest: /odom"
