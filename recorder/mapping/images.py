@@ -8,6 +8,7 @@ becomes float32 meters (H, W, 1), with the value 0 where there is no surface. If
 
 from __future__ import annotations
 
+import struct
 from io import BytesIO
 from typing import Any
 
@@ -39,6 +40,8 @@ _RAW: dict[str, tuple[int, str, tuple[int, ...]]] = {
 }
 _METERS_PER_UNIT = {"16UC1": 1e-3, "mono16": 1e-3, "32FC1": 1.0}
 """Depth encodings (REP 118), with their units in meters."""
+# compressed_depth_image_transport puts format, A and B before the PNG.
+_DEPTH_HEADER = struct.Struct("<iff")
 _RAW_FIELDS = ("height", "width", "encoding", "is_bigendian", "step", "data")
 _COMPRESSED_FIELDS = ("format", "data")
 
@@ -158,11 +161,12 @@ def _raw_image(topic: str, message: dict[str, Any]) -> Image:
 def _compressed_image(topic: str, kind: str, data: bytes) -> Any:
     """Return colors or gray as a Pillow image, or depth as float32 meters."""
     pillow = import_extra("PIL.Image", "bags")
-    # compressed_depth_image_transport puts 12 bytes of parameters before the PNG.
     is_depth = "compressedDepth" in kind
     try:
-        image = pillow.open(BytesIO(data[12:] if is_depth else data))
+        image = pillow.open(BytesIO(data[_DEPTH_HEADER.size :] if is_depth else data))
         image.load()
+        if is_depth and kind.startswith("32FC1"):
+            return _meters_of_code(np.asarray(image), data)
         if image.mode in ("I;16", "I", "F"):
             return _meters(np.asarray(image), 1.0 if image.mode == "F" else 1e-3)
         wanted = "L" if image.mode in ("L", "1") else "RGB"
@@ -171,6 +175,18 @@ def _compressed_image(topic: str, kind: str, data: bytes) -> Any:
     # Pillow raises errors of many types for damaged images.
     except Exception as error:
         raise LogError(f"{topic}: a compressed image ({kind}) cannot be read: {error}") from error
+
+
+def _meters_of_code(code: Image, data: bytes) -> Image:
+    """Return the depth of a coded float image.
+
+    compressed_depth_image_transport stores the integer part of A / depth + B, or 0 where there is
+    no depth.
+    """
+    _, a, b = _DEPTH_HEADER.unpack_from(data)
+    with np.errstate(divide="ignore"):
+        depth = a / (code.astype(np.float64) - b)
+    return _meters(np.where(code > 0, depth, 0.0), 1.0)
 
 
 def _meters(depth: Image, unit_m: float) -> Image:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from io import BytesIO
 from typing import Any
 
@@ -89,8 +90,14 @@ def test_compressed_images() -> None:
     Image.fromarray(COLORS).save(content, "PNG")
     depth = BytesIO()
     Image.fromarray(np.array([[0, 1500]], np.uint16)).save(depth, "PNG")
+    # With quantization 100 and maximum 10 m, A = 100 * 101 and B = 1 - A / 10, so that 2.5 m is
+    # 10100 / 2.5 - 1009 = 3031, and 10 m is 1.
+    code = BytesIO()
+    Image.fromarray(np.array([[0, 3031, 1]], np.uint16)).save(code, "PNG")
+    header = struct.pack("<iff", 0, 10100.0, -1009.0)
     for data, kind, expected in (
         (content.getvalue(), "png", COLORS),
+        (header + code.getvalue(), "32FC1; compressedDepth png", [[[0.0], [2.5], [10.0]]]),
         (bytes(12) + depth.getvalue(), "16UC1; compressedDepth png", [[[0.0], [1.5]]]),
     ):
         columns = {"format": [kind], "data": [data]}
