@@ -31,9 +31,10 @@ def filter_log(
     log = FinishedLog(path)
     table = episode_columns(log.summaries(), condition.names)
     holds = condition.evaluate(table, np.arange(len(log.lengths)))
-    if holds.dtype != np.bool_:
+    if not condition.is_condition(table):
         raise UsageError(f"'{expression}' is not a condition: compare it, as in 'length > 10'")
-    chosen = np.flatnonzero(holds)
+    # A condition on a missing value (NaN) is false.
+    chosen = np.flatnonzero(np.nan_to_num(holds.astype(np.float64)))
     if not len(chosen):
         raise NoEpisodesError(
             f"{path}: '{expression}' is true for no episode ({len(log.lengths)} in the log)"

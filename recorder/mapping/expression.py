@@ -4,6 +4,9 @@ An expression is parsed by `ast` and evaluated for all rows at once. It may cont
 strings for comparison, names, elements such as `pose[0]`, `+ - * / // % **`, comparisons, `and`,
 `or`, `not`, `A if CONDITION else B`, and calls of the functions in `FUNCTIONS`. Attributes, other
 calls, and all other syntax are errors.
+
+A missing number is NaN, and a missing text is None. Comparisons with a missing value are missing,
+and logic has three values, as in SQL: `missing or 1` is 1, `missing or 0` is missing.
 """
 
 from __future__ import annotations
@@ -118,6 +121,24 @@ class Expression:
             raise UsageError(f"'{self.text}' must be one number for each row")
         return np.broadcast_to(found, following.shape)
 
+    def is_condition(self, columns: Mapping[str, Column]) -> bool:
+        """Return whether all values are true, false or missing."""
+
+        def holds(node: ast.AST) -> bool:
+            match node:
+                case ast.Compare() | ast.BoolOp() | ast.UnaryOp(op=ast.Not()):
+                    return True
+                case ast.Call(func=ast.Name(id="isnan")):
+                    return True
+                case ast.Name(id=name):
+                    return columns[name].dtype == np.bool_
+                case ast.IfExp(body=body, orelse=other):
+                    return holds(body) and holds(other)
+                case _:
+                    return False
+
+        return holds(self._tree)
+
     def _check(self, node: ast.AST, depth: int) -> None:
         if depth > _MAX_DEPTH:
             raise UsageError(f"'{self.text[:60]}...' is nested too deeply")
@@ -188,20 +209,22 @@ class Expression:
             case ast.BinOp(left=left, op=op, right=right):
                 return _BINARY[type(op)](_number(value(left)), _number(value(right)))
             case ast.UnaryOp(op=ast.Not(), operand=operand):
-                return np.logical_not(_number(value(operand)))
+                number = _number(value(operand))
+                return np.where(np.isnan(number), np.nan, number == 0)
             case ast.UnaryOp(op=op, operand=operand):
                 number = _number(value(operand))
                 return -number if isinstance(op, ast.USub) else number
             case ast.BoolOp(op=op, values=parts):
-                combine = np.logical_and if isinstance(op, ast.And) else np.logical_or
-                return combine.reduce(np.broadcast_arrays(*(_number(value(p)) for p in parts)))
+                return _combined([_number(value(part)) for part in parts], isinstance(op, ast.Or))
             case ast.Compare(left=left, ops=ops, comparators=others):
                 sides = [value(left), *map(value, others)]
                 pairs = zip(ops, itertools.pairwise(sides), strict=True)
-                holds = [_compared(op, *pair) for op, pair in pairs]
-                return np.logical_and.reduce(np.broadcast_arrays(*holds))
+                return _combined([_compared(op, *pair) for op, pair in pairs], is_or=False)
             case ast.IfExp(test=test, body=body, orelse=other):
-                return np.where(_number(value(test)) != 0, value(body), value(other))
+                condition = _number(value(test))
+                found = np.where(condition != 0, value(body), value(other))
+                nothing = np.nan if found.dtype.kind in "biuf" else None
+                return np.where(np.isnan(condition), nothing, found)
             case ast.Call(func=ast.Name(id=name), args=args):
                 if name == NEXT:
                     found = np.asarray(value(args[0]))
@@ -239,4 +262,21 @@ def _compared(op: ast.cmpop, left: Any, right: Any) -> Any:
         if not all(are_texts) or not isinstance(op, ast.Eq | ast.NotEq):
             raise TypeError(_STRING)
         left, right = np.asarray(left, object), np.asarray(right, object)
-    return _COMPARED[type(op)](left, right)
+    holds = _COMPARED[type(op)](left, right)
+    return np.where(_is_missing(left) | _is_missing(right), np.nan, holds)
+
+
+def _is_missing(side: Any) -> NDArray[np.bool_]:
+    values = np.asarray(side)
+    if values.dtype.kind in "biuf":
+        return np.asarray(np.isnan(values))
+    return np.asarray(np.frompyfunc(lambda value: value is None, 1, 1)(values), bool)
+
+
+def _combined(sides: list[Any], is_or: bool) -> NDArray[np.float64]:
+    """Return the conjunction or disjunction of numbers, NaN where missing values decide it."""
+    numbers = np.stack(np.broadcast_arrays(*sides))
+    is_missing = np.isnan(numbers)
+    decides = ~is_missing & ((numbers != 0) == is_or)
+    undecided = np.where(is_missing.any(axis=0), np.nan, float(not is_or))
+    return np.where(decides.any(axis=0), float(is_or), undecided)

@@ -191,6 +191,8 @@ def test_whole_chunks_are_copied_byte_by_byte(tmp_path: Path) -> None:
         ("duration_s > 0.16", [0]),
         ("start_s < 0.3", [0, 1]),
         ("policy == ''", [0, 1, 2, 3]),
+        ("isnan(epsilon)", [0, 1, 2, 3]),
+        ("epsilon != 1 or episode == 1", [1]),
         ("isnan(epsilon) and 1 <= length <= 3", [1, 2, 3]),
     ],
 )

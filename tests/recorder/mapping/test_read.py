@@ -180,6 +180,17 @@ def test_episodes_end_by_conditions_gaps_and_limits() -> None:
     ]
 
 
+def test_a_condition_on_a_missing_value_is_false() -> None:
+    bag = drive(6, **{"/bumper": ([2.5, 3.5], {"on": [0.0, 1.0]})})
+    fields = {"bumper": {"field": "/bumper.on"}, "cliff": {"field": "/odom.speed", "scale": 0}}
+    data = read(bag, fields=fields, episodes={"terminated": "bumper or cliff"}).dataset
+    assert [(each.length, each.reason) for each in data.episodes] == [(4, "terminated")]
+    data = read(bag, fields=fields, episodes={"terminated": "not cliff and bumper != 0"}).dataset
+    assert [each.length for each in data.episodes] == [4]
+    with pytest.raises(UsageError, match="the reward is nan at 0 ns; it is not finite in 3 of 5"):
+        read(bag, fields=fields, reward="1 if bumper else 0")
+
+
 def test_a_rising_edge_begins_an_episode() -> None:
     times = list(range(9))
     bag = MemoryBag(
