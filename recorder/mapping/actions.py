@@ -11,6 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
+from mcaprl.recorder.format.spaces import MAX_ACTIONS
 from mcaprl.recorder.mapping.config import Action
 
 
@@ -73,13 +74,9 @@ def _discrete(
     values = np.zeros(len(column), np.int64)
     present = np.flatnonzero(~missing)
     if column.dtype.kind == "O":
-        unknown = sorted({str(text) for text in column[present]} - set(action.names))
-        if unknown:
-            raise UsageError(
-                f"{action.field} has the value '{unknown[0]}', which `names` does not contain;"
-                f" names: {', '.join(action.names) or 'none'}"
-            )
-        values[present] = [action.names[str(text)] for text in column[present]]
+        texts = [str(text) for text in column[present]]
+        _check_named(action, set(texts), set(action.names))
+        values[present] = [action.names[text] for text in texts]
     else:
         numbers = column[present]
         wrong = numbers[(numbers != np.rint(numbers)) | (numbers < 0)]
@@ -88,11 +85,28 @@ def _discrete(
                 f"{action.field} has the value {wrong[0]}; a discrete action is a whole number from"
                 " 0; for a continuous command, use `fields` with `actions` or `edges`"
             )
+        if len(numbers) and numbers.max() >= MAX_ACTIONS:
+            raise UsageError(
+                f"{action.field} has the value {numbers.max():g}; a discrete action is less than"
+                f" {MAX_ACTIONS}"
+            )
         values[present] = numbers.astype(np.int64)
+        if action.names:
+            _check_named(action, set(values[present].tolist()), set(action.names.values()))
     by_number = {number: name for name, number in action.names.items()}
     if sorted(by_number) != list(range(len(by_number))):
         return values, ()
     return values, tuple(by_number[number] for number in range(len(by_number)))
+
+
+def _check_named(action: Action, found: set[Any], named: set[Any]) -> None:
+    unknown = sorted(found - named)
+    if unknown:
+        names = ", ".join(f"{name}: {number}" for name, number in action.names.items())
+        raise UsageError(
+            f"{action.field} has the value {unknown[0]!r}, which `names` does not contain; names:"
+            f" {names or 'none'}"
+        )
 
 
 def _nearest(

@@ -114,7 +114,7 @@ class Action(_Part):
     fields: list[str] = Field(
         default=[], description="Paths of the fields of a continuous command."
     )
-    names: dict[str, int] = Field(
+    names: dict[str, Annotated[int, Field(ge=0)]] = Field(
         default={},
         description="Number of each action by its name. For a string field, the names are the"
         " values of the field.",

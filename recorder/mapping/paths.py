@@ -32,8 +32,16 @@ class FieldPath(NamedTuple):
         """Select elements of a column (N, K); without an index or slice, return the whole column.
 
         Raises:
-            UsageError: The field is not an array, or is shorter than the index.
+            UsageError: The field is not an array, has no elements, or is shorter than the index.
         """
+        if not len(column):
+            return column
+        found = self._selected(column)
+        if not found.size:
+            raise UsageError(f"{self}: no elements; the field has {column.shape[1]} elements")
+        return found
+
+    def _selected(self, column: NDArray[Any]) -> NDArray[Any]:
         if self.elements is None:
             return column
         if column.ndim != 2:
@@ -102,7 +110,7 @@ def _elements(match: re.Match[str]) -> int | slice:
 
 
 def as_numbers(column: NDArray[Any], name: str) -> NDArray[np.float64]:
-    """Return a column as float64 numbers (N,) or (N, K).
+    """Return a column as float64 numbers (N,) or (N, K); bytes are numbers from 0 to 255.
 
     Raises:
         UsageError: The column has strings, or arrays of different lengths.
@@ -110,8 +118,19 @@ def as_numbers(column: NDArray[Any], name: str) -> NDArray[np.float64]:
     if column.dtype.kind in "biuf":
         return column.astype(np.float64)
     try:
-        return np.array([np.nan if value is None else value for value in column], np.float64)
+        return np.array([_number(value) for value in column], np.float64)
     except (TypeError, ValueError) as error:
         raise UsageError(
             f"{name} is not a number, or an array of the same length in all messages"
         ) from error
+
+
+def _number(value: Any) -> Any:
+    if value is None:
+        return np.nan
+    if isinstance(value, bytes):
+        return np.frombuffer(value, np.uint8)
+    if isinstance(value, str):
+        # NumPy would parse the text.
+        raise TypeError
+    return value

@@ -169,8 +169,15 @@ class StepReader:
         action = self._mapping.action
         found = [self._values(wanted, number, times_ns) for wanted in self._plan.commands]
         missing = np.logical_or.reduce([each.missing for each in found])
+        columns = [
+            # Only a single discrete field may be a text.
+            each.values
+            if action.field is not None and each.values.dtype.kind == "O"
+            else self._scalars(wanted, each)
+            for wanted, each in zip(self._plan.commands, found, strict=True)
+        ]
         with self._plan.place.named("action"):
-            return actions_of(action, [each.values for each in found], missing)
+            return actions_of(action, columns, missing)
 
     def _conditions(
         self,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -376,6 +377,49 @@ def test_wrong_units_and_fractional_modes_are_clear_errors() -> None:
     far = MemoryBag({"/odom": ([0, 8e9], {"speed": [0, 1]}), "/mode": ([0], {"data": [0]})})
     with pytest.raises(UsageError, match="8000000000001 steps between"):
         read(far, clock={"rate_hz": 1000})
+
+
+def test_actions_that_cannot_be_read_are_clear_errors() -> None:
+    with pytest.raises(
+        UsageError, match=r"action: /mode.data has the value 1, which `names` does not contain; na"
+    ):
+        read(drive(), action={"field": "/mode.data", "names": {"stop": 0, "go": 2}})
+    times = [0, 1, 2]
+    bag = drive(
+        3,
+        **{
+            "/cmd": (times, {"v": [[1.0, 2.0]] * 3, "text": ["a", "b", "a"], "big": [3e9] * 3}),
+        },
+    )
+    with pytest.raises(UsageError, match=r"/cmd.v has 2 elements; choose one of them, such as "):
+        read(bag, action={"field": "/cmd.v"})
+    with pytest.raises(UsageError, match=r"action: /cmd.text is not a number"):
+        read(bag, action={"fields": ["/cmd.text"], "edges": [[0]]})
+    with pytest.raises(UsageError, match=r"has the value 3e\+09; a discrete action is less than"):
+        read(bag, action={"field": "/cmd.big"})
+    with pytest.raises(UsageError, match="has the value 'b', which `names` does not contain"):
+        read(bag, action={"field": "/cmd.text", "names": {"a": 0}})
+
+
+def test_arrays_without_elements_are_clear_errors() -> None:
+    times = [0, 1, 2]
+    bag = drive(3, **{"/s": (times, {"b": [[1.0, 2.0]] * 3, "none": np.empty((3, 0))})})
+    for field, count in (("/s.b[5:]", 2), ("/s.none", 0), ("/s.none[:]", 0)):
+        expected = rf"observation.x: {re.escape(field)}: no elements; the field has {count} elem"
+        with pytest.raises(UsageError, match=expected):
+            read(bag, observation={"x": {"field": field}})
+
+
+def test_bytes_are_numbers_and_texts_are_not() -> None:
+    times = [0, 1, 2]
+    columns = {"b": [b"12", b"13", b"14"], "s": ["1", "2", "3"]}
+    bag = drive(3, **{"/raw": (times, columns)})
+    data = read(bag, observation={"b": {"field": "/raw.b"}}).dataset
+    assert data.observations.tolist() == [[49, 50], [49, 51]]
+    data = read(bag, observation={"b": {"field": "/raw.b[1]"}}).dataset
+    assert data.observations.ravel().tolist() == [50, 51]
+    with pytest.raises(UsageError, match=r"observation.s: s is not a number"):
+        read(bag, observation={"s": {"field": "/raw.s"}})
 
 
 def test_a_reward_that_is_not_a_number_is_refused() -> None:

@@ -1,4 +1,4 @@
-"""Bags with several publishers, several files and resets of the clock, with numbers by hand."""
+"""MCAP files as datasets: publishers, several files and resets of the clock, by hand."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mcap.writer import Writer
 from mcaprl.errors import UsageError
 from mcaprl.recorder.mapping.config import parse_mapping
 from mcaprl.recorder.mapping.read import MappedBag, read_bag
-from tests.support.bags import integer, integers, number, numbers, write_channels
+from tests.support.bags import Channel, integer, integers, number, numbers, write_channels
 
 
 def read(paths: Any, **parts: Any) -> MappedBag:
@@ -160,3 +160,15 @@ def test_clocks_that_are_not_reset_together_are_refused(tmp_path: Path) -> None:
     path = recorded(tmp_path / "one.mcap", [*odom, *cmd[:40]])
     with pytest.raises(UsageError, match="the clock of /odom goes back 1 times, that of /cmd 0"):
         read(path)
+
+
+def test_arrays_of_bytes_are_numbers(tmp_path: Path) -> None:
+    payloads = [(k / 10, bytes([49, 48 + k])) for k in range(5)]
+    path = write_channels(
+        tmp_path / "bytes.mcap",
+        [
+            Channel("/odom", "acme_msgs/msg/Levels", "uint8[2] data", payloads),
+            integers("/cmd", commands(0, 5, 0)),
+        ],
+    )
+    assert read(path).dataset.observations[:3].tolist() == [[49, 48], [49, 49], [49, 50]]
