@@ -287,7 +287,8 @@ def _steps_of(reader: McapReader) -> Topic:
         topics = ", ".join(sorted(channel.topic for channel in reader.channels.values())) or "none"
         raise NoStepsError(
             f"{reader.path} has no topic {STEP_TOPIC} and thus no transitions (topics: {topics});"
-            " to read a robot's bag, pass a mapping: --mapping (mapping= in Python)"
+            " a robot's bag needs a mapping: convert it by `mcaprl convert BAG OUT.mcap --mapping"
+            " FILE`"
         )
     for schema in map(reader.schema_of, channels):
         if not is_intact(schema.name, schema.data):

@@ -182,12 +182,20 @@ def _put_vector(
                 numbers = as_numbers(values, name).astype(np.float32).reshape(len(rows), -1)
             vectors.append(numbers)
             names += _names(name, quantity, numbers.shape[1])
-            limits += [quantity.clip or (-np.inf, np.inf)] * numbers.shape[1]
+            limits += [_limits(quantity)] * numbers.shape[1]
     if vectors:
         arrays[_STATE] = np.concatenate(vectors, axis=1)
         low, high = np.array(limits, np.float32).T
         parts[_STATE] = spaces.Box(low, high)
     return names
+
+
+def _limits(quantity: Quantity) -> tuple[float, float]:
+    """Return the lowest and highest value of a quantity, including the number for missing ones."""
+    if quantity.clip is None:
+        return -np.inf, np.inf
+    missing = [] if quantity.missing is None else [quantity.missing]
+    return min(*quantity.clip, *missing), max(*quantity.clip, *missing)
 
 
 def _names(name: str, quantity: Quantity, count: int) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import keyword
 from collections.abc import Iterator
 from collections.abc import Mapping as MappingOf
 from contextlib import contextmanager
@@ -15,6 +16,8 @@ from mcaprl.errors import UsageError, import_extra
 
 TimeSource = Literal["log_time", "publish_time", "header"]
 Alignment = Literal["last", "nearest", "linear"]
+_EXPRESSION_NAMES = ("action", "terminated", "truncated")
+"""Names in expressions that are not quantities."""
 Positive = Annotated[float, Field(gt=0)]
 
 
@@ -238,6 +241,8 @@ class Mapping(_Part):
         for name in (*self.observation, *self.fields):
             if not name.isidentifier():
                 raise ValueError(f"'{name}' cannot be used in expressions: use letters, digits, _")
+            if name in _EXPRESSION_NAMES or keyword.iskeyword(name):
+                raise ValueError(f"'{name}' has another meaning in expressions: use another name")
         both = set(self.observation) & set(self.fields)
         if both:
             raise ValueError(f"'{min(both)}' is both in observation and in fields")
@@ -329,14 +334,14 @@ def parse_mapping(tree: MappingOf[str, Any], place: Place | None = None) -> Mapp
     """Validate the keys and values of a mapping.
 
     Raises:
-        UsageError: A key is unknown, or a value is wrong; the message has one line per error.
+        UsageError: A key is unknown, or a value is wrong; the message lists all errors.
     """
     place = place or Place()
     try:
         return Mapping.model_validate(tree)
     except ValidationError as error:
         texts = [_text(found, place) for found in error.errors()]
-        raise UsageError("\n".join(texts)) from error
+        raise UsageError("; ".join(texts)) from error
 
 
 def _text(error: Any, place: Place) -> str:

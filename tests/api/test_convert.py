@@ -111,8 +111,14 @@ def test_requests_that_lack_something_are_clear_errors(
     bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mapping = ["--mapping", str(tmp_path / "robot.yaml")]
-    assert run(["convert", str(bag), "out.mcap"]) == 1
-    assert "pass a mapping: --mapping" in capsys.readouterr().err
+    file = str(next(bag.glob("*.mcap")))
+    for request in (
+        ["convert", file, "out.mcap"],
+        ["layout", file, "--out", "-"],
+        ["replay", file],
+    ):
+        assert run(request) == 1
+        assert "by `mcaprl convert BAG OUT.mcap --mapping FILE`" in capsys.readouterr().err
     assert run(["convert", str(bag), *mapping]) == 2
     assert "convert needs SRC and DST, or --dry-run" in capsys.readouterr().err
     (tmp_path / "robot.yaml").write_text(MAPPING.replace("/odom.twist", "/odom.twits", 1))

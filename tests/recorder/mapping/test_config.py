@@ -50,6 +50,9 @@ def test_a_good_mapping_has_defaults(tmp_path: Path) -> None:
         ("{field: /mode.data}", "{fields: [/a.b], edges: [[1], [2]]}", "need 1 entries, one for"),
         ("{field: /mode.data}", "{fields: [/a.b], edges: [[2, 1]]}", "action: edges must rise"),
         ("  speed:", "  a-b:", "observation has"),
+        ("speed:", "action:", "'action' has another meaning in expressions: use another name"),
+        ("speed:", "truncated:", "'truncated' has another meaning in expressions"),
+        ("speed:", "if:", "'if' has another meaning in expressions"),
         ("clock:", "clocks:", ":1: clocks: unknown key; nearest: clock"),
         ("clip: [0, 1]", "resize: [4, 4]", "observation.speed: resize is for images only"),
         ("{rate_hz: 10}", "{rate_hz: 10", "not YAML"),
@@ -63,6 +66,17 @@ def test_errors_name_file_line_and_key(tmp_path: Path, old: str, new: str, expec
         load_mapping(path)
     assert str(path) in str(error.value)
     assert expected in str(error.value)
+
+
+def test_all_errors_are_in_one_line(tmp_path: Path) -> None:
+    path = written(tmp_path, "stack: 0")
+    with pytest.raises(UsageError) as error:
+        load_mapping(path)
+    assert str(error.value) == (
+        f"{path}: clock: this key is missing; {path}: observation: this key is missing;"
+        f" {path}:1: stack: Input should be greater than or equal to 1;"
+        f" {path}: action: this key is missing"
+    )
 
 
 def test_files_that_are_not_mappings_are_refused(tmp_path: Path) -> None:

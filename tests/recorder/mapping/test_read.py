@@ -120,6 +120,15 @@ def test_values_are_scaled_wrapped_clipped_and_sliced() -> None:
     assert report.fields["last"].missing == 0.0
 
 
+def test_the_space_contains_the_number_for_missing_values() -> None:
+    bag = drive(4, **{"/late": ([1.5], {"x": [20.0]})})
+    late = {"field": "/late.x", "clip": [0, 10], "missing": -5}
+    data = read(bag, observation={"late": late}).dataset
+    assert data.frames.ravel().tolist() == [-5, -5, 10, 10]
+    space: Any = data.observation_space
+    assert (space.low.tolist(), space.high.tolist()) == ([-5], [10])
+
+
 def test_yaw_of_quaternions_by_hand() -> None:
     half = math.sqrt(0.5)
     columns = {"q.x": [0.0] * 3, "q.y": [0.0] * 3, "q.z": [0.0, half, 0.0], "q.w": [1.0, half, 0.0]}
