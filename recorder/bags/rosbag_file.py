@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,8 @@ class RosbagFile:
         # rosbags raises errors of many types for a damaged file.
         except Exception as error:
             raise LogError(f"{path} cannot be read as a bag: {error}") from error
+        if is_ros1:
+            _sort_by_place(self._reader)
         self.topics: dict[str, list[TopicSource]] = {}
         for connection in self._reader.connections:
             sources = self.topics.setdefault(connection.topic, [])
@@ -58,6 +61,15 @@ class RosbagFile:
         self._reader.close()
 
 
+def _sort_by_place(reader: Any) -> None:
+    """Sort the messages of a ROS 1 bag by their places in the file.
+
+    rosbags sorts them by time, but the clock of a simulation that restarts goes back.
+    """
+    for index in reader.indexes.values():
+        index.sort(key=lambda entry: (entry.chunk_pos, entry.offset))
+
+
 class _RosbagTopic:
     """Messages of one connection."""
 
@@ -71,6 +83,10 @@ class _RosbagTopic:
         is_ros1: bool,
     ) -> None:
         self._reader, self._path, self._connection = reader, path, connection
+        self._is_ros1 = is_ros1
+        # Connection to the SQLite file, in which messages have ids in the order of recording. A
+        # folder with compressed messages has none, and is read in the order of time.
+        self._database = None if is_ros1 else getattr(reader.storage, "dbconn", None)
         found = connection.msgdef
         known = "ros1msg" if is_ros1 else _ENCODINGS.get(found.format, "")
         encoding = "ros1" if is_ros1 else "cdr"
@@ -78,22 +94,38 @@ class _RosbagTopic:
         self.definition = Definition(connection.msgtype, encoding, known, text, distribution)
         # Position of the next message, and the iterator that will yield this message.
         self._next = 0
-        self._pass: Iterator[tuple[Connection, int, bytes]] = iter(())
+        self._pass: Iterator[tuple[int, bytes]] = iter(())
 
-    @cached_property
+    @property
     def times_ns(self) -> NDArray[np.int64]:
-        return np.array([time_ns for _, time_ns, _ in self._messages()], np.int64)
+        return self._index[:, 0]
 
     @property
     def positions(self) -> NDArray[np.int64]:
-        # rosbags reads the messages of a bag in the order of time.
-        return self.times_ns
+        return self._index[:, 1]
+
+    @cached_property
+    def _index(self) -> NDArray[np.int64]:
+        """(N, 2) log_time and position in the file of each message."""
+        with self._named():
+            if self._is_ros1:
+                number = {pos: k for k, pos in enumerate(sorted(self._reader.chunks))}
+                entries = self._reader.indexes[self._connection.id]
+                # A chunk has fewer than 2^32 bytes.
+                rows = [
+                    (each.time, number[each.chunk_pos] * 2**32 + each.offset) for each in entries
+                ]
+            elif self._database is not None:
+                rows = self._rows("timestamp, id")
+            else:
+                rows = [(time_ns, time_ns) for time_ns, _ in self._messages()]
+            return np.array(list(rows), np.int64).reshape(-1, 2)
 
     def raw(self, rows: NDArray[np.int64]) -> Iterator[RawMessage]:
         if len(rows) and (int(rows[0]) < self._next or self._next == 0):
             self._next, self._pass = 0, self._messages()
         for row in rows.tolist():
-            for _, time_ns, data in self._pass:
+            for time_ns, data in self._pass:
                 self._next += 1
                 if self._next > row:
                     # ROS 1 bags and the rosbag2 databases of distributions before Jazzy store no
@@ -106,9 +138,30 @@ class _RosbagTopic:
     ) -> dict[str, NDArray[Any]] | None:
         return None
 
-    def _messages(self) -> Iterator[tuple[Connection, int, bytes]]:
+    def _messages(self) -> Iterator[tuple[int, bytes]]:
+        """Yield log_time and data of each message, in the order of `_index`."""
+        with self._named():
+            if self._database is not None:
+                yield from self._rows("timestamp, data")
+            else:
+                for _, time_ns, data in self._reader.messages(connections=[self._connection]):
+                    yield time_ns, data
+
+    def _rows(self, columns: str) -> Any:
+        assert self._database is not None, "the bag is a database"
+        return self._database.execute(
+            f"SELECT {columns} FROM messages WHERE topic_id = ? ORDER BY id",
+            (self._connection.id,),
+        )
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Convert errors of rosbags to errors that name file and topic."""
         try:
-            yield from self._reader.messages(connections=[self._connection])
+            yield
+        except LogError:
+            raise
+        # rosbags raises errors of many types for a damaged file.
         except Exception as error:
             raise LogError(
                 f"{self._path}: messages of {self._connection.topic} cannot be read: {error}"

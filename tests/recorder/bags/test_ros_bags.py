@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
 
 from mcaprl.errors import LogError, UnknownNameError
 from mcaprl.recorder.bags.bag import open_bag
@@ -16,6 +20,8 @@ from tests.support.bags import (
     START_NS,
     STEP_NS,
     STEPS,
+    STORE1,
+    STORE2,
     speed,
     turn,
     write_rosbag1,
@@ -87,6 +93,30 @@ def test_rows_are_read_in_the_given_order(form: str, tmp_path: Path) -> None:
             assert [depth[0] for depth in depths] == [1000 + k for k in block.tolist()]
             assert {depth.size for depth in depths} == {IMAGE_SHAPE[0] * IMAGE_SHAPE[1]}
             assert set(images["encoding"]) == {"16UC1"}
+
+
+@pytest.mark.parametrize("form", ["ros2.mcap", "ros2.db3", "ros1.bag"])
+def test_messages_are_read_in_the_order_of_recording(form: str, tmp_path: Path) -> None:
+    is_ros1 = form == "ros1.bag"
+    store, kind = STORE1 if is_ros1 else STORE2, "std_msgs/msg/Float64"
+    plugin = StoragePlugin.MCAP if form == "ros2.mcap" else StoragePlugin.SQLITE3
+    path = tmp_path / form
+    writer: Any = Writer1(path) if is_ros1 else Writer2(path, version=9, storage_plugin=plugin)
+    # The clock is reset after the third message. In ROS 1, each publisher has a connection.
+    rows = [(0, 1, 10.0), (1, 2, 11.0), (0, 3, 12.0), (1, 1, 20.0), (0, 2, 21.0)]
+    serialize = store.serialize_ros1 if is_ros1 else store.serialize_cdr
+    with writer:
+        publishers = [{"callerid": "/a"}, {"callerid": "/b"}] if is_ros1 else [{}]
+        connections = [
+            writer.add_connection("/x", kind, typestore=store, **each) for each in publishers
+        ]
+        for publisher, time_ns, value in rows:
+            connection = connections[publisher if is_ros1 else 0]
+            writer.write(connection, time_ns, serialize(store.types[kind](value), kind))
+    with closing(open_bag(path)) as bag:
+        assert bag.times("/x").tolist() == [1, 2, 3, 1, 2]
+        assert bag.read("/x", ["data"]).columns["data"].tolist() == [10, 11, 12, 20, 21]
+        assert bag.read("/x", ["data"], np.array([3, 0])).columns["data"].tolist() == [20, 10]
 
 
 def test_split_bags_are_joined_in_the_order_of_time(tmp_path: Path) -> None:
