@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -146,8 +147,9 @@ def runs_of(
     for name, clock in clocks.items():
         files, passed = clock.places[:, 0], np.cumsum(clock.is_reset)
         number = first[files] + passed - passed[np.searchsorted(files, files)]
-        for k, run in enumerate(runs):
-            rows = np.flatnonzero(number == k)
+        bounds = np.searchsorted(number, np.arange(len(runs) + 1)).tolist()
+        for run, (start, stop) in zip(runs, itertools.pairwise(bounds), strict=True):
+            rows = np.arange(start, stop)
             order = time_order(clock.times_ns[rows])
             run[name] = Run(clock.times_ns[rows][order], rows[order])
     return runs
@@ -173,10 +175,11 @@ def _resets(clocks: Mapping[str, _Clock], gap_s: float, path: Path) -> int:
             f" {counts[least]} times: use another `time`, or split the bag there"
         )
     count = max(counts.values(), default=0)
+    found = {name: np.flatnonzero(clock.is_reset).tolist() for name, clock in clocks.items()}
     for k in range(count):
         # Each stream has a first message after the reset. The earliest of them in the file is the
         # latest place at which the reset can be.
-        rows = {name: int(np.flatnonzero(clock.is_reset)[k]) for name, clock in clocks.items()}
+        rows = {name: resets[k] for name, resets in found.items()}
         place, earliest = min((clocks[name].places[row, 1], name) for name, row in rows.items())
         for name, row in rows.items():
             clock = clocks[name]
