@@ -156,7 +156,7 @@ def record(
             results = record_file(request, on_episode)
         else:
             results = record_shards(request, envs, on_episode)
-    files = _files(request.out)
+    files = _files(request.out, rotated=request.rotate_mb is not None)
     if upload is not None:
         upload_all([*files, request.out / MANIFEST_NAME] if ray else files, upload)
     returns = np.array([result.total_reward for result in results])
@@ -199,9 +199,10 @@ def _check_for_ray(request: FileRequest, envs: int) -> None:
         )
 
 
-def _files(out: Path) -> list[Path]:
+def _files(out: Path, *, rotated: bool) -> list[Path]:
     """Return the written files: one file, its rotated parts, or the shards in a folder."""
-    if out.is_file():
+    # Beside the parts, there may be a file `out` of an earlier recording.
+    if out.is_file() and not rotated:
         return [out]
     if out.is_dir():
         return sorted(out.glob("*.mcap"))

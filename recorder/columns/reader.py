@@ -69,6 +69,7 @@ _HEAD_BYTES, _TAIL_BYTES = 2**16, 2**18
 _SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
 # Number of bytes in a MessageIndex record before its entries.
 _INDEX_HEAD_BYTES = RECORD_HEADER_BYTES + 6
+_CHANNEL_ID = struct.Struct("<H")
 _START_OF = attrgetter("chunk_start_offset")
 _TOP_LEVEL = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
 
@@ -272,7 +273,8 @@ class McapReader:
                     ranges.append(MessageRange.of_index(chunk, index))
         if channel_id in self._unchunked:
             ranges.append(MessageRange.of_index(None, self._unchunked[channel_id]))
-        return ranges
+        # A writer may store empty indexes, for example of all channels in each chunk.
+        return [one for one in ranges if len(one)]
 
     def records_of(self, messages: MessageRange, scratch: Scratch | None = None) -> memoryview:
         """Return the bytes that contain these messages: the records of a chunk, or the whole file.
@@ -451,8 +453,11 @@ class McapReader:
                     chunk = chunk_header(self._view, offset).to_index(offset, len(content))
                 found.append(chunk)
             elif opcode == Opcode.MESSAGE_INDEX and chunk is not None:
-                (channel_id,) = struct.unpack_from("<H", content)
-                chunk.message_index_offsets[channel_id] = offset
+                if len(content) < _CHANNEL_ID.size:
+                    raise CorruptLogError(
+                        f"{self.path}: the message index at byte {offset} is damaged"
+                    )
+                chunk.message_index_offsets[_CHANNEL_ID.unpack_from(content)[0]] = offset
             elif opcode == Opcode.MESSAGE:
                 unchunked.add(offset, content)
             elif opcode == Opcode.DATA_END:
@@ -468,8 +473,9 @@ class McapReader:
         """Check the CRC of the data section, the only one that covers unchunked messages."""
         offset, opcode, content = next(self.records(self.data_end), (0, 0, memoryview(b"")))
         if opcode == Opcode.DATA_END:
-            (crc,) = struct.unpack_from("<I", content)
-            if crc and crc32(self.view[:offset]) != crc:
+            # The first field of the record is the CRC.
+            crc = int.from_bytes(content[:4], "little")
+            if len(content) < 4 or (crc and crc32(self.view[:offset]) != crc):
                 raise CorruptLogError(f"{self.path}: the data section does not match its CRC")
 
     def _find_topics_in_chunks(self) -> None:

@@ -26,6 +26,7 @@ _TYPES = {
 }
 """ROS type of each dtype."""
 _ENCAPSULATION = int(ENCAPSULATION).to_bytes(4, "little")
+_CHUNK_BYTES = 2**20
 
 
 def flat_infos(info: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -97,7 +98,20 @@ class InfoTopics:
                 )
                 continue
             messages += [(channel, time, each) for time, each in zip(times_ns, data, strict=True)]
-        self._log.sink.write_messages(sorted(messages, key=lambda message: message[1]))
+        messages.sort(key=lambda message: message[1])
+        self._write_chunks(messages)
+
+    def _write_chunks(self, messages: Sequence[Message]) -> None:
+        """Write messages in chunks of about 1 MiB, because the size of a chunk is limited."""
+        chunk: list[Message] = []
+        size = 0
+        for message in messages:
+            chunk.append(message)
+            size += len(message[2])
+            if size > _CHUNK_BYTES:
+                self._log.sink.write_messages(chunk)
+                chunk, size = [], 0
+        self._log.sink.write_messages(chunk)
 
     def _announce(self, name: str, values: NDArray[Any]) -> None:
         dtype, shape = values.dtype, values.shape[1:]

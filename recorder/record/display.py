@@ -218,7 +218,9 @@ class Display:
         end = (time_ns, frames)
         if self._moment is not None:
             inner = self._motion.motion() if self._motion is not None else ()
-            between = [(time_ns - round(left_s * 1e9), each) for left_s, each in inner]
+            # The recording's step may differ from that of the sim.
+            ns_per_s = self._step_ns / getattr(self._motion, "step_duration_s", self._step_ns / 1e9)
+            between = [(time_ns - round(left_s * ns_per_s), each) for left_s, each in inner]
             self._emit(TF, self._moment[0], motion_transforms([self._moment, *between, end]))
         self._moment = end
 

@@ -85,11 +85,12 @@ def _copied(value: Any) -> Any:
     return [_copied(each) for each in value] if isinstance(value, list | tuple) else value
 
 
-def info_of(infos: Mapping[str, Any], number: int) -> dict[str, Any]:
-    """Return the info of one environment from the infos of a vector environment.
+def info_of(infos: Mapping[str, Any], number: int, count: int) -> dict[str, Any]:
+    """Return the info of one of `count` environments from the infos of a vector environment.
 
     Gymnasium stores the values of all environments in one array per info. The mask `_name` selects
-    the environments that returned the info `name`.
+    the environments that returned the info `name`. A value of another length, such as a matrix, is
+    the info of each environment.
     """
     found: dict[str, Any] = {}
     for name, value in infos.items():
@@ -98,9 +99,9 @@ def info_of(infos: Mapping[str, Any], number: int) -> dict[str, Any]:
         if is_own or (mask is not None and not mask[number]):
             continue
         if isinstance(value, Mapping):
-            inner = info_of(value, number)
+            inner = info_of(value, number, count)
             if inner:
                 found[name] = inner
         elif isinstance(value, np.ndarray | list | tuple):
-            found[name] = value[number]
+            found[name] = value[number] if np.shape(value)[:1] == (count,) else value
     return found

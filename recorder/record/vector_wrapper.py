@@ -305,7 +305,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             is_final = same_step and ended[number]
             source = infos.get("final_info", {}) if is_final else infos
             step = self._row + 1 - int(self._first[number])
-            self._infos[number].add(step, info_of(source, number))
+            self._infos[number].add(step, info_of(source, number, self.num_envs))
 
     def _begin(self, numbers: NDArray[np.int64], infos: dict[str, Any]) -> None:
         """Begin an episode of each of these environments.
@@ -315,7 +315,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         for number in numbers.tolist():
             self._open[number] = OpenEpisode(self.policy, self.epsilon)
             if self._infos:
-                self._infos[number].begin(info_of(infos, number))
+                self._infos[number].begin(info_of(infos, number, self.num_envs))
         self._first[numbers] = self._row
         self._running[numbers], self._due[numbers] = True, False
 

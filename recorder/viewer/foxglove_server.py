@@ -9,6 +9,8 @@ from socket import create_server
 from typing import Any
 from urllib.parse import quote
 
+from mcap.records import Schema
+
 from mcaprl.errors import UsageError, import_extra
 from mcaprl.recorder.viewer.origin_filter import VIEWER_ORIGINS, OriginFilter
 
@@ -39,16 +41,18 @@ class ViewerServer:
     def add_channel(
         self,
         topic: str,
-        type_name: str,
-        definition: bytes,
+        schema: Schema | None,
         *,
         encoding: str = "cdr",
-        schema_encoding: str = "ros2msg",
     ) -> Any:
-        """Advertise a topic and return its `foxglove.Channel`."""
-        schema = self._foxglove.Schema(name=type_name, encoding=schema_encoding, data=definition)
+        """Advertise a topic, with or without a schema, and return its `foxglove.Channel`."""
+        known = None
+        if schema is not None:
+            known = self._foxglove.Schema(
+                name=schema.name, encoding=schema.encoding, data=schema.data
+            )
         channel = self._foxglove.Channel(
-            topic, message_encoding=encoding, schema=schema, context=self._context
+            topic, message_encoding=encoding, schema=known, context=self._context
         )
         self._advertised.append(channel)
         return channel

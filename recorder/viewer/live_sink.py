@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
+from mcap.records import Schema
 from numpy.typing import NDArray
 
 from mcaprl.recorder.format.log_writer import Message, MessageSink
@@ -68,7 +69,8 @@ class LiveSink(MessageSink):
         self, topic: str, schema_name: str, schema_text: str, metadata: dict[str, str] | None = None
     ) -> int:
         """Advertise a topic and return its channel id."""
-        self._channels.append(self._viewers.add_channel(topic, schema_name, schema_text.encode()))
+        schema = Schema(len(self._channels) + 1, schema_text.encode(), "ros2msg", schema_name)
+        self._channels.append(self._viewers.add_channel(topic, schema))
         channel_id = len(self._channels) - 1
         if topic in self._kept:
             self._kept_ids.add(channel_id)

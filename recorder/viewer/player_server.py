@@ -26,6 +26,8 @@ MIN_SPEED, MAX_SPEED = 1e-3, 1e3
 _TICKS_AFTER_SEEK = 2
 # Topics whose messages are events. A viewer that receives an event twice shows the event twice.
 _EVENT_TOPICS = (EPISODE_TOPIC, LOG_TOPIC)
+# Schema id of channels without a schema.
+_NO_SCHEMA = 0
 
 
 class LiveServer(ViewerServer):
@@ -217,13 +219,10 @@ class LiveServer(ViewerServer):
         reader, prefix = self._reader(number), self._prefixes[number]
         found = []
         for channel in reader.channels.values():
-            schema = reader.schema_of(channel)
             announced = self.add_channel(
                 f"/{prefix}{channel.topic}" if prefix else channel.topic,
-                schema.name,
-                schema.data,
+                None if channel.schema_id == _NO_SCHEMA else reader.schema_of(channel),
                 encoding=channel.message_encoding,
-                schema_encoding=schema.encoding,
             )
             found.append(((number, channel.id), announced))
         return found
@@ -232,7 +231,8 @@ class LiveServer(ViewerServer):
         data = message.data
         reader, prefix = self._reader(message.track), self._prefixes[message.track]
         if prefix:
-            type_name = reader.schema_of(reader.channels[message.channel_id]).name
+            schema = reader.schemas.get(reader.channels[message.channel_id].schema_id)
+            type_name = "" if schema is None else schema.name
             if type_name in PREFIXED_TYPES:
                 shift_ns = self._player.shifts_ns[message.track]
                 data = prefixed_message(data, type_name, prefix, shift_ns)

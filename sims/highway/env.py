@@ -53,6 +53,10 @@ OBSERVATION_NAMES = (
 )
 OBSERVATION_LIMIT = 4.0
 TRAIL_LENGTH = 40
+_VIEW: Final = {"distance_m": 22.0, "tilt_deg": 73.0, "speed_m_s": 15.0}
+_PANEL_RATIO, _MARGIN = 2.0, 1.1
+"""Width of the panel with the view from above, relative to its height, and size of the view,
+relative to that of the road."""
 # The observation of highway-env is not used; an empty one saves time.
 _NO_OBSERVATION = {"type": "AttributesObservation", "attributes": []}
 
@@ -142,14 +146,6 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
 
     metadata = METADATA
     success_reasons: ClassVar[tuple[str, ...]] = ("finished", "time_limit")
-    view_settings: ClassVar[dict[str, float]] = {
-        "distance_m": 22.0,
-        "tilt_deg": 73.0,
-        "world_m": 260.0,
-        "world_x_m": 250.0,
-        "world_y_m": -22.0,
-        "speed_m_s": 15.0,
-    }
     action_meanings = ACTION_MEANINGS
     observation_names = OBSERVATION_NAMES
 
@@ -176,6 +172,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         self.step_duration_s = 1.0 / frequency_hz
         self.metadata = {**METADATA, "render_fps": frequency_hz}
         self.courses = courses_of(self._inner.road.network)
+        self.view_settings = {**_VIEW, **_view_from_above(self.courses)}
         self._steering_range_rad = float(self._inner.action_type.steering_range[1])
         self.action_space = spaces.Discrete(len(ACTION_MEANINGS))
         self.observation_space = spaces.Box(
@@ -385,3 +382,16 @@ def _car_of(vehicle: Any) -> Car:
         length_m=vehicle.LENGTH,
         width_m=vehicle.WIDTH,
     )
+
+
+def _view_from_above(courses: Sequence[Course]) -> dict[str, float]:
+    """Return height and center of a view from above that shows the whole road, meters."""
+    points_m = np.concatenate([course.points_m for course in courses])
+    low_m, high_m = points_m.min(axis=0), points_m.max(axis=0)
+    width_m, height_m = high_m - low_m
+    x_m, y_m = (low_m + high_m) / 2
+    return {
+        "world_m": round(_MARGIN * max(height_m, width_m / _PANEL_RATIO)),
+        "world_x_m": round(x_m),
+        "world_y_m": round(y_m),
+    }

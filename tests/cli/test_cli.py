@@ -452,6 +452,12 @@ def test_a_rotated_recording_reports_its_files(capsys: pytest.CaptureFixture[str
     )
     assert found.files == (Path("one-00000.mcap"),)
     assert found.size_bytes == found.files[0].stat().st_size
+    # A file of the same name without a number belongs to another recording.
+    Path("two.mcap").touch()
+    found = mcaprl.record(
+        "CartPole-v1", "two.mcap", policy="random", episodes=1, rotate_mb=1000, scene=False
+    )
+    assert found.files == (Path("two-00000.mcap"),)
 
 
 def test_missing_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 import mcaprl
 from mcaprl.errors import SpaceError
+from mcaprl.recorder.columns.reader import McapReader
 
 
 class Infos(gym.Env[Any, Any]):
@@ -344,6 +345,36 @@ def test_vector_environments_record_the_infos_of_each_episode(log_path: Path, mo
         assert np.flatnonzero(~np.ma.getmaskarray(returns)).tolist() == [episode.length]
         assert returns[-1] == episode.total_reward
         assert episode.infos["episode.l"][-1] == episode.length
+
+
+def test_infos_of_other_lengths_are_those_of_each_environment(log_path: Path) -> None:
+    """A custom vector environment may return values that are not arrays over its environments."""
+
+    class Shared(gym.vector.VectorWrapper):
+        """Vector environment with infos of all environments together."""
+
+        def step(self, actions: Any) -> Any:
+            *found, infos = self.env.step(actions)
+            return *found, {**infos, "rate": [0.5], "matrix": np.eye(3)}
+
+    envs = gym.make_vec("CartPole-v1", 2, vectorization_mode="sync", max_episode_steps=3)
+    recorded = mcaprl.RecordVecMcap(Shared(envs), log_path, infos=True)
+    recorded.reset(seed=0)
+    for _ in range(3):
+        recorded.step(np.array([0, 1]))
+    recorded.close()
+    for episode in mcaprl.open(log_path).episodes:
+        assert episode.infos["matrix"][1:].tolist() == [np.eye(3).tolist()] * 3
+        assert episode.infos["rate"][1:].tolist() == [[0.5]] * 3
+
+
+def test_infos_of_an_episode_may_be_larger_than_a_chunk(log_path: Path) -> None:
+    big = np.arange(300_000, dtype=np.uint8)
+    found = record(log_path, *({"image": big + k, "count": k} for k in range(10)))
+    assert found.infos["count"].tolist() == list(range(10))
+    assert all((found.infos["image"][k] == big + k).all() for k in range(10))
+    reader = McapReader(log_path)
+    assert max(chunk.uncompressed_size for chunk in reader.chunks) < 2**21
 
 
 def test_vector_environments_that_are_reset_by_hand_record_infos(log_path: Path) -> None:

@@ -41,6 +41,25 @@ def test_a_log_has_the_poses_at_20_hz_within_4_cm(sim: str, parts: int, tmp_path
     np.testing.assert_allclose(found, expected, atol=0.045)
 
 
+def test_a_step_of_another_duration_has_its_poses_within_the_step(tmp_path: Path) -> None:
+    """The drone's step of 0.5 s is recorded as 0.1 s."""
+    path = tmp_path / "log.mcap"
+    with closing(mcaprl.RecordMcap(make_sim("powerline"), path, step_duration_s=0.1)) as env:
+        env.reset(seed=1)
+        for step in range(STEPS):
+            env.step(step % 2)
+    reader = McapReader(path)
+    channel = reader.channel_of("/tf")
+    assert channel is not None
+    for time_ns, data in reader.messages(channel):
+        tree = messages.decode(data, "tf2_msgs/msg/TFMessage")
+        stamps = [each.header.stamp for each in tree.transforms]
+        after_ns = [stamp.sec * 10**9 + stamp.nanosec - time_ns for stamp in stamps]
+        assert after_ns[0] == 0
+        assert after_ns == sorted(after_ns)
+        assert after_ns[-1] in (0, 10**8)
+
+
 def test_only_poses_that_interpolation_misses_are_kept() -> None:
     def moment(time_ns: int, x_m: float) -> tuple[int, list[Frame]]:
         return time_ns, [Frame("car", (x_m, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))]

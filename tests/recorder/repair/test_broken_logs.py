@@ -19,7 +19,7 @@ import mcaprl
 from mcaprl.errors import CorruptLogError, LogError, NoStepsError, NotMcapError
 from mcaprl.recorder.columns.chunks import chunk_records
 from mcaprl.recorder.columns.message_rows import gather, message_rows
-from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.reader import McapReader, end_of
 from mcaprl.recorder.format.schema import message_dtype
 from mcaprl.recorder.repair.check import check_log
 from tests.support.recordings import record
@@ -42,6 +42,37 @@ def test_a_file_that_is_not_mcap(tmp_path: Path) -> None:
     path.write_text("")
     with pytest.raises(NotMcapError, match="it is empty"):
         mcaprl.open(path)
+
+
+@pytest.mark.filterwarnings("ignore:.*was cut off or is still being written")
+def test_empty_and_damaged_message_indexes(good: bytes, log_path: Path) -> None:
+    """Some writers store an empty index for each channel that a chunk does not contain."""
+    log_path.write_bytes(good)
+    reader = McapReader(log_path)
+    after_first, data_end = end_of(reader.chunks[0]), reader.data_end
+    expected = mcaprl.open(log_path).fingerprint
+    head = [struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6, channel, 0) for channel in (1, 2)]
+    parts = [part for part in head if int.from_bytes(part[9:11], "little") not in _channels(reader)]
+    assert parts
+    log_path.write_bytes(good[:after_first] + b"".join(parts) + good[after_first:data_end])
+    assert mcaprl.open(log_path).fingerprint == expected
+    for record_, what in (
+        (struct.pack("<BQB", Opcode.MESSAGE_INDEX, 1, 0), "message index at byte"),
+        (_unchunked() + struct.pack("<BQB", Opcode.DATA_END, 1, 0), "does not match its CRC"),
+    ):
+        log_path.write_bytes(good[:after_first] + record_)
+        with pytest.raises(CorruptLogError, match=what):
+            mcaprl.open(log_path)
+        assert check_log(log_path)
+
+
+def _channels(reader: McapReader) -> set[int]:
+    """Return the ids of the channels in the first chunk."""
+    return set(reader.chunks[0].message_index_offsets)
+
+
+def _unchunked() -> bytes:
+    return struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, 1, 0, 0, 0)
 
 
 def test_mcap_without_steps(log_path: Path) -> None:

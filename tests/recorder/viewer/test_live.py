@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 import mcaprl
 from mcaprl.errors import UsageError
@@ -284,6 +285,21 @@ def test_a_viewer_connects_seeks_and_receives_the_files_bytes(log: Path) -> None
     assert seen["parameters"][-1][0] == {"name": "episode", "value": 2}
 
 
+def test_a_channel_without_a_schema_is_played(log: Path, tmp_path: Path) -> None:
+    viewer_is_there()
+    notes, both = tmp_path / "notes.mcap", tmp_path / "both.mcap"
+    with notes.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        channel = writer.register_channel("/notes", "json", 0)
+        writer.add_message(channel, START_NS, b"{}", START_NS)
+        writer.finish()
+    mcaprl.merge([log, notes], both)
+    seen, _ = look([str(both)], [["play", 4.0, 12]])
+    assert seen["topics"]["/notes"]["encoding"] == "json"
+    assert seen["topics"].keys() > {"/rl/step", "/notes"}
+
+
 def test_time_comes_before_the_messages_after_a_restart_and_a_jump_back(log: Path) -> None:
     viewer_is_there()
     starts = [str(e.log_time_ns[0]) for e in mcaprl.open(log).episodes]
@@ -354,7 +370,7 @@ class Channels:
     def __init__(self) -> None:
         self.sent: list[tuple[bytes, int]] = []
 
-    def add_channel(self, topic: str, type_name: str, definition: bytes) -> Channels:
+    def add_channel(self, topic: str, schema: Any) -> Channels:
         return self
 
     def has_sinks(self) -> bool:

@@ -230,3 +230,15 @@ def test_many_are_stepped_one_after_the_other() -> None:
     expected, reward, _, _, info = alone.step(4)
     np.testing.assert_array_equal(seen[1], expected)
     assert (rewards[1], infos["progress_m"][1]) == (reward, info["progress_m"])
+
+
+@pytest.mark.parametrize("road", ROADS)
+def test_the_view_from_above_shows_the_whole_road(road: str) -> None:
+    sim = made(road=road)
+    points_m = np.concatenate([course.points_m for course in sim.courses])
+    view = sim.view_settings
+    off_m = np.abs(points_m - [view["world_x_m"], view["world_y_m"]]).max(axis=0)
+    # The panel is twice as wide as it is high.
+    assert off_m[0] <= view["world_m"]
+    assert off_m[1] <= view["world_m"] / 2
+    assert view["world_m"] < 1.3 * max(off_m[0], 2 * off_m[1])
