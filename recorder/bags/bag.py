@@ -144,6 +144,8 @@ class _Topic:
 
     @cached_property
     def times_ns(self) -> NDArray[np.int64]:
+        if len(self._used) == 1:
+            return self._used[0][1].times_ns
         times_ns = np.empty(len(self._order), np.int64)
         for k, (_, source) in enumerate(self._used):
             mine = self._order[:, 2] == k
