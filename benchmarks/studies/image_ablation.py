@@ -27,13 +27,12 @@ from mcaprl.online import (
     FRESH_SEED,
     SELECTION_SEED,
     Agent,
-    Scale,
     Task,
     measure_scale,
     read_policy,
 )
 from mcaprl.runs import BEST_NAME
-from mcaprl.sims import evaluate, make_sim
+from mcaprl.sims import Scale, evaluate, make_sim
 
 MIRRORED: Final = "half of each batch mirrored"
 VARIANTS: Final[dict[str, dict[str, Any]]] = {
