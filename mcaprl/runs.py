@@ -160,7 +160,7 @@ def open_run(
 
 
 def choose_seeds(folder: Path, seeds: int | None, seed: int | None, resume: bool) -> range:
-    """Return the seeds to train.
+    """Return the seeds to train. A resumed run may get further seeds, but keeps its own.
 
     Args:
         folder: Folder of the run.
@@ -169,15 +169,15 @@ def choose_seeds(folder: Path, seeds: int | None, seed: int | None, resume: bool
         resume: Whether to resume the run in the folder.
 
     Raises:
-        UsageError: A number is out of range, or the run has other seeds.
+        UsageError: A number is out of range, or the resumed run has other seeds.
         TrainingError: There is no run to resume.
     """
     if (seeds is not None and seeds < 1) or (seed is not None and seed < 0):
         raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
-    earlier, is_complete = _seeds_of_run(folder) if resume else (range(0), False)
+    earlier = _seeds_of_run(folder) if resume else range(0)
     first = earlier.start if seed is None else seed
     chosen = range(first, first + (seeds or len(earlier) or 1))
-    if chosen != earlier if is_complete else not set(earlier) <= set(chosen):
+    if not set(earlier) <= set(chosen):
         raise UsageError(
             f"{folder} is a run of {counted(len(earlier), 'seed')}, the first of which is"
             f" {earlier.start}: resume it without --seeds and --seed, or choose another folder"
@@ -185,17 +185,17 @@ def choose_seeds(folder: Path, seeds: int | None, seed: int | None, resume: bool
     return chosen
 
 
-def _seeds_of_run(folder: Path) -> tuple[range, bool]:
-    """Return the known seeds of a run, and whether these are all of its seeds.
+def _seeds_of_run(folder: Path) -> range:
+    """Return the seeds of a run.
 
-    Earlier versions did not write the seeds into the config. The run then has at least the seeds
-    that have a folder.
+    Earlier versions did not write them into the config. The result is then the seeds that have a
+    folder.
     """
     match run_to_resume(folder):
         case {"seeds": int(count), "seed": int(first)}:
-            return range(first, first + count), True
+            return range(first, first + count)
     started = _seed_folders(folder)
-    return range(min(started), max(started) + 1) if started else range(0), False
+    return range(min(started), max(started) + 1) if started else range(0)
 
 
 def seed_folder(run: Path, seed: int) -> Path:

@@ -167,12 +167,13 @@ def select(
         raise UsageError(f"--algo {AUTO} needs {FOLDS} episodes or more in the log")
     weights = np.ones(len(dataset.episodes)) if weights is None else weights
     numbers = choose_seeds(out, seeds, seed, resume)
-    data = fingerprint(dataset, weights)
-    identity = RunIdentity({"algo": AUTO, "config": config.to_json(), "data": data})
+    parts: dict[str, Any] = {"algo": AUTO, "config": config.to_json()}
+    # The estimates of all candidates are averages over the same seeds, so none can be added.
+    parts |= {"seeds": len(numbers), "seed": numbers.start, "data": fingerprint(dataset, weights)}
     with locked_run(out, resume):
         open_run(
             out,
-            identity,
+            RunIdentity(parts),
             resume,
             numbers,
             env_id=dataset.env_id,

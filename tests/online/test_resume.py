@@ -215,8 +215,10 @@ def test_resuming_trains_all_seeds_of_the_run(
     assert (out / "scores.json").read_text() == scores
     assert sorted(path.name for path in out.glob("seed-*")) == ["seed-5", "seed-6"]
     capsys.readouterr()
-    assert run(["train-online", "--resume", "--out", str(out), "--seeds", "3"]) == 2
+    assert run(["train-online", "--resume", "--out", str(out), "--seeds", "1"]) == 2
     assert "resume it without --seeds and --seed" in capsys.readouterr().err
+    more = mcaprl.train_online(None, out, resume=True, seeds=3)
+    assert [(one.seed, one.resumed_at) for one in more] == [(5, 200), (6, 200), (7, 0)]
 
 
 def test_a_killed_run_continues(tmp_path: Path) -> None:

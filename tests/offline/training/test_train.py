@@ -290,10 +290,17 @@ def test_resuming_trains_all_seeds_of_the_run(stopped: Path, given: dict[str, An
     ]
 
 
-@pytest.mark.parametrize("given", [{"seeds": 1}, {"seeds": 3}, {"seed": 0}, {"seed": 6}])
-def test_a_run_resumes_only_with_its_own_seeds(stopped: Path, given: dict[str, Any]) -> None:
+@pytest.mark.parametrize("given", [{"seeds": 1}, {"seed": 0}, {"seed": 6}])
+def test_resuming_keeps_the_seeds_of_the_run(stopped: Path, given: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="a run of 2 seeds, the first of which is 5: resume it"):
         train(corridor(), SHORT_CQL, stopped, **given, resume=True, progress=silent)
+
+
+def test_resuming_may_add_seeds(stopped: Path) -> None:
+    summaries = train(corridor(), SHORT_CQL, stopped, seeds=3, resume=True, progress=silent)
+    assert [(one.seed, one.resumed_at) for one in summaries] == [(5, 40), (6, 40), (7, 0)]
+    again = train(corridor(), SHORT_CQL, stopped, resume=True, progress=silent)
+    assert [one.seed for one in again] == [5, 6, 7]
 
 
 def test_the_seeds_of_a_run_without_them_in_its_config_are_its_folders(stopped: Path) -> None:
