@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import FileIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from mcaprl.errors import LogError, McaprlError, OutputExistsError, UsageError
 
@@ -47,6 +47,26 @@ def try_lock(descriptor: int) -> bool:
         except OSError:
             pass
     return True
+
+
+@contextmanager
+def waiting_lock(file: BinaryIO) -> Iterator[None]:
+    """Lock an open file; if another process has locked it, wait. Unlock it at the end.
+
+    On systems without `flock`, nothing is locked; see `try_lock`.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    with suppress(OSError):
+        fcntl.flock(file, fcntl.LOCK_EX)
+    try:
+        yield
+    finally:
+        file.flush()
+        # A forked process may still have the file open, so closing it does not end the lock.
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_UN)
 
 
 @contextmanager

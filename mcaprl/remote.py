@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, UsageError, import_extra
-from mcaprl.files import write_atomically
+from mcaprl.files import waiting_lock
 
 CACHE_VARIABLE = "MCAPRL_CACHE"
 """Name of the environment variable for the folder that keeps fetched parts for later commands."""
@@ -73,11 +73,13 @@ class RemoteFile:
         self._blocks_path = folder / "blocks"
         self._lock = threading.Lock()
         self._has = np.zeros(-(-self.size // BLOCK_BYTES), bool)
-        if self.local.exists() and self._blocks_path.exists():
-            bits = np.frombuffer(self._blocks_path.read_bytes(), np.uint8)
-            self._has = np.unpackbits(bits)[: len(self._has)].astype(bool)
-        else:
-            with self.local.open("wb") as file:
+        with _Errors(f"cannot write {self.local}"):
+            if self._is_kept and self.local.exists():
+                self._merge_blocks()
+            else:
+                self._blocks_path.unlink(missing_ok=True)
+            # Another process may be filling the same file, so an existing file is not emptied.
+            with self.local.open("ab") as file:
                 file.truncate(self.size)
 
     def fetch(self, ranges: Iterable[Range]) -> None:
@@ -110,13 +112,35 @@ class RemoteFile:
                         f" {len(part)} bytes arrived: the file has changed, or its server ignores"
                         " ranges; download it first"
                     )
-            with self.local.open("rb+") as file:
-                for (start, stop), part in zip(pieces, parts, strict=True):
-                    file.seek(start)
-                    file.write(part)
-                    self._has[start // BLOCK_BYTES : -(-stop // BLOCK_BYTES)] = True
+            with _Errors(f"cannot write {self.local}"):
+                self._write(pieces, parts)
+
+    def _write(self, pieces: Iterable[Range], parts: Iterable[bytes]) -> None:
+        """Write fetched parts to the local file, and then mark their blocks."""
+        with self.local.open("rb+") as file:
+            for (start, _), part in zip(pieces, parts, strict=True):
+                file.seek(start)
+                file.write(part)
+            file.flush()
             if self._is_kept:
-                write_atomically(self._blocks_path, np.packbits(self._has).tobytes(), LogError)
+                # Otherwise, a block could be marked after a crash of the system, but empty.
+                os.fsync(file.fileno())
+        for start, stop in pieces:
+            self._has[start // BLOCK_BYTES : -(-stop // BLOCK_BYTES)] = True
+        if self._is_kept:
+            self._merge_blocks()
+
+    def _merge_blocks(self) -> None:
+        """Exchange the marks of fetched blocks with the processes that share the cache."""
+        self._blocks_path.touch()
+        with self._blocks_path.open("rb+") as file, waiting_lock(file):
+            bits = np.zeros(-(-len(self._has) // 8), np.uint8)
+            kept = np.frombuffer(file.read(len(bits)), np.uint8)
+            bits[: len(kept)] = kept
+            self._has |= np.unpackbits(bits)[: len(self._has)].astype(bool)
+            # The file is not emptied before, so a process that is killed here loses no marks.
+            file.seek(0)
+            file.write(np.packbits(self._has).tobytes())
 
     def check_unchanged(self) -> None:
         """Check that the remote file has not changed since it was opened.
@@ -322,7 +346,8 @@ def _folder_of(url: str, version: str) -> tuple[Path, bool]:
     kept = os.environ.get(CACHE_VARIABLE)
     if kept:
         folder = Path(kept) / name
-        folder.mkdir(parents=True, exist_ok=True)
+        with _Errors(f"cannot write {folder}"):
+            folder.mkdir(parents=True, exist_ok=True)
         return folder, True
     return Path(tempfile.mkdtemp(dir=_temporary())), False
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import pickle
 import socket
 from collections.abc import Iterator
+from multiprocessing.queues import Queue
+from multiprocessing.synchronize import Barrier
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +17,7 @@ import pytest
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import LogError, UsageError
-from mcaprl.remote import BLOCK_BYTES, CACHE_VARIABLE, RemotePath, upload
+from mcaprl.remote import BLOCK_BYTES, CACHE_VARIABLE, RemoteFile, RemotePath, upload
 from tests.recorder.remote.range_server import RangeServer, range_server
 
 fsspec = pytest.importorskip("fsspec", reason="needs the extra remote")
@@ -92,6 +95,55 @@ def test_fetched_parts_are_kept_on_request(
     mcaprl.record("lane", other, episodes=2, seed=5, overwrite=True)
     assert mcaprl.open(f"{server.url}/other.mcap").fingerprint != before
     other.unlink()
+
+
+def read_at_once(barrier: Barrier, url: str, results: Queue[str]) -> None:
+    """Open a log at the same time as other processes."""
+    barrier.wait(60)
+    try:
+        results.put(mcaprl.open(url).fingerprint)
+    except LogError as error:
+        results.put(str(error))
+
+
+def test_several_processes_fill_the_same_cache(
+    server: RangeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    url, context = f"{server.url}/images.mcap", multiprocessing.get_context("spawn")
+    barrier, results = context.Barrier(4), context.Queue()
+    arguments = (barrier, url, results)
+    processes = [context.Process(target=read_at_once, args=arguments) for _ in range(4)]
+    for process in processes:
+        process.start()
+    found = {results.get(timeout=120) for _ in processes}
+    for process in processes:
+        process.join(60)
+    assert found == {mcaprl.open(server.folder / "images.mcap").fingerprint}
+    server.sent.clear()
+    assert mcaprl.open(url).fingerprint in found
+    assert server.sent == []
+
+
+def test_a_cached_file_is_not_emptied_while_it_is_filled(
+    server: RangeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    url, content = f"{server.url}/images.mcap", (server.folder / "images.mcap").read_bytes()
+    first, second = RemoteFile(url), RemoteFile(url)
+    first.fetch([(0, BLOCK_BYTES)])
+    second.fetch([(5 * BLOCK_BYTES, 6 * BLOCK_BYTES)])
+    third = RemoteFile(url)
+    server.sent.clear()
+    third.fetch([(0, BLOCK_BYTES), (5 * BLOCK_BYTES, 6 * BLOCK_BYTES)])
+    assert server.sent == []
+    assert third.local.read_bytes()[:BLOCK_BYTES] == content[:BLOCK_BYTES]
+    # The marks of a file that was removed are not valid for the next one.
+    third.local.unlink()
+    RemoteFile(url).fetch([(0, BLOCK_BYTES)])
+    last = RemoteFile(url)
+    last.fetch([(0, last.size)])
+    assert last.local.read_bytes() == content
 
 
 def test_commands_read_urls(server: RangeServer, capsys: pytest.CaptureFixture[str]) -> None:
