@@ -68,7 +68,7 @@ class RemoteFile:
             raise LogError(f"cannot read {url}: its size is unknown; download it first")
         self.size = int(facts["size"])
         self._version = _version_of(facts)
-        folder, self._is_kept = _folder_of(url, f"{self._version} {self.size}")
+        folder, self._is_kept = _folder_of(url, self._version, self.size)
         self.local = folder / _last_part(url)
         self._blocks_path = folder / "blocks"
         self._lock = threading.Lock()
@@ -335,16 +335,23 @@ def _divided(start: int, stop: int) -> list[Range]:
 
 
 def _version_of(facts: dict[str, Any]) -> str:
-    """Return the ETags and timestamps by which the server identifies the version of a file."""
-    names = ("ETag", "etag", "mtime", "LastModified", "last_modified", "created", "generation")
+    """Return the ETag, timestamps and checksums that identify the version of a file, if any."""
+    names = (
+        *("ETag", "etag", "mtime", "LastModified", "last_modified", "created", "generation"),
+        *("Last-Modified", "Content-MD5", "Digest"),  # HTTP
+        "blob_id",  # Hugging Face
+    )
     return " ".join(str(facts[name]) for name in names if facts.get(name) is not None)
 
 
-def _folder_of(url: str, version: str) -> tuple[Path, bool]:
-    """Return the local folder for a remote file, and whether it is kept for later processes."""
-    name = hashlib.sha256(f"{url} {version}".encode()).hexdigest()[:24]
+def _folder_of(url: str, version: str, size: int) -> tuple[Path, bool]:
+    """Return the local folder for a remote file, and whether it is kept for later processes.
+
+    Without a version, a later process could not notice that the remote file has changed.
+    """
+    name = hashlib.sha256(f"{url} {version} {size}".encode()).hexdigest()[:24]
     kept = os.environ.get(CACHE_VARIABLE)
-    if kept:
+    if kept and version:
         folder = Path(kept) / name
         with _Errors(f"cannot write {folder}"):
             folder.mkdir(parents=True, exist_ok=True)

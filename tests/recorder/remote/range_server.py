@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from email.utils import formatdate
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
@@ -20,6 +21,7 @@ class RangeServer:
         folder: Folder that is served.
         sent: Number of bytes of each answer to a GET request.
         knows_ranges: Whether the server supports range requests.
+        sends_dates: Whether the server sends the time of the last change of a file.
         cuts: Whether the server closes the connection in the middle of an answer.
         refusal: Status of the answer to a request for a missing file.
     """
@@ -28,6 +30,7 @@ class RangeServer:
     folder: Path
     sent: list[int] = field(default_factory=list)
     knows_ranges: bool = True
+    sends_dates: bool = True
     cuts: bool = False
     refusal: int = 404
 
@@ -61,6 +64,9 @@ def range_server(folder: Path) -> Iterator[RangeServer]:
                 self.send_response(200)
             if state.knows_ranges:
                 self.send_header("Accept-Ranges", "bytes")
+            if state.sends_dates:
+                changed_s = path.stat().st_mtime
+                self.send_header("Last-Modified", formatdate(changed_s, usegmt=True))
             self.send_header("Content-Length", str(stop - start))
             self.end_headers()
             if send:

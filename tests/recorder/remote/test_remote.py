@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
 import pickle
 import socket
 from collections.abc import Iterator
@@ -213,6 +214,28 @@ def test_a_file_that_changes_is_noticed(server: RangeServer) -> None:
     mcaprl.record("lane", path, episodes=3, overwrite=True)
     with pytest.raises(LogError, match="has changed while it was read"):
         remote.check_unchanged()
+    path.unlink()
+
+
+@pytest.mark.parametrize("sends_dates", [True, False])
+def test_a_change_to_other_bytes_of_the_same_size(
+    server: RangeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sends_dates: bool
+) -> None:
+    """The time of the last change identifies a version; without it, no parts are kept."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    server.sends_dates = sends_dates
+    path = server.folder / "changes.mcap"
+    for value in (b"a", b"b"):
+        path.write_bytes(100 * value)
+        os.utime(path, (ord(value), ord(value)))
+        remote = RemoteFile(f"{server.url}/changes.mcap")
+        remote.check_unchanged()
+        remote.fetch([(0, 100)])
+        assert remote.local.read_bytes() == path.read_bytes()
+    if sends_dates:
+        os.utime(path, (0, 0))
+        with pytest.raises(LogError, match="has changed while it was read"):
+            remote.check_unchanged()
     path.unlink()
 
 
