@@ -59,9 +59,8 @@ class RemoteFile:
             MissingExtraError: The package for the URL's protocol is not installed.
         """
         self.url = url
-        self._system, self._path = system_of(url)
-        with _Errors(f"cannot read {url}"):
-            facts = self._system.info(self._path)
+        self._connected = os.getpid(), system_of(url)
+        facts = self._facts()
         if facts.get("type") == "directory":
             raise LogError(f"cannot read {url}: it is a folder")
         if facts.get("size") is None:
@@ -97,10 +96,9 @@ class RemoteFile:
             if not pieces:
                 return
             starts, stops = (list(each) for each in zip(*pieces, strict=True))
+            system, path = self._system()
             with _Errors(f"cannot read {self.url}"):
-                parts = self._system.cat_ranges(
-                    [self._path] * len(pieces), starts, stops, on_error="raise"
-                )
+                parts = system.cat_ranges([path] * len(pieces), starts, stops, on_error="raise")
                 # Older versions of fsspec return some errors.
                 for part in parts:
                     if isinstance(part, BaseException):
@@ -148,10 +146,22 @@ class RemoteFile:
         Raises:
             LogError: The file has changed, or cannot be reached.
         """
-        with _Errors(f"cannot read {self.url}"):
-            facts = self._system.info(self._path)
+        facts = self._facts()
         if (facts.get("size"), _version_of(facts)) != (self.size, self._version):
             raise LogError(f"{self.url} has changed while it was read: open it again")
+
+    def _facts(self) -> dict[str, Any]:
+        system, path = self._system()
+        with _Errors(f"cannot read {self.url}"):
+            facts: dict[str, Any] = system.info(path)
+        return facts
+
+    def _system(self) -> tuple[Any, str]:
+        """Return the file system, and the path in it."""
+        # A forked process opens its own file system: its parent's needs a thread of the parent.
+        if self._connected[0] != os.getpid():
+            self._connected = os.getpid(), system_of(self.url)
+        return self._connected[1]
 
     def _runs(self, missing: NDArray[np.bool_]) -> Iterator[Range]:
         """Yield the byte ranges of missing blocks; merge ranges with small gaps between them."""

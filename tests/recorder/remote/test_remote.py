@@ -244,6 +244,21 @@ def test_a_path_is_opened_again_in_another_process(server: RangeServer) -> None:
     assert str(pickle.loads(pickle.dumps(path))) == str(path)
 
 
+def test_forked_workers_stream_a_url(server: RangeServer) -> None:
+    torch = pytest.importorskip("torch")
+    if "fork" not in multiprocessing.get_all_start_methods():
+        pytest.skip("needs fork")
+    import mcaprl.torch as loading
+
+    stream = loading.TransitionStream(f"{server.url}/images.mcap", batch_size=100, seed=1)
+    options = {"batch_size": None, "num_workers": 2, "multiprocessing_context": "fork"}
+    batches = list(torch.utils.data.DataLoader(stream, **options))
+    rewards = torch.cat([batch["reward"] for batch in batches]).numpy()
+    episodes = mcaprl.open(server.folder / "images.mcap").episodes
+    expected = np.concatenate([episode.rewards for episode in episodes])
+    np.testing.assert_array_equal(np.sort(rewards), np.sort(expected).astype(np.float32))
+
+
 def test_uploads_appear_when_complete(folder: Path, tmp_path: Path) -> None:
     url = f"file://{tmp_path}/there/lane.mcap"
     upload(folder / "lane.mcap", url)
