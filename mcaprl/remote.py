@@ -6,16 +6,16 @@ readers can memory-map it like any local file.
 
 from __future__ import annotations
 
-import atexit
 import hashlib
 import os
 import shutil
 import tempfile
 import threading
 from collections.abc import Iterable, Iterator, Sequence
-from functools import cache
+from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any, TypeGuard
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,10 @@ class RemoteFile:
         self.size = int(facts["size"])
         self._version = _version_of(facts)
         folder, self._is_kept = _folder_of(url, self._version, self.size)
+        if not self._is_kept:
+            # Unlike `weakref.finalize`, this also works at the end of a process of
+            # `multiprocessing`, and does nothing in a forked process, which shares the folder.
+            Finalize(self, shutil.rmtree, (folder, True), exitpriority=0)
         self.local = folder / _last_part(url)
         self._blocks_path = folder / "blocks"
         self._lock = threading.Lock()
@@ -80,6 +84,19 @@ class RemoteFile:
             # Another process may be filling the same file, so an existing file is not emptied.
             with self.local.open("ab") as file:
                 file.truncate(self.size)
+
+    @classmethod
+    def of(cls, url: str) -> RemoteFile:
+        """Return the file of this URL that is in use, if it is unchanged; otherwise, open it.
+
+        Raises:
+            LogError, MissingExtraError: See `RemoteFile`.
+        """
+        key = os.getpid(), url
+        found = _in_use.get(key)
+        if found is None or not found._version or not found._is_unchanged():
+            found = _in_use[key] = cls(url)
+        return found
 
     def fetch(self, ranges: Iterable[Range]) -> None:
         """Fetch the missing blocks of these byte ranges, with concurrent requests.
@@ -146,9 +163,15 @@ class RemoteFile:
         Raises:
             LogError: The file has changed, or cannot be reached.
         """
-        facts = self._facts()
-        if (facts.get("size"), _version_of(facts)) != (self.size, self._version):
+        if not self._is_unchanged():
             raise LogError(f"{self.url} has changed while it was read: open it again")
+
+    def _is_unchanged(self) -> bool:
+        system, path = self._system()
+        # Some file systems keep listings of folders.
+        system.invalidate_cache(path)
+        facts = self._facts()
+        return (facts.get("size"), _version_of(facts)) == (self.size, self._version)
 
     def _facts(self) -> dict[str, Any]:
         system, path = self._system()
@@ -175,6 +198,11 @@ class RemoteFile:
             yield first * BLOCK_BYTES, min((last + 1) * BLOCK_BYTES, self.size)
 
 
+# Files by process and URL. A forked process opens its own files, because its parent removes the
+# local files when it no longer uses them.
+_in_use: WeakValueDictionary[tuple[int, str], RemoteFile] = WeakValueDictionary()
+
+
 class RemotePath(type(Path())):  # type: ignore[misc]
     """Path of the local copy of a remote file; `str` returns the URL."""
 
@@ -183,7 +211,7 @@ class RemotePath(type(Path())):  # type: ignore[misc]
     @classmethod
     def of(cls, url: str) -> RemotePath:
         """Open a remote file; raise the same errors as `RemoteFile`."""
-        remote = RemoteFile(url)
+        remote = RemoteFile.of(url)
         path = cls(remote.local)
         path.remote = remote
         return path
@@ -366,14 +394,7 @@ def _folder_of(url: str, version: str, size: int) -> tuple[Path, bool]:
         with _Errors(f"cannot write {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
         return folder, True
-    return Path(tempfile.mkdtemp(dir=_temporary())), False
-
-
-@cache
-def _temporary() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="mcaprl-remote-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
+    return Path(tempfile.mkdtemp(prefix="mcaprl-remote-")), False
 
 
 def _last_part(url: str) -> str:

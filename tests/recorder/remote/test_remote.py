@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import pickle
 import socket
+import tempfile
 from collections.abc import Iterator
 from multiprocessing.queues import Queue
 from multiprocessing.synchronize import Barrier
@@ -18,6 +19,7 @@ import pytest
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import LogError, UsageError
+from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.remote import BLOCK_BYTES, CACHE_VARIABLE, RemoteFile, RemotePath, upload
 from tests.recorder.remote.range_server import RangeServer, range_server
 
@@ -85,9 +87,9 @@ def test_fetched_parts_are_kept_on_request(
 ) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     url = f"{server.url}/images.mcap"
-    first = mcaprl.open(url, episodes=[3, 4])
+    first = mcaprl.open(url, episodes=[3, 4]).fingerprint
     server.sent.clear()
-    assert mcaprl.open(url, episodes=[3, 4]).fingerprint == first.fingerprint
+    assert mcaprl.open(url, episodes=[3, 4]).fingerprint == first
     assert server.sent == []
     # Parts of an old version of a file are not used for a new version.
     other = server.folder / "other.mcap"
@@ -257,6 +259,41 @@ def test_forked_workers_stream_a_url(server: RangeServer) -> None:
     episodes = mcaprl.open(server.folder / "images.mcap").episodes
     expected = np.concatenate([episode.rewards for episode in episodes])
     np.testing.assert_array_equal(np.sort(rewards), np.sort(expected).astype(np.float32))
+
+
+def test_local_copies_are_removed_when_they_are_not_used(
+    server: RangeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    url, content = f"{server.url}/lane.mcap", (server.folder / "lane.mcap").read_bytes()
+    first, second = RemotePath.of(url), RemotePath.of(url)
+    assert first.remote is second.remote
+    reader = McapReader(first)
+    assert reader.view == content
+    assert len(list(tmp_path.iterdir())) == 1
+    del first, second, reader
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_process_removes_only_its_own_copies(
+    server: RangeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "fork" not in multiprocessing.get_all_start_methods():
+        pytest.skip("needs fork")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    url, files = f"{server.url}/lane.mcap", dict[str, RemotePath]()
+    files["parent"] = RemotePath.of(url)
+    before = list(tmp_path.iterdir())
+
+    def open_and_exit() -> None:
+        files["child"] = RemotePath.of(url)
+        del files["parent"]
+
+    process = multiprocessing.get_context("fork").Process(target=open_and_exit)
+    process.start()
+    process.join(60)
+    assert process.exitcode == 0
+    assert list(tmp_path.iterdir()) == before
 
 
 def test_uploads_appear_when_complete(folder: Path, tmp_path: Path) -> None:
