@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,8 +13,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.registry import other_format, read_format
-from mcaprl.recorder.dataset.open import find_logs, open_logs
-from mcaprl.remote import RemotePath
+from mcaprl.recorder.dataset.open import file_key, find_logs, open_logs
 
 Item = TypeVar("Item")
 
@@ -72,8 +70,7 @@ def _logs(name: str) -> Iterator[tuple[str, Path]]:
     if other_format(name) is not None:
         raise UsageError(f"{name} is not a log: convert it first (mcaprl convert)")
     for path in find_logs(name):
-        key = str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
-        yield key, path if path.is_absolute() else path.absolute()
+        yield file_key(path), path if path.is_absolute() else path.absolute()
 
 
 def _readers(name: str, threads: int) -> Iterator[tuple[str, Callable[[], Dataset]]]:
@@ -83,8 +80,7 @@ def _readers(name: str, threads: int) -> Iterator[tuple[str, Callable[[], Datase
         yield name, partial(read_format, name, other)
         return
     for path in find_logs(name):
-        key = str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
-        yield key, partial(open_logs, path, threads=threads)
+        yield file_key(path), partial(open_logs, path, threads=threads)
 
 
 def _split_weight(part: str) -> tuple[str, float]:

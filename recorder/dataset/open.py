@@ -18,7 +18,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 from mcaprl.recorder.dataset.manifest import is_manifest, listed_logs
-from mcaprl.remote import as_path, find_remote, is_url
+from mcaprl.remote import RemotePath, as_path, find_remote, is_url
 from mcaprl.texts import counted
 
 # Largest number of logs open at the same time; the system limits the open files of a process.
@@ -126,6 +126,11 @@ def episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
     return np.array(sorted(set((selected % count).tolist())), np.int64)
 
 
+def file_key(path: Path) -> str:
+    """Return the same string for all paths of a file: the URL, or the path without links."""
+    return str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
+
+
 def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
     """Resolve `data` (see `open_logs`) to files, sorted within a folder or glob.
 
@@ -137,7 +142,7 @@ def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
         if not every:
             raise LogError("no data: the list of files is empty")
         # A file that is listed under several paths is read once.
-        return list({os.path.realpath(path): path for path in every}.values())
+        return list({file_key(path): path for path in every}.values())
     if is_manifest(data):
         return listed_logs(data)
     if is_url(data):

@@ -168,9 +168,18 @@ def test_memory_and_file_systems(folder: Path, tmp_path: Path) -> None:
     assert len(mcaprl.open("memory://logs")) == 2 * len(expected)
     assert len(mcaprl.open("memory://logs/*.mcap")) == 2 * len(expected)
     assert len(mcaprl.open(["memory://logs/a.mcap", folder / "lane.mcap"])) == 2 * len(expected)
+    twice = ["memory:///logs/a.mcap", "memory://logs/*.mcap", "memory:///logs/a.mcap"]
+    assert len(mcaprl.open(twice)) == 2 * len(expected)
     url = f"file://{folder}/lane.mcap"
     assert mcaprl.open(url).fingerprint == expected.fingerprint
     memory.rm("/logs", recursive=True)
+
+
+def test_a_url_that_is_listed_twice_is_read_once(server: RangeServer) -> None:
+    url, expected = f"{server.url}/lane.mcap", mcaprl.open(server.folder / "lane.mcap")
+    for sends_dates in (True, False):
+        server.sends_dates = sends_dates
+        assert len(mcaprl.open([url, url])) == len(expected)
 
 
 def test_errors_are_one_clear_line(server: RangeServer, tmp_path: Path) -> None:
