@@ -34,7 +34,7 @@ from mcaprl.recorder.viewer.playback import Player, Track
 from mcaprl.recorder.viewer.player_server import LiveServer
 from mcaprl.recorder.viewer.prefix import prefixes_of, side_by_side
 from mcaprl.recorder.viewer.scene_reader import SeenStep, moments_of_episode
-from mcaprl.recorder.viewer.verify import Verification
+from mcaprl.recorder.viewer.verify import Comparison, Verification
 from mcaprl.recorder.viewer.verify import verify as verify_dataset
 from mcaprl.recorder.viewer.video import (
     VIDEO_KINDS,
@@ -299,22 +299,19 @@ def _of_sim(
     steps: Collection[int],
 ) -> _Images:
     """Yield the images that the sim renders while it repeats the logged actions."""
-    found: list[NDArray[np.uint8]] = []
     with closing(make()) as env:
-
-        def draw(now: Episode, step: int) -> None:
+        comparison = Comparison(dataset, env, episode.index)
+        for now, step in comparison:
             if now.index == episode.index and step in steps:
                 image = env.render()
                 if not isinstance(image, np.ndarray):
                     raise UsageError(f"{path} has no scene, and {dataset.env_id} renders no images")
-                found.append(np.ascontiguousarray(image, np.uint8))
-
-        result = verify_dataset(dataset, env, only=episode.index, on_frame=draw)
-    if result.difference is not None:
-        raise LogError(f"{path} has no scene, and the sim has changed: {result.difference}")
-    if not found:
+                yield np.ascontiguousarray(image, np.uint8)
+    if comparison.result.difference is not None:
+        what = comparison.result.difference
+        raise LogError(f"{path} has no scene, and the sim has changed: {what}")
+    if episode.index in comparison.result.unseeded:
         raise LogError(f"{path} has no scene, and episode {episode.index} has no seed")
-    yield from found
 
 
 def _caption(dataset: Dataset, episode: Episode, step: int, time_ns: int) -> list[str]:

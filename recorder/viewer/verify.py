@@ -8,9 +8,9 @@ continues the random state of the previous episode, so it is replayed directly a
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -28,6 +28,7 @@ from mcaprl.texts import counted
 
 _MOST_FIELDS = 8
 _MOST_EPISODES = 10
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,38 @@ def verify(
         SpaceError: The spaces of the environment and the log differ.
         LogError: The environment raises an error for a logged action.
     """
+    comparison = Comparison(dataset, env, only)
+    for episode, step in comparison:
+        on_frame(episode, step)
+    return comparison.result
+
+
+class Comparison:
+    """Iterable over the frames that are equal in the log and the environment; see `verify`.
+
+    It yields episode and step, while the environment is in the state of that step.
+
+    Attributes:
+        result: Result of the comparison, after the iteration.
+    """
+
+    result: Verification
+
+    def __init__(self, dataset: Dataset, env: gym.Env[Any, Any], only: int | None = None) -> None:
+        """Store the arguments, which are those of `verify`."""
+        self._dataset, self._env, self._only = dataset, env, only
+
+    def __iter__(self) -> Iterator[tuple[Episode, int]]:
+        """Yield each frame; raise the same errors as `verify`."""
+        self.result = yield from _compare_all(self._dataset, self._env, self._only)
+
+
+_Frames = Generator[tuple[Episode, int], None, _Result]
+
+
+def _compare_all(
+    dataset: Dataset, env: gym.Env[Any, Any], only: int | None
+) -> _Frames[Verification]:
     _check_spaces(dataset, env)
     compared = steps = 0
     unseeded: list[int] = []
@@ -129,7 +162,7 @@ def verify(
     for episode in _needed(dataset.episodes, only):
         continues = is_start_known and _follows(dataset.episodes, episode.index)
         is_start_known = episode.seed is not None or continues
-        difference = _compare(dataset, env, episode, on_frame) if is_start_known else None
+        difference = (yield from _compare(dataset, env, episode)) if is_start_known else None
         if difference is not None and episode.seed is None and difference.step == 0:
             # The episode started from an unknown state, so a difference is expected.
             is_start_known, difference = False, None
@@ -163,12 +196,9 @@ def _follows(episodes: tuple[Episode, ...], index: int) -> bool:
 
 
 def _compare(
-    dataset: Dataset,
-    env: gym.Env[Any, Any],
-    episode: Episode,
-    on_frame: Callable[[Episode, int], None],
-) -> Difference | None:
-    """Replay one episode and return the first difference."""
+    dataset: Dataset, env: gym.Env[Any, Any], episode: Episode
+) -> _Frames[Difference | None]:
+    """Replay one episode; yield the equal frames, and return the first difference."""
     leaves = observation_leaves(dataset.observation_space)
     for step, now in enumerate(_stepped(env, episode, dataset.action_space)):
         fields = []
@@ -181,7 +211,7 @@ def _compare(
             time_ns = int(episode.log_time_ns[step])
             since_s = (time_ns - int(episode.log_time_ns[0])) / 1e9
             return Difference(episode.index, step, time_ns, since_s, tuple(fields[:_MOST_FIELDS]))
-        on_frame(episode, step)
+        yield episode, step
     return None
 
 

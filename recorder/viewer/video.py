@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from io import BytesIO
 from pathlib import Path
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import OutputExistsError, ReportError, UnknownNameError, UsageError, import_extra
 from mcaprl.files import replacing
+from mcaprl.recorder.viewer.gif import write_gif
 
 Image = NDArray[np.uint8]
 
@@ -22,11 +23,17 @@ MAX_FPS: Final = 50.0
 """Largest frame rate that GIF viewers support; it is close to the frame rate of screens."""
 SMOOTH_FPS: Final = 20.0
 """Frame rate from which motion looks continuous."""
-# WebP with Pillow's default quality of 80 is nearly twice as large.
-_LOOP_OPTIONS: Final[dict[str, dict[str, int]]] = {".gif": {}, ".webp": {"quality": 50}}
 # x264's defaults, "medium" and 23, take 3 to 4 times the CPU time for a PSNR that is at most 0.3 dB
 # higher. Their files of our scenes are half to two thirds as large.
 _H264_OPTIONS: Final = {"preset": "superfast", "crf": "25"}
+# WebP with a quality of 80 is nearly twice as large. The default level of 4 takes twice as long.
+_WEBP_OPTIONS: Final = {"quality": "50", "compression_level": "0"}
+# Codec, pixel format and options of the encoder.
+_ENCODERS: Final = {
+    ".mp4": ("libx264", "yuv420p", _H264_OPTIONS),
+    ".webp": ("libwebp_anim", "bgra", _WEBP_OPTIONS),
+}
+_CONTAINER_OPTIONS: Final[dict[str, dict[str, str]]] = {".mp4": {}, ".webp": {"loop": "0"}}
 _COLUMNS = 3
 _GAP_PX = 6
 
@@ -42,10 +49,10 @@ def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
     Raises:
         UnknownNameError: The suffix of the path is not supported.
         OutputExistsError: The file exists and `overwrite` is not set.
-        MissingExtraError: imageio is not installed.
+        MissingExtraError: imageio or PyAV is not installed.
     """
     import_extra("imageio", "video")
-    if path.suffix == ".mp4":
+    if path.suffix in _ENCODERS:
         import_extra("av", "video")
     if path.suffix not in kinds:
         raise UnknownNameError("kind of output", path.suffix or path.name, kinds)
@@ -77,46 +84,64 @@ def write_video(path: Path, images: Iterable[Image], fps: float) -> int:
 
 
 def _write(path: Path, kind: str, images: Iterable[Image], fps: float) -> int:
-    imageio = import_extra("imageio.v3", "video")
-    if kind != ".mp4":
-        stills = list(images)
-        if stills:
-            times = {"duration": round(1000 / fps), "loop": 0}
-            options = {"extension": kind, "plugin": "pillow", **times, **_LOOP_OPTIONS[kind]}
-            imageio.imwrite(path, stills, **options)
-        return len(stills)
-    return _encode(path, images, fps)
+    images = _of_one_size(images)
+    if kind == ".gif":
+        return write_gif(path, images, round(1000 / fps))
+    return _encode(path, kind, images, fps)
 
 
-def _encode(path: Path, images: Iterable[Image], fps: float) -> int:
-    """Write an H.264 encoded `.mp4`; see `write_video`."""
-    av = import_extra("av", "video")
-    # This module imports numba. PyAV's own conversion takes three times as long.
-    from mcaprl.recorder.viewer.yuv import fill_frame
+def _of_one_size(images: Iterable[Image]) -> Iterator[Image]:
+    """Yield images.
 
-    # imageio does not offer the options of the encoder.
-    count, stream = 0, None
+    Raises:
+        UsageError: An image has another size than the first one.
+    """
     shape: tuple[int, ...] = ()
+    for image in images:
+        shape = shape or image.shape
+        if image.shape != shape:
+            raise UsageError(f"a video needs images of one size, got {shape} and {image.shape}")
+        yield image
+
+
+def _encode(path: Path, kind: str, images: Iterable[Image], fps: float) -> int:
+    """Write an H.264 encoded `.mp4`, or a `.webp`; see `write_video`."""
+    av = import_extra("av", "video")
+    # imageio does not offer the options of the encoders. Pillow keeps all frames of a WebP.
+    codec, pixels, options = _ENCODERS[kind]
+    count, stream = 0, None
     # The encoder cannot be closed after a failed write, so it writes to memory.
     content = BytesIO()
-    with av.open(content, "w", format="mp4") as container:
+    with av.open(content, "w", format=kind[1:], options=_CONTAINER_OPTIONS[kind]) as container:
         for count, image in enumerate(images, 1):  # noqa: B007
             if stream is None:
-                shape = image.shape
                 rate = Fraction(fps).limit_denominator(10_000)
-                stream = container.add_stream("libx264", rate=rate, options=_H264_OPTIONS)
-                # The encoder needs an even height and width.
-                stream.height, stream.width = (edge // 2 * 2 for edge in shape[:2])
-                stream.pix_fmt = "yuv420p"
-            if image.shape != shape:
-                raise UsageError(f"a video needs images of one size, got {shape} and {image.shape}")
-            frame = av.VideoFrame(stream.width, stream.height, "yuv420p")
-            fill_frame(image, frame)
-            container.mux(stream.encode(frame))
+                stream = container.add_stream(codec, rate=rate, options=options)
+                # H.264 needs an even height and width.
+                unit = 2 if kind == ".mp4" else 1
+                stream.height, stream.width = (edge // unit * unit for edge in image.shape[:2])
+                stream.pix_fmt = pixels
+            container.mux(stream.encode(_frame(image, kind)))
         if stream is not None:
             container.mux(stream.encode())
     path.write_bytes(content.getvalue())
     return count
+
+
+def _frame(image: Image, kind: str) -> Any:
+    av = import_extra("av", "video")
+    if kind == ".webp":
+        # Some versions of PyAV do not free images that they convert.
+        alpha = np.full((*image.shape[:2], 1), 255, np.uint8)
+        pixels = np.concatenate([image[..., ::-1], alpha], axis=-1)
+        return av.VideoFrame.from_ndarray(pixels, format="bgra")
+    # This module imports numba. PyAV's own conversion takes three times as long.
+    from mcaprl.recorder.viewer.yuv import fill_frame
+
+    height, width = (edge // 2 * 2 for edge in image.shape[:2])
+    frame = av.VideoFrame(width, height, "yuv420p")
+    fill_frame(image, frame)
+    return frame
 
 
 def write_sheet(path: Path, images: Sequence[Image]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import weakref
 from contextlib import closing
 from pathlib import Path
 from typing import Any, get_args
@@ -16,6 +17,7 @@ from mcaprl.cli import run
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.viewer.scene_reader import moments_of_episode
 from mcaprl.recorder.viewer.video import (
+    VIDEO_KINDS,
     contact_sheet,
     evenly_spaced,
     parts_of_step,
@@ -258,8 +260,84 @@ def test_an_encoded_video_looks_like_its_images(view: ChaseView, tmp_path: Path)
         assert 10 * np.log10(255**2 / (error**2).mean()) > 33, "dB"
 
 
+class LiveImages:
+    """Images of which the largest number in memory is counted."""
+
+    def __init__(self) -> None:
+        self.most = 0
+        self._made: list[weakref.ref[Any]] = []
+
+    def make(self) -> Any:
+        image = np.full((40, 60, 3), len(self._made), np.uint8)
+        self._made.append(weakref.ref(image))
+        self.most = max(self.most, sum(made() is not None for made in self._made))
+        return image
+
+
+@pytest.mark.parametrize("kind", VIDEO_KINDS)
+def test_images_are_written_one_by_one(tmp_path: Path, kind: str) -> None:
+    images = LiveImages()
+    assert write_video(tmp_path / f"video{kind}", (images.make() for _ in range(20)), 20.0) == 20
+    assert images.most <= 3
+
+
+def test_images_of_a_sim_are_written_one_by_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gymnasium.envs.classic_control.cartpole import CartPoleEnv
+
+    log, images = tmp_path / "cart.mcap", LiveImages()
+    mcaprl.record("CartPole-v1", log, policy="random", episodes=1)
+    monkeypatch.setattr(CartPoleEnv, "render", lambda env: images.make())
+    result = mcaprl.render(log, video=tmp_path / "cart.mp4")
+    assert result.frames > 5
+    assert images.most <= 3
+
+
+def test_frames_of_a_gif(tmp_path: Path) -> None:
+    """Each frame has the palette that Pillow chooses for it; equal frames have one duration."""
+    from PIL import Image as pillow
+
+    random = np.random.default_rng(0)
+    noise = random.integers(0, 256, (2, 41, 51, 3), np.uint8)
+    flat = np.full((3, 41, 51, 3), 90, np.uint8)
+    flat[1:, 5:9, 7:20] = 20, 40, 60
+    flat[2, 30:, :3] = 200
+    images = [*noise, *flat[[0, 0, 1, 2, 2]]]
+    path = tmp_path / "video.gif"
+    assert write_video(path, iter(images), 25.0) == 7
+    with pillow.open(path) as video:
+        assert video.info["loop"] == 0
+        for number, image in enumerate([*noise, *flat]):
+            video.seek(number)
+            expected = pillow.fromarray(image).convert("P", palette=pillow.Palette.ADAPTIVE)
+            np.testing.assert_array_equal(video.convert("RGB"), expected.convert("RGB"))
+            assert video.info["duration"] == (80 if number in (2, 4) else 40)
+        with pytest.raises(EOFError):
+            video.seek(5)
+
+
+def test_frames_of_a_webp(tmp_path: Path) -> None:
+    from PIL import Image as pillow
+
+    x, y = np.meshgrid(np.arange(51), np.arange(41))
+    images = [np.stack([4 * x, 5 * y, 0 * x + shade], -1).astype(np.uint8) for shade in (0, 99, 0)]
+    path = tmp_path / "video.webp"
+    assert write_video(path, iter(images), 25.0) == 3
+    with pillow.open(path) as video:
+        assert video.info["loop"] == 0
+        for number, image in enumerate(images):
+            video.seek(number)
+            video.load()
+            assert video.info["duration"] == 40
+            error = np.asarray(video.convert("RGB")).astype(float) - image
+            assert np.abs(error).mean() < 5.0
+        with pytest.raises(EOFError):
+            video.seek(3)
+
+
 def test_a_video_needs_frames(tmp_path: Path) -> None:
-    for kind in ("mp4", "gif"):
+    for kind in ("mp4", "gif", "webp"):
         path = tmp_path / f"video.{kind}"
         with pytest.raises(mcaprl.errors.UsageError, match="no frames"):
             write_video(path, [], 20.0)
@@ -278,8 +356,9 @@ def test_images_of_an_odd_size_lose_a_row_and_a_column(tmp_path: Path) -> None:
 
 def test_images_of_different_sizes_are_refused(tmp_path: Path) -> None:
     images = [np.zeros((size, 50, 3), np.uint8) for size in (40, 20)]
-    with pytest.raises(mcaprl.errors.UsageError, match=r"\(40, 50, 3\) and \(20, 50, 3\)"):
-        write_video(tmp_path / "video.mp4", images, 20.0)
+    for kind in VIDEO_KINDS:
+        with pytest.raises(mcaprl.errors.UsageError, match=r"\(40, 50, 3\) and \(20, 50, 3\)"):
+            write_video(tmp_path / f"video{kind}", images, 20.0)
     assert list(tmp_path.iterdir()) == []
 
 
