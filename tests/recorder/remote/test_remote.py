@@ -27,6 +27,8 @@ fsspec = pytest.importorskip("fsspec", reason="needs the extra remote")
 pytest.importorskip("aiohttp", reason="needs the extra remote")
 
 EPISODES, STEPS = 50, 40
+# Python 3.12 and later warn of a fork of a process with threads, such as the server's.
+IN_THREADS = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
 
 
 @pytest.fixture(scope="module")
@@ -255,6 +257,7 @@ def test_a_path_is_opened_again_in_another_process(server: RangeServer) -> None:
     assert str(pickle.loads(pickle.dumps(path))) == str(path)
 
 
+@IN_THREADS
 def test_forked_workers_stream_a_url(server: RangeServer) -> None:
     torch = pytest.importorskip("torch")
     if "fork" not in multiprocessing.get_all_start_methods():
@@ -262,8 +265,8 @@ def test_forked_workers_stream_a_url(server: RangeServer) -> None:
     import mcaprl.torch as loading
 
     stream = loading.TransitionStream(f"{server.url}/images.mcap", batch_size=100, seed=1)
-    options = {"batch_size": None, "num_workers": 2, "multiprocessing_context": "fork"}
-    batches = list(torch.utils.data.DataLoader(stream, **options))
+    options = {"num_workers": 2, "multiprocessing_context": "fork", "timeout": 60}
+    batches = list(torch.utils.data.DataLoader(stream, batch_size=None, **options))
     rewards = torch.cat([batch["reward"] for batch in batches]).numpy()
     episodes = mcaprl.open(server.folder / "images.mcap").episodes
     expected = np.concatenate([episode.rewards for episode in episodes])
@@ -284,6 +287,7 @@ def test_local_copies_are_removed_when_they_are_not_used(
     assert list(tmp_path.iterdir()) == []
 
 
+@IN_THREADS
 def test_a_process_removes_only_its_own_copies(
     server: RangeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -298,7 +302,7 @@ def test_a_process_removes_only_its_own_copies(
         files["child"] = RemotePath.of(url)
         del files["parent"]
 
-    process = multiprocessing.get_context("fork").Process(target=open_and_exit)
+    process = multiprocessing.get_context("fork").Process(target=open_and_exit, daemon=True)
     process.start()
     process.join(60)
     assert process.exitcode == 0
