@@ -128,6 +128,20 @@ def check_target(path: Path, *, overwrite: bool) -> None:
         pass
 
 
+def check_writable(path: Path, error_type: type[McaprlError]) -> None:
+    """Check that a file can be written, without writing it; create its folder if it is missing.
+
+    Raises:
+        LogError: Another process is writing the file.
+        McaprlError: The file cannot be written; the type is `error_type`.
+    """
+    try:
+        with work_folder(path):
+            pass
+    except OSError as error:
+        raise error_type(f"cannot write {path}: {_reason(path, error)}") from error
+
+
 def check_log_name(path: str | Path) -> Path:
     """Check that the name of a log to write ends in `.mcap`; return the path.
 
@@ -339,6 +353,8 @@ def _reason(path: Path, error: OSError) -> str:
 def _check_folder(path: Path, *, overwrite: bool) -> None:
     if path.is_symlink() or (path.exists() and not path.is_dir()):
         raise OutputExistsError(f"{path} is not a folder: choose another path")
+    if path.name in ("", ".."):
+        raise OutputExistsError(f"{path} cannot be replaced: give the name of the folder")
     if path.exists() and not overwrite:
         raise OutputExistsError(
             f"{path} exists: choose another path, or pass --overwrite (overwrite=True in Python)"

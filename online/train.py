@@ -21,8 +21,8 @@ from typing import Any
 
 import gymnasium as gym
 
-from mcaprl.errors import TrainingError
-from mcaprl.files import write_json
+from mcaprl.errors import TrainingError, UsageError
+from mcaprl.files import check_log_name, write_json
 from mcaprl.online.agent import Agent
 from mcaprl.online.algorithms import check_spaces
 from mcaprl.online.curves import IMAGE_NAME, SCORES_NAME, draw_curves, read_run
@@ -45,6 +45,9 @@ from mcaprl.runs import (
 )
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.evaluate import Scale, evaluate
+
+_SEEDS = 2**32
+"""Number of seeds that Stable-Baselines3 accepts."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,8 @@ def train(
 
     Raises:
         UnknownNameError: There is no such sim.
-        UsageError: The run to resume has other seeds.
+        UsageError: The run to resume has other seeds, a seed is too large, or `record` is not the
+            name of a log.
         OutputExistsError: `out` or `record` exists.
         SpaceError: The algorithm does not support these observations or actions.
         PolicyError: The networks of `policy` and the agent differ.
@@ -110,6 +114,10 @@ def train(
     """
     folder = Path(out)
     numbers = choose_seeds(folder, seeds, seed, resume)
+    if numbers.stop > _SEEDS:
+        raise UsageError(f"seed {numbers[-1]}: Stable-Baselines3 needs seeds below 2**32")
+    if record is not None and len(numbers) == 1:
+        check_log_name(record)
     logs = log_paths(Path(record), numbers, resume) if record is not None else {}
     config = task.config
     with locked_run(folder, resume), closing(make_sim(task.sim, **task.sim_options)) as env:

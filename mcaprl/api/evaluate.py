@@ -18,7 +18,7 @@ from mcaprl.api.evaluate_parts import Part, results_on_ray
 from mcaprl.api.policies import SCRIPTED, Names, as_names, policies_of, policy_names
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import ReportError, UsageError, import_extra
-from mcaprl.files import check_log_name, write_json
+from mcaprl.files import check_log_name, check_target, check_writable, write_json
 from mcaprl.page import Figure
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.open import find_logs, open_logs
@@ -160,7 +160,9 @@ def evaluate(
         if folder is not None:
             import_extra("matplotlib", "report")
             import_extra("jinja2", "report")
-            write_json(folder / RESULT_NAME, {}, ReportError)
+            check_writable(folder / RESULT_NAME, ReportError)
+        if log is not None:
+            check_target(log, overwrite=overwrite)
         world = list(getattr(env.unwrapped, "static_scene", list)())
         is_batched = env.spec is not None and bool(env.spec.vector_entry_point) and log is None
         found = _policies(names, env)

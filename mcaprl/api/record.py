@@ -12,7 +12,7 @@ import numpy as np
 
 from mcaprl.api.cluster import ClusterOptions
 from mcaprl.api.environments import all_options
-from mcaprl.api.ranges import check_fraction, check_least
+from mcaprl.api.ranges import check_fraction, check_least, check_positive
 from mcaprl.api.record_file import FileRequest, record_file
 from mcaprl.api.shards import record_on_ray, record_shards
 from mcaprl.errors import UsageError
@@ -176,6 +176,8 @@ def _check_request(request: FileRequest, envs: int) -> None:
     if (request.episodes is None) == (request.steps is None):
         raise UsageError("record needs either --episodes N or --steps N")
     check_fraction(epsilon=request.epsilon)
+    if request.rotate_mb is not None:
+        check_positive(rotate_mb=request.rotate_mb)
     check_least(1, episodes=request.episodes, steps=request.steps, envs=envs)
     check_least(0, seed=request.seed)
     if envs > 1 and request.append:

@@ -31,7 +31,7 @@ from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.log_layout import attached_layout
 from mcaprl.recorder.viewer.playback import Player, Track
-from mcaprl.recorder.viewer.player_server import LiveServer
+from mcaprl.recorder.viewer.player_server import MAX_SPEED, MIN_SPEED, LiveServer
 from mcaprl.recorder.viewer.prefix import prefixes_of, side_by_side
 from mcaprl.recorder.viewer.scene_reader import SeenStep, moments_of_episode
 from mcaprl.recorder.viewer.verify import Comparison, Verification
@@ -218,7 +218,8 @@ def render(
         OutputExistsError: An output exists.
         MissingExtraError: The packages of the `video` extra are not installed.
     """
-    check_positive(speed=speed)
+    if not MIN_SPEED <= speed <= MAX_SPEED:
+        raise UsageError(f"--speed {speed}: give a number from {MIN_SPEED:g} to {MAX_SPEED:g}")
     if video is None and contact_sheet is None:
         raise UsageError("render needs a video, a contact sheet, or both")
     if height is not None and not _HEIGHTS_PX[0] <= height <= _HEIGHTS_PX[1]:

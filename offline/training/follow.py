@@ -41,6 +41,8 @@ class GrowingLogs:
         """
         self._data = data
         self._counts: dict[Path, int] = {}
+        # End of the last episode that was read, nanoseconds.
+        self._ends_ns: dict[Path, int] = {}
         self._states: dict[Path, tuple[int, int, int]] = {}
         give_up_s = time.monotonic() + patience_s
         while True:
@@ -71,11 +73,35 @@ class GrowingLogs:
             if state == self._states.get(path):
                 continue
             self._states[path] = state
-            part = _read_from(path, self._counts.get(path, 0))
+            part = self._read_from(path)
             if part is not None:
                 self._counts[path] = self._counts.get(path, 0) + len(part.episodes)
+                self._ends_ns[path] = part.episodes[-1].summary.end_time_ns
                 parts.append(part)
         return parts
+
+    def _read_from(self, path: Path) -> Dataset | None:
+        """Read the new episodes of a log; return None if there are none.
+
+        Raises:
+            LogError: The log is damaged, or does not contain the episodes that were read before.
+        """
+        first = self._counts.get(path, 0)
+        with warnings.catch_warnings():
+            # The warning that a log is still being written is expected here.
+            warnings.simplefilter("ignore", UserWarning)
+            try:
+                whole = open_logs(path, columns=[]).episodes
+                if first and (
+                    len(whole) < first
+                    or whole[first - 1].summary.end_time_ns != self._ends_ns[path]
+                ):
+                    raise LogError(
+                        f"{path} was replaced by another log during the training: train again"
+                    )
+                return open_logs(path, episodes=slice(first, None)) if len(whole) > first else None
+            except NoStepsError:
+                return None
 
 
 def _state_of(path: Path) -> tuple[int, int, int]:
@@ -107,17 +133,3 @@ def with_more_data(
     for seed in learner.seeds:
         grown.load_state(seed, learner.state(seed), learner.step)
     return grown
-
-
-def _read_from(path: Path, first: int) -> Dataset | None:
-    """Read the episodes of a log from index `first` on; return None if there are none."""
-    with warnings.catch_warnings():
-        # The warning that a log is still being written is expected here.
-        warnings.simplefilter("ignore", UserWarning)
-        try:
-            whole = open_logs(path, columns=[])
-            if len(whole.episodes) <= first:
-                return None
-            return open_logs(path, episodes=slice(first, None))
-        except NoStepsError:
-            return None

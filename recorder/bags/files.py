@@ -65,10 +65,12 @@ def _files_of(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], str]:
 
     Files that `metadata.yaml` lists come first, in the listed order. If the recorder was killed,
     `metadata.yaml` is missing or does not list all files.
+
+    Raises:
+        LogError: A listed file is missing.
     """
     listed = metadata.get("relative_file_paths") or []
-    first = [folder / Path(str(name)).name for name in listed]
-    first = [path for path in first if path.exists()]
+    first = [_existing(folder / Path(str(name)).name) for name in listed]
     kinds = (*_KINDS, *(f"{kind}{_COMPRESSED}" for kind in _KINDS))
     rest = sorted(path for path in folder.iterdir() if path.name.endswith(kinds))
     # A compressed file and its original may both exist; only one of them is opened.
@@ -78,6 +80,22 @@ def _files_of(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], str]:
             known.add(_plain_name(path))
             first.append(path)
     return first, str(metadata.get("ros_distro") or "")
+
+
+def _existing(path: Path) -> Path:
+    """Return a listed file, or its compressed or decompressed copy.
+
+    Raises:
+        LogError: The file is missing.
+    """
+    plain = path.with_name(_plain_name(path))
+    for found in (path, plain, plain.with_name(plain.name + _COMPRESSED)):
+        if found.exists():
+            return found
+    raise LogError(
+        f"{path} is listed in {_METADATA}, but is missing: restore it, or delete {_METADATA} to"
+        " read the other files"
+    )
 
 
 def _plain_name(path: Path) -> str:

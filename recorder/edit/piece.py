@@ -129,12 +129,18 @@ def _window_of_time(log: FinishedLog, time: Bounds | None) -> tuple[int, int]:
     assert time is not None
     begin_ns, end_ns = log.span_of_messages()
     start, stop = time
-    low = 0 if start is None else begin_ns + round(start * _NS_PER_S)
-    high = _LAST_TIME if stop is None else begin_ns + round(stop * _NS_PER_S) - 1
+    low = 0 if start is None else begin_ns + _ns(start)
+    high = _LAST_TIME if stop is None else min(begin_ns + _ns(stop) - 1, _LAST_TIME)
     if not (low <= min(high, end_ns) and high >= begin_ns):
         seconds = (end_ns - begin_ns) / _NS_PER_S
         raise UsageError(f"{log.path} lasts {seconds:.9g} s: no message is in this part")
     return max(low, 0), high
+
+
+def _ns(seconds: float) -> int:
+    """Convert seconds to nanoseconds; limit them to the times that a log can have."""
+    most_s = _LAST_TIME / _NS_PER_S
+    return round(max(-most_s, min(seconds, most_s)) * _NS_PER_S)
 
 
 def _pieces(log: FinishedLog, low: int, high: int) -> list[_Piece]:

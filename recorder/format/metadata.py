@@ -38,7 +38,7 @@ import gymnasium as gym
 from gymnasium import spaces
 
 from mcaprl._version import __version__
-from mcaprl.errors import LogError
+from mcaprl.errors import LogError, UsageError
 from mcaprl.files import parse_json
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.spaces import action_leaf, leaves_of, space_from_json, space_to_json
@@ -248,6 +248,10 @@ class LogMetadata:
             fps = inner.metadata.get("render_fps")
             fallback = 1 / fps if fps else DEFAULT_STEP_DURATION_NS / 1e9
             step_duration_s = float(getattr(inner, "step_duration_s", fallback))
+        if not math.isfinite(step_duration_s):
+            raise UsageError(
+                f"step_duration_s is {step_duration_s}: it must be a number of seconds"
+            )
         is_vector = isinstance(one, gym.vector.VectorEnv)
         kwargs = dict(one.spec.kwargs) if one.spec else {}
         for name in _NOT_OF_ONE_ENV:

@@ -23,7 +23,8 @@ class EpisodeInfos:
                 includes nested infos such as `episode.r`.
         """
         self._topics = topics
-        self._names = None if isinstance(names, bool) else tuple(names)
+        one = [names] if isinstance(names, str) else names
+        self._names = None if isinstance(one, bool) else tuple(one)
         self._values: dict[str, tuple[list[int], list[Any]]] = {}
         self._twice: set[str] = set()
 

@@ -71,8 +71,10 @@ class EpisodeLog:
         # folder.
         self._folder = Path.cwd()
         self.step_ns = description.step_duration_ns
-        first_ns = time.time_ns() if start_time_ns is None else start_time_ns
-        if self.step_ns < 1 or not 0 <= first_ns < _END_OF_TIME_NS:
+        if not isinstance(start_time_ns, int | np.integer | None):
+            raise UsageError(f"start_time_ns is {start_time_ns}: it must be an integer")
+        first_ns = time.time_ns() if start_time_ns is None else int(start_time_ns)
+        if not (1 <= self.step_ns < _END_OF_TIME_NS and 0 <= first_ns < _END_OF_TIME_NS):
             raise UsageError(
                 f"step of {self.step_ns} ns, start at {first_ns} ns: the step must be positive and"
                 " the start between the years 1970 and 2262; set step_duration_s and start_time_ns"

@@ -210,13 +210,14 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
             except TypeError:
                 number = reward_number(reward)
                 self._store_reward(number)
-            if terminated or truncated or step >= self._full_at:
+            has_ended = terminated or truncated
+            if has_ended or step >= self._full_at:
+                reason = reason_of(info.get("reason"), bool(terminated)) if has_ended else ""
                 # A signal must not interrupt the writes and the update of the step counter.
                 with HoldSignals():
                     self._make_room(step)
                     self._count(episode, step, float(number))
-                    if terminated or truncated:
-                        reason = reason_of(info.get("reason"), bool(terminated))
+                    if has_ended:
                         self._end(bool(terminated), bool(truncated), reason)
             elif self._shows_steps:
                 self._count(episode, step, float(number))

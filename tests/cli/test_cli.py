@@ -16,7 +16,7 @@ import pytest
 
 import mcaprl
 from mcaprl.cli import run
-from mcaprl.errors import SpaceError
+from mcaprl.errors import OutputExistsError, SpaceError
 from mcaprl.recorder.columns.reader import McapReader
 from tests.support.paths import GOLDEN
 
@@ -229,6 +229,10 @@ def test_learn_evaluate_replay(capsys: pytest.CaptureFixture[str]) -> None:
     assert result["behavior"]["episodes"] == len(mcaprl.open("data").episodes)
     for name in ("comparison.png", "trajectories.png", "evaluation.json"):
         assert (Path("report") / name).stat().st_size > 500
+    before = Path("report/evaluation.json").read_bytes()
+    with pytest.raises(OutputExistsError):
+        mcaprl.evaluate("run", "lane", episodes=3, report="report", record="episodes.mcap")
+    assert Path("report/evaluation.json").read_bytes() == before
     recorded = mcaprl.open("episodes.mcap")
     assert [episode.total_reward for episode in recorded.episodes] == scores["run"]["returns"]
     assert {episode.policy for episode in recorded.episodes} == {"run/seed-0", "run/seed-1"}

@@ -210,6 +210,10 @@ def test_mistakes_leave_no_folder(tmp_path: Path) -> None:
         train(Task.for_sim("Pendulum-v1", "dqn", **SHORT), out)
     with pytest.raises(UsageError, match="seeds must be at least 1"):
         train(lane(), out, seeds=0)
+    with pytest.raises(UsageError, match=r"Stable-Baselines3 needs seeds below 2\*\*32"):
+        train(lane(), out, seed=2**32 - 1, seeds=2)
+    with pytest.raises(UsageError, match=r"x.txt.*\.mcap"):
+        train(lane(), out, record=tmp_path / "x.txt")
     for algo in ("dqn", "ppo"):
         with pytest.raises(SpaceError, match=f"{algo} needs actions that start at 0, got"):
             check_spaces(algo, spaces.Box(-1, 1), spaces.Discrete(3, start=1))

@@ -84,9 +84,24 @@ def test_a_compacted_log_is_not_read_twice(tmp_path: Path) -> None:
     # A file that is replaced is noticed even if its size is the same.
     copy = path.with_name("copy")
     copy.write_bytes(path.read_bytes())
-    logs._counts[path] = 8
+    logs._counts[path], logs._ends_ns[path] = 8, whole.episodes[7].summary.end_time_ns
     copy.replace(path)
     assert logs.grow()
+
+
+def test_a_replaced_log_is_an_error(tmp_path: Path) -> None:
+    path, other = tmp_path / "log.mcap", tmp_path / "other.mcap"
+    recorder = Recorder(path)
+    recorder.record(3)
+    recorder.env.close()
+    logs = GrowingLogs([path])
+    for episodes in (2, 6):
+        another = Recorder(other)
+        another.record(episodes)
+        another.env.close()
+        other.replace(path)
+        with pytest.raises(LogError, match="was replaced by another log during the training"):
+            logs.grow()
 
 
 def test_new_files_are_read(tmp_path: Path) -> None:

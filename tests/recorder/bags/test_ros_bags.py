@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -126,6 +127,24 @@ def test_split_bags_are_joined_in_the_order_of_time(tmp_path: Path) -> None:
         speeds = bag.read("/odom", ["twist.twist.linear.x"]).columns["twist.twist.linear.x"]
         assert speeds.tolist() == [speed(k) for k in range(STEPS)]
         assert len(bag.paths) == 3
+
+
+def test_a_missing_file_of_a_split_bag_is_an_error(tmp_path: Path) -> None:
+    parts = write_rosbag2(tmp_path / "split", parts=3)
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    files = [file for folder in sorted(parts.iterdir()) for file in folder.glob("*.mcap")]
+    for number, file in enumerate(files):
+        shutil.copyfile(file, whole / f"part_{number}.mcap")
+    names = "".join(f"    - part_{number}.mcap\n" for number in range(3))
+    (whole / "metadata.yaml").write_text(
+        f"rosbag2_bagfile_information:\n  relative_file_paths:\n{names}"
+    )
+    with closing(open_bag(whole)) as bag:
+        assert len(bag.paths) == 3
+    (whole / "part_1.mcap").unlink()
+    with pytest.raises(LogError, match=r"part_1.mcap is listed in metadata.yaml, but is missing"):
+        open_bag(whole)
 
 
 def test_missing_files_topics_and_types_are_clear_errors(tmp_path: Path) -> None:

@@ -108,6 +108,7 @@ def test_part_of_whole_episodes_changes_no_message(log: Path, tmp_path: Path) ->
         # The part ends after the first record of the last episode, which alone is not a transition.
         ((0.25, 0.4), [(1, 0, 1)]),
         ((None, None), [(0, 0, 4), (1, 0, 1), (2, 0, 3)]),
+        ((-1e300, 1e300), [(0, 0, 4), (1, 0, 1), (2, 0, 3)]),
     ],
 )
 def test_parts_in_time(

@@ -111,6 +111,8 @@ def test_vector_environment_appends_to_a_log_of_one_environment(log_path: Path) 
         ("MountainCar-v0", {}, {}, "cannot be appended to"),
         ("CartPole-v1", {}, {"start_time_ns": 1_000}, "must be later"),
         ("CartPole-v1", {}, {"start_time_ns": 2**63}, "between the years 1970 and 2262"),
+        ("CartPole-v1", {}, {"start_time_ns": 1.5e18}, "must be an integer"),
+        ("CartPole-v1", {}, {"step_duration_s": float("nan")}, "step_duration_s is nan"),
         ("CartPole-v1", {}, {"overwrite": True}, "mutually exclusive"),
     ],
 )

@@ -110,6 +110,11 @@ def test_infos_are_off_unless_wanted(tmp_path: Path) -> None:
     assert sorted(some.infos) == ["a", "b.c"]
 
 
+def test_a_single_name_selects_one_info(log_path: Path) -> None:
+    data = record(log_path, {"a": 1, "speed": 2.0}, {"a": 3, "speed": 4.0}, infos="speed")
+    assert {name: values.tolist() for name, values in data.infos.items()} == {"speed": [2.0, 4.0]}
+
+
 def test_values_that_a_log_cannot_store_are_named_once(log_path: Path) -> None:
     infos: tuple[dict[str, Any], ...] = ({"set": {1}, "n": 1}, {"set": {2}, "n": "text"})
     with warnings.catch_warnings(record=True) as caught:

@@ -78,3 +78,21 @@ def test_a_name_of_nul_characters_is_not_lost(tmp_path: Path) -> None:
             pass
     (episode,) = mcaprl.open(path).episodes
     assert episode.policy == "a\ufffd"
+
+
+def test_an_info_that_is_not_a_dict_does_not_change_the_end(log_path: Path) -> None:
+    """The episode is recorded up to the transition before the error."""
+
+    class WithoutInfo(gym.Wrapper[Any, Any, Any, Any]):
+        """Environment that returns None instead of an info."""
+
+        def step(self, action: Any) -> tuple[Any, Any, bool, bool, Any]:
+            return *self.env.step(action)[:4], None
+
+    with closing(mcaprl.RecordMcap(WithoutInfo(Returning(1.0)), log_path)) as env:
+        env.reset()
+        env.step(0)
+        with pytest.raises(AttributeError):
+            env.step(0)
+    (episode,) = mcaprl.open(log_path).episodes
+    assert (episode.length, episode.reason) == (1, "interrupted")
