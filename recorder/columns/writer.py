@@ -173,7 +173,6 @@ class McapWriter(OutputFile):
         channel_id, size = int(rows["channel_id"][0]), rows.itemsize
         times = rows["log_time"].copy()
         first = self._summary.counts[channel_id]
-        self._summary.counts[channel_id] += len(rows)
         rows["sequence"] = np.arange(first, first + len(rows)).astype(np.uint32)
         rows["publish_time"] = times
         index = np.empty(len(rows), INDEX_ENTRY)
@@ -194,9 +193,10 @@ class McapWriter(OutputFile):
         entries: dict[int, list[int]] = {}
         counts = self._summary.counts
         for channel_id, time_ns, data in messages:
-            entries.setdefault(channel_id, []).extend((time_ns, len(records)))
-            records += message_record(channel_id, counts[channel_id] % 2**32, time_ns, data)
-            counts[channel_id] += 1
+            pairs = entries.setdefault(channel_id, [])
+            sequence = (counts[channel_id] + len(pairs) // 2) % 2**32
+            pairs += (time_ns, len(records))
+            records += message_record(channel_id, sequence, time_ns, data)
         times = [time_ns for _, time_ns, _ in messages]
         compress = self._compressors.mixed
         if len(records) > RARE_MESSAGE_BYTES * len(messages):
@@ -218,8 +218,6 @@ class McapWriter(OutputFile):
             records: Message records with sequence numbers. Their channels are already in the file.
             indexes: Arrays of `message_rows.INDEX_ENTRY` by channel id.
         """
-        for channel_id, index in indexes.items():
-            self._summary.counts[channel_id] += len(index)
         starts = [int(index["log_time"].min()) for index in indexes.values()]
         ends = [int(index["log_time"].max()) for index in indexes.values()]
         self._store(
@@ -237,9 +235,10 @@ class McapWriter(OutputFile):
             chunk: Index of the chunk. Its channels are already in this file, with the same ids.
             counts: Number of messages of the chunk by channel id.
         """
-        self._copy_chunk(view, chunk)
-        for channel_id, count in counts.items():
-            self._summary.counts[channel_id] += count
+        with HoldSignals():
+            self._copy_chunk(view, chunk)
+            for channel_id, count in counts.items():
+                self._summary.counts[channel_id] += count
 
     def close(self) -> None:
         """Write the summary, merge small chunks, and close the file. Closing twice is harmless."""
@@ -306,7 +305,12 @@ class McapWriter(OutputFile):
         times: tuple[int, int],
         compress: Callable[[Any], bytes],
     ) -> None:
-        self._write_chunk(records, indexes, times, compress(records), self._compressors.chunk_name)
+        data = compress(records)
+        # After an interruption, the file is closed, so the counts must match the chunks.
+        with HoldSignals():
+            self._write_chunk(records, indexes, times, data, self._compressors.chunk_name)
+            for channel_id, entries in indexes.items():
+                self._summary.counts[channel_id] += len(entries) // INDEX_ENTRY.itemsize
 
     def _write_top_level(self, record: TopLevelRecord) -> None:
         offset = self.position

@@ -250,7 +250,9 @@ class Display:
         self._messages.sort(key=itemgetter(0))
         # The static scene is written as a separate chunk, which is compressed at a higher level.
         static = self.shown.channels.get(SCENE_STATIC)
-        for alone in (True, False):
-            part = [message for message in self._messages if (message[0] == static) == alone]
-            self._log.sink.write_messages(part)
-        self._messages, self._bytes = [], 0
+        # A signal must not interrupt the writes, because some messages would be written twice.
+        with HoldSignals():
+            for alone in (True, False):
+                part = [message for message in self._messages if (message[0] == static) == alone]
+                self._log.sink.write_messages(part)
+            self._messages, self._bytes = [], 0
