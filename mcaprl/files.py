@@ -30,6 +30,8 @@ if sys.platform != "win32":
 _MAX_NAME_BYTES = 255
 _MAX_JSON_DEPTH = 100
 _DIGITS = re.compile(r"\d+")
+# `Path` turns the two slashes of a URL into one.
+_URL = re.compile(r"[a-z][a-z0-9+.-]+:/")
 _TAKEN = "{} is being written by another process; wait until it ends, or choose another path"
 
 
@@ -76,8 +78,10 @@ def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Ite
     If the folder is new and empty at the end, it is removed.
 
     Raises:
+        UsageError: The path is a URL.
         McaprlError: Another process is writing to the folder, or it cannot be created.
     """
+    _check_local(folder)
     descriptor, is_new = -1, not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -108,8 +112,10 @@ def check_target(path: Path, *, overwrite: bool) -> None:
     Raises:
         OutputExistsError: The file exists and `overwrite` is not set, or the path belongs to a
             symbolic link, folder, device or FIFO.
+        UsageError: The path is a URL.
         LogError: Another writer has locked the file.
     """
+    _check_local(path)
     try:
         mode = path.lstat().st_mode
     except OSError:
@@ -126,6 +132,16 @@ def check_target(path: Path, *, overwrite: bool) -> None:
         )
     with locked_file(path):
         pass
+
+
+def _check_local(path: Path) -> None:
+    """Raise UsageError if the path of an output is a URL."""
+    if _URL.match(str(path)):
+        url = str(path).replace(":/", "://", 1)
+        raise UsageError(
+            f"{url} is a URL, but outputs are local: choose a local path; record, convert and"
+            " train-online copy their logs with --upload URL"
+        )
 
 
 def check_writable(path: Path, error_type: type[McaprlError]) -> None:
@@ -203,6 +219,7 @@ def work_folder(path: Path, *, concurrent: bool = False) -> Iterator[Path]:
         LogError: Another process is writing the target, or a log in the folder cannot be written.
         OSError: The folder cannot be created.
     """
+    _check_local(path)
     folder = _work_path(path, f".{os.getpid()}.part" if concurrent else ".part")
     path.parent.mkdir(parents=True, exist_ok=True)
     if concurrent:
@@ -351,6 +368,7 @@ def _reason(path: Path, error: OSError) -> str:
 
 
 def _check_folder(path: Path, *, overwrite: bool) -> None:
+    _check_local(path)
     if path.is_symlink() or (path.exists() and not path.is_dir()):
         raise OutputExistsError(f"{path} is not a folder: choose another path")
     if path.name in ("", ".."):

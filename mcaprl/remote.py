@@ -20,7 +20,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, UsageError, import_extra
+from mcaprl.errors import LogError, OutputExistsError, UsageError, import_extra
 from mcaprl.files import waiting_lock
 
 CACHE_VARIABLE = "MCAPRL_CACHE"
@@ -310,18 +310,28 @@ def upload_all(paths: Sequence[Path], url: str) -> None:
         upload(path, f"{url.rstrip('/')}/{path.name}")
 
 
-def check_upload(url: str) -> None:
+def check_upload(url: str, *, overwrite: bool) -> None:
     """Check that a URL can be written to, before anything is recorded.
+
+    Args:
+        url: URL of a file or folder.
+        overwrite: Whether an existing file at the URL may be replaced.
 
     Raises:
         UsageError: The name is not a URL, or the protocol can only be read.
+        OutputExistsError: There is a file at the URL, and `overwrite` is not set.
+        LogError: The server cannot be reached.
         MissingExtraError: The package for the URL's protocol is not installed.
     """
     if not is_url(url):
         raise UsageError(f"{url} is not a URL, such as s3://bucket/lane.mcap")
     if url.startswith(("http://", "https://")):
         raise UsageError(f"{url}: this protocol can only be read")
-    system_of(url)
+    system, path = system_of(url)
+    with _Errors(f"cannot open {url}"):
+        exists = not overwrite and system.isfile(path)
+    if exists:
+        raise OutputExistsError(f"{url} exists: choose another URL, or pass --overwrite")
 
 
 def system_of(url: str) -> tuple[Any, str]:

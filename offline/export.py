@@ -96,7 +96,7 @@ def export_onnx(policy: object, path: Path, *, overwrite: bool = True) -> None:
         PolicyError: The policy is not from an offline run, or the file cannot be written.
     """
     if not isinstance(policy, Policy):
-        raise PolicyError(f"{getattr(policy, 'name', policy)} is not the policy of an offline run")
+        raise PolicyError(f"{getattr(policy, 'name', policy)} is not a policy of train-offline")
     for package in ("onnx", "onnxscript"):
         import_extra(package, "export")
     module = ExportedPolicy(policy).eval()

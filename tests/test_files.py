@@ -5,11 +5,19 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from mcaprl.errors import ReportError
-from mcaprl.files import replacing, write_atomically, write_json
+from mcaprl.errors import ReportError, UsageError
+from mcaprl.files import (
+    locked_folder,
+    replacing,
+    replacing_folder,
+    work_folder,
+    write_atomically,
+    write_json,
+)
 from mcaprl.problem import Problem
 
 
@@ -45,6 +53,17 @@ def test_json_has_null_where_a_number_is_not_finite(tmp_path: Path) -> None:
     write_json(tmp_path / "a.json", {"a": [math.nan, -math.inf, 1.5], 2: (True, None)})
     found = json.loads((tmp_path / "a.json").read_text(), parse_constant=pytest.fail)
     assert found == {"a": [None, None, 1.5], "2": [True, None]}
+
+
+@pytest.mark.parametrize("write", [work_folder, locked_folder, replacing, replacing_folder])
+def test_outputs_are_local(write: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with (
+        pytest.raises(UsageError, match=r"s3://bucket/log.mcap is a URL, but outputs are local"),
+        write(Path("s3://bucket/log.mcap")),
+    ):
+        pass
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_problem_is_one_line() -> None:

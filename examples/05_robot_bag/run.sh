@@ -7,6 +7,7 @@ set -eu
 here=$(dirname "$0")
 out=${1:-robot_bag}
 mkdir -p "$out"
+rm -rf "$out/runs"
 export OMP_NUM_THREADS=1
 
 mcaprl record lane --policy pilot --epsilon 0.1 --episodes 40 --seed 1 --out "$out/native.mcap" --overwrite

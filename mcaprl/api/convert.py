@@ -100,7 +100,7 @@ def convert(
     if out is not None and is_log:
         check_target(Path(out), overwrite=overwrite)
     if upload is not None:
-        check_upload(upload)
+        check_upload(upload, overwrite=overwrite)
         if out is None or (form is not None and not form.suffix):
             raise UsageError("upload copies one file: choose a file, not a folder, as the output")
     dataset, report = _read(source, mapping, source_format, trust_code)

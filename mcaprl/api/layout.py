@@ -13,6 +13,7 @@ from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.scene import DepthSource
 from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.recorder.viewer.log_layout import attached_layout
+from mcaprl.remote import is_url
 from mcaprl.sims import SIMS, make_sim
 
 
@@ -22,7 +23,7 @@ def layout(
     """Return the Foxglove layout of a log, or of the logs of a sim.
 
     Args:
-        source: Path of a log, short name of a sim, or Gymnasium id.
+        source: Path or URL of a log, short name of a sim, or Gymnasium id.
         out: JSON file to write; None to write nothing.
         overwrite: Whether an existing file is replaced.
 
@@ -39,8 +40,9 @@ def layout(
     if path is not None and path.exists() and not overwrite:
         raise OutputExistsError(f"{path} exists: choose another path, or pass --overwrite")
     name = str(source)
-    is_file = name not in SIMS and (Path(name).is_file() or name.endswith(".mcap"))
-    found = attached_layout(McapReader(Path(name))) if is_file else _layout_of_sim(name)
+    is_file = is_url(name) or Path(name).is_file() or name.endswith(".mcap")
+    is_log = name not in SIMS and is_file
+    found = attached_layout(McapReader(name)) if is_log else _layout_of_sim(name)
     if path is not None:
         write_json(path, found, ReportError)
     return found

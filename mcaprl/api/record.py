@@ -144,7 +144,7 @@ def record(
     elif envs == 1:
         check_log_name(request.out)
     if upload is not None:
-        check_upload(upload)
+        check_upload(upload, overwrite=overwrite or append)
     with progress(f"recording {sim}", episodes or steps) as advance:
 
         def on_episode(result: EpisodeResult) -> None:

@@ -307,7 +307,7 @@ def train_online(
     check_positive(live_speed=live_speed)
     check_port(port)
     if upload is not None:
-        check_upload(upload)
+        check_upload(upload, overwrite=resume)
         if record is None:
             raise UsageError("upload needs record: there is no log to copy")
     out = Path(out)

@@ -40,7 +40,7 @@ class LogSink(Datasink[LogFile | None]):  # type: ignore[misc]
         self._description, self._compression = description, compression
         self._versions = installed_versions()
         if self._url is not None:
-            check_upload(self._url)
+            check_upload(self._url, overwrite=True)
             return
         self._folder = Path(folder).absolute()
         if self._folder.is_file() or (self._folder.is_dir() and any(self._folder.glob("*.mcap"))):

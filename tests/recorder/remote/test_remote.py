@@ -18,7 +18,7 @@ import pytest
 
 import mcaprl
 from mcaprl.cli import run
-from mcaprl.errors import LogError, UsageError
+from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.remote import BLOCK_BYTES, CACHE_VARIABLE, RemoteFile, RemotePath, upload
 from tests.recorder.remote.range_server import RangeServer, range_server
@@ -314,9 +314,14 @@ def test_uploads_appear_when_complete(folder: Path, tmp_path: Path) -> None:
     upload(folder / "lane.mcap", url)
     assert (tmp_path / "there" / "lane.mcap").read_bytes() == (folder / "lane.mcap").read_bytes()
     assert [path.name for path in (tmp_path / "there").iterdir()] == ["lane.mcap"]
+    assert mcaprl.layout(url) == mcaprl.layout(folder / "lane.mcap")
     out = tmp_path / "out.mcap"
     mcaprl.record("lane", out, episodes=1, upload=f"file://{tmp_path}/there/new.mcap")
     assert (tmp_path / "there" / "new.mcap").read_bytes() == out.read_bytes()
+    with pytest.raises(OutputExistsError, match=r"new.mcap exists: choose another URL"):
+        mcaprl.record(
+            "lane", tmp_path / "x.mcap", upload=f"file://{tmp_path}/there/new.mcap", episodes=1
+        )
     with pytest.raises(UsageError, match="can only be read"):
         mcaprl.record("lane", tmp_path / "x.mcap", episodes=1, upload="https://host/x.mcap")
     assert not (tmp_path / "x.mcap").exists()
