@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -54,6 +55,18 @@ def _same_weights() -> None:
 def log_path(tmp_path: Path) -> Path:
     """Return the path of a test's log."""
     return tmp_path / "log.mcap"
+
+
+@pytest.fixture
+def python_sigint() -> Iterator[None]:
+    """Install Python's SIGINT handler.
+
+    A process that a shell starts in the background ignores SIGINT, and libraries that other tests
+    use replace the handler.
+    """
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.hookimpl(optionalhook=True)

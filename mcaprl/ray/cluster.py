@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import secrets
+import signal
 import socket
 import sys
+import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,6 +26,10 @@ _MIB = 1 << 20
 SMALL_STORE_BYTES: Final = 100 * _MIB
 # Ray listens on every network interface unless this variable is 0 before Ray is imported.
 _LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+# Signals whose handlers Ray Train and Ray Tune replace. Windows has no SIGUSR1.
+_REPLACED: Final = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGUSR1") if hasattr(signal, name)
+)
 _TOKENS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
@@ -93,6 +99,26 @@ def connect(
     else:
         _join(address)
     return True
+
+
+@contextmanager
+def restored_handlers() -> Iterator[None]:
+    """Restore the signal handlers that Ray Train and Ray Tune replace and do not restore.
+
+    Without this context, Ctrl-C does not interrupt this process after a run.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        # Ray, like this function, can set handlers only in the main thread.
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in _REPLACED}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            # A handler that was not installed from Python (None) cannot be restored.
+            if handler is not None:
+                signal.signal(number, handler)
 
 
 def cpus() -> int:

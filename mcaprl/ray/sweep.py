@@ -27,6 +27,7 @@ from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
 from mcaprl.offline.policy import read_policy
 from mcaprl.offline.training.train import train
 from mcaprl.progress import Advance, TrainingProgress
+from mcaprl.ray.cluster import restored_handlers
 from mcaprl.ray.sweep_file import SweepPlan, Trial
 from mcaprl.ray.workers import MOST_DEATHS, check_machine, check_machines
 from mcaprl.recorder.dataset.log_reader import LogReader
@@ -196,7 +197,8 @@ def _run(tune: Any, job: _Job, folder: Path, workers: int | None, advance: Advan
             failure_config=tune.FailureConfig(max_failures=MOST_DEATHS),
         ),
     )
-    found = tuner.fit()
+    with restored_handlers():
+        found = tuner.fit()
     for error in found.errors:
         raise TrainingError(f"{job.out}: {str(error).strip().splitlines()[-1]}")
 

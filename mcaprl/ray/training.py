@@ -37,7 +37,7 @@ from mcaprl.offline.training.train import (
 from mcaprl.offline.training.watch import choose_held_out, horizon_warning
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.ray.board import Board
-from mcaprl.ray.cluster import cpus
+from mcaprl.ray.cluster import cpus, restored_handlers
 from mcaprl.ray.workers import MOST_DEATHS, check_machine, check_machines
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader
@@ -178,7 +178,8 @@ def _fit(job: _Job, workers: int) -> None:
             ),
         )
         try:
-            fitted.fit()
+            with restored_handlers():
+                fitted.fit()
         except train.TrainingFailedError as error:
             _, ours = ray.get(job.board.outcome.remote())
             if ours is None:

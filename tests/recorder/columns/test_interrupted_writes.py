@@ -17,6 +17,7 @@ from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.writer import McapWriter
 from mcaprl.sims import make_sim
 
+pytestmark = pytest.mark.usefixtures("python_sigint")
 START_NS = 10**18
 
 

@@ -11,7 +11,6 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import closing
 from io import BytesIO, FileIO
 from pathlib import Path
@@ -444,15 +443,7 @@ def test_the_working_folder_may_change_while_recording(
     assert len(mcaprl.open(log_path).episodes) == 1
 
 
-@pytest.fixture
-def _hears_sigint() -> Iterator[None]:
-    """Install Python's SIGINT handler, because background processes of a shell ignore SIGINT."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("_hears_sigint")
+@pytest.mark.usefixtures("python_sigint")
 def test_interrupts_at_any_moment_leave_whole_episodes(log_path: Path) -> None:
     """Interrupt a hundred recordings, each at a different time."""
     main = threading.get_ident()
@@ -553,6 +544,7 @@ def test_killed_recorder_loses_only_the_open_episode(log_path: Path) -> None:
     assert math.isclose(data.episodes[0].total_reward, data.episodes[0].length)
 
 
+@pytest.mark.usefixtures("python_sigint")
 def test_an_interruption_while_a_log_is_created_leaves_a_log_without_episodes(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -562,35 +554,27 @@ def test_an_interruption_while_a_log_is_created_leaves_a_log_without_episodes(
         return file
 
     monkeypatch.setattr("mcaprl.recorder.columns.writer.create", create_and_interrupt)
-    usual = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            mcaprl.RecordMcap(scripted(ONE), log_path)
-    finally:
-        signal.signal(signal.SIGINT, usual)
+    with pytest.raises(KeyboardInterrupt):
+        mcaprl.RecordMcap(scripted(ONE), log_path)
     assert McapReader(log_path).complete
     with pytest.raises(NoEpisodesError):
         mcaprl.open(log_path)
 
 
+@pytest.mark.usefixtures("python_sigint")
 def test_a_deferred_signal_keeps_no_references() -> None:
     """A pending signal keeps no references to buffers.
 
     A signal arrives while a buffer is in use. The buffer is resized before the signal is handled.
     """
     buffer = BytesIO(b"12345678")
-    # If a shell starts pytest in the background, pytest ignores Ctrl-C.
-    usual = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def look() -> int:
         view = buffer.getbuffer()
         signal.raise_signal(signal.SIGINT)
         return len(view)
 
-    try:
-        with pytest.raises(KeyboardInterrupt), HoldSignals():  # noqa: PT012
-            assert look() == 8
-            buffer.truncate(0)
-    finally:
-        signal.signal(signal.SIGINT, usual)
+    with pytest.raises(KeyboardInterrupt), HoldSignals():  # noqa: PT012
+        assert look() == 8
+        buffer.truncate(0)
     assert buffer.getvalue() == b""
