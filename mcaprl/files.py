@@ -387,13 +387,9 @@ def _check_contents(path: Path, replacement: Path) -> None:
             its numbers.
         LogError: Another writer has locked a file.
     """
-    new, old = (
-        {entry: _DIGITS.sub("0", str(entry.relative_to(folder))) for entry in _files_in(folder)}
-        for folder in (replacement, path)
-    )
-    names = set(new.values())
-    for entry, name in sorted(old.items()):
-        if name not in names:
+    names = {_without_numbers(entry, replacement) for entry in _files_in(replacement)}
+    for entry in sorted(_files_in(path)):
+        if _without_numbers(entry, path) not in names:
             raise OutputExistsError(
                 f"{path} has other files ({entry.relative_to(path)}), which would be deleted:"
                 " choose another folder"
@@ -403,6 +399,11 @@ def _check_contents(path: Path, replacement: Path) -> None:
 
 def _files_in(folder: Path) -> list[Path]:
     return [entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir()]
+
+
+def _without_numbers(entry: Path, folder: Path) -> str:
+    """Return the path of an entry in a folder, with 0 for each number."""
+    return _DIGITS.sub("0", str(entry.relative_to(folder)))
 
 
 def _move(source: Path, path: Path, *, overwrite: bool) -> None:

@@ -331,7 +331,9 @@ def check_upload(url: str, *, overwrite: bool) -> None:
     with _Errors(f"cannot open {url}"):
         exists = not overwrite and system.isfile(path)
     if exists:
-        raise OutputExistsError(f"{url} exists: choose another URL, or pass --overwrite")
+        raise OutputExistsError(
+            f"{url} exists: choose another URL, or pass --overwrite to record or convert"
+        )
 
 
 def system_of(url: str) -> tuple[Any, str]:

@@ -187,7 +187,7 @@ def reason_of(chosen: str, ratings: Mapping[str, Rating], traits: LogTraits) -> 
 def confidence_of(chosen: str, ratings: Mapping[str, Rating]) -> str:
     """Return the confidence in a choice, in words."""
     if chosen not in ratings:
-        return "There is no evidence: no candidate was evaluated."
+        return "Unknown, because no candidate was evaluated."
     chance = ratings[chosen].best_chance
     return (
         f"In {chance:.0%} of the resamplings of episodes, networks and models, {chosen}"

@@ -244,7 +244,7 @@ class _Race:
         count = min(len(self._eligible), self._config.survivors)
         total = len(trying) * short + count * (full - short)
         bar = _Bar(self._progress, total)
-        self._warn_of_short_horizons(trying)
+        self._warn_about_short_horizons(trying)
         stages = self._read_stages()
         for k, candidate in enumerate(trying):
             share_s = self._clock.left_s(SHARES[0]) / (len(trying) - k)
@@ -281,7 +281,7 @@ class _Race:
         choice.write(self._out)
         return choice, self._summaries(choice.chosen)
 
-    def _warn_of_short_horizons(self, candidates: Sequence[Candidate]) -> None:
+    def _warn_about_short_horizons(self, candidates: Sequence[Candidate]) -> None:
         """Warn once about all candidates that have the same short horizon."""
         found: dict[str, list[str]] = {}
         for one in candidates:
@@ -342,7 +342,7 @@ class _Race:
         """Start or resume a run. Return when it ends, or when the callback pauses it."""
         folder.parent.mkdir(exist_ok=True)
         with suppress(_Pause), warnings.catch_warnings():
-            # `_warn_of_short_horizons` names the candidates, once for both stages.
+            # `_warn_about_short_horizons` names the candidates, once for both stages.
             warnings.filterwarnings("ignore", SHORT_HORIZON)
             train(
                 self._dataset,

@@ -274,7 +274,7 @@ def _is_missing(side: Any) -> NDArray[np.bool_]:
 
 
 def _combined(sides: list[Any], is_or: bool) -> NDArray[np.float64]:
-    """Return the conjunction or disjunction of numbers, NaN where missing values decide it."""
+    """Return the conjunction or disjunction of numbers, NaN where it depends on missing values."""
     numbers = np.stack(np.broadcast_arrays(*sides))
     is_missing = np.isnan(numbers)
     decides = ~is_missing & ((numbers != 0) == is_or)

@@ -204,7 +204,7 @@ def _rate(topics: Iterable[_Topic]) -> float:
 
 
 def _rate_of(times_ns: NDArray[np.int64]) -> float:
-    """Return messages per second by the median interval; 0 if there is no interval."""
+    """Return messages per second by the median interval; 0 for fewer than two times."""
     intervals_ns = np.diff(times_ns)
     intervals_ns = intervals_ns[intervals_ns > 0]
     return float(NS_PER_S / np.median(intervals_ns)) if len(intervals_ns) else 0.0

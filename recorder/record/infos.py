@@ -90,8 +90,8 @@ def info_of(infos: Mapping[str, Any], number: int, count: int) -> dict[str, Any]
     """Return the info of one of `count` environments from the infos of a vector environment.
 
     Gymnasium stores the values of all environments in one array per info. The mask `_name` selects
-    the environments that returned the info `name`. A value of another length, such as a matrix, is
-    the info of each environment.
+    the environments that returned the info `name`. A value with another length is the info of
+    each environment.
     """
     found: dict[str, Any] = {}
     for name, value in infos.items():

@@ -9,6 +9,7 @@ import gymnasium as gym
 from mcaprl.errors import UnknownNameError
 from mcaprl.sims import SIMS
 from mcaprl.sims.evaluation.rollout import Policy
+from mcaprl.sims.spec import SimSpec
 
 
 def make_pilot(env: gym.Env[Any, Any]) -> Policy:
@@ -17,16 +18,21 @@ def make_pilot(env: gym.Env[Any, Any]) -> Policy:
     Raises:
         UnknownNameError: The environment has no pilot.
     """
-    spec = SIMS.find(_id_of(env))
-    if spec is None or spec.pilot is None:
+    spec = _spec_of(env)
+    if spec is None:
         raise UnknownNameError("environment with a pilot", _id_of(env), SIMS)
     return cast(Policy, spec.make_pilot(env.unwrapped))
 
 
 def has_pilot(env: gym.Env[Any, Any]) -> bool:
     """Return whether the sim in `env`, which may be wrapped, has a pilot."""
+    return _spec_of(env) is not None
+
+
+def _spec_of(env: gym.Env[Any, Any]) -> SimSpec | None:
+    """Return the sim in `env` if it has a pilot."""
     spec = SIMS.find(_id_of(env))
-    return spec is not None and spec.pilot is not None
+    return spec if spec is not None and spec.pilot is not None else None
 
 
 def _id_of(env: gym.Env[Any, Any]) -> str:

@@ -18,14 +18,7 @@ from mcaprl.recorder.record.wrapper import RecordMcap
 def log(tmp_path: Path) -> Path:
     """Write a log with metadata of another program, an attachment, and uncompressed chunks."""
     plain, extra, path = tmp_path / "plain.mcap", tmp_path / "extra.mcap", tmp_path / "log.mcap"
-    env = RecordMcap(gym.make("CartPole-v1", max_episode_steps=5), plain, compression="none")
-    for seed in range(3):
-        env.reset(seed=seed)
-        ended = False
-        while not ended:
-            *_, terminated, truncated, _ = env.step(0)
-            ended = terminated or truncated
-    env.close()
+    mcaprl.record("CartPole-v1", plain, policy="random", episodes=3, compression="none")
     with extra.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="ros2")
