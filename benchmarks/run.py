@@ -73,7 +73,7 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
   messages of each episode take most of the time. Ordinary environments with long episodes reach
   the goal.
 - A batch of 1,024 cars: three fifths of the time is the compiled step. Half of that is the motion,
-  which has three divisions and three square roots in each of five substeps. The infos take a
+  which has a division and three square roots in each of five substeps. The infos take a
   seventh, half of it the array of reasons, and starting the cars whose episodes ended an eighth.
   The rest are about 20 calls of NumPy on arrays of 1,024 values.
 - Depth images: drawing takes half of the time, downsampling two fifths, and encoding a twelfth.

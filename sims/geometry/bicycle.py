@@ -59,7 +59,7 @@ def roll_pose(
     cos, sin = motion.heading
     slip_cosine = math.sqrt(1.0 - slip_sine * slip_sine)
     distance_m = motion.speed_m_s * duration_s
-    turn_rad = distance_m * slip_sine / (0.5 * wheelbase_m)
+    turn_rad = distance_m * slip_sine * (2.0 / wheelbase_m)
     moved = Motion(
         motion.x_m + distance_m * (cos * slip_cosine - sin * slip_sine),
         motion.y_m + distance_m * (sin * slip_cosine + cos * slip_sine),
@@ -71,28 +71,33 @@ def roll_pose(
 
 
 @inlined
-def slip_of(steering_rad: float) -> float:
-    """Return sin(beta) for a steering angle from -45 to 45 degrees.
+def slip_of(
+    steering_rad: float, speed_m_s: float, most_lateral_m_s2: float, wheelbase_m: float
+) -> float:
+    """Return sin(beta) for a steering angle, limited by a maximum lateral acceleration.
 
-    tan(beta) = tan(steering) / 2, so sin(beta) = sin(steering) / sqrt(4 - 3 sin^2(steering)).
+    tan(beta) = tan(steering) / 2, so sin(beta) = sin(steering) / sqrt(4 - 3 sin^2(steering)). Let l
+    be half the wheelbase and v the speed. The radius of the turn is l / sin(beta), so the lateral
+    acceleration is v^2 sin(beta) / l. It limits sin(beta) to l / v^2 times the maximum.
+
+    Args:
+        steering_rad: Steering angle, from -45 to 45 degrees.
+        speed_m_s: Speed v; at speed 0, there is no limit.
+        most_lateral_m_s2: Maximum lateral acceleration.
+        wheelbase_m: Distance between the axles.
     """
     steering_sine = sine(steering_rad)
-    return steering_sine / math.sqrt(4.0 - 3.0 * steering_sine * steering_sine)
+    root = math.sqrt(4.0 - 3.0 * steering_sine * steering_sine)
+    limit, square = 0.5 * wheelbase_m * most_lateral_m_s2, speed_m_s * speed_m_s
+    # The quotients are compared by products, so that there is only one division, which takes as
+    # long as many products.
+    is_limited = abs(steering_sine) * square > limit * root
+    size = limit if is_limited else abs(steering_sine)
+    slip_size = size / (square if is_limited else root)
+    return -slip_size if steering_sine < 0.0 else slip_size
 
 
 @inlined
 def steering_of(slip_sine: float) -> float:
-    """Return the steering angle in radians for sin(beta). This is the inverse of `slip_of`."""
+    """Return the steering angle in radians for sin(beta): the inverse of `slip_of` at speed 0."""
     return math.atan2(2.0 * slip_sine, math.sqrt(1.0 - slip_sine * slip_sine))
-
-
-@inlined
-def slip_for_lateral(lateral_m_s2: float, speed_m_s: float, wheelbase_m: float) -> float:
-    """Return sin(beta) for a turn with the given lateral acceleration and speed.
-
-    Let l be half the wheelbase and v the speed. The radius of the turn is l / sin(beta), so the
-    lateral acceleration is v^2 sin(beta) / l. At speeds too low for
-    the given acceleration, the result is 1, the maximum of sin(beta).
-    """
-    least = 0.5 * wheelbase_m * lateral_m_s2
-    return least / max(speed_m_s * speed_m_s, least)

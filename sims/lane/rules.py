@@ -13,7 +13,6 @@ from mcaprl.sims.geometry.bicycle import (
     Motion,
     moving,
     roll,
-    slip_for_lateral,
     slip_of,
     steering_of,
 )
@@ -128,8 +127,8 @@ def slip(steering: float, speed_m_s: float) -> float:
         ),
         STEERING_CURVE[1] - _FALL_3 * (speed_m_s - STEERING_CURVE_M_S[1]),
     )
-    limit = slip_for_lateral(MAX_LATERAL_M_S2, speed_m_s, WHEELBASE_M)
-    return min(max(slip_of(steering * MAX_STEERING_RAD * share), -limit), limit)
+    steering_rad = steering * MAX_STEERING_RAD * share
+    return slip_of(steering_rad, speed_m_s, MAX_LATERAL_M_S2, WHEELBASE_M)
 
 
 @compiled

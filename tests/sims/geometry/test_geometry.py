@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from mcaprl.sims.geometry.bicycle import moving, roll, slip_for_lateral, slip_of, steering_of
+from mcaprl.sims.geometry.bicycle import moving, roll, slip_of, steering_of
 from mcaprl.sims.geometry.paths import (
     Heading,
     Projection,
@@ -173,6 +173,11 @@ def test_pavement_has_the_streets_area() -> None:
     assert area == pytest.approx(7 * (896 + 7 * 7) - 4 * 49 - 2 * 2 * 49)
 
 
+def free_slip_of(steering_rad: float) -> float:
+    """Return the sine of the slip angle without a limit."""
+    return slip_of(steering_rad, 0.0, 9.0, 2.7)
+
+
 def test_straight_ahead_by_hand() -> None:
     moved = roll(moving(1.0, 2.0, math.pi / 2, 4.0), 0.0, 2.0, 2.7, 0.5)
     assert moved[:4] == pytest.approx((1.0, 4.0, math.pi / 2, 5.0))
@@ -186,7 +191,7 @@ def test_a_constant_steering_drives_a_circle() -> None:
     motion = moving(0.0, 0.0, 0.0, 5.0)
     points = []
     for _ in range(4000):
-        motion = roll(motion, slip_of(angle_rad), 0.0, wheelbase_m, 0.001)
+        motion = roll(motion, free_slip_of(angle_rad), 0.0, wheelbase_m, 0.001)
         points.append((motion.x_m, motion.y_m))
     center = (-radius_m * math.sin(slip_rad), radius_m * math.cos(slip_rad))
     np.testing.assert_allclose(
@@ -195,24 +200,29 @@ def test_a_constant_steering_drives_a_circle() -> None:
     assert motion.yaw_rad == pytest.approx(4.0 * 5.0 / radius_m)
 
 
-@given(st.floats(4.0, 30.0), st.floats(0.5, 9.0))
-def test_the_slip_for_a_lateral_acceleration_causes_it(
-    speed_m_s: float, lateral_m_s2: float
+@given(st.sampled_from([-0.7, 0.7]), st.floats(8.0, 30.0), st.floats(0.5, 9.0))
+def test_the_limit_of_the_slip_is_the_lateral_acceleration(
+    steering_rad: float, speed_m_s: float, lateral_m_s2: float
 ) -> None:
-    slip_sine = slip_for_lateral(lateral_m_s2, speed_m_s, 2.7)
+    slip_sine = slip_of(steering_rad, speed_m_s, lateral_m_s2, 2.7)
     moved = roll(moving(0.0, 0.0, 0.0, speed_m_s), slip_sine, 0.0, 2.7, 1e-3)
-    assert moved.yaw_rad / 1e-3 * speed_m_s == pytest.approx(lateral_m_s2)
+    expected_m_s2 = math.copysign(lateral_m_s2, steering_rad)
+    assert moved.yaw_rad / 1e-3 * speed_m_s == pytest.approx(expected_m_s2)
 
 
-def test_a_slow_car_may_slip_freely() -> None:
-    assert slip_for_lateral(9.0, 1.0, 2.7) == 1.0
-    assert steering_of(1.0) == pytest.approx(math.pi / 2)
+@given(st.floats(-math.pi / 4, math.pi / 4), st.floats(0.0, 40.0), st.floats(0.5, 9.0))
+def test_the_slip_is_that_of_the_steering_or_that_of_the_limit(
+    steering_rad: float, speed_m_s: float, lateral_m_s2: float
+) -> None:
+    free = math.sin(math.atan(math.tan(steering_rad) / 2))
+    limit = 2.7 / 2 * lateral_m_s2 / max(speed_m_s**2, 1e-9)
+    expected = min(max(free, -limit), limit)
+    assert slip_of(steering_rad, speed_m_s, lateral_m_s2, 2.7) == pytest.approx(expected)
 
 
 @given(st.floats(-math.pi / 4, math.pi / 4))
 def test_slip_and_steering_are_inverse(steering_rad: float) -> None:
-    assert slip_of(steering_rad) == pytest.approx(math.sin(math.atan(math.tan(steering_rad) / 2)))
-    assert steering_of(slip_of(steering_rad)) == pytest.approx(steering_rad)
+    assert steering_of(free_slip_of(steering_rad)) == pytest.approx(steering_rad)
 
 
 @given(st.floats(-7, 7))
