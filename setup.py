@@ -1,4 +1,4 @@
-"""Make the sdist reproducible. All other settings of the build are in pyproject.toml."""
+"""Build the C extension, and a reproducible sdist. pyproject.toml has all other settings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import tarfile
 from pathlib import Path
 
-from setuptools import setup
+from setuptools import Extension, setup
 from setuptools.command.sdist import sdist
 
 
@@ -40,4 +40,19 @@ class ReproducibleSdist(sdist):
         return str(path)
 
 
-setup(cmdclass={"sdist": ReproducibleSdist})
+NATIVE = Extension(
+    "mcaprl.recorder.columns._native",
+    ["recorder/columns/_native.c"],
+    # Debug information contains the path of the build.
+    extra_compile_args=["-O3", "-g0"] if os.name == "posix" else [],
+    py_limited_api=True,
+    # Without a C compiler, NumPy does the same in more time.
+    optional=True,
+)
+
+setup(
+    ext_modules=[NATIVE],
+    cmdclass={"sdist": ReproducibleSdist},
+    # The module works with all versions of Python from 3.11 on.
+    options={"bdist_wheel": {"py_limited_api": "cp311"}},
+)

@@ -8,6 +8,7 @@ import zipfile
 from pathlib import Path
 
 METADATA = {"METADATA", "RECORD", "WHEEL", "entry_points.txt", "top_level.txt"}
+EXTENSION = "mcaprl/recorder/columns/_native.abi3.so"
 NEEDED = {"CHANGELOG.md", "CITATION.cff", "LICENSE", "README.md", "SECURITY.md", "pyproject.toml"}
 
 
@@ -20,7 +21,7 @@ def main(first: Path, second: Path, source: Path) -> None:
         if (first / name).read_bytes() != (second / name).read_bytes():
             sys.exit(f"{name} is not reproducible: two builds differ")
     (wheel,) = first.glob("*.whl")
-    expected = {path.relative_to(source).as_posix() for path in modules(source)}
+    expected = {path.relative_to(source).as_posix() for path in modules(source)} | {EXTENSION}
     if stray := files_of_wheel(wheel) ^ expected:
         sys.exit(f"{wheel.name} and the packages differ in: {', '.join(sorted(stray))}")
     (sdist,) = first.glob("*.tar.gz")
@@ -42,14 +43,14 @@ def modules(source: Path) -> list[Path]:
         path
         for root in roots
         for path in root.rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts and not is_source_of_vendored(path)
+        if path.is_file() and "__pycache__" not in path.parts and not is_source(path)
     )
 
 
-def is_source_of_vendored(path: Path) -> bool:
-    """Return whether a file is only an input for bundling the libraries of the browser page."""
+def is_source(path: Path) -> bool:
+    """Return whether a file is only an input of a build: C code, or libraries of the page."""
     names = ("libraries.min.css", "libraries.min.js", "LICENSES.txt")
-    return "vendor" in path.parts and path.name not in names
+    return path.suffix == ".c" or ("vendor" in path.parts and path.name not in names)
 
 
 def files_of_wheel(wheel: Path) -> set[str]:

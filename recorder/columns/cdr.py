@@ -14,7 +14,7 @@ elements. Up to three bytes of padding may follow.
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Literal
@@ -93,6 +93,24 @@ class Layout:
             end = start + dtype.itemsize
         values = (np.array(value, fields[name][0]) for name, value in self.constants.items())
         return struct.Struct(code), tuple(value.tobytes() for value in values)
+
+    @cached_property
+    def constant_bytes(self) -> list[tuple[int, bytes]]:
+        """Offset in the message, and bytes, of each constant."""
+        fields: Any = self.dtype.fields
+        places = (fields[name][1] for name in self.constants)
+        return list(zip(places, self._packed[1], strict=True))
+
+    def places_of(self, columns: Mapping[str, NDArray[Any]]) -> list[int] | None:
+        """Return the offset of each column's field; None if a field is converted when copied."""
+        fields: Any = self.dtype.fields
+        places = []
+        for name, column in columns.items():
+            dtype, place = fields[name][:2]
+            if dtype.base != column.dtype or dtype.shape != column.shape[1:]:
+                return None
+            places.append(place)
+        return places
 
     def matching(self, payloads: NDArray[Any]) -> NDArray[np.bool_]:
         """Return a mask of the messages that have this layout."""

@@ -19,10 +19,17 @@ from mcaprl.recorder.columns.message_rows import (
     are_messages,
     as_items,
     gather,
+    message_head,
     record_dtype,
 )
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import RECORD_HEADER
+
+try:
+    from mcaprl.recorder.columns._native import copy_fields as copy_fields
+except ImportError:
+    # The package was installed without a C compiler. NumPy does the same in more time.
+    copy_fields = None  # type: ignore[assignment]
 
 # If the messages of a chunk have more different lengths than this, they are decoded one by one.
 _MAX_LENGTHS = 16
@@ -144,6 +151,8 @@ class Decoder:
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows
     ) -> bool:
         """If all messages share one layout, copy them and return True; else return False."""
+        if self._copy(columns, records, index, rows):
+            return True
         found = self.alike(records, index, columns)
         if found is None:
             return False
@@ -159,6 +168,22 @@ class Decoder:
             else:
                 _put(column, rows, found[name])
         return True
+
+    def _copy(self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows) -> bool:
+        """Check and copy the messages by one compiled call; return whether this was possible."""
+        if copy_fields is None or not isinstance(rows, slice):
+            return False
+        layout = self.type.known_layout(self._length(records, index), columns)
+        places = None if layout is None else layout.places_of(columns)
+        if layout is None or places is None:
+            return False
+        header = MESSAGE_HEADER.itemsize
+        size = header + layout.dtype.itemsize
+        expected = [(0, message_head(self.channel.id, size))]
+        expected += [(header + place, value) for place, value in layout.constant_bytes]
+        parts = zip(places, columns.values(), strict=True)
+        targets = [(header + place, column[rows]) for place, column in parts]
+        return copy_fields(records, index, size, expected, targets)
 
     def alike(
         self, records: memoryview, index: NDArray[Any], wanted: Collection[str]

@@ -64,10 +64,17 @@ def message_record(channel_id: int, sequence: int, time_ns: int, data: bytes) ->
     return head + data
 
 
+@lru_cache(maxsize=64)
+def message_head(channel_id: int, size: int) -> bytes:
+    """Return the first bytes of a channel's Message records of `size` bytes."""
+    head: bytes = _HEAD.pack(Opcode.MESSAGE, size - RECORD_HEADER_BYTES, channel_id)
+    return head
+
+
 def are_messages(rows: NDArray[Any], channel_id: int) -> bool:
     """Return whether all rows are messages of this channel and have the length of the dtype."""
     size = rows.dtype.itemsize
-    head = _HEAD.pack(Opcode.MESSAGE, size - RECORD_HEADER_BYTES, channel_id)
+    head = message_head(channel_id, size)
     words, expected = rows.view(_words(size)), np.frombuffer(head, _words(_HEAD.size))[0]
     return all(bool((words[name] == expected[name]).all()) for name in ("front", "back"))
 

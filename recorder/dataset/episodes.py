@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,33 +68,37 @@ def episode_lengths(columns: Columns, where: object) -> NDArray[np.int64]:
     if not len(finals):
         return np.empty(0, np.int64)
     read = int(finals[-1]) + 1
-    steps, episodes = columns["step"][:read], columns["episode"][:read]
-    # After a final record, a new episode begins. After any other record, `step` increases by 1.
-    begins = np.concatenate([[0], finals[:-1] + 1])
-    breaks = np.concatenate([_breaks(steps, 1), _breaks(episodes, 0)])
-    wrong = [begins[steps[begins] != 0], breaks[~final[breaks]] + 1]
-    if "terminated" in columns:
-        # The end flags are set on the last transition, which precedes the final record.
-        ends = np.flatnonzero(columns["terminated"][: read - 1] | columns["truncated"][: read - 1])
-        wrong.append(ends[~final[ends + 1]])
-    rows = np.concatenate(wrong)
-    if len(rows):
-        row = int(rows.min())
+    row = _first_wrong(columns, final[:read])
+    if row is not None:
+        episode, step = columns["episode"][row], columns["step"][row]
         raise CorruptLogError(
-            f"{where}: record {row} of {STEP_TOPIC} (episode {episodes[row]}, step {steps[row]}) is"
-            " out of order: records are missing or duplicated, or an episode continues after its"
-            " end"
+            f"{where}: record {row} of {STEP_TOPIC} (episode {episode}, step {step}) is out of"
+            " order: records are missing or duplicated, or an episode continues after its end"
         )
-    return np.diff(finals, prepend=-1) - 1
+    lengths = finals.copy()
+    lengths[1:] -= finals[:-1] + 1
+    return lengths
 
 
-def _breaks(column: NDArray[Any], by: int) -> NDArray[np.int64]:
-    """Return the rows k where `column[k + 1] - column[k]` differs from `by`."""
-    found = []
-    for start in range(0, len(column) - 1, _BLOCK_ROWS):
-        block = column[start : start + _BLOCK_ROWS + 1]
-        found.append(start + np.flatnonzero(block[1:] - block[:-1] != by))
-    return np.concatenate(found) if found else np.empty(0, np.int64)
+def _first_wrong(columns: Columns, final: NDArray[np.bool_]) -> int | None:
+    """Return the first row that does not fit the row before or after it; None if all fit."""
+    steps, episodes = columns["step"], columns["episode"]
+    if steps[0] != 0:
+        return 0
+    for start in range(0, len(final) - 1, _BLOCK_ROWS):
+        # Pairs of successive rows.
+        before = slice(start, min(start + _BLOCK_ROWS, len(final) - 1))
+        after = slice(before.start + 1, before.stop + 1)
+        # After a final record, a new episode begins. After any other record, `step` increases by 1.
+        continues = (steps[after] - steps[before] == 1) & (episodes[after] == episodes[before])
+        wrong = np.flatnonzero(~np.where(final[before], steps[after] == 0, continues)) + 1
+        if "terminated" in columns:
+            # The end flags are set on the last transition, which precedes the final record.
+            has_ended = (columns["terminated"][before] | columns["truncated"][before]).astype(bool)
+            wrong = np.concatenate([wrong, np.flatnonzero(has_ended & ~final[after])])
+        if len(wrong):
+            return start + int(wrong.min())
+    return None
 
 
 class EpisodeTopic:
@@ -124,7 +127,9 @@ class EpisodeTopic:
             return []
         fields, rows = EpisodeSummary._fields, None
         if len(ends) < len(self._topic) // 2:
-            rows = np.flatnonzero(np.isin(self._columns["end_time_ns"], ends))
+            # `np.isin` takes longer than everything else here if there are few episodes.
+            recorded, ends = self._columns["end_time_ns"], np.sort(ends)
+            rows = np.flatnonzero(ends[np.searchsorted(ends[:-1], recorded)] == recorded)
         if len(self._topic) > _FEW_EPISODES:
             columns = self._topic.read(self._fields, rows)
         else:

@@ -89,7 +89,7 @@ def slip_of(
     steering_sine = sine(steering_rad)
     root = math.sqrt(4.0 - 3.0 * steering_sine * steering_sine)
     limit, square = 0.5 * wheelbase_m * most_lateral_m_s2, speed_m_s * speed_m_s
-    # The quotients are compared by products, so that there is only one division, which takes as
+    # The fractions are compared by products, so that there is only one division, which takes as
     # long as many products.
     is_limited = abs(steering_sine) * square > limit * root
     size = limit if is_limited else abs(steering_sine)

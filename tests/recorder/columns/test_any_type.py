@@ -21,6 +21,7 @@ from mcaprl.recorder.columns.definitions import TIME_TYPES
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.topic import Topic
 
+pytestmark = pytest.mark.usefixtures("each_copy")
 NAME = "demo_msgs/msg/Outer"
 SCALARS = ("float64", "int64", "uint32", "float32", "int16", "uint8", "bool", "string")
 TIMES = ("builtin_interfaces/Time", "builtin_interfaces/Duration")

@@ -9,6 +9,7 @@ import pytest
 from tests.support.damage.fuzz_target import try_bytes, write_seeds
 from tests.support.paths import FUZZ_CORPUS
 
+pytestmark = pytest.mark.usefixtures("each_copy")
 CORPUS = sorted((FUZZ_CORPUS).iterdir())
 
 

@@ -16,6 +16,7 @@ from mcaprl.errors import UnknownNameError
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.topic import Topic
 
+pytestmark = pytest.mark.usefixtures("each_copy")
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 START_NS = 1_700_000_000 * 10**9
 COUNT = 40
