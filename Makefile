@@ -9,15 +9,16 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constrain
 # CI also runs the tests that take minutes.
 QUICK := $(if $(filter true,$(CI)),,-m "not slow and not long")
 # A change of these files reinstalls the environments.
-SETTINGS := pyproject.toml constraints.txt
+SETTINGS := pyproject.toml constraints.txt setup.py recorder/columns/_native.c
 
-.PHONY: help demo test faults fuzz check bench bench-learning sim-grid docs docs-test vendor wheel clean
+.PHONY: help demo test faults fuzz sanitize check bench bench-learning sim-grid docs docs-test vendor wheel clean
 
 help:
 	@echo "make demo             record a car, train on its log offline, evaluate, and write the replay"
 	@echo "make test             run the tests; with CI=true, also those that take minutes"
 	@echo "make faults           run the fault tests at full size: kills, damaged files, failed writes"
 	@echo "make fuzz             fuzz the reader for ten minutes"
+	@echo "make sanitize         test the C code with AddressSanitizer and UndefinedBehaviorSanitizer (needs gcc)"
 	@echo "make check            check format, lint, words, types and import contracts"
 	@echo "make bench            measure speed relative to other libraries"
 	@echo "make bench-learning   measure training and off-policy estimates relative to d3rlpy, SB3 and SCOPE-RL"
@@ -48,6 +49,11 @@ faults: $(VENV)/.dev
 fuzz: $(VENV)/.fuzz
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.support.damage.fuzz_reader $(VENV)/fuzz \
 	  -max_total_time=600 -max_len=60000 -timeout=20 -rss_limit_mb=2048
+
+sanitize: $(VENV)/.dev
+	CFLAGS="-fsanitize=address,undefined -fno-sanitize-recover" $(PIP) --no-deps -e .
+	LD_PRELOAD="$$(cc -print-file-name=libasan.so) $$(cc -print-file-name=libubsan.so)" ASAN_OPTIONS=detect_leaks=0 \
+	  OMP_NUM_THREADS=1 $(BIN)/pytest -q tests/recorder/columns; code=$$?; $(PIP) --no-deps -e . && exit $$code
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .

@@ -43,35 +43,37 @@ the previous chunk; and the minimum of any reader, which maps the file, decompre
 the CRCs. A reader also copies the columns into new memory; the rows `memcpy of ...`
 measure this copy.
 
-The ratios depend on the machine, too. On another machine with slower memory, rerun's reader took
-4.4 times our time instead of 5.7 for the log of vectors, and mcap's 10 times instead of 13 for a
-single episode.
+The ratios depend on the machine, too. The tables of logs and bags are from a machine with slow
+memory. On a faster one, and before messages were copied by compiled code, rerun's reader took 5.7
+times our time for the log of vectors, and foxglove-sdk 5.2 times our time for writing.
 
 foxglove-sdk writes files and does not read them.
 
 A missed goal stays in its table. What limits us, as far as these tables and profiles show it:
 
-- Logs of images: the minimum of any reader and the copy of the images into new memory take four
-  fifths of our time, and plain zstd two thirds. A reader that did nothing else would reach 80 %.
+- Logs of images: the minimum of any reader and the copy of the images into new memory take three
+  quarters of our time, and plain zstd 55 %. A reader that did nothing else would reach 73 %.
   Chunks of 200 images instead of 100 would save 7 % of the time, but a viewer that shows one image
   would decompress twice as much.
-- Logs of other writers: the rest is one pass of NumPy over a chunk for each check and each column.
-  Passes over smaller blocks, which stay in the cache, took longer.
-- A single episode: decompressing its chunk is an eighth of the time. The rest is Python code that
+- Logs of other writers: decompression takes as long as plain zstd or longer, because the columns
+  displace its memory from the cache. A fifth of the time is the copy, which the compiled code makes
+  in one pass with the checks, mostly into memory that is used for the first time. The rest is the
+  order of the records and the ends of the episodes.
+- A single episode: decompressing its chunk is a seventh of the time. The rest is Python code that
   finds out what the log contains and where, and no function of it takes more than an eighth. The
-  goal would leave this code a quarter of its time. Minari reads an episode sooner, because HDF5 or
+  goal would leave this code a fifth of its time. Minari reads an episode sooner, because HDF5 or
   Arrow has its position, and it checks no CRC. Smaller chunks would save decompression and need as
   much time for their indexes.
-- Two threads: decompression, CRC and the copy alone are about 1.6 times as fast with two threads,
-  because writing to new memory hardly gains. In addition, a tenth of our time is spent in one
-  thread, on the order of the records and the ends of the episodes.
+- Two threads: the copy takes 1.4 times as long if two threads write to new memory at the same time.
+  In addition, a sixth of our time is spent in one thread, on the file's index, the order of the
+  records and the ends of the episodes.
 - Recording one environment: assigning the values to NumPy arrays, without writing them, takes
-  three fifths of our time, and compression a tenth. The rest is the messages, CRCs and indexes at
-  the end of an episode.
+  three fifths of our time or more, and compression a tenth. The rest is the messages, CRCs and
+  indexes at the end of an episode.
 - Recording 256 environments: where a step is cheap, as in the lane sim, compressing the records
   alone takes two thirds of the time of stepping or more. Where episodes are short, the five
-  messages of each episode take most of the time. Ordinary environments with long episodes reach
-  the goal.
+  messages of each episode take most of the time. Pendulum, with long episodes, reaches the goal,
+  and the powerline sim, whose steps take less time in a batch, does not.
 - A batch of 1,024 cars: three fifths of the time is the compiled step. Half of that is the motion,
   which has a division and three square roots in each of five substeps. The infos take a
   seventh, half of it the array of reasons, and starting the cars whose episodes ended an eighth.

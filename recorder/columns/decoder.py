@@ -18,18 +18,12 @@ from mcaprl.recorder.columns.message_rows import (
     MessageRange,
     are_messages,
     as_items,
+    check_and_copy,
     gather,
-    message_head,
     record_dtype,
 )
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import RECORD_HEADER
-
-try:
-    from mcaprl.recorder.columns._native import copy_fields as copy_fields
-except ImportError:
-    # The package was installed without a C compiler. NumPy does the same in more time.
-    copy_fields = None  # type: ignore[assignment]
 
 # If the messages of a chunk have more different lengths than this, they are decoded one by one.
 _MAX_LENGTHS = 16
@@ -171,19 +165,17 @@ class Decoder:
 
     def _copy(self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows) -> bool:
         """Check and copy the messages by one compiled call; return whether this was possible."""
-        if copy_fields is None or not isinstance(rows, slice):
+        if not isinstance(rows, slice):
             return False
         layout = self.type.known_layout(self._length(records, index), columns)
         places = None if layout is None else layout.places_of(columns)
         if layout is None or places is None:
             return False
-        header = MESSAGE_HEADER.itemsize
-        size = header + layout.dtype.itemsize
-        expected = [(0, message_head(self.channel.id, size))]
-        expected += [(header + place, value) for place, value in layout.constant_bytes]
-        parts = zip(places, columns.values(), strict=True)
-        targets = [(header + place, column[rows]) for place, column in parts]
-        return copy_fields(records, index, size, expected, targets)
+        size = MESSAGE_HEADER.itemsize + layout.dtype.itemsize
+        parts = zip(places, (column[rows] for column in columns.values()), strict=True)
+        return bool(
+            check_and_copy(records, index, self.channel.id, size, layout.constant_bytes, parts)
+        )
 
     def alike(
         self, records: memoryview, index: NDArray[Any], wanted: Collection[str]

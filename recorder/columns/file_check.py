@@ -17,6 +17,8 @@ from mcaprl.recorder.columns.message_rows import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
+    are_adjacent,
+    check_and_copy,
     message_index,
     windows,
 )
@@ -63,6 +65,8 @@ def _has_only(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
     A chunk that also contains other records can be valid. If this function returns False, the
     caller therefore compares each message with the indexes.
     """
+    if len(indexes) == 1 and _has_alike(records, *next(iter(indexes.items()))):
+        return True
     ids = np.repeat(list(indexes), [len(index) for index in indexes.values()])
     if not len(ids):
         return False
@@ -86,6 +90,22 @@ def _has_only(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
         and (heads["opcode"] == Opcode.MESSAGE).all()
         and (heads["channel_id"] == ids).all()
         and (heads["log_time"] == index["log_time"]).all()
+    )
+
+
+def _has_alike(records: memoryview, channel_id: int, index: NDArray[Any]) -> bool:
+    """Return whether a chunk contains exactly these messages, one after another, of one size.
+
+    Return False if the compiled module was not built.
+    """
+    size, rest = divmod(len(records), max(len(index), 1))
+    return (
+        len(index) > 0
+        and rest == 0
+        and size >= MESSAGE_HEADER.itemsize
+        and index["offset"][0] == 0
+        and are_adjacent(index["offset"], size, len(records))
+        and bool(check_and_copy(records, index, channel_id, size))
     )
 
 

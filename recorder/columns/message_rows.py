@@ -8,7 +8,7 @@ array of `record_dtype(payload)`; the entries of a MessageIndex form an array of
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cached_property, lru_cache
 from typing import Any, Self
 
@@ -18,6 +18,12 @@ from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
+
+try:
+    from mcaprl.recorder.columns._native import copy_fields as copy_fields
+except ImportError:
+    # The package was installed without a C compiler. NumPy does the same in more time.
+    copy_fields = None  # type: ignore[assignment]
 
 MESSAGE_HEADER = np.dtype(
     [
@@ -64,8 +70,40 @@ def message_record(channel_id: int, sequence: int, time_ns: int, data: bytes) ->
     return head + data
 
 
-@lru_cache(maxsize=64)
-def message_head(channel_id: int, size: int) -> bytes:
+def check_and_copy(
+    records: memoryview,
+    index: NDArray[Any],
+    channel_id: int,
+    size: int,
+    constants: Iterable[tuple[int, bytes]] = (),
+    columns: Iterable[tuple[int, NDArray[Any]]] = (),
+) -> bool | None:
+    """Check messages of one size, and copy their fields to columns, by one compiled call.
+
+    Args:
+        records: Records of the chunk.
+        index: Array of `INDEX_ENTRY`, at least one.
+        channel_id: Channel of the messages.
+        size: Number of bytes of each record.
+        constants: Offsets in the payload, with the bytes that must be there.
+        columns: Offsets in the payload, with the column for the field there: a contiguous array
+            with one row for each index entry.
+
+    Returns:
+        Whether all messages are in the chunk, have the times of the index, the channel, the size
+        and the constants; if not, the contents of the columns are undefined. None if the compiled
+        module was not built.
+    """
+    if copy_fields is None:
+        return None
+    payload = MESSAGE_HEADER.itemsize
+    expected = [(0, _head(channel_id, size))]
+    expected += [(payload + offset, value) for offset, value in constants]
+    targets = [(payload + offset, column) for offset, column in columns]
+    return copy_fields(records, index, size, expected, targets)
+
+
+def _head(channel_id: int, size: int) -> bytes:
     """Return the first bytes of a channel's Message records of `size` bytes."""
     head: bytes = _HEAD.pack(Opcode.MESSAGE, size - RECORD_HEADER_BYTES, channel_id)
     return head
@@ -74,7 +112,7 @@ def message_head(channel_id: int, size: int) -> bytes:
 def are_messages(rows: NDArray[Any], channel_id: int) -> bool:
     """Return whether all rows are messages of this channel and have the length of the dtype."""
     size = rows.dtype.itemsize
-    head = message_head(channel_id, size)
+    head = _head(channel_id, size)
     words, expected = rows.view(_words(size)), np.frombuffer(head, _words(_HEAD.size))[0]
     return all(bool((words[name] == expected[name]).all()) for name in ("front", "back"))
 
@@ -175,7 +213,7 @@ def gather(records: memoryview, index: NDArray[Any], dtype: np.dtype[Any]) -> ND
     offsets, size = index["offset"], dtype.itemsize
     if len(offsets) == 0:
         return np.empty(0, dtype)
-    if _are_adjacent(offsets, size, len(records)):
+    if are_adjacent(offsets, size, len(records)):
         return np.frombuffer(records, dtype, len(offsets), int(offsets[0]))
     # Subtract instead of adding: a sum above 2**64 would wrap around.
     if len(records) < size or offsets.max() > len(records) - size:
@@ -191,7 +229,7 @@ def windows(data: memoryview, offsets: NDArray[Any], dtype: np.dtype[Any]) -> ND
     return every[offsets.astype(np.intp)].view(dtype)
 
 
-def _are_adjacent(offsets: NDArray[Any], size: int, end: int) -> bool:
+def are_adjacent(offsets: NDArray[Any], size: int, end: int) -> bool:
     """Return whether messages of one size follow each other without gaps and end before `end`."""
     first, last = int(offsets[0]), int(offsets[-1])
     if last - first != size * (len(offsets) - 1) or last + size > end:

@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+import mcaprl
 from mcaprl.errors import McaprlError
-from mcaprl.recorder.columns import decoder
+from mcaprl.recorder.columns import message_rows
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, message_record
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.topic import Topic
@@ -29,8 +30,8 @@ COUNT = 300
 
 
 def copy_fields(*arguments: Any) -> bool:
-    need(decoder.copy_fields is not None, "the C extension was not built")
-    return decoder.copy_fields(*arguments)
+    need(message_rows.copy_fields is not None, "the C extension was not built")
+    return message_rows.copy_fields(*arguments)
 
 
 def message(k: int) -> bytes:
@@ -128,14 +129,15 @@ def test_arguments_of_other_types_are_refused() -> None:
     "path", [*sorted(GOLDEN.glob("*.mcap")), *sorted(FUZZ_CORPUS.iterdir())], ids=lambda p: p.name
 )
 def test_numpy_reads_the_same(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both read the same values, or report the same error."""
-    need(decoder.copy_fields is not None, "the C extension was not built")
+    """Both read the same values, and report the same problems or the same error."""
+    need(message_rows.copy_fields is not None, "the C extension was not built")
     # The inputs of the fuzzer have other names.
     (tmp_path / "log.mcap").write_bytes(path.read_bytes())
 
     def read() -> list[str]:
         found = []
         try:
+            found += [str(one) for one in mcaprl.check(tmp_path / "log.mcap").problems]
             reader = McapReader(tmp_path / "log.mcap")
             for name in sorted({channel.topic for channel in reader.channels.values()}):
                 topic = Topic(reader, name)
@@ -147,5 +149,5 @@ def test_numpy_reads_the_same(path: Path, tmp_path: Path, monkeypatch: pytest.Mo
         return found
 
     compiled = read()
-    monkeypatch.setattr(decoder, "copy_fields", None)
+    monkeypatch.setattr(message_rows, "copy_fields", None)
     assert read() == compiled
