@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mcaprl.compiled import Arrays, array_at, compiled
 from mcaprl.errors import UsageError
 from mcaprl.sims.geometry.bicycle import moving
-from mcaprl.sims.geometry.paths import leg_at, project
+from mcaprl.sims.geometry.paths import project, wrap_angle
 from mcaprl.sims.lane.block import observe_cars
 from mcaprl.sims.lane.classic import CLASSIC_SUBSTEPS, STRAIGHT
 from mcaprl.sims.lane.course import COURSE, LANE_HALF_WIDTH_M
@@ -49,7 +49,7 @@ def start_on_line(shares: NDArray[np.float64]) -> Car:
 
     Two random numbers from 0 to 1 set its offset (up to 0.3 m) and heading error (up to 0.05 rad).
     """
-    return beside(LINE_M, spread(shares[0], 0.3), spread(shares[1], 0.05), 0.0)
+    return beside(0, LINE_M, spread(shares[0], 0.3), spread(shares[1], 0.05), 0.0)
 
 
 @compiled
@@ -59,21 +59,28 @@ def start_anywhere(shares: NDArray[np.float64]) -> Car:
     leg = 0
     while _CLEAR_M[leg + 1] <= clear_m:
         leg += 1
-    along_m = COURSE.along_m[leg] + AFTER_CORNER_M + clear_m - _CLEAR_M[leg]
+    rest_m = AFTER_CORNER_M + clear_m - _CLEAR_M[leg]
     offset_m, error_rad = spread(shares[1], 1.5), spread(shares[2], 0.2)
-    return beside(along_m, offset_m, error_rad, FASTEST_START_M_S * shares[3])
+    return beside(leg, rest_m, offset_m, error_rad, FASTEST_START_M_S * shares[3])
 
 
 @compiled
-def beside(along_m: float, offset_m: float, error_rad: float, speed_m_s: float) -> Car:
-    """Return a car beside a path point, with an offset and a heading error; left is positive."""
-    leg = leg_at(COURSE, along_m)
-    rest_m = along_m - COURSE.along_m[leg]
+def beside(leg: int, rest_m: float, offset_m: float, error_rad: float, speed_m_s: float) -> Car:
+    """Return a car beside a point of the path, with an offset and a heading error, left positive.
+
+    Args:
+        leg: Index of the leg with the point, which must be the path point nearest to the car.
+        rest_m: Distance of the point from the start of the leg.
+        offset_m: Distance of the car from the point.
+        error_rad: Yaw of the car relative to the leg.
+        speed_m_s: Speed of the car.
+    """
+    along_m = COURSE.along_m[leg] + rest_m
     cos, sin = COURSE.forward[leg]
     x_m = COURSE.points_m[leg, 0] + rest_m * cos - offset_m * sin
     y_m = COURSE.points_m[leg, 1] + rest_m * sin + offset_m * cos
-    motion = moving(x_m, y_m, COURSE.yaw_rad[leg] + error_rad, speed_m_s)
-    return located(motion, 0.0, along_m, 0.0)
+    yaw_rad, error_rad = wrap_angle(COURSE.yaw_rad[leg] + error_rad), wrap_angle(error_rad)
+    return Car(x_m, y_m, yaw_rad, speed_m_s, 0.0, along_m, offset_m, error_rad, 0.0)
 
 
 @compiled

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaprl.errors import UnknownNameError, UsageError
 
@@ -55,28 +54,6 @@ def check_action(action: int | np.integer[Any], count: int) -> int:
     if not 0 <= number < count:
         raise UsageError(f"action {action} does not exist: actions are 0 to {count - 1}")
     return number
-
-
-def check_actions(actions: Any, vehicles: int, count: int) -> NDArray[np.int64]:
-    """Validate the actions of many vehicles and return them as int64.
-
-    Raises:
-        UsageError: The number of actions is wrong, or an action is not an integer from 0 to
-            count - 1.
-    """
-    numbers = np.asarray(actions)
-    if numbers.shape != (vehicles,) or numbers.dtype.kind not in "iu":
-        raise UsageError(
-            f"actions must be an array of {vehicles} integers,"
-            f" not {numbers.dtype} of shape {numbers.shape}"
-        )
-    numbers = numbers.astype(np.int64, copy=False)
-    # In the unsigned view, a negative action is larger than `count`.
-    unsigned = numbers.view(np.uint64)
-    if unsigned.max() >= count:
-        wrong = numbers[unsigned >= count][0]
-        raise UsageError(f"action {wrong} does not exist: actions are 0 to {count - 1}")
-    return numbers
 
 
 def read_pose(options: dict[str, Any], names: Sequence[str], least: int) -> list[float]:

@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
-from mcaprl.sims.vehicle.arguments import check_actions, check_name
+from mcaprl.sims.vehicle.arguments import check_name
 from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
 
 Bools = NDArray[np.bool_]
@@ -128,7 +128,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
                 not reset.
             ResetNeeded: `reset` was not called.
         """
-        self.fleet.actions[:] = check_actions(actions, self.num_envs, len(self.action_meanings))
+        self.fleet.set_actions(actions)
         if not self._is_started:
             raise gym.error.ResetNeeded("call reset() before step()")
         if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():

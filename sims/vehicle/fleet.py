@@ -11,7 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.compiled import ready
+from mcaprl.compiled import compiled, ready
+from mcaprl.errors import UsageError
 
 GOING_ON = 0
 """Value of `Fleet.ends` while an episode runs."""
@@ -77,6 +78,33 @@ class Fleet(ABC):
         """
         for i in chosen.tolist():
             self.begin(i, randoms[i], None)
+
+    def set_actions(self, actions: Any) -> None:
+        """Set the actions of the next step.
+
+        Args:
+            actions: (N,) integers.
+
+        Raises:
+            UsageError: The number of actions is wrong, or an action is not an integer from 0 to the
+                number of actions - 1. The vehicles must not be advanced.
+        """
+        numbers = np.asarray(actions)
+        if numbers.shape != (self.count,) or numbers.dtype.kind not in "iu":
+            raise UsageError(
+                f"actions must be an array of {self.count} integers,"
+                f" not {numbers.dtype} of shape {numbers.shape}"
+            )
+        self.actions[:] = numbers
+        most = len(self.action_meanings)
+        if self._largest_action() >= most:
+            wrong = numbers[(numbers < 0) | (numbers >= most)][0]
+            raise UsageError(f"action {wrong} does not exist: actions are 0 to {most - 1}")
+
+    @cached_property
+    def _largest_action(self) -> Callable[[], np.uint64]:
+        """Function that returns the largest element of `actions`, as an unsigned number."""
+        return ready(_largest, self.actions)
 
     @abstractmethod
     def advance(self) -> None:
@@ -167,3 +195,13 @@ class Fleet(ABC):
     @abstractmethod
     def infos(self) -> dict[str, NDArray[Any]]:
         """Return the `info` of all vehicles, each value as a new (N,) array."""
+
+
+@compiled
+def _largest(numbers: NDArray[np.int64]) -> np.uint64:
+    """Return the largest number (N,) as an unsigned number; negative numbers are above 2**63."""
+    # NumPy takes several times as long for as few numbers as there are vehicles.
+    largest = np.uint64(0)
+    for number in numbers.view(np.uint64):
+        largest = max(largest, number)
+    return largest
