@@ -44,15 +44,16 @@ the CRCs. A reader also copies the columns into new memory; the rows `memcpy of 
 measure this copy.
 
 The ratios depend on the machine, too. The tables of logs and bags are from a machine with slow
-memory. On a faster one, and before messages were copied by compiled code, rerun's reader took 5.7
-times our time for the log of vectors, and foxglove-sdk 5.2 times our time for writing.
+memory. In five runs on it, rerun's reader took 4.5 to 5.2 times our time for the log of vectors. On
+a faster machine, and before messages were copied by compiled code, it took 5.7 times, foxglove-sdk
+5.2 times our time for writing, and 1.8 times for recording.
 
 foxglove-sdk writes files and does not read them.
 
 A missed goal stays in its table. What limits us, as far as these tables and profiles show it:
 
 - Logs of images: the minimum of any reader and the copy of the images into new memory take three
-  quarters of our time, and plain zstd 55 %. A reader that did nothing else would reach 73 %.
+  quarters of our time, and plain zstd 57 %. A reader that did nothing else would reach 76 %.
   Chunks of 200 images instead of 100 would save 7 % of the time, but a viewer that shows one image
   would decompress twice as much.
 - Logs of other writers: decompression takes as long as plain zstd or longer, because the columns
@@ -72,12 +73,13 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
   indexes at the end of an episode.
 - Recording 256 environments: where a step is cheap, as in the lane sim, compressing the records
   alone takes two thirds of the time of stepping or more. Where episodes are short, the five
-  messages of each episode take most of the time. Pendulum, with long episodes, reaches the goal,
-  and the powerline sim, whose steps take less time in a batch, does not.
+  messages of each episode take most of the time. In four runs, recording added 0 to 15 % to
+  Pendulum, which has long episodes, and 7 to 12 % to the powerline sim, whose steps take less time
+  in a batch.
 - A batch of 1,024 cars: three fifths of the time is the compiled step. Half of that is the motion,
-  which has a division and three square roots in each of five substeps. The infos take a
-  seventh, half of it the array of reasons, and starting the cars whose episodes ended an eighth.
-  The rest are about 20 calls of NumPy on arrays of 1,024 values.
+  which has a division and three square roots in each of five substeps. The infos take a sixth, a
+  third of it the array of reasons, and starting the cars whose episodes ended a ninth. The rest are
+  about 20 calls of NumPy on arrays of 1,024 values.
 - Depth images: drawing takes half of the time, downsampling two fifths, and encoding a twelfth.
   Drawing is limited by its short rows of pixels, 15 in the median; sums over columns are near the
   throughput of scalar instructions.
