@@ -62,7 +62,7 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
   order of the records and the ends of the episodes.
 - A single episode: decompressing its chunk is a seventh of the time. The rest is Python code that
   finds out what the log contains and where, and no function of it takes more than an eighth. The
-  goal would leave this code a fifth of its time. Minari reads an episode sooner, because HDF5 or
+  goal would leave this code a sixth of its time. Minari reads an episode sooner, because HDF5 or
   Arrow has its position, and it checks no CRC. Smaller chunks would save decompression and need as
   much time for their indexes.
 - Two threads: the copy takes 1.4 times as long if two threads write to new memory at the same time.

@@ -1,7 +1,7 @@
 /* Copy of equal messages to columns, in one pass over the messages and without Python's lock.
  *
- * The module is optional: if it was not built, `decoder.py` does the same with NumPy. All offsets are
- * checked here, because they come from files that may be damaged.
+ * The module is optional: if it was not built, NumPy does the same. All offsets are checked here,
+ * because they come from files that may be damaged.
  */
 
 #define PY_SSIZE_T_CLEAN
@@ -110,8 +110,8 @@ copy_field(unsigned char *target, const unsigned char *const *rows, Py_ssize_t c
     }
 }
 
-/* Return whether all messages have the expected bytes and the times of their index entries. Copy
- * the fields of the messages before the first that does not. */
+/* Copy the fields of all messages, and return whether all of them have the expected bytes and the
+ * times of their index entries. Stop before the first block with a message that does not. */
 static int
 copy_rows(const Py_buffer *records, const Py_buffer *index, Py_ssize_t size, const Parts *expected,
           const Parts *columns)
