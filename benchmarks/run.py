@@ -44,7 +44,7 @@ the CRCs. A reader also copies the columns into new memory; the rows `memcpy of 
 measure this copy.
 
 The ratios depend on the machine, too. The tables of logs and bags are from a machine with slow
-memory. In five runs on it, rerun's reader took 4.5 to 5.2 times our time for the log of vectors. On
+memory. In four runs on it, rerun's reader took 4.5 to 5.2 times our time for the log of vectors. On
 a faster machine, and before messages were copied by compiled code, it took 5.7 times, foxglove-sdk
 5.2 times our time for writing, and 1.8 times for recording.
 
