@@ -56,9 +56,6 @@ static int
 read_parts(PyObject *list, int flags, Py_ssize_t size, Py_ssize_t rows, Parts *found)
 {
     Py_ssize_t count = PyList_Size(list);
-    if (count < 0) {
-        return 0;
-    }
     found->count = 0;
     found->parts = PyMem_Malloc((count ? count : 1) * sizeof(Part));
     if (found->parts == NULL) {
@@ -67,8 +64,13 @@ read_parts(PyObject *list, int flags, Py_ssize_t size, Py_ssize_t rows, Parts *f
     }
     for (Py_ssize_t k = 0; k < count; k++) {
         Part *part = &found->parts[k];
-        PyObject *object;
-        if (!PyArg_ParseTuple(PyList_GetItem(list, k), "nO", &part->offset, &object) ||
+        PyObject *pair = PyList_GetItem(list, k), *object;
+        if (!PyTuple_Check(pair)) {
+            PyErr_SetString(PyExc_TypeError, "a part must be a tuple of an offset and a buffer");
+            release(found);
+            return 0;
+        }
+        if (!PyArg_ParseTuple(pair, "nO", &part->offset, &object) ||
             PyObject_GetBuffer(object, &part->buffer, flags) < 0) {
             release(found);
             return 0;
@@ -174,8 +176,8 @@ copy_fields(PyObject *module, PyObject *args)
     PyObject *constants, *targets, *found = NULL;
     Parts expected, columns;
     (void)module;
-    const char *types = "y*y*nOO"; /* codespell:ignore noo */
-    if (!PyArg_ParseTuple(args, types, &records, &index, &size, &constants, &targets)) {
+    if (!PyArg_ParseTuple(args, "y*y*nO!O!", &records, &index, &size, &PyList_Type, &constants,
+                          &PyList_Type, &targets)) {
         return NULL;
     }
     Py_ssize_t total = index.len / ENTRY_BYTES;

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import struct
-import threading
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import lz4.frame
@@ -248,16 +248,6 @@ def parse_chunk_indexes(summary: memoryview) -> tuple[list[ChunkIndex], int]:
 _NOTHING = (-1, memoryview(b""))
 
 
-class _Thread(threading.local):
-    """Decompressor of a thread; creating one takes as long as decompressing 50 KB."""
-
-    def __init__(self) -> None:
-        self.zstd = zstandard.ZstdDecompressor()
-
-
-_thread = _Thread()
-
-
 class Scratch:
     """Memory that one thread reuses for each chunk it decompresses.
 
@@ -272,6 +262,11 @@ class Scratch:
         """Create empty scratch memory."""
         self._memory = np.empty(0, np.uint8)
         self.kept = _NOTHING
+
+    @cached_property
+    def zstd(self) -> zstandard.ZstdDecompressor:
+        """Decompressor for zstd."""
+        return zstandard.ZstdDecompressor()
 
     def take(self, size: int) -> memoryview:
         """Return `size` bytes of memory, which the next call reuses."""
@@ -329,7 +324,7 @@ def _inflate_zstd(data: memoryview, scratch: Scratch, limit: int) -> memoryview:
     If the frame header states the size, one call of the decompressor is enough.
     """
     memory, count = scratch.take(limit), 0
-    with _thread.zstd.stream_reader(data) as reader:
+    with scratch.zstd.stream_reader(data) as reader:
         while count < limit:
             inflated = reader.readinto(memory[count:])
             if not inflated:

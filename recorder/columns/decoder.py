@@ -173,9 +173,7 @@ class Decoder:
             return False
         size = MESSAGE_HEADER.itemsize + layout.dtype.itemsize
         parts = zip(places, (column[rows] for column in columns.values()), strict=True)
-        return bool(
-            check_and_copy(records, index, self.channel.id, size, layout.constant_bytes, parts)
-        )
+        return check_and_copy(records, index, self.channel.id, size, layout.constant_bytes, parts)
 
     def alike(
         self, records: memoryview, index: NDArray[Any], wanted: Collection[str]

@@ -65,7 +65,7 @@ def _has_only(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
     A chunk that also contains other records can be valid. If this function returns False, the
     caller therefore compares each message with the indexes.
     """
-    if len(indexes) == 1 and _has_alike(records, *next(iter(indexes.items()))):
+    if _has_alike(records, indexes):
         return True
     ids = np.repeat(list(indexes), [len(index) for index in indexes.values()])
     if not len(ids):
@@ -93,11 +93,14 @@ def _has_only(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
     )
 
 
-def _has_alike(records: memoryview, channel_id: int, index: NDArray[Any]) -> bool:
-    """Return whether a chunk contains exactly these messages, one after another, of one size.
+def _has_alike(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
+    """Return whether a chunk contains exactly the messages of one index, all of one size.
 
     Return False if the compiled module was not built.
     """
+    if len(indexes) != 1:
+        return False
+    ((channel_id, index),) = indexes.items()
     size, rest = divmod(len(records), max(len(index), 1))
     return (
         len(index) > 0
@@ -105,7 +108,7 @@ def _has_alike(records: memoryview, channel_id: int, index: NDArray[Any]) -> boo
         and size >= MESSAGE_HEADER.itemsize
         and index["offset"][0] == 0
         and are_adjacent(index["offset"], size, len(records))
-        and bool(check_and_copy(records, index, channel_id, size))
+        and check_and_copy(records, index, channel_id, size)
     )
 
 

@@ -77,7 +77,7 @@ def check_and_copy(
     size: int,
     constants: Iterable[tuple[int, bytes]] = (),
     columns: Iterable[tuple[int, NDArray[Any]]] = (),
-) -> bool | None:
+) -> bool:
     """Check messages of one size, and copy their fields to columns, by one compiled call.
 
     Args:
@@ -90,12 +90,12 @@ def check_and_copy(
             with one row for each index entry.
 
     Returns:
-        Whether all messages are in the chunk, have the times of the index, the channel, the size
-        and the constants; if not, the contents of the columns are undefined. None if the compiled
-        module was not built.
+        Whether all messages are in the chunk and have the times of the index, the channel, the
+        size and the constants; if not, the contents of the columns are undefined. False if the
+        compiled module was not built.
     """
     if copy_fields is None:
-        return None
+        return False
     payload = MESSAGE_HEADER.itemsize
     expected = [(0, _head(channel_id, size))]
     expected += [(payload + offset, value) for offset, value in constants]

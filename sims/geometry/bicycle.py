@@ -82,7 +82,7 @@ def slip_of(
 
     Args:
         steering_rad: Steering angle, from -45 to 45 degrees.
-        speed_m_s: Speed v; at speed 0, there is no limit.
+        speed_m_s: Speed v; 0 for a slip without a limit.
         most_lateral_m_s2: Maximum lateral acceleration.
         wheelbase_m: Distance between the axles.
     """

@@ -87,7 +87,7 @@ class Fleet(ABC):
 
         Raises:
             UsageError: The number of actions is wrong, or an action is not an integer from 0 to the
-                number of actions - 1. The vehicles must not be advanced.
+                number of actions - 1. The attribute `actions` is then invalid.
         """
         numbers = np.asarray(actions)
         if numbers.shape != (self.count,) or numbers.dtype.kind not in "iu":
@@ -199,7 +199,7 @@ class Fleet(ABC):
 
 @compiled
 def _largest(numbers: NDArray[np.int64]) -> np.uint64:
-    """Return the largest number (N,) as an unsigned number; negative numbers are above 2**63."""
+    """Return the largest of N numbers as unsigned numbers; negative ones are 2**63 or more."""
     # NumPy takes several times as long for as few numbers as there are vehicles.
     largest = np.uint64(0)
     for number in numbers.view(np.uint64):

@@ -10,7 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaprl.sims.geometry.bicycle import moving
+from mcaprl.sims.geometry.paths import project
 from mcaprl.sims.lane.block import step_cars
+from mcaprl.sims.lane.course import COURSE
 from mcaprl.sims.lane.rules import (
     BRAKE,
     DRIVING,
@@ -27,6 +29,7 @@ from mcaprl.sims.lane.rules import (
     reward_of,
     wheel_angle,
 )
+from mcaprl.sims.lane.start import start_at_random
 
 STRAIGHT, RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT = 1, 2, 3, 4, 5
 
@@ -34,6 +37,18 @@ STRAIGHT, RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT = 1, 2, 3, 4, 5
 def placed(x_m: float, y_m: float, yaw_rad: float, speed_m_s: float, near_m: float) -> Car:
     """Return a car at a pose; search its place on the path near a distance along the path."""
     return located(moving(x_m, y_m, yaw_rad, speed_m_s), 0.0, near_m, 0.0)
+
+
+SHARE = st.floats(0.0, 1.0, exclude_max=True)
+
+
+@given(st.tuples(SHARE, SHARE, SHARE, SHARE), st.booleans())
+def test_a_start_is_beside_the_nearest_path_point(shares: tuple[float, ...], on_line: bool) -> None:
+    """Compare the start with searches of the path, which contains one street twice."""
+    car = start_at_random(np.array(shares), on_line, False)
+    nearest = project(COURSE, car.x_m, car.y_m, 0.0, COURSE.length_m)
+    assert abs(car.offset_m) == pytest.approx(abs(nearest.offset_m), abs=1e-9)
+    assert car == pytest.approx(placed(*car[:4], car.along_m), abs=1e-9)
 
 
 def at_rest() -> Car:
