@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -23,6 +23,8 @@ from mcaprl.recorder.columns.message_rows import MessageRange
 from mcaprl.recorder.columns.reader import McapReader, end_of
 
 LOG_TIME = "log_time"
+# Largest number of chunks that a thread reads one after the other.
+_BLOCK_CHUNKS = 16
 
 
 class _Selected(NamedTuple):
@@ -158,24 +160,24 @@ class Topic:
         count = len(self) if order is None else len(order)
         times = self.times if order is None else np.empty(count, np.int64)
 
-        def fill(part: _Selected) -> None:
+        def fill(parts: Iterable[_Selected]) -> None:
             if not hasattr(local, "scratch"):
                 local.scratch = Scratch()
-            records = self._reader.records_of(part.messages, local.scratch)
-            part.decoder.fill(columns, records, part.messages.index, part.rows)
-            if order is not None:
-                times[part.rows] = part.messages.index["log_time"]
+            for part in parts:
+                records = self._reader.records_of(part.messages, local.scratch)
+                part.decoder.fill(columns, records, part.messages.index, part.rows)
+                if order is not None:
+                    times[part.rows] = part.messages.index["log_time"]
 
         with self._reading:
             columns = first.decoder.empty_columns(wanted, count, first.messages, self._scratch)
             every = itertools.chain([first], selected)
             if threads <= 1:
-                for part in every:
-                    fill(part)
+                fill(every)
             else:
                 with ThreadPoolExecutor(threads) as pool:
                     try:
-                        for _ in pool.map(fill, every):
+                        for _ in pool.map(fill, _blocks(list(every), threads)):
                             pass
                     except BaseException:
                         pool.shutdown(cancel_futures=True)
@@ -229,3 +231,13 @@ class Topic:
                 part = MessageRange.of_index(part.chunk, index)
             rows = slice(low, high) if by_place is None else by_place[low:high]
             yield _Selected(decoder, part, rows)
+
+
+def _blocks(parts: Sequence[_Selected], threads: int) -> Iterator[Sequence[_Selected]]:
+    """Divide parts into blocks, each of which one thread reads.
+
+    Threads that read neighboring chunks would write to new memory in the same large page at the
+    same time, and each of them would clear this page.
+    """
+    size = min(-(-len(parts) // threads), _BLOCK_CHUNKS)
+    return (parts[start : start + size] for start in range(0, len(parts), size))
