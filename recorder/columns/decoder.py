@@ -200,13 +200,16 @@ class Decoder:
     def _laid_out(
         self, records: memoryview, index: NDArray[Any], layout: Layout
     ) -> NDArray[Any] | None:
-        dtype = record_dtype(layout.dtype)
+        dtype, id_ = record_dtype(layout.dtype), self.channel.id
+        if check_and_copy(records, index, id_, dtype.itemsize, layout.constant_bytes):
+            found: NDArray[Any] = gather(records, index, dtype)["payload"]
+            return found
         try:
             rows = gather(records, index, dtype)
         except CorruptLogError:
             # The layout may extend beyond the end of the chunk if the last messages are shorter.
             return None
-        are_valid = are_messages(rows, self.channel.id) and bool(
+        are_valid = are_messages(rows, id_) and bool(
             (rows["log_time"] == index["log_time"]).all()
         )
         payloads: NDArray[Any] = rows["payload"]

@@ -160,15 +160,15 @@ class MessageRange:
     """
 
     def __init__(
-        self, chunk: ChunkIndex | None, count: int, read: Callable[[], NDArray[Any]]
+        self, chunk: ChunkIndex | None, count: int, read: Callable[[Self], NDArray[Any]]
     ) -> None:
-        """Store the number of messages and the function that reads their index."""
+        """Store the number of messages, and the function that reads the index of a range."""
         self.chunk, self._count, self._read = chunk, count, read
 
     @classmethod
     def of_index(cls, chunk: ChunkIndex | None, index: NDArray[Any]) -> Self:
         """Create a range from index entries that are already in memory."""
-        return cls(chunk, len(index), lambda: index)
+        return cls(chunk, len(index), lambda _: index)
 
     @cached_property
     def index(self) -> NDArray[Any]:
@@ -179,7 +179,7 @@ class MessageRange:
         Raises:
             CorruptLogError: The index is damaged.
         """
-        return self._read()
+        return self._read(self)
 
     def __len__(self) -> int:
         """Return the number of messages."""

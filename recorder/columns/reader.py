@@ -14,7 +14,6 @@ import os
 import struct
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -253,6 +252,12 @@ class McapReader:
 
     def _find_ranges(self, channel_id: int, *, lazily: bool) -> list[MessageRange]:
         ranges = []
+
+        def read(part: MessageRange) -> NDArray[Any]:
+            assert part.chunk is not None
+            offset = part.chunk.message_index_offsets[channel_id]
+            return self._index_at(channel_id, offset, len(part))
+
         # A writer that was killed may have written only some indexes of the last chunk.
         uncertain = None if self.complete or not self.chunks else self.chunks[-1]
         for chunk in self.chunks:
@@ -262,14 +267,12 @@ class McapReader:
                 if index is not None:
                     ranges.append(MessageRange.of_index(chunk, index))
             elif channel_id in offsets:
-                offset = offsets[channel_id]
                 if lazily and len(offsets) == 1:
                     entries_bytes = chunk.message_index_length - _INDEX_HEAD_BYTES
                     count = max(entries_bytes, 0) // INDEX_ENTRY.itemsize
-                    read = partial(self._index_at, channel_id, offset, count)
                     ranges.append(MessageRange(chunk, count, read))
                 else:
-                    index = self._index_at(channel_id, offset)
+                    index = self._index_at(channel_id, offsets[channel_id])
                     ranges.append(MessageRange.of_index(chunk, index))
         if channel_id in self._unchunked:
             ranges.append(MessageRange.of_index(None, self._unchunked[channel_id]))

@@ -20,7 +20,7 @@ from mcaprl.recorder.dataset.mapped import MappedImages, rows_of
 from mcaprl.recorder.dataset.statistics import Statistics, describe_columns
 from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, TransitionBatch, Transitions
 from mcaprl.recorder.format.metadata import ESTIMATED, LogMetadata
-from mcaprl.recorder.format.spaces import leaves_of, nest, space_to_json
+from mcaprl.recorder.format.spaces import nest, space_to_json
 
 if TYPE_CHECKING:
     import pandas
@@ -44,7 +44,7 @@ class Dataset(Conversions):
         """Create a dataset; use `mcaprl.open` or `Dataset.from_arrays` instead."""
         self._transitions = transitions
         self._description = description
-        self._leaves = leaves_of(description.observation_space)
+        self._leaves = description.leaves
         self.sources = sources
 
     @classmethod

@@ -31,7 +31,7 @@ from mcaprl.recorder.format.infos import read_infos
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.reading import LOG_TIME, Columns, McapReader, Topic
 from mcaprl.recorder.format.schema import is_intact, stored_dtype
-from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves, restricted, select
+from mcaprl.recorder.format.spaces import Leaf, action_leaf, restricted, select
 from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 
 # If episodes have at least this many steps on average, `_without` moves rows in place.
@@ -168,8 +168,7 @@ class LogReader:
 
     def _leaves(self, metadata: LogMetadata) -> list[Leaf]:
         """Return the observation leaves to read."""
-        every = observation_leaves(metadata.observation_space)
-        return select(every, self._selection.columns)
+        return select(metadata.leaves, self._selection.columns)
 
     def _check_fields(self, wanted: Sequence[str]) -> None:
         if not len(self._steps):

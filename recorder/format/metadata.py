@@ -30,7 +30,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -41,7 +41,13 @@ from mcaprl._version import __version__
 from mcaprl.errors import LogError, UsageError
 from mcaprl.files import parse_json
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
-from mcaprl.recorder.format.spaces import action_leaf, leaves_of, space_from_json, space_to_json
+from mcaprl.recorder.format.spaces import (
+    Leaf,
+    action_leaf,
+    leaves_of,
+    space_from_json,
+    space_to_json,
+)
 from mcaprl.texts import encodable
 
 FORMAT_VERSION = "1"
@@ -117,6 +123,15 @@ class LogMetadata:
     behavior_prob: str = ""
     about: Mapping[str, Any] = field(default_factory=dict)
 
+    @cached_property
+    def leaves(self) -> tuple[Leaf, ...]:
+        """Leaves of the observation space in order; empty for an empty Dict.
+
+        Raises:
+            SpaceError: A log cannot store a part of the space.
+        """
+        return leaves_of(self.observation_space)
+
     def action_names(self) -> dict[int, str]:
         """Return the names of the discrete actions by value; empty for other action spaces.
 
@@ -147,7 +162,7 @@ class LogMetadata:
                 "path": leaf.path,
                 **({"topic": leaf.topic} if leaf.encoding else {"field": leaf.name}),
             }
-            for leaf in leaves_of(self.observation_space)
+            for leaf in self.leaves
         ]
         return {
             "format_version": FORMAT_VERSION,

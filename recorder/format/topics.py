@@ -10,7 +10,7 @@ PHASE_TOPIC = "/rl/phase"
 RUNNING = "running"
 """Phase of a running episode. At its end, the phase changes to the reason of the end."""
 # Maximum number of /rl/step rows, of images, and of bytes in one chunk.
-STEPS_PER_CHUNK = 8192
+STEPS_PER_CHUNK = 4096
 IMAGES_PER_CHUNK = 100
 BYTES_PER_CHUNK = 8 * 2**20
 # Minimum number of rows in a buffer: the last transition, a new transition, and a spare row. The

@@ -200,7 +200,7 @@ def test_indexes_of_other_chunks_are_not_read(large: Path, tmp_path: Path) -> No
     assert channel is not None
     spoilt = bytearray(large.read_bytes())
     chunks = [part.chunk for part in reader.message_ranges(channel)]
-    assert len(chunks) == 5
+    assert len(chunks) == 10
     for chunk in chunks[:-1]:
         assert chunk is not None
         start = chunk.message_index_offsets[channel.id]
@@ -227,5 +227,5 @@ def test_an_index_with_too_few_messages_is_refused(large: Path, tmp_path: Path) 
     struct.pack_into("<I", spoilt, place, reported - 16)
     path = tmp_path / "spoilt.mcap"
     path.write_bytes(spoilt)
-    with pytest.raises(CorruptLogError, match="has 8191 entries, but the summary counts 8192"):
+    with pytest.raises(CorruptLogError, match="has 4095 entries, but the summary counts 4096"):
         mcaprl.open(path)

@@ -240,7 +240,7 @@ def killed(path: Path, steps: int) -> tuple[bytes, Truth]:
     images = chunks_of(whole.read_bytes(), "/rl/observation/image", path)
     data = whole.read_bytes()
     whole.unlink()
-    # Images are written in chunks of 100 images, and records of /rl/step in chunks of 8192.
+    # Images are written in chunks of 100 images, and records of /rl/step in chunks of 4096.
     later = [offset for offset, _ in images if offset > 0]
     return data[: later[-1]], truth
 
