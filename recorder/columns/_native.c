@@ -24,7 +24,7 @@
 
 /* Bytes at an offset of each record: either expected bytes, or the rows of a column. */
 typedef struct {
-    Py_ssize_t offset;
+    Py_ssize_t offset, bytes;
     Py_buffer buffer;
 } Part;
 
@@ -66,8 +66,9 @@ release(Parts *found)
     PyMem_Free(found->parts);
 }
 
-/* Read a list of pairs (offset, buffer), each of which has `rows` items within a record of `size`
- * bytes. Return 0 and set an exception if it is invalid. */
+/* Read a list of pairs (offset, buffer); an item of the buffer must be within a record of `size`
+ * bytes. With PyBUF_ND, a buffer has as many items as rows, at least `rows`; otherwise it is one
+ * item. Return 0 and set an exception if it is invalid. */
 static int
 read_parts(PyObject *list, int flags, Py_ssize_t size, Py_ssize_t rows, Parts *found)
 {
@@ -92,9 +93,14 @@ read_parts(PyObject *list, int flags, Py_ssize_t size, Py_ssize_t rows, Parts *f
             return 0;
         }
         found->count++;
-        Py_ssize_t bytes = part->buffer.len / rows;
-        if (part->offset < 0 || part->offset > size || bytes > size - part->offset ||
-            bytes * rows != part->buffer.len) {
+        Py_ssize_t items = !(flags & PyBUF_ND) ? 1 : part->buffer.ndim ? part->buffer.shape[0] : 0;
+        if (items < rows) {
+            PyErr_SetString(PyExc_ValueError, "a column has too few rows");
+            release(found);
+            return 0;
+        }
+        part->bytes = part->buffer.len / items;
+        if (part->offset < 0 || part->offset > size || part->bytes > size - part->offset) {
             PyErr_SetString(PyExc_ValueError, "a field is not within the record");
             release(found);
             return 0;
@@ -173,7 +179,7 @@ copy_field(unsigned char *target, const unsigned char *const *rows, Py_ssize_t c
  * times of their index entries. Stop before the first block with a message that does not. */
 static int
 copy_rows(const Py_buffer *records, const Py_buffer *index, Py_ssize_t size, const Word *words,
-          Py_ssize_t word_count, const Parts *columns)
+          Py_ssize_t word_count, const Parts *columns, Py_ssize_t row)
 {
     const unsigned char *rows[BLOCK], *entry = index->buf;
     unsigned char collected[BLOCK * SHORT_BYTES];
@@ -197,14 +203,13 @@ copy_rows(const Py_buffer *records, const Py_buffer *index, Py_ssize_t size, con
         }
         for (Py_ssize_t n = 0; n < columns->count; n++) {
             const Part *part = &columns->parts[n];
-            Py_ssize_t bytes = part->buffer.len / total;
-            unsigned char *target = (unsigned char *)part->buffer.buf + first * bytes;
-            if (bytes > SHORT_BYTES) {
-                copy_field(target, rows, count, part->offset, bytes);
+            unsigned char *target = (unsigned char *)part->buffer.buf + (row + first) * part->bytes;
+            if (part->bytes > SHORT_BYTES) {
+                copy_field(target, rows, count, part->offset, part->bytes);
             }
             else {
-                copy_field(collected, rows, count, part->offset, bytes);
-                memcpy(target, collected, count * bytes);
+                copy_field(collected, rows, count, part->offset, part->bytes);
+                memcpy(target, collected, count * part->bytes);
             }
         }
     }
@@ -212,7 +217,7 @@ copy_rows(const Py_buffer *records, const Py_buffer *index, Py_ssize_t size, con
 }
 
 PyDoc_STRVAR(copy_fields_doc,
-             "copy_fields(records, index, size, expected, targets)\n--\n\n"
+             "copy_fields(records, index, size, expected, targets, row)\n--\n\n"
              "Copy fields of messages to columns; return whether all messages are as expected.\n\n"
              "If not, the contents of the columns are undefined.\n\n"
              "Args:\n"
@@ -221,34 +226,38 @@ PyDoc_STRVAR(copy_fields_doc,
              "    size: Number of bytes of each message's record.\n"
              "    expected: List of offsets in the record, with the bytes that must be there.\n"
              "    targets: List of offsets in the record, with the column for the field there: a\n"
-             "        contiguous array with one row for each index entry.\n\n"
+             "        contiguous array.\n"
+             "    row: Row of the columns for the first message; the next rows are for the others.\n\n"
              "Raises:\n"
-             "    ValueError: The index is empty, or a field is not within the record.");
+             "    ValueError: The index is empty, a field is not within the record, or a column has\n"
+             "        too few rows.");
 
 static PyObject *
 copy_fields(PyObject *module, PyObject *args)
 {
     Py_buffer records, index;
-    Py_ssize_t size;
+    Py_ssize_t size, row;
     PyObject *constants, *targets, *found = NULL;
     Parts expected, columns;
     (void)module;
-    if (!PyArg_ParseTuple(args, "y*y*nO!O!", &records, &index, &size, &PyList_Type, &constants,
-                          &PyList_Type, &targets)) {
+    if (!PyArg_ParseTuple(args, "y*y*nO!O!n", &records, &index, &size, &PyList_Type, &constants,
+                          &PyList_Type, &targets, &row)) {
         return NULL;
     }
     Py_ssize_t total = index.len / ENTRY_BYTES;
-    if (!total || size < TIME_OFFSET + 8) {
-        PyErr_SetString(PyExc_ValueError, "there are no messages, or the record is too short");
+    if (!total || size < TIME_OFFSET + 8 || row < 0 || row > PY_SSIZE_T_MAX - total) {
+        PyErr_SetString(PyExc_ValueError,
+                        "there are no messages, the record is too short, or the row is not valid");
     }
     else if (read_parts(constants, PyBUF_SIMPLE, size, 1, &expected)) {
         Py_ssize_t word_count;
         Word *words = words_of(&expected, size, &word_count);
-        if (words != NULL && read_parts(targets, PyBUF_WRITABLE, size, total, &columns)) {
+        if (words != NULL &&
+            read_parts(targets, PyBUF_WRITABLE | PyBUF_ND, size, row + total, &columns)) {
             int are_expected = 0;
             Py_BEGIN_ALLOW_THREADS
             if (records.len >= size) {
-                are_expected = copy_rows(&records, &index, size, words, word_count, &columns);
+                are_expected = copy_rows(&records, &index, size, words, word_count, &columns, row);
             }
             Py_END_ALLOW_THREADS
             found = PyBool_FromLong(are_expected);

@@ -8,4 +8,5 @@ def copy_fields(
     size: int,
     expected: list[tuple[int, bytes]],
     targets: list[tuple[int, NDArray[Any]]],
+    row: int,
 ) -> bool: ...

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,10 @@ from mcaprl.recorder.columns.chunks import Scratch
 from mcaprl.recorder.columns.definitions import TIME_TYPES
 from mcaprl.recorder.columns.message_rows import (
     MESSAGE_HEADER,
+    FieldCopy,
     MessageRange,
     are_messages,
     as_items,
-    check_and_copy,
     gather,
     record_dtype,
 )
@@ -34,6 +35,22 @@ Columns = dict[str, NDArray[Any]]
 """Arrays of equal length by field name. Strings are `str`, and arrays of strings are lists."""
 Rows = slice | NDArray[np.int64]
 """Selection of rows of a column."""
+
+
+@dataclass
+class Target:
+    """Columns that are filled.
+
+    Attributes:
+        columns: Columns by field name.
+        copies: Latest layout, and compiled copy of its messages, by channel and message length;
+            None if there is none.
+    """
+
+    columns: Columns
+    copies: dict[tuple[int, int], tuple[Layout | None, FieldCopy | None]] = field(
+        default_factory=dict
+    )
 
 
 class Decoder:
@@ -82,8 +99,11 @@ class Decoder:
         dtypes = self.type.leaf_dtypes
         return {name: np.empty((count, *shapes[name]), dtypes[name]) for name in wanted}
 
-    def fill(self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows) -> None:
+    def fill(self, target: Target, records: memoryview, index: NDArray[Any], rows: Rows) -> None:
         """Decode the messages that `index` lists, and store them in `rows` of the columns."""
+        if self._copy(target, records, index, rows):
+            return
+        columns = target.columns
         if self._put_alike(columns, records, index, rows):
             return
         if isinstance(rows, slice):
@@ -145,8 +165,6 @@ class Decoder:
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows
     ) -> bool:
         """If all messages share one layout, copy them and return True; else return False."""
-        if self._copy(columns, records, index, rows):
-            return True
         found = self.alike(records, index, columns)
         if found is None:
             return False
@@ -163,17 +181,26 @@ class Decoder:
                 _put(column, rows, found[name])
         return True
 
-    def _copy(self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows) -> bool:
+    def _copy(self, target: Target, records: memoryview, index: NDArray[Any], rows: Rows) -> bool:
         """Check and copy the messages by one compiled call; return whether this was possible."""
         if not isinstance(rows, slice):
             return False
-        layout = self.type.known_layout(self._length(records, index), columns)
-        places = None if layout is None else layout.places_of(columns)
-        if layout is None or places is None:
-            return False
+        length = self._length(records, index)
+        layout = self.type.known_layout(length, target.columns)
+        key = self.channel.id, length
+        known, copy = target.copies.get(key, (None, None))
+        if known is not layout:
+            copy = None if layout is None else self._new_copy(layout, target.columns)
+            target.copies[key] = layout, copy
+        return copy is not None and copy(records, index, rows.start)
+
+    def _new_copy(self, layout: Layout, columns: Columns) -> FieldCopy | None:
+        places = layout.places_of(columns)
+        if places is None:
+            return None
         size = MESSAGE_HEADER.itemsize + layout.dtype.itemsize
-        parts = zip(places, (column[rows] for column in columns.values()), strict=True)
-        return check_and_copy(records, index, self.channel.id, size, layout.constant_bytes, parts)
+        parts = zip(places, columns.values(), strict=True)
+        return FieldCopy(self.channel.id, size, layout.constant_bytes, parts)
 
     def alike(
         self, records: memoryview, index: NDArray[Any], wanted: Collection[str]
@@ -201,7 +228,7 @@ class Decoder:
         self, records: memoryview, index: NDArray[Any], layout: Layout
     ) -> NDArray[Any] | None:
         dtype, id_ = record_dtype(layout.dtype), self.channel.id
-        if check_and_copy(records, index, id_, dtype.itemsize, layout.constant_bytes):
+        if FieldCopy(id_, dtype.itemsize, layout.constant_bytes)(records, index):
             found: NDArray[Any] = gather(records, index, dtype)["payload"]
             return found
         try:
@@ -209,9 +236,7 @@ class Decoder:
         except CorruptLogError:
             # The layout may extend beyond the end of the chunk if the last messages are shorter.
             return None
-        are_valid = are_messages(rows, id_) and bool(
-            (rows["log_time"] == index["log_time"]).all()
-        )
+        are_valid = are_messages(rows, id_) and bool((rows["log_time"] == index["log_time"]).all())
         payloads: NDArray[Any] = rows["payload"]
         return payloads if are_valid and layout.fits(payloads) else None
 

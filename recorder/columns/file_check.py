@@ -17,8 +17,8 @@ from mcaprl.recorder.columns.message_rows import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
+    FieldCopy,
     are_adjacent,
-    check_and_copy,
     message_index,
     windows,
 )
@@ -108,7 +108,7 @@ def _has_alike(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
         and size >= MESSAGE_HEADER.itemsize
         and index["offset"][0] == 0
         and are_adjacent(index["offset"], size, len(records))
-        and check_and_copy(records, index, channel_id, size)
+        and FieldCopy(channel_id, size)(records, index)
     )
 
 

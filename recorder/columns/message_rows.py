@@ -70,37 +70,48 @@ def message_record(channel_id: int, sequence: int, time_ns: int, data: bytes) ->
     return head + data
 
 
-def check_and_copy(
-    records: memoryview,
-    index: NDArray[Any],
-    channel_id: int,
-    size: int,
-    constants: Iterable[tuple[int, bytes]] = (),
-    columns: Iterable[tuple[int, NDArray[Any]]] = (),
-) -> bool:
-    """Check messages of one size, and copy their fields to columns, by one compiled call.
+class FieldCopy:
+    """Compiled check of messages of one size, and copy of their fields to columns.
 
-    Args:
-        records: Records of the chunk.
-        index: Array of `INDEX_ENTRY`, at least one.
-        channel_id: Channel of the messages.
-        size: Number of bytes of each record.
-        constants: Offsets in the payload, with the bytes that must be there.
-        columns: Offsets in the payload, with the column for the field there: a contiguous array
-            with one row for each index entry.
-
-    Returns:
-        Whether all messages are in the chunk and have the times of the index, the channel, the
-        size and the constants; if not, the contents of the columns are undefined. False if the
-        compiled module was not built.
+    Without the compiled module, calls return False.
     """
-    if copy_fields is None:
-        return False
-    payload = MESSAGE_HEADER.itemsize
-    expected = [(0, _head(channel_id, size))]
-    expected += [(payload + offset, value) for offset, value in constants]
-    targets = [(payload + offset, column) for offset, column in columns]
-    return copy_fields(records, index, size, expected, targets)
+
+    def __init__(
+        self,
+        channel_id: int,
+        size: int,
+        constants: Iterable[tuple[int, bytes]] = (),
+        columns: Iterable[tuple[int, NDArray[Any]]] = (),
+    ) -> None:
+        """Store what is expected and copied.
+
+        Args:
+            channel_id: Channel of the messages.
+            size: Number of bytes of each record.
+            constants: Offsets in the payload, with the bytes that must be there.
+            columns: Offsets in the payload, with the contiguous column for the field there.
+        """
+        payload = MESSAGE_HEADER.itemsize
+        self._size = size
+        self._expected = [(0, _head(channel_id, size))]
+        self._expected += [(payload + offset, value) for offset, value in constants]
+        self._targets = [(payload + offset, column) for offset, column in columns]
+
+    def __call__(self, records: memoryview, index: NDArray[Any], row: int = 0) -> bool:
+        """Check and copy messages, in one pass.
+
+        Args:
+            records: Records of the chunk.
+            index: Array of `INDEX_ENTRY`, at least one.
+            row: Row of the columns for the first message.
+
+        Returns:
+            Whether all messages are in the chunk and have the times of the index, the channel, the
+            size and the constants; if not, the contents of the rows are undefined.
+        """
+        if copy_fields is None:
+            return False
+        return copy_fields(records, index, self._size, self._expected, self._targets, row)
 
 
 def _head(channel_id: int, size: int) -> bytes:
@@ -160,7 +171,7 @@ class MessageRange:
     """
 
     def __init__(
-        self, chunk: ChunkIndex | None, count: int, read: Callable[[Self], NDArray[Any]]
+        self, chunk: ChunkIndex | None, count: int, read: Callable[[MessageRange], NDArray[Any]]
     ) -> None:
         """Store the number of messages, and the function that reads the index of a range."""
         self.chunk, self._count, self._read = chunk, count, read

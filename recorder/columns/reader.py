@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -102,6 +101,7 @@ class McapReader:
         self.fetch([(0, _HEAD_BYTES), (size - _TAIL_BYTES, size)])
         if bytes(self._view[: len(MAGIC)]) != MAGIC:
             raise NotMcapError(f"{self.path} is not an MCAP file: it has no magic bytes")
+        self._named = _Named(self.path)
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.chunks: list[ChunkIndex] = []
@@ -113,7 +113,7 @@ class McapReader:
         # a chunk one after another.
         self._last_chunk = (-1, memoryview(b""))
         self._contents: dict[int, ChunkContents] = {}
-        with self._named():
+        with self._named:
             footer = self._footer()
         self.complete = footer is not None
         self.summary_start = footer.summary_start if footer is not None else 0
@@ -307,7 +307,7 @@ class McapReader:
             return kept
         self.check_unchanged()
         self.fetch([(start, end_of(chunk))])
-        with self._named():
+        with self._named:
             records = chunk_records(self._view, start, scratch)
         if scratch is None:
             self._last_chunk = start, records
@@ -353,7 +353,7 @@ class McapReader:
         """
         self.check_unchanged()
         found = None
-        with self._named():
+        with self._named:
             for offset, opcode, content in self.records(len(MAGIC)):
                 if opcode == Opcode.DATA_END:
                     break
@@ -380,7 +380,7 @@ class McapReader:
             self.fetch([(offset, offset + RECORD_HEADER_BYTES)])
             _, length = RECORD_HEADER.unpack_from(self._view, offset)
             self.fetch([(offset, offset + RECORD_HEADER_BYTES + length)])
-        with self._named():
+        with self._named:
             entries = message_index(self._view, offset, channel_id)
             if count not in (None, len(entries)):
                 raise CorruptLogError(
@@ -393,13 +393,13 @@ class McapReader:
         start = chunk.chunk_start_offset
         if start not in self._contents:
             records = self.chunk_records(chunk)
-            with self._named(f" (chunk at byte {start})"):
+            with _Named(self.path, f" (chunk at byte {start})"):
                 self._contents[start] = contents_of(records)
         return self._contents[start]
 
     def _read_summary(self) -> None:
         view, end = self._view, self.summary_start
-        with self._named():
+        with self._named:
             while (record := next(records_of(view, end), None)) is not None:
                 offset, opcode, content = record
                 end = offset + RECORD_HEADER_BYTES + len(content)
@@ -452,7 +452,7 @@ class McapReader:
         self.data_end, found = start, []
         for offset, opcode, content in records_of(self._view, start, stop):
             if opcode == Opcode.CHUNK:
-                with self._named():
+                with self._named:
                     chunk = chunk_header(self._view, offset).to_index(offset, len(content))
                 found.append(chunk)
             elif opcode == Opcode.MESSAGE_INDEX and chunk is not None:
@@ -510,7 +510,7 @@ class McapReader:
         )
 
     def _parse(self, opcode: int, content: memoryview, offset: int) -> None:
-        with self._named(f" (byte {offset})"):
+        with _Named(self.path, f" (byte {offset})"):
             self._keep(parse_record(opcode, content))
 
     def _keep(self, record: McapRecord) -> None:
@@ -525,15 +525,19 @@ class McapReader:
             case Statistics():
                 self._counts = record.channel_message_counts
 
-    @contextmanager
-    def _named(self, where: str = "") -> Iterator[None]:
-        """Add the path of the file, and `where`, to the message of a CorruptLogError."""
-        try:
-            yield
-        except CorruptLogError as error:
-            if str(error).startswith(f"{self.path}: "):
-                raise
-            raise CorruptLogError(f"{self.path}: {error}{where}") from error
+
+class _Named:
+    """Context that adds the path of a file, and `where`, to the message of a CorruptLogError."""
+
+    def __init__(self, path: Path, where: str = "") -> None:
+        self._path, self._where = path, where
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        if isinstance(error, CorruptLogError) and not str(error).startswith(f"{self._path}: "):
+            raise CorruptLogError(f"{self._path}: {error}{self._where}") from error
 
 
 def end_of(chunk: ChunkIndex) -> int:

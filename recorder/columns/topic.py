@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, UnknownNameError
 from mcaprl.recorder.columns.chunks import Scratch
-from mcaprl.recorder.columns.decoder import Columns, Decoder, Rows
+from mcaprl.recorder.columns.decoder import Columns, Decoder, Rows, Target
 from mcaprl.recorder.columns.message_rows import MessageRange
 from mcaprl.recorder.columns.reader import McapReader, end_of
 
@@ -165,12 +165,14 @@ class Topic:
                 local.scratch = Scratch()
             for part in parts:
                 records = self._reader.records_of(part.messages, local.scratch)
-                part.decoder.fill(columns, records, part.messages.index, part.rows)
+                part.decoder.fill(target, records, part.messages.index, part.rows)
                 if order is not None:
                     times[part.rows] = part.messages.index["log_time"]
 
         with self._reading:
-            columns = first.decoder.empty_columns(wanted, count, first.messages, self._scratch)
+            target = Target(
+                first.decoder.empty_columns(wanted, count, first.messages, self._scratch)
+            )
             every = itertools.chain([first], selected)
             if threads <= 1:
                 fill(every)
@@ -182,7 +184,7 @@ class Topic:
                     except BaseException:
                         pool.shutdown(cancel_futures=True)
                         raise
-        return {LOG_TIME: times, **columns}
+        return {LOG_TIME: times, **target.columns}
 
     def _check(self, wanted: Collection[str]) -> None:
         """Check that all channels have the wanted fields, with equal dtypes."""

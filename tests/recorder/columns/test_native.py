@@ -56,7 +56,7 @@ def copied(records: Any, index: NDArray[Any], size: int = SIZE) -> bool:
     numbers, pairs = columns()
     expected = [(0, HEAD), (HEADER, b"\x09\0")]
     return copy_fields(
-        records, index, size, expected, [(HEADER + 2, numbers), (HEADER + 10, pairs)]
+        records, index, size, expected, [(HEADER + 2, numbers), (HEADER + 10, pairs)], 0
     )
 
 
@@ -65,9 +65,44 @@ def test_fields_are_copied(gap: int) -> None:
     records, index = messages(gap)
     numbers, pairs = columns()
     targets = [(HEADER + 2, numbers), (HEADER + 10, pairs)]
-    assert copy_fields(records, index, SIZE, [(0, HEAD), (HEADER, b"\x09\0")], targets)
+    assert copy_fields(records, index, SIZE, [(0, HEAD), (HEADER, b"\x09\0")], targets, 0)
     assert numbers.tolist() == [k / 4 for k in range(COUNT)]
     assert pairs.tolist() == [[k % 256, 255] for k in range(COUNT)]
+
+
+def test_messages_are_copied_to_the_rows_from_the_given_one() -> None:
+    records, index = messages()
+    numbers, pairs = np.full(COUNT, -1.0), np.zeros((COUNT, 2), np.uint8)
+    assert copy_fields(records, index[5:8], SIZE, [], [(HEADER + 2, numbers)], 2)
+    assert numbers[:6].tolist() == [-1, -1, 5 / 4, 6 / 4, 7 / 4, -1]
+    assert copy_fields(records, index[:1], SIZE, [], [(HEADER + 10, pairs)], COUNT - 1)
+    assert pairs[-2:].tolist() == [[0, 0], [0, 255]]
+    for row in (1, COUNT, 2**62):
+        with pytest.raises(ValueError, match="too few rows"):
+            copy_fields(records, index, SIZE, [], [(HEADER + 2, numbers)], row)
+    for row in (-1, 2**63 - 1):
+        with pytest.raises(ValueError, match="the row is not valid"):
+            copy_fields(records, index, SIZE, [], [], row)
+
+
+@pytest.mark.parametrize("size", [*range(1, 40), 127, 128, 129, 1000])
+def test_fields_of_any_size_are_copied(size: int) -> None:
+    payloads = np.random.default_rng(size).integers(0, 256, (COUNT, 3 + size), np.uint8)
+    records = b"".join(
+        message_record(CHANNEL, k, k, row.tobytes()) for k, row in enumerate(payloads)
+    )
+    index, length = np.zeros(COUNT, INDEX_ENTRY), len(records) // COUNT
+    index["log_time"], index["offset"] = np.arange(COUNT), np.arange(COUNT) * length
+    fields = np.zeros((COUNT, size), np.uint8)
+    assert copy_fields(records, index, length, [], [(HEADER + 3, fields)], 0)
+    assert (fields == payloads[:, 3:]).all()
+    # All bytes of one message are expected in another one, except one byte.
+    expected = bytearray(payloads[7, 3:].tobytes())
+    assert copy_fields(records, index[7:8], length, [(HEADER + 3, expected)], [], 0)
+    for place in range(size):
+        expected[place] ^= 0x80
+        assert not copy_fields(records, index[7:8], length, [(HEADER + 3, expected)], [], 0)
+        expected[place] ^= 0x80
 
 
 @given(st.integers(0, COUNT - 1), st.sampled_from([*range(11), *range(15, 23), HEADER]))
@@ -101,15 +136,17 @@ def test_fields_outside_of_the_record_are_refused() -> None:
         ([], [(-1, numbers)]),
         ([], [(SIZE - 7, numbers)]),
         ([], [(SIZE - 1, pairs)]),
-        ([], [(0, numbers[:-1])]),
     ]
     for expected, targets in invalid:
         with pytest.raises(ValueError, match="not within the record"):
-            copy_fields(records, index, SIZE, expected, targets)
+            copy_fields(records, index, SIZE, expected, targets, 0)
+    for few in (numbers[:-1], np.zeros(())):
+        with pytest.raises(ValueError, match="too few rows"):
+            copy_fields(records, index, SIZE, [], [(0, few)], 0)
     with pytest.raises(ValueError, match="no messages"):
-        copy_fields(records, index[:0], SIZE, [], [])
+        copy_fields(records, index[:0], SIZE, [], [], 0)
     with pytest.raises(ValueError, match="too short"):
-        copy_fields(records, index, 22, [], [])
+        copy_fields(records, index, 22, [], [], 0)
 
 
 def test_arguments_of_other_types_are_refused() -> None:
@@ -117,12 +154,12 @@ def test_arguments_of_other_types_are_refused() -> None:
     numbers, pairs = columns()
     numbers.flags.writeable = False
     with pytest.raises(ValueError, match="read-only"):
-        copy_fields(records, index, SIZE, [], [(0, numbers)])
+        copy_fields(records, index, SIZE, [], [(0, numbers)], 0)
     with pytest.raises(ValueError, match="contiguous"):
-        copy_fields(records, index, SIZE, [], [(0, np.zeros((COUNT, 2))[:, 0])])
+        copy_fields(records, index, SIZE, [], [(0, np.zeros((COUNT, 2))[:, 0])], 0)
     for expected in ((), [0], [(0, "text")], [("0", HEAD)]):
         with pytest.raises(TypeError):
-            copy_fields(records, index, SIZE, expected, [(0, pairs)])
+            copy_fields(records, index, SIZE, expected, [(0, pairs)], 0)
 
 
 @pytest.mark.parametrize(
