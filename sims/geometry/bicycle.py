@@ -34,7 +34,7 @@ def roll(
     wheelbase_m: float,
     duration_s: float,
 ) -> Motion:
-    """Advance a bicycle by one explicit Euler step, which must turn it by at most 90 degrees."""
+    """Advance a bicycle by one explicit Euler step, which must turn it by at most 12 degrees."""
     moved, turn_rad = roll_pose(motion, slip_sine, acceleration_m_s2, wheelbase_m, duration_s)
     heading = turned(moved.heading, turn_rad)
     return Motion(moved.x_m, moved.y_m, moved.yaw_rad, moved.speed_m_s, heading)

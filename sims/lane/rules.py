@@ -19,9 +19,7 @@ from mcaprl.sims.geometry.bicycle import (
 from mcaprl.sims.geometry.paths import Heading, heading_of, in_body_frame, wrap_angle
 from mcaprl.sims.lane.course import LANE_HALF_WIDTH_M
 from mcaprl.sims.lane.path import (
-    Leg,
-    course_leg,
-    course_next,
+    CourseSpot,
     course_point_ahead,
     course_project,
     course_spot_at,
@@ -229,12 +227,11 @@ Numbers = tuple[float, float, float, float, float, float, float, float, float, f
 def seen_from(car: Car) -> Numbers:
     """Return the 12 observed numbers, clipped to their limits."""
     here = course_spot_at(car.along_m)
-    leg, after = course_leg(here.leg), course_leg(course_next(here.leg))
     heading = heading_of(car.yaw_rad)
-    near_x, near_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[0])
-    mid_x, mid_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[1])
-    far_x, far_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[2])
-    last_x, last_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[3])
+    near_x, near_y = _ahead(car, heading, here, LOOKAHEADS_M[0])
+    mid_x, mid_y = _ahead(car, heading, here, LOOKAHEADS_M[1])
+    far_x, far_y = _ahead(car, heading, here, LOOKAHEADS_M[2])
+    last_x, last_y = _ahead(car, heading, here, LOOKAHEADS_M[3])
     return (
         _within(car.offset_m * (1.0 / LANE_HALF_WIDTH_M), _LIMITS[0]),
         _within(car.heading_error_rad * (2.0 / math.pi), _LIMITS[1]),
@@ -252,11 +249,9 @@ def seen_from(car: Car) -> Numbers:
 
 
 @inlined
-def _ahead(
-    car: Car, heading: Heading, leg: Leg, after: Leg, rest_m: float, lookahead_m: float
-) -> tuple[float, float]:
+def _ahead(car: Car, heading: Heading, here: CourseSpot, lookahead_m: float) -> tuple[float, float]:
     """Return a path point ahead as (forward, left) of the car, divided by `lookahead_m`."""
-    x_m, y_m = course_point_ahead(leg, after, rest_m, lookahead_m)
+    x_m, y_m = course_point_ahead(here, lookahead_m)
     forward_m, left_m = in_body_frame(x_m - car.x_m, y_m - car.y_m, heading.cos, heading.sin)
     forward, left = forward_m * (1.0 / lookahead_m), left_m * (1.0 / lookahead_m)
     return _within(forward, _LIMITS[4]), _within(left, _LIMITS[4])

@@ -80,7 +80,6 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._some_truncate = bool(self._truncates.any())
         self._reasons = np.array(fleet.reasons, dtype=object)
         self._all = np.ones(num_envs, dtype=np.bool_)
-        self._nothing = np.full(num_envs, None, dtype=object)
         self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
         # Number of steps so far, and its value when each vehicle's episode started.
         self._steps = 0
@@ -168,7 +167,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         if self.autoreset_mode is not AutoresetMode.SAME_STEP or not self._ended.any():
             return self._infos_of(self._all, has_reason)
         ended = self._ended.copy()
-        last = self._nothing.copy()
+        last = np.empty(self.num_envs, dtype=object)
         final = self._infos_of(ended, has_reason)
         chosen = ended.nonzero()[0]
         for i in chosen.tolist():
@@ -190,7 +189,8 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
             infos[f"_{key}"] = chosen.copy()
         those = has_reason.nonzero()[0]
         if len(those):
-            reasons = self._nothing.copy()
+            # The items of an empty object array are None.
+            reasons = np.empty(self.num_envs, dtype=object)
             reasons[those] = self._reasons[self.fleet.ends[those]]
             infos["reason"], infos["_reason"] = reasons, has_reason.copy()
         return infos

@@ -11,8 +11,7 @@ from mcaprl.sims.geometry.paths import further, point_of, project, spot_at
 from mcaprl.sims.lane.course import COURSE
 from mcaprl.sims.lane.path import (
     LONGEST_LOOK_M,
-    course_leg,
-    course_next,
+    Leg,
     course_point_ahead,
     course_project,
     course_spot_at,
@@ -25,6 +24,12 @@ along = st.one_of(
 )
 
 
+def leg_of(k: int) -> Leg:
+    length_m = float(COURSE.along_m[k + 1] - COURSE.along_m[k])
+    (x_m, y_m), (cos, sin) = COURSE.points_m[k].tolist(), COURSE.forward[k].tolist()
+    return Leg(x_m, y_m, float(COURSE.yaw_rad[k]), cos, sin, length_m)
+
+
 def test_no_lookahead_exceeds_the_shortest_leg() -> None:
     assert LONGEST_LOOK_M == 126.0
     assert max(*LOOKAHEADS_M, BACK_M + AHEAD_M) < LONGEST_LOOK_M
@@ -34,14 +39,16 @@ def test_no_lookahead_exceeds_the_shortest_leg() -> None:
 @example(-1e-17)
 @example(1026.0)
 def test_a_place_on_the_course(along_m: float) -> None:
-    leg, rest_m = course_spot_at(along_m)
-    assert (int(leg), rest_m) == spot_at(COURSE, along_m)
+    rest_m, leg, after = course_spot_at(along_m)
+    spot = spot_at(COURSE, along_m)
+    assert rest_m == spot.rest_m
+    assert leg == leg_of(spot.leg)
+    assert after == leg_of((spot.leg + 1) % 8)
 
 
 @given(along, st.sampled_from(LOOKAHEADS_M))
 def test_a_point_ahead(along_m: float, ahead_m: float) -> None:
-    leg, rest_m = course_spot_at(along_m)
-    found = course_point_ahead(course_leg(leg), course_leg(course_next(leg)), rest_m, ahead_m)
+    found = course_point_ahead(course_spot_at(along_m), ahead_m)
     assert found == point_of(COURSE, further(COURSE, spot_at(COURSE, along_m), ahead_m))
 
 

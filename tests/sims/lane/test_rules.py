@@ -23,6 +23,7 @@ from mcaprl.sims.lane.rules import (
     Car,
     car_at,
     drive,
+    driven,
     end_of,
     located,
     observe,
@@ -79,6 +80,13 @@ def test_no_speed_makes_more_than_9_m_s2_sideways(steering: float, speed_m_s: fl
     slip_rad = math.atan(0.5 * math.tan(wheel_angle(steering, speed_m_s)))
     lateral_m_s2 = speed_m_s**2 * math.sin(slip_rad) / (WHEELBASE_M / 2)
     assert abs(lateral_m_s2) <= 9.0 + 1e-9
+
+
+@given(st.floats(-1, 1), st.floats(0, 30))
+def test_a_car_turns_by_less_than_five_degrees_in_a_substep(steering: float, v_m_s: float) -> None:
+    """`paths.turned` is accurate up to 12 degrees."""
+    moved = driven(moving(0.0, 0.0, 0.0, v_m_s), steering, False)
+    assert abs(moved.yaw_rad) < math.radians(5.0)
 
 
 def test_full_throttle_from_rest() -> None:
