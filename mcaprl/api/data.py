@@ -108,7 +108,7 @@ def _only(data: Paths) -> str | Path | None:
 def _other_format(data: Paths, name: str | None) -> Format | None:
     """Return the format of another tool's dataset; None for logs."""
     one = _only(data)
-    if name is None and (one is None or Path(one).suffix == ".mcap"):
+    if name is None and (one is None or str(one).endswith(".mcap")):
         return None
     from mcaprl.recorder.dataset.formats.registry import format_named, other_format
 

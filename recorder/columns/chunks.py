@@ -1,8 +1,7 @@
-"""Chunk records and ChunkIndex records: compression, CRCs, parsing and serialization."""
+"""Chunk records: compression, CRCs, parsing and serialization."""
 
 from __future__ import annotations
 
-import itertools
 import struct
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -22,18 +21,6 @@ from mcaprl.recorder.columns.message_rows import RECORD_HEADER_BYTES
 MAX_CHUNK_BYTES = 256 * 2**20
 
 _CHUNK_START = struct.Struct("<BQQQQII")
-# A ChunkIndex record consists of the start, the map entries, the middle, the name of the
-# compression, and the end.
-_INDEX_START, _INDEX_MAP_ENTRY = struct.Struct("<QQQQI"), struct.Struct("<HQ")
-_INDEX_MIDDLE, _INDEX_END = struct.Struct("<QI"), struct.Struct("<QQ")
-# A whole ChunkIndex record of a chunk with one channel and zstd compression.
-_INDEX_OF_ONE = struct.Struct("<9sQQQQ4sHQQ8sQQ")
-# The parts of these records that are always equal: header, length of the map, and compression.
-_HEADS_OF_ONE = (
-    struct.pack("<BQ", Opcode.CHUNK_INDEX, _INDEX_OF_ONE.size - RECORD_HEADER_BYTES),
-    struct.pack("<I", _INDEX_MAP_ENTRY.size),
-    struct.pack("<I4s", 4, b"zstd"),
-)
 _ZSTD = zstandard.ZstdCompressionParameters.from_level
 # Settings for short records of numbers. Each record is most similar to the records just before it.
 # A small hash table is therefore faster than the large table of zstd level 1, and it finds more
@@ -171,77 +158,6 @@ def chunk_header(file: memoryview, offset: int) -> ChunkHeader:
             f"the chunk at byte {offset} declares {size} bytes; the limit is {MAX_CHUNK_BYTES}"
         )
     return ChunkHeader(start, end, size, crc, name, slice(data_start, data_start + data_bytes))
-
-
-def chunk_index_record(chunk: ChunkIndex) -> bytes:
-    """Serialize a ChunkIndex record. The `mcap` library takes twenty times as long."""
-    offsets, name = chunk.message_index_offsets, chunk.compression.encode()
-    start = _INDEX_START.pack(
-        chunk.message_start_time,
-        chunk.message_end_time,
-        chunk.chunk_start_offset,
-        chunk.chunk_length,
-        len(offsets) * _INDEX_MAP_ENTRY.size,
-    )
-    pairs = b"".join(itertools.starmap(_INDEX_MAP_ENTRY.pack, offsets.items()))
-    middle = _INDEX_MIDDLE.pack(chunk.message_index_length, len(name))
-    end = _INDEX_END.pack(chunk.compressed_size, chunk.uncompressed_size)
-    content = b"".join((start, pairs, middle, name, end))
-    return struct.pack("<BQ", Opcode.CHUNK_INDEX, len(content)) + content
-
-
-def parse_chunk_index(content: memoryview) -> ChunkIndex:
-    """Parse the content of a ChunkIndex record.
-
-    Raises:
-        CorruptLogError: The record is damaged.
-    """
-    try:
-        start_time, end_time, offset, length, map_bytes = _INDEX_START.unpack_from(content)
-        middle = _INDEX_START.size + map_bytes
-        offsets = dict(_INDEX_MAP_ENTRY.iter_unpack(content[_INDEX_START.size : middle]))
-        index_bytes, name_bytes = _INDEX_MIDDLE.unpack_from(content, middle)
-        name = middle + _INDEX_MIDDLE.size
-        compression = str(content[name : name + name_bytes], "utf-8")
-        compressed_bytes, raw_bytes = _INDEX_END.unpack_from(content, name + name_bytes)
-    except (struct.error, UnicodeDecodeError) as error:
-        raise CorruptLogError("a chunk_index record is damaged") from error
-    if len(offsets) * _INDEX_MAP_ENTRY.size < map_bytes:
-        raise CorruptLogError("a chunk_index record has several indexes of one channel")
-    # The arguments are positional, because keyword arguments take twice as long.
-    return ChunkIndex(
-        length,
-        offset,
-        compression,
-        compressed_bytes,
-        end_time,
-        index_bytes,
-        offsets,
-        start_time,
-        raw_bytes,
-    )
-
-
-def parse_chunk_indexes(summary: memoryview) -> tuple[list[ChunkIndex], int]:
-    """Parse ChunkIndex records of chunks with one channel and zstd compression.
-
-    For each record, this takes a third of the time of `parse_chunk_index`.
-
-    Args:
-        summary: Records of the summary; parsing stops before the first record of another kind.
-
-    Returns:
-        The parsed records, and their total length in bytes.
-    """
-    size, found = _INDEX_OF_ONE.size, list[ChunkIndex]()
-    records = _INDEX_OF_ONE.iter_unpack(summary[: len(summary) // size * size])
-    for record in records:
-        head, start, end, offset, length, ids, channel, place, indexes, name, packed, raw = record
-        if (head, ids, name) != _HEADS_OF_ONE:
-            break
-        offsets = {channel: place}
-        found.append(ChunkIndex(length, offset, "zstd", packed, end, indexes, offsets, start, raw))
-    return found, len(found) * size
 
 
 _NOTHING = (-1, memoryview(b""))

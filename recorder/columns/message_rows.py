@@ -8,7 +8,7 @@ array of `record_dtype(payload)`; the entries of a MessageIndex form an array of
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property, lru_cache
 from typing import Any, Self
 
@@ -195,6 +195,54 @@ class MessageRange:
     def __len__(self) -> int:
         """Return the number of messages."""
         return self._count
+
+
+class MessageRanges:
+    """Message ranges of one channel, in file order, each created when it is first used.
+
+    Attributes:
+        counts: (P,) number of messages of each range.
+        chunks: (P,) number of the chunk of each range; -1 for unchunked messages.
+    """
+
+    def __init__(
+        self,
+        counts: NDArray[np.int64],
+        chunks: NDArray[np.int64],
+        create: Callable[[int, int], MessageRange],
+        made: dict[int, MessageRange],
+    ) -> None:
+        """Store the ranges that were already created, and how to create the others.
+
+        Args:
+            counts: Number of messages of each range; ranges without messages are left out.
+            chunks: Number of the chunk of each range; -1 for unchunked messages.
+            create: Function that creates the range of a chunk with that number of messages.
+            made: Ranges by their position in `counts`.
+        """
+        kept = np.flatnonzero(counts)
+        self.counts, self.chunks = counts[kept], chunks[kept]
+        self._create = create
+        if made and len(kept) < len(counts):
+            made = {new: made[old] for new, old in enumerate(kept.tolist()) if old in made}
+        self._made = made
+
+    def __len__(self) -> int:
+        """Return the number of ranges."""
+        return len(self.counts)
+
+    def __getitem__(self, number: int) -> MessageRange:
+        """Return a range."""
+        number = range(len(self.counts))[number]
+        found = self._made.get(number)
+        if found is None:
+            found = self._create(int(self.chunks[number]), int(self.counts[number]))
+            self._made[number] = found
+        return found
+
+    def __iter__(self) -> Iterator[MessageRange]:
+        """Yield the ranges."""
+        return map(self.__getitem__, range(len(self.counts)))
 
 
 def as_items(column: NDArray[Any]) -> NDArray[Any]:

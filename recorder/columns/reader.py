@@ -13,10 +13,10 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterable, Iterator
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
@@ -32,18 +32,18 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
 from mcaprl.recorder.columns.checksum import crc32
-from mcaprl.recorder.columns.chunks import (
-    Scratch,
-    chunk_header,
-    chunk_records,
+from mcaprl.recorder.columns.chunk_indexes import (
+    ChunkIndexes,
+    indexes_of_one,
     parse_chunk_index,
-    parse_chunk_indexes,
 )
+from mcaprl.recorder.columns.chunks import Scratch, chunk_header, chunk_records
 from mcaprl.recorder.columns.message_rows import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
     MessageRange,
+    MessageRanges,
     message_index,
 )
 from mcaprl.recorder.columns.records import (
@@ -65,10 +65,7 @@ from mcaprl.remote import RemotePath, as_path
 # Number of bytes at the start and at the end of a remote file that are fetched when it is opened.
 _HEAD_BYTES, _TAIL_BYTES = 2**16, 2**18
 _SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
-# Number of bytes in a MessageIndex record before its entries.
-_INDEX_HEAD_BYTES = RECORD_HEADER_BYTES + 6
 _CHANNEL_ID = struct.Struct("<H")
-_START_OF = attrgetter("chunk_start_offset")
 _TOP_LEVEL = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
 
 
@@ -104,7 +101,6 @@ class McapReader:
         self._named = _Named(self.path)
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        self.chunks: list[ChunkIndex] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self.data_end = 0
         self._counts: dict[int, int] = {}
@@ -120,8 +116,7 @@ class McapReader:
         if not self.summary_start:
             # Without a summary, all records are read.
             self.fetch([(0, size)])
-        if self.summary_start:
-            self._read_summary()
+        self.chunks = self._read_summary()
         self._summary_has_topics = bool(self.channels)
         self._read_between_chunks(unchunked)
         self._unchunked = unchunked.indexes()
@@ -220,7 +215,7 @@ class McapReader:
             raise CorruptLogError(f"{self.path}: {channel.topic} has no schema")
         return schema
 
-    def message_ranges(self, channel: Channel) -> list[MessageRange]:
+    def message_ranges(self, channel: Channel) -> MessageRanges:
         """Return the positions of the messages of a channel, in file order.
 
         Only chunks without an index are decompressed. The index of a chunk with a single channel is
@@ -233,16 +228,17 @@ class McapReader:
         if self._remote is not None:
             # Fetch the indexes of all chunks with several channels in one call, not with one
             # request for each chunk.
-            places = [one for one in self.chunks if len(one.message_index_offsets) > 1]
+            others = [self.chunks[k] for k in np.flatnonzero(self.chunks.channels < 0).tolist()]
+            places = [one for one in others if one.message_index_offsets]
             starts = [one.chunk_start_offset + one.chunk_length for one in places]
             self.fetch(zip(starts, map(end_of, places), strict=True))
         # The ranges refer to this reader, so the reader does not store them: a file stays open
         # until its reader is deleted, and a cycle of references would delay that.
         count, ranges = self._counts.get(channel.id), self._find_ranges(channel.id, lazily=True)
-        found = sum(map(len, ranges))
+        found = int(ranges.counts.sum())
         if found != count:
             ranges = self._find_ranges(channel.id, lazily=False)
-            found = sum(map(len, ranges))
+            found = int(ranges.counts.sum())
         if count not in (None, found):
             raise CorruptLogError(
                 f"{self.path}: the summary counts {count} messages of {channel.topic}, but the"
@@ -250,34 +246,45 @@ class McapReader:
             )
         return ranges
 
-    def _find_ranges(self, channel_id: int, *, lazily: bool) -> list[MessageRange]:
-        ranges = []
-
+    def _find_ranges(self, channel_id: int, *, lazily: bool) -> MessageRanges:
         def read(part: MessageRange) -> NDArray[Any]:
             assert part.chunk is not None
             offset = part.chunk.message_index_offsets[channel_id]
             return self._index_at(channel_id, offset, len(part))
 
-        # A writer that was killed may have written only some indexes of the last chunk.
-        uncertain = None if self.complete or not self.chunks else self.chunks[-1]
-        for chunk in self.chunks:
-            offsets = chunk.message_index_offsets
-            if not offsets or chunk is uncertain:
-                index = self._contents_of(chunk).indexes.get(channel_id)
-                if index is not None:
-                    ranges.append(MessageRange.of_index(chunk, index))
-            elif channel_id in offsets:
-                if lazily and len(offsets) == 1:
-                    entries_bytes = chunk.message_index_length - _INDEX_HEAD_BYTES
-                    count = max(entries_bytes, 0) // INDEX_ENTRY.itemsize
-                    ranges.append(MessageRange(chunk, count, read))
-                else:
-                    index = self._index_at(channel_id, offsets[channel_id])
-                    ranges.append(MessageRange.of_index(chunk, index))
+        def create(number: int, count: int) -> MessageRange:
+            return MessageRange(self.chunks[number], count, read)
+
+        chunks = self.chunks
+        is_alone = chunks.channels == channel_id
+        may_have = is_alone | (chunks.channels < 0)
+        if not self.complete and len(chunks):
+            # A writer that was killed may have written only some indexes of the last chunk.
+            is_alone[-1], may_have[-1] = False, True
+        numbers = np.flatnonzero(may_have)
+        counts, made = chunks.counts[numbers], dict[int, MessageRange]()
+        for place in np.flatnonzero(~is_alone[numbers]).tolist() if lazily else range(len(numbers)):
+            number = int(numbers[place])
+            index = self._index_in(channel_id, number)
+            made[place] = MessageRange.of_index(chunks[number], index)
+            counts[place] = len(index)
         if channel_id in self._unchunked:
-            ranges.append(MessageRange.of_index(None, self._unchunked[channel_id]))
+            index = self._unchunked[channel_id]
+            made[len(counts)] = MessageRange.of_index(None, index)
+            counts, numbers = np.append(counts, len(index)), np.append(numbers, -1)
         # A writer may store empty indexes, for example of all channels in each chunk.
-        return [one for one in ranges if len(one)]
+        return MessageRanges(counts, numbers, create, made)
+
+    def _index_in(self, channel_id: int, number: int) -> NDArray[Any]:
+        """Return the index of the messages of a channel in a chunk; it may be empty."""
+        chunk = self.chunks[number]
+        offsets = chunk.message_index_offsets
+        if not offsets or (not self.complete and number == len(self.chunks) - 1):
+            found = self._contents_of(chunk).indexes.get(channel_id)
+            return np.empty(0, INDEX_ENTRY) if found is None else found
+        if channel_id in offsets:
+            return self._index_at(channel_id, offsets[channel_id])
+        return np.empty(0, INDEX_ENTRY)
 
     def records_of(self, messages: MessageRange, scratch: Scratch | None = None) -> memoryview:
         """Return the bytes that contain these messages: the records of a chunk, or the whole file.
@@ -397,45 +404,53 @@ class McapReader:
                 self._contents[start] = contents_of(records)
         return self._contents[start]
 
-    def _read_summary(self) -> None:
-        view, end = self._view, self.summary_start
+    def _read_summary(self) -> ChunkIndexes:
+        """Read the summary if there is one; return the chunk indexes in it."""
+        view, end = self._view, self.summary_start or len(self._view)
+        rows, others = None, list[ChunkIndex]()
         with self._named:
             while (record := next(records_of(view, end), None)) is not None:
                 offset, opcode, content = record
                 end = offset + RECORD_HEADER_BYTES + len(content)
-                if opcode == Opcode.CHUNK_INDEX:
-                    self.chunks.append(parse_chunk_index(content))
-                    # In most logs, the next records are chunk indexes that can be parsed faster.
-                    following, length = parse_chunk_indexes(view[end:])
-                    self.chunks += following
-                    end += length
+                if opcode == Opcode.CHUNK_INDEX and rows is None:
+                    # In most logs, all chunk indexes can be parsed together.
+                    rows = indexes_of_one(view[offset:])
+                    end = offset + rows.nbytes
+                elif opcode == Opcode.CHUNK_INDEX:
+                    others.append(parse_chunk_index(content))
                 elif opcode in _SUMMARY:
                     self._parse(opcode, content, offset)
-        self.chunks.sort(key=_START_OF)
+        return ChunkIndexes(indexes_of_one(view[:0]) if rows is None else rows, others)
 
     def _read_between_chunks(self, unchunked: UnindexedMessages) -> None:
         """Read the records that the summary does not list. Without a summary, read all records."""
-        start, before = len(MAGIC), None
-        found: list[ChunkIndex] = []
+        chunks, starts, ends = self.chunks, self.chunks.starts, self.chunks.ends
+        if ends.max(initial=0) > len(self._view):
+            start = chunks[int(ends.argmax())].chunk_start_offset
+            raise CorruptLogError(
+                f"{self.path}: the chunk at byte {start} extends beyond the end of the file"
+            )
+        # Most chunks follow each other without a gap.
+        gaps = np.flatnonzero(starts[1:] != ends[:-1]).tolist()
+        befores = [-1, *gaps, len(chunks) - 1] if len(chunks) else [-1]
+        bounds = [
+            (
+                int(ends[number]) if number >= 0 else len(MAGIC),
+                int(starts[number + 1]) if number + 1 < len(chunks) else None,
+            )
+            for number in befores
+        ]
         if self._remote is not None and self.summary_start:
-            starts = [start, *map(end_of, self.chunks)]
-            stops = [*(one.chunk_start_offset for one in self.chunks), self.summary_start]
-            gaps = zip(starts, stops, strict=True)
-            self.fetch([(low, high) for low, high in gaps if low < high])
-        size = len(self._view)
-        for chunk in self.chunks:
-            # Most chunks follow each other without a gap.
-            if start != chunk.chunk_start_offset:
-                found += self._read_records(start, chunk.chunk_start_offset, before, unchunked)
-            before, start = chunk, end_of(chunk)
-            if start > size:
-                raise CorruptLogError(
-                    f"{self.path}: the chunk at byte {chunk.chunk_start_offset} extends beyond the"
-                    " end of the file"
-                )
-        found += self._read_records(start, None, before, unchunked)
-        if found:
-            self.chunks = sorted([*self.chunks, *found], key=_START_OF)
+            ranges = [(low, high or self.summary_start) for low, high in bounds]
+            self.fetch([(low, high) for low, high in ranges if low < high])
+        found, has_changed = [], False
+        for number, (low, high) in zip(befores, bounds, strict=True):
+            before = chunks[number] if number >= 0 else None
+            indexes = 0 if before is None else len(before.message_index_offsets)
+            found += self._read_records(low, high, before, unchunked)
+            has_changed |= before is not None and len(before.message_index_offsets) != indexes
+        if found or has_changed:
+            self.chunks = chunks.plus(found)
 
     def _read_records(
         self,
@@ -484,7 +499,11 @@ class McapReader:
     def _find_topics_in_chunks(self) -> None:
         """Search chunks for schemas and channels that are stored nowhere else."""
         described = self._described_channels()
-        for chunk in self.chunks:
+        # A chunk of the channel -1 may contain any channel.
+        others = [one for one in set(self.chunks.channels.tolist()) if one not in described]
+        numbers = np.flatnonzero(np.isin(self.chunks.channels, others)).tolist() if others else ()
+        for number in numbers:
+            chunk = self.chunks[number]
             indexed = chunk.message_index_offsets.keys()
             if indexed:
                 is_known = indexed <= described

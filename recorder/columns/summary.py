@@ -22,7 +22,7 @@ from mcap.records import (
 )
 
 from mcaprl.recorder.columns.checksum import crc32
-from mcaprl.recorder.columns.chunks import chunk_index_record
+from mcaprl.recorder.columns.chunk_indexes import chunk_index_record
 from mcaprl.recorder.columns.records import MAGIC
 
 

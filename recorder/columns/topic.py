@@ -40,7 +40,6 @@ class Topic:
 
     Attributes:
         name: Name of the topic.
-        parts: Message ranges with their decoders, channel by channel, in file order.
     """
 
     def __init__(self, reader: McapReader, name: str) -> None:
@@ -54,11 +53,10 @@ class Topic:
         self._reader = reader
         found = [(channel, reader.message_ranges(channel)) for channel in reader.channels_of(name)]
         # A channel without messages may have any type.
-        by_decoder = [(Decoder(reader, channel), ranges) for channel, ranges in found if ranges]
-        self._decoders = [decoder for decoder, _ in by_decoder]
-        self.parts = [(decoder, part) for decoder, ranges in by_decoder for part in ranges]
-        self._counts = np.array([len(part) for _, part in self.parts], np.int64)
-        self._stops = np.cumsum(self._counts)
+        self._ranges = [(Decoder(reader, channel), ranges) for channel, ranges in found if ranges]
+        self._decoders = [decoder for decoder, _ in self._ranges]
+        counts = [ranges.counts for _, ranges in self._ranges]
+        self._stops = np.cumsum(np.concatenate(counts)) if counts else np.empty(0, np.int64)
         # The scratch memory keeps the last chunk, because the next call may read other columns of
         # it.
         self._scratch, self._reading = Scratch(), threading.Lock()
@@ -66,6 +64,19 @@ class Topic:
     def __len__(self) -> int:
         """Return the number of messages."""
         return int(self._stops[-1]) if len(self._stops) else 0
+
+    @cached_property
+    def parts(self) -> list[tuple[Decoder, MessageRange]]:
+        """Message ranges with their decoders, channel by channel, in file order."""
+        return [(decoder, part) for decoder, ranges in self._ranges for part in ranges]
+
+    def _part(self, number: int) -> tuple[Decoder, MessageRange]:
+        """Return an item of `parts` without creating the others."""
+        for decoder, ranges in self._ranges:
+            if number < len(ranges):
+                return decoder, ranges[number]
+            number -= len(ranges)
+        raise IndexError(number)
 
     @cached_property
     def times(self) -> NDArray[np.int64]:
@@ -92,21 +103,16 @@ class Topic:
     @property
     def channel_ids(self) -> NDArray[np.uint16]:
         """(N,) channel of each message, in the order of `parts`."""
-        ids = np.array([decoder.channel.id for decoder, _ in self.parts], np.uint16)
-        return np.repeat(ids, self._counts)
+        ids = np.array([decoder.channel.id for decoder in self._decoders], np.uint16)
+        return np.repeat(ids, [int(ranges.counts.sum()) for _, ranges in self._ranges])
 
     @cached_property
     def chunks_rise(self) -> bool:
         """Whether all messages are in one channel, and in chunks that do not overlap in time."""
-        chunks = [part.chunk for _, part in self.parts if part.chunk is not None]
-        return (
-            self.channels == 1
-            and len(chunks) == len(self.parts)
-            and all(
-                before.message_end_time <= after.message_start_time
-                for before, after in itertools.pairwise(chunks)
-            )
-        )
+        if self.channels != 1:
+            return False
+        numbers = self._ranges[0][1].chunks
+        return bool((numbers >= 0).all()) and self._reader.chunks.do_rise(numbers)
 
     @cached_property
     def fields(self) -> dict[str, np.dtype[Any]]:
@@ -201,10 +207,10 @@ class Topic:
 
     def _needed(self, order: NDArray[np.int64] | None) -> Iterator[MessageRange]:
         """Yield the parts that contain the messages at these positions."""
-        numbers = range(len(self.parts))
+        numbers = range(len(self._stops))
         if order is not None:
             numbers = np.unique(np.searchsorted(self._stops, order, side="right")).tolist()
-        return (self.parts[number][1] for number in numbers)
+        return (self._part(number)[1] for number in numbers)
 
     def _fetch_indexes(self) -> None:
         """Fetch the message indexes of a remote file in parallel."""
@@ -226,7 +232,7 @@ class Topic:
         highs = np.searchsorted(places, self._stops)
         lows = np.concatenate([[0], highs[:-1]])
         for number in np.flatnonzero(highs > lows).tolist():
-            decoder, part = self.parts[number]
+            decoder, part = self._part(number)
             low, high = int(lows[number]), int(highs[number])
             if high - low < len(part):
                 index = part.index[places[low:high] - (self._stops[number] - len(part))]

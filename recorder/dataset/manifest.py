@@ -51,7 +51,7 @@ def write_manifest(folder: Path, files: Sequence[LogFile]) -> Path:
 
 def is_manifest(name: str | Path) -> bool:
     """Return whether a path or URL has the name of a manifest."""
-    return PurePosixPath(str(name).partition("?")[0]).name == MANIFEST_NAME
+    return str(name).partition("?")[0].rpartition("/")[2] == MANIFEST_NAME
 
 
 def listed_logs(name: str | Path) -> list[Path]:

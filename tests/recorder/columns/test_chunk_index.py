@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from gymnasium import spaces
 from hypothesis import given
@@ -18,10 +19,11 @@ from mcap.records import ChunkIndex
 
 import mcaprl
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns.chunks import (
+from mcaprl.recorder.columns.chunk_indexes import (
+    ChunkIndexes,
     chunk_index_record,
+    indexes_of_one,
     parse_chunk_index,
-    parse_chunk_indexes,
 )
 from mcaprl.recorder.columns.message_rows import message_index
 from mcaprl.recorder.columns.reader import McapReader
@@ -72,8 +74,40 @@ def test_rows_of_chunk_indexes_are_parsed_like_each_one(
             chunks,
         )
     )
-    found, size = parse_chunk_indexes(memoryview(b"".join(records) + b"\0" + after))
-    assert (found, size) == (alike, sum(map(len, records[: len(alike)])))
+    found = indexes_of_one(memoryview(b"".join(records) + b"\0" + after))
+    assert found.nbytes == sum(map(len, records[: len(alike)]))
+    alike.sort(key=lambda chunk: chunk.chunk_start_offset)
+    assert list(ChunkIndexes(found)) == alike
+
+
+@given(st.lists(CHUNK_INDEXES | CHUNKS_OF_ONE, max_size=9))
+def test_values_of_chunk_indexes_are_those_of_the_objects(every: list[ChunkIndex]) -> None:
+    """Indexes can be parsed together or one by one, in any order."""
+    rows = indexes_of_one(memoryview(b"".join(map(chunk_index_record, every))))
+    chunks = ChunkIndexes(rows, every[len(rows) :])
+    expected = sorted(every, key=lambda chunk: chunk.chunk_start_offset)
+    assert len(chunks) == len(expected)
+    assert list(chunks) == [chunks[k] for k in range(len(chunks))] == expected
+    for k, chunk in enumerate(expected):
+        ids = list(chunk.message_index_offsets)
+        assert chunks.channels[k] == (ids[0] if len(ids) == 1 else -1)
+        start, length, indexes = (
+            min(number, 2**60)
+            for number in (
+                chunk.chunk_start_offset,
+                chunk.chunk_length,
+                chunk.message_index_length,
+            )
+        )
+        assert (chunks.starts[k], chunks.ends[k]) == (start, start + length + indexes)
+        assert chunks.counts[k] == max(indexes - 15, 0) // 16
+    do_rise = all(
+        before.message_end_time <= after.message_start_time
+        for before, after in itertools.pairwise(expected)
+    )
+    assert chunks.do_rise(np.arange(len(chunks))) == do_rise
+    with pytest.raises(IndexError):
+        chunks[len(expected)]
 
 
 @pytest.mark.parametrize("every", [1, 2])
@@ -90,7 +124,7 @@ def test_indexes_missing_from_the_summary_are_found(log_path: Path, every: int) 
     summary = Summary(dict(reader.schemas), dict(reader.channels), reader._counts, chunks)
     data = log_path.read_bytes()[: reader.summary_start]
     log_path.write_bytes(data + summary.to_bytes(len(data)))
-    assert McapReader(log_path).chunks != reader.chunks
+    assert list(McapReader(log_path).chunks) != list(reader.chunks)
     found = [mcaprl.open(log_path), mcaprl.open(log_path, episodes=1)]
     assert [data.fingerprint for data in found] == [data.fingerprint for data in reported]
 
@@ -99,10 +133,11 @@ def test_chunk_indexes_are_sorted_by_offset(log_path: Path) -> None:
     record(log_path, MIXED_SPACE, spaces.Discrete(2), [5, 1, 30])
     reader = McapReader(log_path)
     data = log_path.read_bytes()[: reader.summary_start]
-    for chunks in (reader.chunks[::-1], reader.chunks[1:] + reader.chunks[:1]):
+    before = list(reader.chunks)
+    for chunks in (before[::-1], before[1:] + before[:1]):
         summary = Summary(dict(reader.schemas), dict(reader.channels), reader._counts, chunks)
         log_path.write_bytes(data + summary.to_bytes(len(data)))
-        assert McapReader(log_path).chunks == reader.chunks
+        assert list(McapReader(log_path).chunks) == before
 
 
 def test_a_channel_that_is_listed_twice_is_refused() -> None:
@@ -120,7 +155,7 @@ def test_chunks_beyond_the_end_are_refused(log_path: Path, field: str) -> None:
     data = log_path.read_bytes()[: reader.summary_start]
     for value in (2 * len(data), 2**63, 2**64 - 1):
         fields: dict[str, Any] = {field: value}
-        chunks = [*reader.chunks[:-1], replace(reader.chunks[-1], **fields)]
+        chunks = [*list(reader.chunks)[:-1], replace(reader.chunks[-1], **fields)]
         summary = Summary(dict(reader.schemas), dict(reader.channels), reader._counts, chunks)
         log_path.write_bytes(data + summary.to_bytes(len(data)))
         with pytest.raises(CorruptLogError, match=r"end of the file|no valid record at byte"):

@@ -212,7 +212,7 @@ def test_an_image_type_without_a_field_is_reported(log_path: Path, tmp_path: Pat
 def test_several_threads_find_the_same_problems(good: Path, threads: int) -> None:
     assert check_log(good, threads=threads) == []
     spoilt = bytearray(good.read_bytes())
-    for chunk in McapReader(good).chunks[1:3]:
+    for chunk in list(McapReader(good).chunks)[1:3]:
         spoilt[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= 1
     good.write_bytes(spoilt)
     problems = check_log(good)
