@@ -89,10 +89,7 @@ def _write_infos(path: Path, log: LogWriter, columns: Transitions) -> None:
 def _write_steps(log: LogWriter, columns: Transitions) -> None:
     """Write the rows of `/rl/step` chunk by chunk."""
     count = len(columns.log_time_ns)
-    frames_per_episode = columns.lengths + 1
-    episode = np.repeat(np.arange(len(columns.episodes)), frames_per_episode)
-    step = np.arange(count) - np.repeat(columns.first_frames, frames_per_episode)
-    frame_of_step, finals = columns.frame_of_step(), columns.first_frames + columns.lengths
+    firsts, finals = columns.first_frames, columns.first_frames + columns.lengths
     transitions = {
         "action": columns.actions,
         "reward": columns.rewards,
@@ -104,14 +101,23 @@ def _write_steps(log: LogWriter, columns: Transitions) -> None:
     rows = log.step_rows()
     for start in range(0, count, len(rows)):
         frames = slice(start, min(start + len(rows), count))
-        steps = slice(*np.searchsorted(frame_of_step, [frames.start, frames.stop]))
-        where, taken = slice(frames.stop - start), frame_of_step[steps] - start
-        rows.number(where, episode[frames], step[frames])
+        # The episodes from `low` to `high` have frames in this chunk.
+        low, high = int(np.searchsorted(finals, start)), int(np.searchsorted(firsts, frames.stop))
+        stops = np.minimum(finals[low:high] + 1, frames.stop)
+        episode = np.repeat(np.arange(low, high), stops - np.maximum(firsts[low:high], start))
+        where = slice(frames.stop - start)
+        rows.number(where, episode, np.arange(start, frames.stop) - firsts[episode])
         for name, values in vectors:
             rows.put(name, where, values[frames])
+        ends = finals[low:high][finals[low:high] < frames.stop] - start
+        # With a mask, NumPy copies whole runs of rows.
+        has_transition = np.arange(len(rows)) < where.stop
+        has_transition[ends] = False
+        # Each episode before `low` has one frame more than it has transitions.
+        steps = slice(start - low, frames.stop - low - len(ends))
         for name, values in transitions.items():
-            rows.put(name, taken, values[steps])
-        rows.finish(finals[(finals >= start) & (finals < frames.stop)] - start)
+            rows.put(name, has_transition, values[steps])
+        rows.finish(ends)
         rows.write(where, columns.log_time_ns[frames])
 
 

@@ -125,7 +125,8 @@ def outside(space: spaces.Space[Any], values: NDArray[Any]) -> NDArray[np.bool_]
         return np.zeros(len(values), np.bool_)
     low, high = bounds
     wrong = ~((values >= low) & (values <= high))
-    return cast(NDArray[np.bool_], wrong.reshape(len(values), -1).any(1))
+    # The type is a string, because evaluating it takes as long as the comparison of short arrays.
+    return cast("NDArray[np.bool_]", wrong.reshape(len(values), -1).any(1))
 
 
 def bounds_of(space: spaces.Space[Any]) -> tuple[NDArray[Any], NDArray[Any]] | None:

@@ -10,7 +10,7 @@ Each chunk is decompressed once.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -33,6 +33,9 @@ from mcaprl.recorder.format.reading import (
 from mcaprl.recorder.format.topics import STEP_TOPIC
 from mcaprl.recorder.repair.episode_check import EpisodeCheck
 from mcaprl.remote import as_path
+
+# Number of chunks that a thread decompresses one after the other.
+_BLOCK_CHUNKS = 4
 
 
 def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
@@ -115,18 +118,41 @@ def _decompressed(
         for chunk in reader.chunks:
             yield chunk, partial(reader.chunk_records, chunk, scratch)
         return
-    chunks = iter(reader.chunks)
+    # Handing over several chunks at once takes less time than handing over each one.
+    blocks = _blocks_of(reader.chunks, _BLOCK_CHUNKS)
     with ThreadPoolExecutor(threads) as pool:
-        ahead = deque[tuple[ChunkIndex, Future[memoryview]]]()
-        # Memory use is limited: there is one buffer for each thread, and one for the caller.
-        scratches = cycle([Scratch() for _ in range(threads + 1)])
+        ahead = deque[tuple[list[ChunkIndex], Future[list[Callable[[], memoryview]]]]]()
+        # Memory use is limited: there are buffers for a block for each thread, and for the caller.
+        scratches = cycle([[Scratch() for _ in range(_BLOCK_CHUNKS)] for _ in range(threads + 1)])
         while True:
-            for chunk in islice(chunks, threads + 1 - len(ahead)):
-                ahead.append((chunk, pool.submit(reader.chunk_records, chunk, next(scratches))))
+            for block in islice(blocks, threads + 1 - len(ahead)):
+                ahead.append((block, pool.submit(_read_block, reader, block, next(scratches))))
             if not ahead:
                 return
-            chunk, future = ahead.popleft()
-            yield chunk, future.result
+            block, future = ahead.popleft()
+            yield from zip(block, future.result(), strict=True)
+
+
+def _read_block(
+    reader: McapReader, block: Sequence[ChunkIndex], scratches: Sequence[Scratch]
+) -> list[Callable[[], memoryview]]:
+    """Decompress chunks; return functions that return the records, or raise the error."""
+
+    def read(chunk: ChunkIndex, scratch: Scratch) -> Callable[[], memoryview]:
+        done: Future[memoryview] = Future()
+        try:
+            done.set_result(reader.chunk_records(chunk, scratch))
+        except CorruptLogError as error:
+            done.set_exception(error)
+        return done.result
+
+    return list(map(read, block, scratches))
+
+
+def _blocks_of(chunks: Iterable[ChunkIndex], size: int) -> Iterator[list[ChunkIndex]]:
+    rest = iter(chunks)
+    while block := list(islice(rest, size)):
+        yield block
 
 
 def _recover(path: Path) -> str:

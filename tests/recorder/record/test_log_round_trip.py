@@ -46,12 +46,18 @@ def test_recording_round_trip(
     assert dataset.action_space == action_space
 
 
-def test_episode_longer_than_a_chunk(log_path: Path) -> None:
-    lengths = [4095, 4096, 4097, 10_000, 2]
+@pytest.mark.parametrize(
+    "lengths", [[4095, 4096, 4097, 10_000, 2], [1] * 2047 + [4094, 1], [4093, 1, 1]]
+)
+def test_episodes_that_end_near_the_end_of_a_chunk(log_path: Path, lengths: list[int]) -> None:
     truth = record(log_path, VECTOR, spaces.Discrete(2), lengths)
     dataset = mcaprl.open(log_path)
     assert_holds(dataset, truth)
     assert [episode.length for episode in dataset.episodes] == lengths
+    copy = log_path.with_name("copy.mcap")
+    dataset.save(copy)
+    assert_holds(mcaprl.open(copy), truth)
+    assert mcaprl.open(copy).fingerprint == dataset.fingerprint
 
 
 @settings(max_examples=150)
