@@ -60,30 +60,29 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
   quarters of our time, and plain zstd 57 %. A reader that did nothing else would reach 76 %.
   Chunks of 200 images instead of 100 would save 7 % of the time, but a viewer that shows one image
   would decompress twice as much.
-- Logs of other writers: decompression takes a fifth more than plain zstd, because the columns
-  displace its memory from the cache. A fifth of the time is the copy, which the compiled code makes
-  in one pass with the checks, mostly into memory that is used for the first time. The rest is the
-  order of the records and the ends of the episodes.
-- A single episode: decompressing its chunk is a seventh of the time. The rest is Python code that
-  finds out what the log contains and where, and no function of it takes more than an eighth. The
-  goal would leave this code a sixth of its time. Minari reads an episode sooner, because HDF5 or
-  Arrow has its position, and it checks no CRC. Smaller chunks would save decompression and need as
-  much time for their indexes.
-- Two threads: the copy takes 1.4 times as long if two threads write to new memory at the same time.
-  In addition, a sixth of our time is spent in one thread, on the file's index, the order of the
-  records and the ends of the episodes.
+- Logs of other writers: a reader that only decompresses the chunks, checks their CRCs and copies
+  the fields by the same compiled code reaches .72 to .75 of plain zstd's speed (in three runs, in
+  which ours reached .61 to .64). The goal leaves 2 to 6 % of the time to find the order of the
+  records and the ends of the episodes, among others; ours takes 13 to 18 %.
+- A single episode: decompressing its chunk is a tenth of the time. The rest is Python code that
+  finds out what the log contains and where, and no function of it takes more than a tenth. A script
+  that knows all of this, and only finds the chunk, decompresses, checks and copies it, takes a
+  fifth of the time, and the goal is a third. Parsing the metadata takes a twelfth.
+- Two threads: the copy takes up to 1.5 times as long if two threads write to new memory at the same
+  time. In addition, a seventh of our time is spent in one thread, on the file's index, the order of
+  the records and the ends of the episodes.
 - Recording one environment: assigning the values to NumPy arrays, without writing them, takes
   three fifths of our time or more, and compression a tenth. The rest is the messages, CRCs and
   indexes at the end of an episode.
 - Recording 256 environments: where a step is cheap, as in the lane sim, compressing the records
   alone takes two thirds of the time of stepping or more. Where episodes are short, the five
-  messages of each episode take most of the time. In four runs, recording added 0 to 15 % to
+  messages of each episode take most of the time. In six runs, recording added 0 to 15 % to
   Pendulum, which has long episodes, and 7 to 12 % to the powerline sim, whose steps take less time
   in a batch.
-- A batch of 1,024 cars: three fifths of the time is the compiled step. Half of that is the motion,
-  which has a division and three square roots in each of five substeps. The infos take a sixth, a
-  third of it the array of reasons, and starting the cars whose episodes ended a ninth. The rest are
-  about 20 calls of NumPy on arrays of 1,024 values.
+- A batch of 1,024 cars: three fifths of the time is the compiled step. Nearly half of that is the
+  motion, which has a division and three square roots in each of five substeps. The infos take a
+  seventh, a third of it the array of reasons, and starting the cars whose episodes ended a ninth.
+  The rest are about 20 calls of NumPy on arrays of 1,024 values.
 - Depth images: drawing takes half of the time, downsampling two fifths, and encoding a twelfth.
   Drawing is limited by its short rows of pixels, 15 in the median; sums over columns are near the
   throughput of scalar instructions.

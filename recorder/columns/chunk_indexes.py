@@ -113,12 +113,15 @@ def indexes_of_one(summary: memoryview) -> NDArray[Any]:
         Copy of the records, an array of `_INDEX_OF_ONE`. Parsing many records takes a hundredth of
         the time of `parse_chunk_index`.
     """
-    rows = np.frombuffer(bytes(summary), _INDEX_OF_ONE, len(summary) // _INDEX_OF_ONE.itemsize)
+    size = _INDEX_OF_ONE.itemsize
+    rows = np.frombuffer(summary, _INDEX_OF_ONE, len(summary) // size)
     are_such = np.ones(len(rows) + 1, bool)
+    are_such[-1] = False
     for name, value in _EQUAL.items():
         are_such[:-1] &= rows[name] == value
-    are_such[-1] = False
-    return rows[: int(are_such.argmin())]
+    count = int(are_such.argmin())
+    # Copying bytes takes a tenth of the time of copying rows.
+    return np.frombuffer(bytes(summary[: count * size]), _INDEX_OF_ONE, count)
 
 
 class ChunkIndexes:
@@ -193,8 +196,8 @@ class ChunkIndexes:
         found: NDArray[np.int64] = entries_bytes // INDEX_ENTRY.itemsize
         return found
 
-    def do_rise(self, numbers: NDArray[np.int64]) -> bool:
-        """Return whether the chunks with these numbers do not overlap in time."""
+    def follow_in_time(self, numbers: NDArray[np.int64]) -> bool:
+        """Return whether chunks follow each other without overlap in time."""
         starts, ends = self._rows["start_time"][numbers], self._rows["end_time"][numbers]
         return bool((ends[:-1] <= starts[1:]).all())
 

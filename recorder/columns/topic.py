@@ -112,7 +112,7 @@ class Topic:
         if self.channels != 1:
             return False
         numbers = self._ranges[0][1].chunks
-        return bool((numbers >= 0).all()) and self._reader.chunks.do_rise(numbers)
+        return bool((numbers >= 0).all()) and self._reader.chunks.follow_in_time(numbers)
 
     @cached_property
     def fields(self) -> dict[str, np.dtype[Any]]:

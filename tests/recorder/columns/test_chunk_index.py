@@ -101,11 +101,11 @@ def test_values_of_chunk_indexes_are_those_of_the_objects(every: list[ChunkIndex
         )
         assert (chunks.starts[k], chunks.ends[k]) == (start, start + length + indexes)
         assert chunks.counts[k] == max(indexes - 15, 0) // 16
-    do_rise = all(
+    follow_in_time = all(
         before.message_end_time <= after.message_start_time
         for before, after in itertools.pairwise(expected)
     )
-    assert chunks.do_rise(np.arange(len(chunks))) == do_rise
+    assert chunks.follow_in_time(np.arange(len(chunks))) == follow_in_time
     with pytest.raises(IndexError):
         chunks[len(expected)]
 
