@@ -44,9 +44,8 @@ the CRCs. A reader also copies the columns into new memory; the rows `memcpy of 
 measure this copy.
 
 The ratios depend on the machine, too. The tables of logs and bags are from a machine with slow
-memory. In four runs on it, rerun's reader took 4.5 to 5.2 times our time for the log of vectors. On
-a faster machine, and before messages were copied by compiled code, it took 5.7 times, foxglove-sdk
-5.2 times our time for writing, and 1.8 times for recording.
+memory. In three runs on it, rerun's reader took 5.1 to 5.6 times our time for the log of vectors.
+On a faster machine, foxglove-sdk took 5.2 times our time for writing, and 1.8 times for recording.
 
 foxglove-sdk writes files and does not read them.
 
@@ -54,30 +53,29 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
 
 - Writing beside foxglove-sdk: compression takes 94 % of our time. On this machine, a writer that
   only compresses would need a quarter of foxglove-sdk's time, and the goal is a fifth.
-- Logs of vectors beside rerun: decompression takes 45 % of our time, and a quarter or more is the
-  copy to columns, mostly into memory that is used for the first time, which is slow here.
 - Logs of images: the minimum of any reader and the copy of the images into new memory take three
-  quarters of our time, and plain zstd 57 %. A reader that did nothing else would reach 76 %.
-  Chunks of 200 images instead of 100 would save 7 % of the time, but a viewer that shows one image
-  would decompress twice as much.
+  quarters of our time or more, and plain zstd 55 to 64 % (three runs). A reader that did nothing
+  else would reach 72 to 76 %. Chunks of 200 images instead of 100 would save 7 % of the time, but a
+  viewer that shows one image would decompress twice as much.
 - Logs of other writers: a reader that only decompresses the chunks, checks their CRCs and copies
   the fields by the same compiled code reaches .72 to .75 of plain zstd's speed (in three runs, in
   which ours reached .61 to .64). The goal leaves 2 to 6 % of the time to find the order of the
   records and the ends of the episodes, among others; ours takes 13 to 18 %.
 - A single episode: decompressing its chunk is a tenth of the time. The rest is Python code that
-  finds out what the log contains and where, and no function of it takes more than a tenth. A script
-  that knows all of this, and only finds the chunk, decompresses, checks and copies it, takes a
-  fifth of the time, and the goal is a third. Parsing the metadata takes a twelfth.
+  finds out what the log contains and where, and no function of it takes more than 4 % by itself. A
+  script that knows all of this, and only finds the chunk, decompresses, checks and copies it, takes
+  a fifth of the time, and the goal is a third. Parsing the metadata takes a twelfth. In three runs,
+  Minari's HDF5 took .99 to 1.08 times our time for one of 1,000 episodes.
 - Two threads: the copy takes up to 1.5 times as long if two threads write to new memory at the same
   time. In addition, a seventh of our time is spent in one thread, on the file's index, the order of
   the records and the ends of the episodes.
-- Recording one environment: assigning the values to NumPy arrays, without writing them, takes
-  three fifths of our time or more, and compression a tenth. The rest is the messages, CRCs and
-  indexes at the end of an episode.
+- Recording one environment: assigning the values to NumPy arrays, without writing them, takes 54 to
+  62 % of our time (three runs), and compression a tenth. The rest is the messages, CRCs and indexes
+  at the end of an episode.
 - Recording 256 environments: where a step is cheap, as in the lane sim, compressing the records
   alone takes two thirds of the time of stepping or more. Where episodes are short, the five
-  messages of each episode take most of the time. In six runs, recording added 0 to 15 % to
-  Pendulum, which has long episodes, and 7 to 12 % to the powerline sim, whose steps take less time
+  messages of each episode take most of the time. In seven runs, recording added 0 to 15 % to
+  Pendulum, which has long episodes, and 7 to 15 % to the powerline sim, whose steps take less time
   in a batch.
 - A batch of 1,024 cars: three fifths of the time is the compiled step. Nearly half of that is the
   motion, which has a division and three square roots in each of five substeps. The infos take a
