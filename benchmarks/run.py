@@ -62,10 +62,10 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
   which ours reached .61 to .64). The goal leaves 2 to 6 % of the time to find the order of the
   records and the ends of the episodes, among others; ours takes 13 to 18 %.
 - A single episode: decompressing its chunk is a tenth of the time. The rest is Python code that
-  finds out what the log contains and where, and no function of it takes more than 4 % by itself. A
-  script that knows all of this, and only finds the chunk, decompresses, checks and copies it, takes
-  a fifth of the time, and the goal is a third. Parsing the metadata takes a twelfth. In three runs,
-  Minari's HDF5 took .99 to 1.08 times our time for one of 1,000 episodes.
+  finds out what the log contains and where, in many short functions. A script that knows all of
+  this, and only finds the chunk, decompresses, checks and copies it, takes a fifth of the time, and
+  the goal is a third. Parsing the metadata takes a twelfth. In three runs, Minari's HDF5 took .99
+  to 1.08 times our time for one of 1,000 episodes.
 - Two threads: the copy takes up to 1.5 times as long if two threads write to new memory at the same
   time. In addition, a seventh of our time is spent in one thread, on the file's index, the order of
   the records and the ends of the episodes.
