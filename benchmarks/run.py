@@ -63,12 +63,14 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
   records and the ends of the episodes, among others; ours takes 13 to 18 %.
 - A single episode: decompressing its chunk is a tenth of the time. The rest is Python code that
   finds out what the log contains and where, in many short functions. A script that knows all of
-  this, and only finds the chunk, decompresses, checks and copies it, takes a fifth of the time, and
-  the goal is a third. Parsing the metadata takes a twelfth. In three runs, Minari's HDF5 took .99
-  to 1.08 times our time for one of 1,000 episodes.
-- Two threads: the copy takes up to 1.5 times as long if two threads write to new memory at the same
-  time. In addition, a seventh of our time is spent in one thread, on the file's index, the order of
-  the records and the ends of the episodes.
+  this, and only finds the chunk, decompresses, checks and copies it, takes a fifth of the time.
+  Parsing the metadata, the schemas and the channels takes an eighth. Together, this is the goal,
+  and leaves nothing for finding and validating the episode, and for the objects of the dataset. In
+  three runs, Minari's HDF5 took .99 to 1.08 times our time for one of 1,000 episodes.
+- Two threads: a seventh of our time is spent in one thread, on the file's index, the order of the
+  records and the ends of the episodes. A quarter is the copy, which takes up to 1.5 times as long
+  if two threads write to new memory at the same time. Both together limit two threads to 1.6 times
+  the speed of one.
 - Recording one environment: assigning the values to NumPy arrays, without writing them, takes 54 to
   62 % of our time (three runs), and compression a tenth. The rest is the messages, CRCs and indexes
   at the end of an episode.
@@ -76,7 +78,8 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
   alone takes two thirds of the time of stepping or more. Where episodes are short, the five
   messages of each episode take most of the time. In seven runs, recording added 0 to 15 % to
   Pendulum, which has long episodes, and 7 to 15 % to the powerline sim, whose steps take less time
-  in a batch.
+  in a batch. A recorder that only keeps the arrays of each step, and copies, compresses and checks
+  the records, would add 2 to 5 % to all but the lane sim.
 - A batch of 1,024 cars: three fifths of the time is the compiled step. Nearly half of that is the
   motion, which has a division and three square roots in each of five substeps. The infos take a
   seventh, a third of it the array of reasons, and starting the cars whose episodes ended a ninth.
