@@ -5,7 +5,8 @@ BENCH ?= .venv-bench
 BIN := $(VENV)/bin
 # Without the cache of compiled modules, every process that is started compiles what it imports.
 unexport PYTHONDONTWRITEBYTECODE
-PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
+# Setuptools warns of every editable installation.
+PIP := PYTHONWARNINGS=ignore:::setuptools.command.editable_wheel $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 # CI also runs the tests that take minutes.
 QUICK := $(if $(filter true,$(CI)),,-m "not slow and not long")
 # A change of these files reinstalls the environments.

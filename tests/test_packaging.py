@@ -35,6 +35,8 @@ def test_every_folder_is_a_package() -> None:
     for root in ROOTS:
         for init in (ROOT / root).rglob("__init__.py"):
             found.add("mcaprl." + ".".join(init.parent.relative_to(ROOT).parts))
+    # Folders of data files are packages, too.
+    found |= set(SETTINGS["tool"]["setuptools"]["package-data"])
     assert found == set(PACKAGES)
     assert {"mcaprl", *(f"mcaprl.{root}" for root in ROOTS)} == set(FOLDERS)
     others = {path.parent.name for path in ROOT.glob("*/__init__.py")} - set(ROOTS)
