@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +14,7 @@ from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, RECORD_HEADER_BYTES
+from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, RECORD_HEADER_BYTES, LazySequence
 
 # A ChunkIndex record consists of the start, the map entries, the middle, the name of the
 # compression, and the end.
@@ -124,8 +124,8 @@ def indexes_of_one(summary: memoryview) -> NDArray[Any]:
     return np.frombuffer(bytes(summary[: count * size]), _INDEX_OF_ONE, count)
 
 
-class ChunkIndexes:
-    """Indexes of chunks, in file order, each created when it is first used.
+class ChunkIndexes(LazySequence[ChunkIndex]):
+    """Indexes of chunks, in file order.
 
     A log of 100 million transitions has 24,000 chunks, and reading an episode needs two of them.
     """
@@ -137,39 +137,27 @@ class ChunkIndexes:
             rows: Result of `indexes_of_one`.
             others: Other indexes.
         """
-        self._rows, self._made = rows, dict(enumerate(others, len(rows)))
+        made = dict(enumerate(others, len(rows)))
         if others:
-            self._rows = np.append(rows, np.array(list(map(_row_of, others)), _INDEX_OF_ONE))
-        offsets = self._rows["offset"]
+            rows = np.append(rows, np.array(list(map(_row_of, others)), _INDEX_OF_ONE))
+        offsets = rows["offset"]
         if (offsets[1:] < offsets[:-1]).any():
             order = np.argsort(offsets, kind="stable")
-            places = enumerate(order.tolist())
-            self._rows = self._rows[order]
-            self._made = {new: self._made[old] for new, old in places if old in self._made}
+            rows, places = rows[order], enumerate(order.tolist())
+            made = {new: made[old] for new, old in places if old in made}
+        super().__init__(len(rows), made)
+        self._rows = rows
 
-    def __len__(self) -> int:
-        """Return the number of chunks."""
-        return len(self._rows)
-
-    def __getitem__(self, number: int) -> ChunkIndex:
-        """Return the index of a chunk."""
-        number = range(len(self._rows))[number]
-        found = self._made.get(number)
-        if found is None:
-            row = self._rows[number].item()
-            _, _, start, end, offset, length, _, channel, place, indexes, _, _, packed, raw = row
-            offsets = {channel: place}
-            found = ChunkIndex(length, offset, "zstd", packed, end, indexes, offsets, start, raw)
-            self._made[number] = found
-        return found
+    def _create(self, number: int) -> ChunkIndex:
+        row = self._rows[number].item()
+        _, _, start, end, offset, length, _, channel, place, indexes, _, _, packed, raw = row
+        return ChunkIndex(
+            length, offset, "zstd", packed, end, indexes, {channel: place}, start, raw
+        )
 
     def plus(self, found: Sequence[ChunkIndex]) -> ChunkIndexes:
         """Return these and other indexes, with the current message indexes of each."""
         return ChunkIndexes(self._rows[:0], [*self, *found])
-
-    def __iter__(self) -> Iterator[ChunkIndex]:
-        """Yield the indexes."""
-        return map(self.__getitem__, range(len(self._rows)))
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:

@@ -161,7 +161,7 @@ def chunk_header(file: memoryview, offset: int) -> ChunkHeader:
 
 
 _NOTHING = (-1, memoryview(b""))
-# Decompressors that no thread uses now; each of them has at most this much memory.
+# Decompressors that no thread uses now. Each of them has at most `_IDLE_BYTES` of memory.
 _IDLE: list[zstandard.ZstdDecompressor] = []
 _IDLE_BYTES = 2**20
 
@@ -238,7 +238,7 @@ def _inflate_zstd(data: memoryview, scratch: Scratch, limit: int) -> memoryview:
     """
     memory, count = scratch.take(limit), 0
     try:
-        # Creating a decompressor takes a tenth of the time to decompress a chunk.
+        # Creating a decompressor takes a tenth as long as decompressing a chunk.
         decompressor = _IDLE.pop()
     except IndexError:
         decompressor = zstandard.ZstdDecompressor()

@@ -43,8 +43,8 @@ class Target:
 
     Attributes:
         columns: Columns by field name.
-        copies: Latest layout, and compiled copy of its messages, by channel and message length;
-            None if there is none.
+        copies: Layout of the last messages with this channel and length, and their compiled copy;
+            None if they have no layout, or cannot be copied by compiled code.
     """
 
     columns: Columns

@@ -8,9 +8,10 @@ array of `record_dtype(payload)`; the entries of a MessageIndex form an array of
 from __future__ import annotations
 
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property, lru_cache
-from typing import Any, Self
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -25,6 +26,7 @@ except ImportError:
     # The package was installed without a C compiler. NumPy does the same in more time.
     copy_fields = None  # type: ignore[assignment]
 
+Item = TypeVar("Item")
 MESSAGE_HEADER = np.dtype(
     [
         ("opcode", "u1"),
@@ -197,8 +199,36 @@ class MessageRange:
         return self._count
 
 
-class MessageRanges:
-    """Message ranges of one channel, in file order, each created when it is first used.
+class LazySequence(ABC, Generic[Item]):
+    """Sequence whose items are created when they are first used."""
+
+    def __init__(self, count: int, made: dict[int, Item]) -> None:
+        """Store the number of items, and the items that exist already, by their position."""
+        self._count, self._made = count, made
+
+    @abstractmethod
+    def _create(self, number: int) -> Item:
+        """Create an item."""
+
+    def __len__(self) -> int:
+        """Return the number of items."""
+        return self._count
+
+    def __getitem__(self, number: int) -> Item:
+        """Return an item."""
+        number = range(self._count)[number]
+        found = self._made.get(number)
+        if found is None:
+            found = self._made[number] = self._create(number)
+        return found
+
+    def __iter__(self) -> Iterator[Item]:
+        """Yield the items."""
+        return map(self.__getitem__, range(self._count))
+
+
+class MessageRanges(LazySequence[MessageRange]):
+    """Message ranges of one channel, in file order.
 
     Attributes:
         counts: (P,) number of messages of each range.
@@ -209,40 +239,26 @@ class MessageRanges:
         self,
         counts: NDArray[np.int64],
         chunks: NDArray[np.int64],
-        create: Callable[[int, int], MessageRange],
+        range_of: Callable[[int, int], MessageRange],
         made: dict[int, MessageRange],
     ) -> None:
-        """Store the ranges that were already created, and how to create the others.
+        """Leave out the ranges without messages.
 
         Args:
-            counts: Number of messages of each range; ranges without messages are left out.
+            counts: Number of messages of each range.
             chunks: Number of the chunk of each range; -1 for unchunked messages.
-            create: Function that creates the range of a chunk with that number of messages.
-            made: Ranges by their position in `counts`.
+            range_of: Function that creates a range from the number of its chunk and its count.
+            made: Ranges that exist already, by their position in `counts`.
         """
         kept = np.flatnonzero(counts)
-        self.counts, self.chunks = counts[kept], chunks[kept]
-        self._create = create
         if made and len(kept) < len(counts):
             made = {new: made[old] for new, old in enumerate(kept.tolist()) if old in made}
-        self._made = made
+        super().__init__(len(kept), made)
+        self.counts, self.chunks = counts[kept], chunks[kept]
+        self._range_of = range_of
 
-    def __len__(self) -> int:
-        """Return the number of ranges."""
-        return len(self.counts)
-
-    def __getitem__(self, number: int) -> MessageRange:
-        """Return a range."""
-        number = range(len(self.counts))[number]
-        found = self._made.get(number)
-        if found is None:
-            found = self._create(int(self.chunks[number]), int(self.counts[number]))
-            self._made[number] = found
-        return found
-
-    def __iter__(self) -> Iterator[MessageRange]:
-        """Yield the ranges."""
-        return map(self.__getitem__, range(len(self.counts)))
+    def _create(self, number: int) -> MessageRange:
+        return self._range_of(int(self.chunks[number]), int(self.counts[number]))
 
 
 def as_items(column: NDArray[Any]) -> NDArray[Any]:

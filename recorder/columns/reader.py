@@ -252,15 +252,13 @@ class McapReader:
             offset = part.chunk.message_index_offsets[channel_id]
             return self._index_at(channel_id, offset, len(part))
 
-        def create(number: int, count: int) -> MessageRange:
+        def range_of(number: int, count: int) -> MessageRange:
             return MessageRange(self.chunks[number], count, read)
 
         chunks = self.chunks
         is_alone = chunks.channels == channel_id
         may_have = is_alone | (chunks.channels < 0)
-        if not self.complete and len(chunks):
-            # A writer that was killed may have written only some indexes of the last chunk.
-            is_alone[-1], may_have[-1] = False, True
+        is_alone[self._certain :], may_have[self._certain :] = False, True
         numbers = np.flatnonzero(may_have)
         counts, made = chunks.counts[numbers], dict[int, MessageRange]()
         for place in np.flatnonzero(~is_alone[numbers]).tolist() if lazily else range(len(numbers)):
@@ -273,13 +271,19 @@ class McapReader:
             made[len(counts)] = MessageRange.of_index(None, index)
             counts, numbers = np.append(counts, len(index)), np.append(numbers, -1)
         # A writer may store empty indexes, for example of all channels in each chunk.
-        return MessageRanges(counts, numbers, create, made)
+        return MessageRanges(counts, numbers, range_of, made)
+
+    @property
+    def _certain(self) -> int:
+        """Number of chunks before the first one that may lack some of its indexes."""
+        # A writer that was killed may have written only some indexes of the last chunk.
+        return len(self.chunks) if self.complete else max(len(self.chunks) - 1, 0)
 
     def _index_in(self, channel_id: int, number: int) -> NDArray[Any]:
         """Return the index of the messages of a channel in a chunk; it may be empty."""
         chunk = self.chunks[number]
         offsets = chunk.message_index_offsets
-        if not offsets or (not self.complete and number == len(self.chunks) - 1):
+        if not offsets or number >= self._certain:
             found = self._contents_of(chunk).indexes.get(channel_id)
             return np.empty(0, INDEX_ENTRY) if found is None else found
         if channel_id in offsets:
@@ -430,24 +434,18 @@ class McapReader:
             raise CorruptLogError(
                 f"{self.path}: the chunk at byte {start} extends beyond the end of the file"
             )
-        # Most chunks follow each other without a gap.
-        gaps = np.flatnonzero(starts[1:] != ends[:-1]).tolist()
-        befores = [-1, *gaps, len(chunks) - 1] if len(chunks) else [-1]
-        bounds = [
-            (
-                int(ends[number]) if number >= 0 else len(MAGIC),
-                int(starts[number + 1]) if number + 1 < len(chunks) else None,
-            )
-            for number in befores
-        ]
+        lows = [len(MAGIC), *ends.tolist()]
+        highs = [*starts.tolist(), None]
+        # Most chunks follow each other without a gap. The last gap is always read.
+        gaps = [number for number, low in enumerate(lows) if low != highs[number]]
         if self._remote is not None and self.summary_start:
-            ranges = [(low, high or self.summary_start) for low, high in bounds]
-            self.fetch([(low, high) for low, high in ranges if low < high])
+            bounds = [(lows[number], highs[number] or self.summary_start) for number in gaps]
+            self.fetch([(low, high) for low, high in bounds if low < high])
         found, has_changed = [], False
-        for number, (low, high) in zip(befores, bounds, strict=True):
-            before = chunks[number] if number >= 0 else None
+        for number in gaps:
+            before = chunks[number - 1] if number else None
             indexes = 0 if before is None else len(before.message_index_offsets)
-            found += self._read_records(low, high, before, unchunked)
+            found += self._read_records(lows[number], highs[number], before, unchunked)
             has_changed |= before is not None and len(before.message_index_offsets) != indexes
         if found or has_changed:
             self.chunks = chunks.plus(found)

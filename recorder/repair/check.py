@@ -10,10 +10,9 @@ Each chunk is decompressed once.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 
@@ -34,8 +33,11 @@ from mcaprl.recorder.format.topics import STEP_TOPIC
 from mcaprl.recorder.repair.episode_check import EpisodeCheck
 from mcaprl.remote import as_path
 
-# Number of chunks that a thread decompresses one after the other.
+# Number of chunks that a thread decompresses before it hands them over. Handing over each one takes
+# more time.
 _BLOCK_CHUNKS = 4
+_Read = memoryview | CorruptLogError
+"""Records of a chunk, or the error if the chunk is damaged."""
 
 
 def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
@@ -90,9 +92,10 @@ def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: i
             # The chunks of any MCAP file can be checked, so they are checked before this error is
             # raised.
             refusal = error
-    for chunk, read in _decompressed(reader, threads):
+    for chunk, records in _decompressed(reader, threads):
         try:
-            records = read()
+            if isinstance(records, CorruptLogError):
+                raise records
             found.extend(check_chunk(reader, chunk, records))
         except CorruptLogError as error:
             found.append(Problem(_without_path(error, reader.path), place(reader, chunk)))
@@ -106,53 +109,38 @@ def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: i
         found.extend(log.finish())
 
 
-def _decompressed(
-    reader: McapReader, threads: int
-) -> Iterator[tuple[ChunkIndex, Callable[[], memoryview]]]:
-    """Yield each chunk and a function that returns its records.
+def _decompressed(reader: McapReader, threads: int) -> Iterator[tuple[ChunkIndex, _Read]]:
+    """Yield each chunk and its records, or the error if it is damaged.
 
     The records are valid until the caller requests the next chunk.
     """
+    chunks = iter(reader.chunks)
     if threads == 1:
         scratch = Scratch()
-        for chunk in reader.chunks:
-            yield chunk, partial(reader.chunk_records, chunk, scratch)
+        yield from ((chunk, _records_of(reader, chunk, scratch)) for chunk in chunks)
         return
-    # Handing over several chunks at once takes less time than handing over each one.
-    blocks = _blocks_of(reader.chunks, _BLOCK_CHUNKS)
+
+    def read(block: list[ChunkIndex], scratches: list[Scratch]) -> list[_Read]:
+        return [_records_of(reader, *each) for each in zip(block, scratches, strict=False)]
+
     with ThreadPoolExecutor(threads) as pool:
-        ahead = deque[tuple[list[ChunkIndex], Future[list[Callable[[], memoryview]]]]]()
+        ahead = deque[tuple[list[ChunkIndex], Future[list[_Read]]]]()
         # Memory use is limited: there are buffers for a block for each thread, and for the caller.
-        scratches = cycle([[Scratch() for _ in range(_BLOCK_CHUNKS)] for _ in range(threads + 1)])
+        buffers = cycle([[Scratch() for _ in range(_BLOCK_CHUNKS)] for _ in range(threads + 1)])
         while True:
-            for block in islice(blocks, threads + 1 - len(ahead)):
-                ahead.append((block, pool.submit(_read_block, reader, block, next(scratches))))
+            while len(ahead) <= threads and (block := list(islice(chunks, _BLOCK_CHUNKS))):
+                ahead.append((block, pool.submit(read, block, next(buffers))))
             if not ahead:
                 return
             block, future = ahead.popleft()
             yield from zip(block, future.result(), strict=True)
 
 
-def _read_block(
-    reader: McapReader, block: Sequence[ChunkIndex], scratches: Sequence[Scratch]
-) -> list[Callable[[], memoryview]]:
-    """Decompress chunks; return functions that return the records, or raise the error."""
-
-    def read(chunk: ChunkIndex, scratch: Scratch) -> Callable[[], memoryview]:
-        done: Future[memoryview] = Future()
-        try:
-            done.set_result(reader.chunk_records(chunk, scratch))
-        except CorruptLogError as error:
-            done.set_exception(error)
-        return done.result
-
-    return list(map(read, block, scratches))
-
-
-def _blocks_of(chunks: Iterable[ChunkIndex], size: int) -> Iterator[list[ChunkIndex]]:
-    rest = iter(chunks)
-    while block := list(islice(rest, size)):
-        yield block
+def _records_of(reader: McapReader, chunk: ChunkIndex, scratch: Scratch) -> _Read:
+    try:
+        return reader.chunk_records(chunk, scratch)
+    except CorruptLogError as error:
+        return error
 
 
 def _recover(path: Path) -> str:

@@ -144,8 +144,8 @@ def _on_leg(
 def _at(lap_m: float, numbers: Eight) -> float:
     """Return the number of the leg at a distance from the start of the lap.
 
-    There is no array lookup, which the compiler cannot vectorize. All calls for one distance share
-    the comparisons.
+    The compiler cannot vectorize lookups in an array, but it can vectorize these comparisons. In
+    calls with the same distance, it compares only once.
     """
     number = numbers[1] if lap_m >= _ALONG_M[1] else numbers[0]
     number = numbers[2] if lap_m >= _ALONG_M[2] else number
