@@ -66,9 +66,9 @@ release(Parts *found)
     PyMem_Free(found->parts);
 }
 
-/* Read a list of pairs (offset, buffer); an item of the buffer must be within a record of `size`
- * bytes. With PyBUF_ND, a buffer has as many items as rows, at least `rows`; otherwise it is one
- * item. Return 0 and set an exception if it is invalid. */
+/* Read a list of pairs (offset, buffer). With PyBUF_ND in the flags, a buffer is a column of at
+ * least `rows` items; otherwise, it is one item. An item at the offset must be within a record of
+ * `size` bytes. Return 0 and set an exception if the list is invalid. */
 static int
 read_parts(PyObject *list, int flags, Py_ssize_t size, Py_ssize_t rows, Parts *found)
 {

@@ -156,7 +156,7 @@ class ChunkIndexes(LazySequence[ChunkIndex]):
         )
 
     def plus(self, found: Sequence[ChunkIndex]) -> ChunkIndexes:
-        """Return these and other indexes, with the current message indexes of each."""
+        """Return these indexes, as they are now, together with others."""
         return ChunkIndexes(self._rows[:0], [*self, *found])
 
     @cached_property
