@@ -25,6 +25,7 @@ from mcaprl.recorder.columns.append import TopLevelRecord, WrittenState, written
 from mcaprl.recorder.columns.chunks import (
     LONG_MESSAGE_BYTES,
     RARE_MESSAGE_BYTES,
+    TEXT_BYTES,
     Compressors,
 )
 from mcaprl.recorder.columns.compact import SMALL_CHUNK_BYTES, compact
@@ -201,7 +202,7 @@ class McapWriter(OutputFile):
         compress = self._compressors.mixed
         if len(records) > RARE_MESSAGE_BYTES * len(messages):
             compress = self._compressors.rare
-        elif len(records) < SMALL_CHUNK_BYTES:
+        elif len(records) < SMALL_CHUNK_BYTES or len(records) < TEXT_BYTES * len(messages):
             compress = self._compressors.few
         self._store(
             memoryview(records),

@@ -88,16 +88,3 @@ def add_up_each(
             float(np.add.accumulate(rewards[start:stop])[-1] + 0.0) if start < stop else 0.0
             for start, stop in zip(starts, stops, strict=True)
         ]
-
-
-def add_up_rows(rewards: NDArray[np.float64], counts: NDArray[np.int64]) -> list[float]:
-    """Return the sum of the first rewards of each row, added up in order.
-
-    Args:
-        rewards: (K, T) rewards.
-        counts: (K,) numbers of rewards to add up, 1 or more.
-    """
-    with np.errstate(all="ignore"):
-        sums = np.add.accumulate(rewards, axis=1)[np.arange(len(counts)), counts - 1] + 0.0
-    found: list[float] = sums.tolist()
-    return found

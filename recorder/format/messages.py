@@ -53,7 +53,10 @@ INFO, WARN = 20, 30
 _ENCAPSULATION = b"\0\1\0\0"
 # A NUL character ends a ROS string, so it is replaced.
 _NUL, _REPLACEMENT = b"\0", "\ufffd".encode()
-_EPISODE_START, _LOG_START = struct.Struct("<dqqqdII??"), struct.Struct("<IIB")
+# Encapsulation header and all fields before the strings, which begin at a multiple of 4.
+_EPISODE_START = struct.Struct("<4sdqqqdII??2x")
+# Encapsulation header and all fields before the text; the name of the node is a string.
+_LOG_START, _NODE = struct.Struct("<4sIIB3x12s"), b"\7\0\0\0mcaprl\0"
 # Number of bytes to which a string is aligned.
 _ALIGNMENT = 4
 # The end of a log line: two empty strings, and the field `line`, 0.
@@ -118,13 +121,19 @@ def episode_message(
     options: str,
 ) -> bytes:
     """Encode the fields of `EPISODE_TEXT` as CDR bytes."""
-    times, counts = (start_time_ns, end_time_ns, stored_seed(seed)), (episode, length)
-    start = _EPISODE_START.pack(total_reward, *times, epsilon, *counts, terminated, truncated)
-    message = CdrWriter()
-    message.add(start, _FLOAT64_BYTES)
-    for text in (reason, policy, options):
-        message.add_text(text)
-    return message.to_bytes()
+    start = _EPISODE_START.pack(
+        _ENCAPSULATION,
+        total_reward,
+        start_time_ns,
+        end_time_ns,
+        stored_seed(seed),
+        epsilon,
+        episode,
+        length,
+        terminated,
+        truncated,
+    )
+    return start + _texts(reason, policy, options)
 
 
 def stored_seed(seed: int | None) -> int:
@@ -145,12 +154,9 @@ def text_message(text: str) -> bytes:
 
 def log_message(time_ns: int, text: str, level: int = INFO) -> bytes:
     """Encode an `rcl_interfaces/msg/Log` as CDR bytes."""
-    message = CdrWriter()
-    message.add(_LOG_START.pack(*_seconds(time_ns), level), _COUNT.size)
-    message.add_text("mcaprl")
-    message.add_text(text)
-    message.add(_LOG_END, _ALIGNMENT)
-    return message.to_bytes()
+    sec, nanosec = _seconds(time_ns)
+    start = _LOG_START.pack(_ENCAPSULATION, sec, nanosec, level, _NODE)
+    return start + _padded(_string(text)) + _LOG_END
 
 
 def _string(text: str) -> bytes:
@@ -160,6 +166,17 @@ def _string(text: str) -> bytes:
     """
     encoded = text.encode(errors="backslashreplace").replace(_NUL, _REPLACEMENT) + _NUL
     return len(encoded).to_bytes(4, "little") + encoded
+
+
+@lru_cache
+def _texts(*texts: str) -> bytes:
+    """Encode the last fields of a message, which are strings."""
+    *others, last = map(_string, texts)
+    return b"".join(map(_padded, others)) + last
+
+
+def _padded(string: bytes) -> bytes:
+    return string + bytes(-len(string) % _ALIGNMENT)
 
 
 def _seconds(time_ns: int) -> tuple[int, int]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.recorder.columns.cdr import ENCAPSULATION
-from mcaprl.recorder.columns.message_rows import as_items, message_rows
+from mcaprl.recorder.columns.cdr import ENCAPSULATION, ENCAPSULATION_BYTES
+from mcaprl.recorder.columns.message_rows import message_rows, part_of
 from mcaprl.recorder.format.schema import fill_image_constants, image_dtype, message_dtype
 from mcaprl.recorder.format.topics import BYTES_PER_CHUNK, IMAGE_FRAME, MIN_ROWS
 
@@ -85,15 +85,32 @@ class TopicRows:
             values = np.reshape(values, (-1, column.shape[-1]))
         column[where] = values
 
-    def take(self, field: str, column: NDArray[Any], places: NDArray[np.int64]) -> None:
-        """Set a field of the first rows to rows of a column.
+    def from_field(self, fields: Sequence[str]) -> tuple[NDArray[np.void], np.dtype[Any]]:
+        """Describe the part of the rows from the first of these fields to the end of the message.
 
         Args:
-            field: Name in the message.
-            column: (N, *shape) values, of the same dtype as the field.
-            places: (K,) indexes of the rows of the column.
+            fields: Names in the message.
+
+        Returns:
+            That part of all rows as items, (N,), and a dtype of these fields, in which they have
+            the same distances and are aligned. Its items may be longer than the part.
         """
-        as_items(self.fields[field])[: len(places)] = as_items(column)[places]
+        payload = self._rows.dtype["payload"]
+        assert payload.fields is not None, "messages have fields"
+        offsets = {name: payload.fields[name][1] for name in fields}
+        # CDR aligns each field relative to the end of the encapsulation header.
+        first, largest = min(offsets.values()), 8
+        first -= (first - ENCAPSULATION_BYTES) % largest
+        size = payload.itemsize - first
+        dtype = np.dtype(
+            {
+                "names": list(offsets),
+                "formats": [payload[name] for name in offsets],
+                "offsets": [offset - first for offset in offsets.values()],
+                "itemsize": -(-size // largest) * largest,
+            }
+        )
+        return part_of(self._rows, slice(self.itemsize - size, self.itemsize)), dtype
 
     def write(self, where: Any, times_ns: Any) -> None:
         """Set the log_time of consecutive rows, and write these rows as one chunk."""

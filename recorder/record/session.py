@@ -111,6 +111,11 @@ class EpisodeLog:
         """Whether the log is closed."""
         return self.log.mcap.closed
 
+    @property
+    def max_file_bytes(self) -> int | None:
+        """File size from which the next episode begins a new file; None if there is no limit."""
+        return None if self._parts is None else self._parts.max_file_bytes
+
     def check_can_begin(self, seeds: Iterable[int | None]) -> None:
         """Check that episodes with these seeds can be recorded.
 

@@ -1,8 +1,8 @@
 """Buffers for the open episodes of a vector environment.
 
-Each field has one array with a row for each step of the vector environment, so that a step writes
-one contiguous row. The array is a ring buffer: row r is at position r modulo its length. When an
-episode ends, its values in the rows since its first observation are copied to message records.
+Each topic has one array with the message fields of each environment, and a row for each step of the
+vector environment, so that a step writes adjacent memory. The array is a ring buffer: row r is at
+position r modulo its length. When an episode ends, its rows are copied to message records.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up_rows
+from mcaprl.recorder.columns.message_rows import part_of
+from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.rows import StepRows, TopicRows
 
 # Limits of the initial capacity: number of rows, and number of bytes per environment. The capacity
 # doubles when an episode needs more.
-_FIRST_CAPACITY = 256
+_FIRST_CAPACITY = 512
 _FIRST_BYTES = 2**20
 
 Rows = TypeVar("Rows", bound=TopicRows)
@@ -28,44 +29,36 @@ class OpenRows(Generic[Rows]):
     """Values of one topic for all open episodes.
 
     Attributes:
-        capacity: Number of rows in the arrays, a power of 2.
+        capacity: Number of rows in the array, a power of 2.
+        row_bytes: Number of bytes of the message record of one environment in one row.
     """
 
     def __init__(self, chunk: Rows, environments: int, fields: Sequence[str]) -> None:
-        """Allocate the arrays.
+        """Allocate the array.
 
         Args:
             chunk: Message records of one chunk; their constant fields are set.
             environments: Number of environments.
-            fields: Names of the fields that `put` sets.
+            fields: Names of the fields that `put` sets. `write` overwrites all fields after the
+                first of them.
         """
-        self._chunk, self._environments = chunk, environments
-        first = max(2, min(_FIRST_CAPACITY, _FIRST_BYTES // chunk.itemsize))
-        self.capacity = 2 ** (first.bit_length() - 1)
-        self._columns: dict[str, NDArray[Any]] = {}
-        for name in fields:
-            column = chunk.fields[name]
-            shape = (self.capacity, environments, *column.shape[1:])
-            self._columns[name] = np.empty(shape, column.dtype)
-
-    @property
-    def per_chunk(self) -> int:
-        """Maximum number of rows of a chunk."""
-        return len(self._chunk)
+        self._chunk, self._fields, self.row_bytes = chunk, fields, chunk.itemsize
+        self._records, dtype = chunk.from_field(fields)
+        first = max(2, min(_FIRST_CAPACITY, _FIRST_BYTES // self.row_bytes))
+        self._set(np.empty((2 ** (first.bit_length() - 1), environments), dtype))
 
     def make_room(self, count: int, row: int) -> None:
-        """Grow the arrays until `count` rows fit.
+        """Grow the array until `count` rows fit.
 
         The rows up to `row` are kept.
         """
         kept = np.arange(max(row - self.capacity + 1, 0), row + 1)
-        old = kept % self.capacity
-        while self.capacity < count:
-            self.capacity *= 2
-        for name, column in self._columns.items():
-            grown = np.empty((self.capacity, *column.shape[1:]), column.dtype)
-            grown[kept % self.capacity] = column[old]
-            self._columns[name] = grown
+        capacity = self.capacity
+        while capacity < count:
+            capacity *= 2
+        old, old_places = self._rows, kept % self.capacity
+        self._set(np.empty((capacity, *old.shape[1:]), old.dtype))
+        self._items[kept % capacity] = self._items_of(old)[old_places]
 
     def put(self, field: str, row: int, values: Any, environments: Any = ...) -> None:
         """Set a field in one row.
@@ -73,52 +66,72 @@ class OpenRows(Generic[Rows]):
         Args:
             field: Name of the message field.
             row: Number of the row.
-            values: (K, *shape) values, or one scalar for all.
+            values: (K, *shape) values; for a field without a shape, also one scalar for all.
             environments: Index of K environments, by default all.
         """
         column = self._columns[field]
         if column.ndim > 2:
-            values = np.reshape(values, (-1, column.shape[-1]))
+            values = values.reshape(-1, column.shape[-1])
         column[row % self.capacity, environments] = values
 
     def write(
         self,
         environments: Sequence[int],
-        firsts: NDArray[np.int64],
-        counts: NDArray[np.int64],
-        starts_ns: Any,
+        firsts: Sequence[int],
+        counts: Sequence[int],
+        starts_ns: NDArray[np.int64],
         step_ns: int,
     ) -> None:
         """Write rows of environments, one environment after the other.
 
         Args:
             environments: K indexes of environments.
-            firsts: (K,) first row of each environment.
-            counts: (K,) numbers of rows.
+            firsts: K first rows.
+            counts: K numbers of rows.
             starts_ns: (K,) log_time of each environment's first row.
             step_ns: Time between two rows, nanoseconds.
         """
-        starts = np.asarray(starts_ns)
         for which, steps in self._chunks(environments, firsts, counts):
-            self._chunk.write(slice(len(steps)), starts[which] + steps * step_ns)
+            self._chunk.write(slice(len(steps)), starts_ns[which] + steps * step_ns)
+
+    def _set(self, rows: NDArray[Any]) -> None:
+        self._rows, self.capacity = rows, len(rows)
+        self._columns = {name: rows[name] for name in self._fields}
+        self._items = self._items_of(rows)
+
+    def _items_of(self, rows: NDArray[Any]) -> NDArray[np.void]:
+        """Return a view of the bytes that the message records have as well."""
+        return part_of(rows, slice(0, self._records.itemsize))
 
     def _chunks(
-        self, environments: Sequence[int], firsts: NDArray[np.int64], counts: NDArray[np.int64]
+        self, environments: Sequence[int], firsts: Sequence[int], counts: Sequence[int]
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Copy rows of environments to `_chunk`, one full chunk after the other.
+        """Copy rows of environments to the message records of one chunk after the other.
+
+        Environments share a chunk if all their rows fit.
 
         Yields:
             For each row of a chunk, its position in `environments` and its step.
         """
-        which = np.repeat(np.arange(len(counts)), counts)
-        steps = np.arange(len(which)) - (np.cumsum(counts) - counts)[which]
-        places = (firsts[which] + steps) % self.capacity * self._environments
-        places += np.asarray(environments)[which]
-        for start in range(0, len(which), self.per_chunk):
-            part = slice(start, start + self.per_chunk)
-            for name, column in self._columns.items():
-                self._chunk.take(name, column.reshape(-1, *column.shape[2:]), places[part])
-            yield which[part], steps[part]
+        parts: list[_Part] = []
+        used, most = 0, len(self._chunk)
+        for position, first in enumerate(firsts):
+            step, count = 0, counts[position]
+            if used + count > most and used:
+                yield _rows_of(parts)
+                parts, used = [], 0
+            while step < count:
+                place = (first + step) % self.capacity
+                size = min(count - step, most - used, self.capacity - place)
+                source = self._items[place : place + size, environments[position]]
+                self._records[used : used + size] = source
+                parts.append((position, step, size))
+                step, used = step + size, used + size
+                if used == most:
+                    yield _rows_of(parts)
+                    parts, used = [], 0
+        if parts:
+            yield _rows_of(parts)
 
 
 class OpenSteps(OpenRows[StepRows]):
@@ -127,17 +140,17 @@ class OpenSteps(OpenRows[StepRows]):
     def end(
         self,
         environments: Sequence[int],
-        firsts: NDArray[np.int64],
+        firsts: Sequence[int],
         summaries: Sequence[EpisodeSummary],
         step_ns: int,
     ) -> None:
-        """Set the numbers and end flags in the rows of ended episodes, and write the rows."""
+        """Write the rows of ended episodes, with their numbers and end flags."""
         numbers, lengths, starts, terminated, truncated = (
             np.array([getattr(summary, name) for summary in summaries])
             for name in ("episode", "length", "start_time_ns", "terminated", "truncated")
         )
         chunk = self._chunk
-        for which, steps in self._chunks(environments, firsts, lengths + 1):
+        for which, steps in self._chunks(environments, firsts, (lengths + 1).tolist()):
             left = lengths[which] - steps
             last, where = np.flatnonzero(left == 1), slice(len(steps))
             chunk.number(where, numbers[which], steps)
@@ -146,16 +159,13 @@ class OpenSteps(OpenRows[StepRows]):
             chunk.finish(np.flatnonzero(left == 0))
             chunk.write(where, starts[which] + steps * step_ns)
 
-    def total_rewards(
-        self, environments: Sequence[int], firsts: NDArray[np.int64], counts: NDArray[np.int64]
-    ) -> list[float]:
-        """Return the sums of environments' rewards, each added up in the order of the steps.
 
-        Args:
-            environments: K indexes of environments.
-            firsts: (K,) first row of each environment.
-            counts: (K,) numbers of rewards, 1 or more.
-        """
-        rows = (firsts[:, None] + np.arange(counts.max())) % self.capacity
-        rewards = self._columns["reward"][rows, np.asarray(environments)[:, None]]
-        return add_up_rows(rewards, counts)
+_Part = tuple[int, int, int]
+"""Position of an environment, step of its first row in a chunk, and number of rows."""
+
+
+def _rows_of(parts: list[_Part]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the position and the step of each row of a chunk."""
+    positions, first_steps, sizes = np.array(parts, np.int64).T
+    shift = first_steps - (np.cumsum(sizes) - sizes)
+    return np.repeat(positions, sizes), np.arange(sizes.sum()) + np.repeat(shift, sizes)

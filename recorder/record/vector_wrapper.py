@@ -10,7 +10,7 @@ No scene is recorded. To get a scene, replay the seeds and actions in a single e
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -48,6 +48,19 @@ class _Ended(NamedTuple):
     terminated: bool
     truncated: bool
     reason: str
+
+
+class _Now(NamedTuple):
+    """State of the open episodes.
+
+    Attributes:
+        row: Row of the latest observations in the buffers. The next step sets its actions and
+            rewards.
+        returns: (N,) sum of the rewards so far, added from the first to the last.
+    """
+
+    row: int
+    returns: NDArray[np.float64]
 
 
 class RecordVecMcap(FinishesAtExit, VectorWrapper):
@@ -90,7 +103,8 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
 
         `env` must have spaces that `RecordMcap` supports and declare its autoreset mode. If
         `policy_version` is None, the log has no `/rl/learner`. Episodes that end in the same step
-        share chunks, so `max_file_bytes` applies to the chunk, not to each episode in it.
+        share chunks. With `max_file_bytes`, episodes that end in the same step are in the same file
+        as long as their uncompressed rows have at most this size.
 
         Raises:
             SpaceError: The log format does not support the environments' spaces.
@@ -146,14 +160,15 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         self._action_of = converter(action_leaf(self.action_space))
         self._every = np.arange(count)
         self._open = [OpenEpisode("", math.nan) for _ in range(count)]
-        # Row of the latest observations in the buffers. The next step sets its actions and rewards.
-        self._row = 0
+        self._now = _Now(0, np.zeros(count))
         # For each environment: row of the first observation of its open episode, and whether an
         # episode is open.
         self._first = np.zeros(count, np.int64)
         self._running = np.zeros(count, np.bool_)
         # For each environment: whether it resets itself in the next step.
         self._due = np.zeros(count, np.bool_)
+        # Whether every environment can make a step, and whether any resets itself in the next step.
+        self._ready = self._any_due = False
         # First row for which the buffers may have to grow.
         self._full_at = 0
         self._watch()
@@ -187,10 +202,11 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         observations, infos = self.env.reset(seed=seed, options=options)
         values = [convert(observations) for convert in self._converters]
         with HoldSignals():
-            self._put(self._row, numbers, [value[numbers] for value in values])
+            self._put(self._now.row, [value[numbers] for value in values], numbers)
             self._begin(numbers, infos)
             for number in numbers.tolist():
                 self._open[number].seed, self._open[number].options = seeds[number], given or None
+            self._look_ahead()
         return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -206,7 +222,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             SpaceError: The actions do not fit their space (the environments are not stepped), or an
                 observation does not fit its space.
         """
-        if not (self._running | self._due).all():
+        if not self._ready:
             idle = np.flatnonzero(~(self._running | self._due)).tolist()
             raise gym.error.ResetNeeded(
                 f"call reset() before step(): environments {idle} have no open episode"
@@ -214,20 +230,25 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         self._act(actions)
         try:
             observations, rewards, terminated, truncated, infos = self.env.step(actions)
-            self._columns.put("reward", self._row, np.asarray(rewards, np.float64))
+            rewards_64 = np.asarray(rewards, np.float64).reshape(self.num_envs)
+            self._columns.put("reward", self._now.row, rewards_64)
             values = [convert(observations) for convert in self._converters]
             ended = self._running & np.logical_or(terminated, truncated)
             if self._infos:
                 self._add_infos(infos, ended)
-            if ended.any() or self._due.any() or self._row + 1 >= self._full_at:
+            any_ended = np.count_nonzero(ended)
+            if any_ended or self._any_due or self._now.row + 1 >= self._full_at:
                 # A signal must not interrupt the writes and the update of the row.
                 with HoldSignals():
                     self._make_room()
-                    self._observe(values)
-                    self._begin(np.flatnonzero(self._due), infos)
-                    self._end_some(np.flatnonzero(ended), values, terminated, truncated, infos)
+                    self._observe(values, rewards_64)
+                    if self._any_due:
+                        self._begin(np.flatnonzero(self._due), infos)
+                    if any_ended:
+                        self._end_some(np.flatnonzero(ended), values, terminated, truncated, infos)
+                    self._look_ahead()
             else:
-                self._observe(values)
+                self._observe(values, rewards_64)
         except BaseException:
             # The environments may have made a step that the log lacks, so all episodes end here.
             self._interrupt(self._every)
@@ -249,7 +270,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
 
     def _act(self, actions: Any) -> None:
         """Store the actions before the environments can change them."""
-        row = self._row
+        row = self._now.row
         # The checks take longer than storing the values, and most recordings have no probabilities.
         probs = self._checked_probs() if self.behavior_probs is not math.nan else math.nan
         self._columns.put("action", row, self._action_of(actions))
@@ -283,18 +304,23 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
 
     def _make_room(self) -> None:
         """Grow the buffers that the next row does not fit into."""
-        first = int(self._first[self._running].min(initial=self._row))
+        row = self._now.row
+        first = int(self._first[self._running].min(initial=row))
         for table in self._tables():
-            if self._row + 2 - first > table.capacity:
-                table.make_room(self._row + 2 - first, self._row)
+            if row + 2 - first > table.capacity:
+                table.make_room(row + 2 - first, row)
         self._full_at = first + min(table.capacity for table in self._tables())
 
-    def _observe(self, values: list[NDArray[Any]]) -> None:
+    def _observe(self, values: list[NDArray[Any]], rewards: NDArray[np.float64]) -> None:
         """Store each environment's observation in the next row, which becomes the current one."""
-        self._put(self._row + 1, ..., values)
-        self._row += 1
+        row = self._now.row + 1
+        self._put(row, values)
+        with np.errstate(all="ignore"):
+            returns = self._now.returns + rewards
+        # One assignment, because signals are not delayed in most steps.
+        self._now = _Now(row, returns)
 
-    def _put(self, row: int, environments: Any, values: list[NDArray[Any]]) -> None:
+    def _put(self, row: int, values: list[NDArray[Any]], environments: Any = ...) -> None:
         for (table, field), value in zip(self._places, values, strict=True):
             table.put(field, row, value, environments)
 
@@ -304,7 +330,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         for number in np.flatnonzero(self._running).tolist():
             is_final = same_step and ended[number]
             source = infos.get("final_info", {}) if is_final else infos
-            step = self._row + 1 - int(self._first[number])
+            step = self._now.row + 1 - int(self._first[number])
             self._infos[number].add(step, info_of(source, number, self.num_envs))
 
     def _begin(self, numbers: NDArray[np.int64], infos: dict[str, Any]) -> None:
@@ -316,7 +342,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             self._open[number] = OpenEpisode(self.policy, self.epsilon)
             if self._infos:
                 self._infos[number].begin(info_of(infos, number, self.num_envs))
-        self._first[numbers] = self._row
+        self._first[numbers], self._now.returns[numbers] = self._now.row, 0.0
         self._running[numbers], self._due[numbers] = True, False
 
     def _end_some(
@@ -338,14 +364,14 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             for number in numbers.tolist():
                 if same_step:
                     final = self._final_observation(infos, number)
-                    self._put(self._row, number, final)
+                    self._put(self._now.row, final, number)
                 is_terminal = bool(terminated[number])
                 reason = reason_of(_of_env(infos_of_ended, "reason", number), is_terminal)
                 ended.append(_Ended(number, is_terminal, bool(truncated[number]), reason))
         finally:
             self._end(ended)
         if same_step:
-            self._put(self._row, numbers, [value[numbers] for value in values])
+            self._put(self._now.row, [value[numbers] for value in values], numbers)
             self._begin(numbers, infos)
         self._due[numbers] = self._autoreset is AutoresetMode.NEXT_STEP
 
@@ -359,52 +385,62 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             )
         return [convert(final) for convert in self._converters_of_one]
 
+    def _look_ahead(self) -> None:
+        """Update what the next step needs to know; call this after episodes began or ended."""
+        self._ready = bool((self._running | self._due).all())
+        self._any_due = bool(self._due.any())
+
     def _interrupt(self, numbers: NDArray[np.int64]) -> None:
         """Record unfinished episodes as truncated, and drop episodes without a transition."""
         with HoldSignals():
-            if not self._recording.closed:
-                unfinished = numbers[self._running[numbers] & (self._first[numbers] < self._row)]
-                self._end([_Ended(each, False, True, INTERRUPTED) for each in unfinished.tolist()])
-            self._running[numbers] = self._due[numbers] = False
-            self._display.clear()
+            try:
+                if not self._recording.closed:
+                    has_steps = self._first[numbers] < self._now.row
+                    unfinished = numbers[self._running[numbers] & has_steps].tolist()
+                    self._end([_Ended(each, False, True, INTERRUPTED) for each in unfinished])
+            finally:
+                self._running[numbers] = self._due[numbers] = False
+                self._look_ahead()
+                self._display.clear()
 
     def _end(self, ended: list[_Ended]) -> None:
-        """Append ended episodes to the log.
-
-        Episodes that fit into one chunk share it, because writing a chunk takes longer than
-        recording a short episode.
-        """
-        tables: list[OpenRows[Any]] = [self._columns, *self._images.values()]
-        most = min(table.per_chunk for table in tables)
-        batch: list[_Ended] = []
-        rows = 0
-        for one in ended:
-            count = self._row + 1 - int(self._first[one.number])
-            if batch and rows + count > most:
-                self._write(batch)
-                batch, rows = [], 0
-            batch.append(one)
-            rows += count
-        if batch:
-            self._write(batch)
+        """Append ended episodes to the log."""
+        for group in self._groups(ended):
+            self._write(group)
         if self._infos:
             self._infos[0].warn()
 
-    def _write(self, ended: list[_Ended]) -> None:
-        """Write ended episodes, one after the other, with one chunk for each topic.
+    def _groups(self, ended: list[_Ended]) -> Iterator[list[_Ended]]:
+        """Group the episodes that are written to the same file."""
+        most = self._recording.max_file_bytes
+        if most is None:
+            yield from [ended] if ended else []
+            return
+        row_bytes = sum(table.row_bytes for table in self._tables())
+        group: list[_Ended] = []
+        size = 0
+        for one in ended:
+            added = row_bytes * (self._now.row + 1 - int(self._first[one.number]))
+            if group and size + added > most:
+                yield group
+                group, size = [], 0
+            group.append(one)
+            size += added
+        if group:
+            yield group
 
-        If a single episode does not fit into one chunk, it has several.
-        """
+    def _write(self, ended: list[_Ended]) -> None:
+        """Write ended episodes, one after the other, with the chunks of `/rl/step` last."""
         recording, step_ns = self._recording, self._recording.step_ns
         numbers = [one.number for one in ended]
-        firsts = self._first[numbers]
-        lengths = self._row - firsts
+        firsts: list[int] = self._first[numbers].tolist()
+        lengths = [self._now.row - first for first in firsts]
+        returns = (self._now.returns[numbers] + 0.0).tolist()
         # Set this before writing, so that an error does not cause a second write of the episodes.
         self._running[numbers] = False
         recording.begin(self._display)
-        totals = self._columns.total_rewards(numbers, firsts, lengths)
         summaries: list[EpisodeSummary] = []
-        for one, length, total in zip(ended, lengths.tolist(), totals, strict=True):
+        for one, length, total in zip(ended, lengths, returns, strict=True):
             episode = self._open[one.number]
             episode.steps = length
             summary = recording.summary(
@@ -416,9 +452,9 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
                 after=summaries[-1] if summaries else None,
             )
             summaries.append(summary)
-        starts = [summary.start_time_ns for summary in summaries]
+        starts = np.array([summary.start_time_ns for summary in summaries])
         for table in self._images.values():
-            table.write(numbers, firsts, lengths + 1, starts, step_ns)
+            table.write(numbers, firsts, [length + 1 for length in lengths], starts, step_ns)
         if self._infos:
             for number, summary in zip(numbers, summaries, strict=True):
                 self._infos[number].end(summary.length, summary.start_time_ns, step_ns)

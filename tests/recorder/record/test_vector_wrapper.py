@@ -216,6 +216,37 @@ def test_episodes_that_end_in_one_step_share_chunks(
     assert env.episodes == 4, "episodes that were not written are not counted"
 
 
+@pytest.mark.parametrize(("limit", "lengths"), [(1, [1, 1, 1]), (500, [2, 1]), (10**6, [3])])
+def test_a_limited_file_gets_few_of_the_episodes_that_end_in_one_step(
+    tmp_path: Path, limit: int, lengths: list[int]
+) -> None:
+    space = spaces.Box(-1, 1, (2,), np.float32)
+    envs = SyncVectorEnv(members(tmp_path, space, [[2], [2], [2]]))
+    # Each episode has three records of 74 bytes.
+    with closing(
+        mcaprl.RecordVecMcap(envs, tmp_path / "limited.mcap", max_file_bytes=limit)
+    ) as env:
+        env.reset(seed=0)
+        for _ in range(2):
+            env.step(np.zeros(3, np.int64))
+    files = sorted(tmp_path.glob("limited-*.mcap"))
+    assert [len(mcaprl.open(file).episodes) for file in files] == lengths
+
+
+def test_no_step_is_lost_after_an_error_in_reset(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with closing(mcaprl.RecordVecMcap(cartpoles(2), log_path)) as env:
+        env.reset(seed=0)
+        env.step(np.zeros(2, np.int64))
+        with monkeypatch.context() as patch:
+            patch.setattr(OpenSteps, "end", failing_end)
+            with pytest.raises(LogError, match="no room"):
+                env.reset(seed=0)
+        with pytest.raises(gym.error.ResetNeeded, match="no open episode"):
+            env.step(np.zeros(2, np.int64))
+
+
 def failing_end(*_: Any) -> None:
     """Take the place of `OpenSteps.end`, as if the disk were full."""
     raise LogError("no room")
