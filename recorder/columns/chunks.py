@@ -69,7 +69,7 @@ class Compressors:
         chunk_name: Name of the compression in Chunk records.
         short: Compressor for short messages of one length.
         long: Compressor for long messages.
-        mixed: Compressor for short messages of different lengths.
+        mixed: Compressor for messages of different lengths.
         few: Compressor for a few such messages, or for short texts.
         rare: Compressor for rare long messages that are not images.
     """

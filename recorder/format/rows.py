@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.recorder.columns.cdr import ENCAPSULATION, ENCAPSULATION_BYTES
-from mcaprl.recorder.columns.message_rows import message_rows, part_of
+from mcaprl.recorder.columns.message_rows import message_rows
 from mcaprl.recorder.format.schema import fill_image_constants, image_dtype, message_dtype
 from mcaprl.recorder.format.topics import BYTES_PER_CHUNK, IMAGE_FRAME, MIN_ROWS
 
@@ -92,8 +92,8 @@ class TopicRows:
             fields: Names in the message.
 
         Returns:
-            That part of all rows as items, (N,), and a dtype of these fields, in which they have
-            the same distances and are aligned. Its items may be longer than the part.
+            A view of that part of each row as one item, (N,), and a dtype for buffers of these
+            fields. An item of the dtype begins with the bytes of the part. Its fields are aligned.
         """
         payload = self._rows.dtype["payload"]
         assert payload.fields is not None, "messages have fields"
@@ -179,6 +179,18 @@ class ImageRows(TopicRows):
         seconds, self.fields["nanosec"][where] = np.divmod(times_ns, 10**9)
         self.fields["sec"][where] = seconds
         super().write(where, times_ns)
+
+
+def part_of(rows: NDArray[Any], part: slice) -> NDArray[np.void]:
+    """Return a view of these bytes of each structured item, as items.
+
+    Copying items is twice as fast as copying rows of bytes.
+    """
+    item, itemsize = np.dtype((np.void, part.stop - part.start)), rows.itemsize
+    layout = np.dtype(
+        {"names": ["part"], "formats": [item], "offsets": [part.start], "itemsize": itemsize}
+    )
+    return rows.view(layout)["part"]
 
 
 def make_final(message: NDArray[Any]) -> None:

@@ -113,7 +113,7 @@ class EpisodeLog:
 
     @property
     def max_file_bytes(self) -> int | None:
-        """File size from which the next episode begins a new file; None if there is no limit."""
+        """Size at which the recording continues in another file; None if it is not divided."""
         return None if self._parts is None else self._parts.max_file_bytes
 
     def check_can_begin(self, seeds: Iterable[int | None]) -> None:

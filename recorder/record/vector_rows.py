@@ -13,9 +13,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.recorder.columns.message_rows import part_of
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
-from mcaprl.recorder.format.rows import StepRows, TopicRows
+from mcaprl.recorder.format.rows import StepRows, TopicRows, part_of
 
 # Limits of the initial capacity: number of rows, and number of bytes per environment. The capacity
 # doubles when an episode needs more.
@@ -30,7 +29,7 @@ class OpenRows(Generic[Rows]):
 
     Attributes:
         capacity: Number of rows in the array, a power of 2.
-        row_bytes: Number of bytes of the message record of one environment in one row.
+        row_bytes: Length of a message record.
     """
 
     def __init__(self, chunk: Rows, environments: int, fields: Sequence[str]) -> None:
@@ -39,13 +38,13 @@ class OpenRows(Generic[Rows]):
         Args:
             chunk: Message records of one chunk; their constant fields are set.
             environments: Number of environments.
-            fields: Names of the fields that `put` sets. `write` overwrites all fields after the
-                first of them.
+            fields: Names of the fields that `put` sets. All fields of the message after the first
+                of these are copied to the records, so the caller sets the others there.
         """
         self._chunk, self._fields, self.row_bytes = chunk, fields, chunk.itemsize
         self._records, dtype = chunk.from_field(fields)
         first = max(2, min(_FIRST_CAPACITY, _FIRST_BYTES // self.row_bytes))
-        self._set(np.empty((2 ** (first.bit_length() - 1), environments), dtype))
+        self._use(np.empty((2 ** (first.bit_length() - 1), environments), dtype))
 
     def make_room(self, count: int, row: int) -> None:
         """Grow the array until `count` rows fit.
@@ -57,7 +56,7 @@ class OpenRows(Generic[Rows]):
         while capacity < count:
             capacity *= 2
         old, old_places = self._rows, kept % self.capacity
-        self._set(np.empty((capacity, *old.shape[1:]), old.dtype))
+        self._use(np.empty((capacity, *old.shape[1:]), old.dtype))
         self._items[kept % capacity] = self._items_of(old)[old_places]
 
     def put(self, field: str, row: int, values: Any, environments: Any = ...) -> None:
@@ -94,7 +93,8 @@ class OpenRows(Generic[Rows]):
         for which, steps in self._chunks(environments, firsts, counts):
             self._chunk.write(slice(len(steps)), starts_ns[which] + steps * step_ns)
 
-    def _set(self, rows: NDArray[Any]) -> None:
+    def _use(self, rows: NDArray[Any]) -> None:
+        """Use this array, (capacity, N)."""
         self._rows, self.capacity = rows, len(rows)
         self._columns = {name: rows[name] for name in self._fields}
         self._items = self._items_of(rows)

@@ -206,7 +206,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             self._begin(numbers, infos)
             for number in numbers.tolist():
                 self._open[number].seed, self._open[number].options = seeds[number], given or None
-            self._look_ahead()
+            self._update_flags()
         return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -246,7 +246,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
                         self._begin(np.flatnonzero(self._due), infos)
                     if any_ended:
                         self._end_some(np.flatnonzero(ended), values, terminated, truncated, infos)
-                    self._look_ahead()
+                    self._update_flags()
             else:
                 self._observe(values, rewards_64)
         except BaseException:
@@ -385,8 +385,8 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             )
         return [convert(final) for convert in self._converters_of_one]
 
-    def _look_ahead(self) -> None:
-        """Update what the next step needs to know; call this after episodes began or ended."""
+    def _update_flags(self) -> None:
+        """Update the flags that the next step checks; call this after episodes began or ended."""
         self._ready = bool((self._running | self._due).all())
         self._any_due = bool(self._due.any())
 
@@ -400,7 +400,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
                     self._end([_Ended(each, False, True, INTERRUPTED) for each in unfinished])
             finally:
                 self._running[numbers] = self._due[numbers] = False
-                self._look_ahead()
+                self._update_flags()
                 self._display.clear()
 
     def _end(self, ended: list[_Ended]) -> None:
@@ -412,10 +412,8 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
 
     def _groups(self, ended: list[_Ended]) -> Iterator[list[_Ended]]:
         """Group the episodes that are written to the same file."""
-        most = self._recording.max_file_bytes
-        if most is None:
-            yield from [ended] if ended else []
-            return
+        limit = self._recording.max_file_bytes
+        most = math.inf if limit is None else limit
         row_bytes = sum(table.row_bytes for table in self._tables())
         group: list[_Ended] = []
         size = 0

@@ -233,7 +233,7 @@ def test_a_limited_file_gets_few_of_the_episodes_that_end_in_one_step(
     assert [len(mcaprl.open(file).episodes) for file in files] == lengths
 
 
-def test_no_step_is_lost_after_an_error_in_reset(
+def test_environments_have_to_be_reset_after_an_error_in_reset(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with closing(mcaprl.RecordVecMcap(cartpoles(2), log_path)) as env:
