@@ -78,9 +78,9 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
   alone takes two thirds of the time of stepping or more. Where episodes are short, most steps write
   a chunk of messages and a chunk of records, which takes most of the time. In the medians of 14
   pairs of runs, recording added 4 to 7 % to Pendulum, which has long episodes, and 5 to 7 % to the
-  powerline sim, whose steps take less time in a batch. The table was measured before the last
-  change of the recorder. A recorder that only keeps the arrays of each step, copies and compresses
-  the records, and computes their CRCs, would add 2 to 5 % to all but the lane sim.
+  powerline sim, whose steps take less time in a batch. A recorder that only keeps the arrays of
+  each step, copies and compresses the records, and computes their CRCs, would add 2 to 5 % to all
+  but the lane sim.
 - A batch of 1,024 cars: three fifths of the time is the compiled step. Nearly half of that is the
   motion, which has a division and three square roots in each of five substeps. The infos take a
   seventh, a third of it the array of reasons, and starting the cars whose episodes ended a ninth.
