@@ -1,12 +1,13 @@
 """CRC-32 of data that is read or written.
 
-ISA-L is eight times as fast as zlib; `pip install 'mcaprl[fast]'` installs it.
+zlib-ng is 3 to 15 times as fast as zlib: 3 times for data in memory, 15 times for data in the cache.
+`pip install 'mcaprl[fast]'` installs it.
 """
 
 from __future__ import annotations
 
 try:
-    from isal.isal_zlib import crc32
+    from zlib_ng.zlib_ng import crc32
 except ImportError:
     from zlib import crc32
 

@@ -23,8 +23,8 @@ def test_known_value() -> None:
     assert checksum.crc32(b"123456789") == 0xCBF43926
 
 
-def test_zlib_where_isal_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "isal.isal_zlib", None)
+def test_zlib_where_zlib_ng_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zlib_ng.zlib_ng", None)
     try:
         assert importlib.reload(checksum).crc32 is zlib.crc32
     finally:
