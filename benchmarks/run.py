@@ -74,13 +74,15 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
 - Recording one environment: assigning the values to NumPy arrays, without writing them, takes 54 to
   62 % of our time (three runs), and compression a tenth. The rest is the messages, CRCs and indexes
   at the end of an episode.
-- Recording 256 environments: where a step is cheap, as in the lane sim, compressing the records
-  alone takes two thirds of the time of stepping or more. Where episodes are short, most steps write
-  a chunk of messages and a chunk of records, which takes most of the time. In the medians of 14
-  pairs of runs, recording added 4 to 7 % to Pendulum, which has long episodes, and 5 to 7 % to the
-  powerline sim, whose steps take less time in a batch. A recorder that only keeps the arrays of
-  each step, copies and compresses the records, and computes their CRCs, would add 2 to 5 % to all
-  but the lane sim.
+- Recording 256 environments: the rows `least work of a recorder` only keep the arrays of each step,
+  and copy, compress and write the records of the episodes that ended in it. Where episodes are
+  short or a step is cheap, this alone exceeds the goal. Where episodes are long, as in Pendulum and
+  in the powerline sim without changes, it leaves 0 to 2 % of the time of stepping for everything
+  else. In the medians of 8 to 14 pairs of runs, recording added 3 to 7 % to Pendulum, and 5 to 7 %
+  to the powerline sim. In short episodes, most steps write a chunk of messages and a chunk of
+  records. In a profile of CartPole, we spend a quarter of the time that we add on compressing,
+  indexing and writing chunks, a fifth on encoding five messages for each episode, a seventh on
+  merging the chunks, and an eighth on copying rows.
 - A batch of 1,024 cars: three fifths of the time is the compiled step. Nearly half of that is the
   motion, which has a division and three square roots in each of five substeps. The infos take a
   seventh, a third of it the array of reasons, and starting the cars whose episodes ended a ninth.

@@ -17,9 +17,11 @@ describe the contents of a log. `scene` and `layout` define what viewers show.
 from mcaprl.lazy import lazy_attributes
 
 __all__ = [
+    "EPISODE_TOPIC",
     "MAPPING_SECTIONS",
     "STEP_TOPIC",
     "ChunkHeader",
+    "Compressors",
     "LogReader",
     "McapReader",
     "Player",
@@ -40,12 +42,12 @@ __getattr__ = lazy_attributes(
         "mcaprl.recorder.bags.bag": ("open_bag",),
         "mcaprl.recorder.columns.cdr": ("clear_types",),
         "mcaprl.recorder.columns.checksum": ("crc32",),
-        "mcaprl.recorder.columns.chunks": ("ChunkHeader", "chunk_header"),
+        "mcaprl.recorder.columns.chunks": ("ChunkHeader", "Compressors", "chunk_header"),
         "mcaprl.recorder.columns.reader": ("McapReader",),
         "mcaprl.recorder.columns.records": ("map_file",),
         "mcaprl.recorder.dataset.log_reader": ("LogReader",),
         "mcaprl.recorder.format.schema": ("message_dtype", "step_schema"),
-        "mcaprl.recorder.format.topics": ("STEP_TOPIC",),
+        "mcaprl.recorder.format.topics": ("EPISODE_TOPIC", "STEP_TOPIC"),
         "mcaprl.recorder.mapping.config": ("MAPPING_SECTIONS",),
         "mcaprl.recorder.viewer.playback": ("Player", "Track"),
     },
