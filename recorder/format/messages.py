@@ -11,9 +11,6 @@ import struct
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mcaprl.errors import CorruptLogError
 
 if TYPE_CHECKING:
@@ -61,7 +58,7 @@ _LOG_START, _NODE = struct.Struct("<4sIIB3x12s"), b"\7\0\0\0mcaprl\0"
 _ALIGNMENT = 4
 # The end of a log line: two empty strings, and the field `line`, 0.
 _LOG_END = 2 * b"\1\0\0\0\0\0\0\0" + bytes(4)
-_COUNT, _STAMP, _FLOAT64_BYTES = struct.Struct("<I"), struct.Struct("<II"), 8
+_COUNT, _STAMP = struct.Struct("<I"), struct.Struct("<II")
 
 
 @lru_cache(maxsize=1)
@@ -217,15 +214,13 @@ class CdrWriter:
         """Add a string."""
         self.add(_known_string(text), _ALIGNMENT)
 
-    def add_points(self, points: NDArray[np.float64]) -> None:
-        """Add a sequence of `geometry_msgs/msg/Point`, (N, 3)."""
-        self.add_count(len(points))
-        if len(points):
-            self.add(points.astype("<f8", copy=False).tobytes(), _FLOAT64_BYTES)
-
     def to_bytes(self) -> bytes:
         """Return the message."""
         return bytes(self._data)
+
+    def fields(self) -> bytes:
+        """Return the fields without the encapsulation header."""
+        return bytes(self._data[len(_ENCAPSULATION) :])
 
 
 @lru_cache

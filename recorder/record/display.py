@@ -115,8 +115,10 @@ class Display:
         self._camera = b""
         self.shows_steps = any((self._scene, self._telemetry, self._depth))
         self._shown: ShownTopics | None = None
-        self._tracks, self._bytes_since_tracks = Tracks(), 0
+        self._tracks, self._bytes_since_tracks, self._tracks_bytes = Tracks(), 0, 0
         self._static: dict[str, bytes] = {}
+        # Latest static shapes and their message.
+        self._static_scene: tuple[Sequence[Shape], bytes] = ((), marker_array(()))
         # Latest shapes that are not in a message yet. If no later message contains them, they are
         # written at the end of the episode.
         self._pending: tuple[int, Sequence[Shape]] | None = None
@@ -151,7 +153,7 @@ class Display:
                     channel = self._log.add_channel(CAMERA_INFO, "sensor_msgs/msg/CameraInfo")
                     self.shown.channels[CAMERA_INFO] = channel
         if self._scene is not None:
-            self._emit_changed(SCENE_STATIC, start_ns, marker_array(self._scene.static_scene()))
+            self._emit_changed(SCENE_STATIC, start_ns, self._encode_static(self._scene))
             self._emit_changed(TF_STATIC, start_ns, transforms(self._scene.static_frames(), 0))
         if self._depth_images is not None:
             self._depth_images.begin(start_ns, step_ns)
@@ -228,10 +230,23 @@ class Display:
         """Write the tracks so far, but limit their share of the log if episodes are short."""
         failed = self._log.metadata.is_failure(summary.reason)
         self._tracks.end(summary.episode, summary.total_reward, failed=failed)
+        # Encoding the tracks takes longer than all other messages of a short episode. They seldom
+        # become shorter.
+        if self._bytes_since_tracks < _BYTES_PER_TRACKS * self._tracks_bytes:
+            return
         data = marker_array(self._tracks.shapes())
+        self._tracks_bytes = len(data)
         if self._bytes_since_tracks >= _BYTES_PER_TRACKS * len(data):
             self._emit(TRACKS, summary.end_time_ns, data)
             self._bytes_since_tracks = 0
+
+    def _encode_static(self, scene: SceneSource) -> bytes:
+        """Return the message of the static shapes, which are usually those of the last episode."""
+        shapes = scene.static_scene()
+        # Other sequences may have changed without being replaced.
+        if not (isinstance(shapes, tuple) and shapes is self._static_scene[0]):
+            self._static_scene = shapes, marker_array(shapes)
+        return self._static_scene[1]
 
     def _emit_changed(self, topic: str, time_ns: int, data: bytes) -> None:
         if self._static.get(topic) != data:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -36,10 +37,9 @@ MARKER_TYPES = {
 }
 _ADD, _DELETE_ALL = 0, 3
 _NO_POINTS = np.empty((0, 3))
-# Fields of a marker: id, type and action; pose and scale; color, lifetime and frame_locked.
-_KIND, _POSE_AND_SCALE, _COLOR_TO_FLAG = (
-    struct.Struct(f"<{code}") for code in ("3i", "10d", "4fiI?")
-)
+# Fields of a marker: id, type and action; then pose, scale, color, lifetime, frame_locked and the
+# number of points.
+_KIND, _POSE_TO_COUNT = struct.Struct("<3i"), struct.Struct("<10d4fiI?3xI")
 _TRANSFORM = struct.Struct("<7d")
 _FLOAT32_BYTES, _FLOAT64_BYTES = 4, 8
 # Fields that are empty in all markers. An empty string consists of its length, 1, and a NUL. First
@@ -47,6 +47,7 @@ _FLOAT32_BYTES, _FLOAT64_BYTES = 4, 8
 _EMPTY, _NONE = b"\1\0\0\0\0\0\0\0", bytes(4)
 _COLORS_TO_TEXTURE = _NONE + _EMPTY + bytes(8) + _EMPTY + _EMPTY + _NONE + _NONE
 _MESH = _EMPTY + _EMPTY + _NONE + b"\0"
+_COLORS_TO_MESH = _COLORS_TO_TEXTURE + _EMPTY + _MESH
 # Values are rounded to binary fractions. This halves their size in a log without visible changes.
 _POINTS_PER_M = 2**6
 _POSITIONS_PER_M = 2**8
@@ -118,7 +119,10 @@ class SceneSource(Protocol):
     """An environment that provides shapes and coordinate frames."""
 
     def static_scene(self) -> Sequence[Shape]:
-        """Return the shapes that stay the same in an episode. Their coordinate frames may move."""
+        """Return the shapes that stay the same in an episode. Their coordinate frames may move.
+
+        If this is the same tuple as in the previous episode, its shapes must not have changed.
+        """
 
     def scene(self) -> Sequence[Shape]:
         """Return the current shapes that change from step to step."""
@@ -276,19 +280,31 @@ def _add_marker(
     text: str = "",
 ) -> None:
     """Add a `visualization_msgs/msg/Marker`."""
-    message.add_header(0, frame)
-    message.add_text(name)
-    message.add(_KIND.pack(0, kind, action), _FLOAT32_BYTES)
-    message.add(_POSE_AND_SCALE.pack(*position, *rotation, *size), _FLOAT64_BYTES)
+    message.add(_header_to_action(frame, name, kind, action), _FLOAT32_BYTES)
     # A lifetime of 0 means that a marker never expires. With `frame_locked`, a marker moves with
     # its frame, so static bodies are sent only once.
-    message.add(_COLOR_TO_FLAG.pack(*color, 0, 0, True), _FLOAT32_BYTES)
+    pose = *position, *rotation
+    data = _POSE_TO_COUNT.pack(*pose, *size, *color, 0, 0, True, len(points))
+    message.add(data, _FLOAT64_BYTES)
     if len(points):
         points = np.rint(np.multiply(points, _POINTS_PER_M)) / _POINTS_PER_M
-    message.add_points(points)
+        message.add(points.astype("<f8", copy=False).tobytes(), _FLOAT64_BYTES)
+    if not text:
+        message.add(_COLORS_TO_MESH, _FLOAT32_BYTES)
+        return
     message.add(_COLORS_TO_TEXTURE, _FLOAT32_BYTES)
     message.add_text(text)
     message.add(_MESH, _FLOAT32_BYTES)
+
+
+@lru_cache(maxsize=1024)
+def _header_to_action(frame: str, name: str, kind: int, action: int) -> bytes:
+    """Encode the first fields of a marker, which are often equal to those of an earlier marker."""
+    fields = messages.CdrWriter()
+    fields.add_header(0, frame)
+    fields.add_text(name)
+    fields.add(_KIND.pack(0, kind, action), _FLOAT32_BYTES)
+    return fields.fields()
 
 
 def _rounded(numbers: Iterable[float], per_one: int) -> list[float]:

@@ -73,14 +73,8 @@ class Tracks:
             return []
         width_m = self._width_m()
         shapes = [
-            TrackShape(
-                f"track_{track.episode}",
-                "line",
-                self._color(track.total_reward),
-                track.points_m,
-                (width_m, 0.0, 0.0),
-            )
-            for track in self._tracks
+            TrackShape(f"track_{track.episode}", "line", color, track.points_m, (width_m, 0.0, 0.0))
+            for track, color in zip(self._tracks, self._colors(), strict=True)
         ]
         mark_m = _WIDTHS_PER_MARK * width_m
         for track in self._tracks:
@@ -96,10 +90,12 @@ class Tracks:
         world_m = float(np.ptp(points_m, axis=0).max())
         return max(_MIN_WIDTH_M, world_m / _WIDTHS_PER_WORLD)
 
-    def _color(self, total_reward: float) -> Quad:
+    def _colors(self) -> list[Quad]:
         # Infinite returns and NaN have no color, so finite numbers replace them.
-        returns = np.nan_to_num([total_reward, *(track.total_reward for track in self._tracks)])
+        returns = np.nan_to_num([track.total_reward for track in self._tracks])
         low, high = returns.min(), returns.max()
-        share = returns[0] / (high - low) - low / (high - low) if high > low else 1.0
-        red, green, blue = (_LOW_RETURN + share * (_HIGH_RETURN - _LOW_RETURN)).tolist()
-        return red, green, blue, 1.0
+        shares = np.ones(len(returns))
+        if high > low:
+            shares = returns / (high - low) - low / (high - low)
+        colors = _LOW_RETURN + shares[:, None] * (_HIGH_RETURN - _LOW_RETURN)
+        return [(red, green, blue, 1.0) for red, green, blue in colors.tolist()]

@@ -1,12 +1,14 @@
-"""Topics about whole episodes: phases, log lines and tracks."""
+"""Topics about whole episodes: phases, log lines, static shapes and tracks."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.record.tracks import Tracks
 from mcaprl.sims import make_sim
+from mcaprl.sims.drawing.scene import Shape
 
 START_NS = 1_700_000_000 * 10**9
 STEP_NS = 250_000_000
@@ -73,6 +76,59 @@ def test_an_environment_without_success_reasons_causes_no_warnings(tmp_path: Pat
     lines = read(path, "/rosout", messages.LOG_TYPE)
     assert [line.level for _, line in lines] == [messages.INFO, messages.INFO]
     assert read(path, "/rl/phase", messages.TEXT_TYPE)[-1][1].data == "terminated"
+
+
+class _World(gym.Env[Any, Any]):
+    """An environment that shows these static shapes; an episode has one step."""
+
+    observation_space = action_space = gym.spaces.Discrete(2)
+    shapes: Sequence[Shape] = ()
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[int, dict[str, Any]]:
+        return 0, {}
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        return 0, 0.0, True, False, {}
+
+    def static_scene(self) -> Sequence[Shape]:
+        return self.shapes
+
+    def scene(self) -> Sequence[Shape]:
+        return ()
+
+    static_frames = frames = scene
+
+
+@pytest.mark.parametrize("kind", [tuple, list])
+def test_static_shapes_are_written_when_they_change(tmp_path: Path, kind: Any) -> None:
+    white = (1.0, 1.0, 1.0, 1.0)
+    first, second = Shape("first", "box", white), Shape("second", "box", white)
+    lists = [kind([first]), kind([first]), kind([first, second]), kind([first])]
+    world, path = _World(), tmp_path / "world.mcap"
+    with closing(mcaprl.RecordMcap(world, path, start_time_ns=0, step_duration_s=1.0)) as env:
+        for shapes in lists:
+            # The sims return the same object again.
+            for world.shapes in (shapes, shapes):
+                env.reset()
+                env.step(0)
+    found = read(path, "/scene/static", "visualization_msgs/msg/MarkerArray")
+    assert [(time // 10**9, len(array.markers) - 1) for time, array in found] == [
+        (0, 1),
+        (8, 2),
+        (12, 1),
+    ]
+
+
+def test_static_shapes_in_a_changed_list_are_written(tmp_path: Path) -> None:
+    world, path = _World(), tmp_path / "world.mcap"
+    world.shapes = shapes = [Shape("first", "box", (1.0, 1.0, 1.0, 1.0))]
+    with closing(mcaprl.RecordMcap(world, path)) as env:
+        for _ in range(2):
+            env.reset()
+            env.step(0)
+            shapes.append(Shape("second", "box", (1.0, 1.0, 1.0, 1.0)))
+    found = read(path, "/scene/static", "visualization_msgs/msg/MarkerArray")
+    assert [len(array.markers) - 1 for _, array in found] == [1, 2]
 
 
 def test_tracks_follow_the_vehicle_and_mark_failures(log: Path) -> None:
