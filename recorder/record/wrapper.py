@@ -200,7 +200,8 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
             self._interrupt()
             raise
         try:
-            observation, reward, terminated, truncated, info = self.env.step(action)
+            transition = self.env.step(action)
+            observation, reward, terminated, truncated, info = transition
             self._store_observation(observation)
             if self._infos is not None:
                 self._infos.add(step, info)
@@ -227,7 +228,7 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
             # The log may lack the last step of the environment, so the episode cannot continue.
             self._interrupt()
             raise
-        return observation, reward, terminated, truncated, info
+        return transition
 
     def close(self) -> None:
         """Finish the log and close the environment; a second call has no effect."""
