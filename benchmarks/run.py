@@ -51,9 +51,9 @@ foxglove-sdk writes files and does not read them.
 
 A missed goal stays in its table. What limits us, as far as these tables and profiles show it:
 
-- Writing beside foxglove-sdk: compression takes 72 % of our time, and a copy of the records a fifth.
-  A writer that did nothing else would be 4.3 times as fast as foxglove-sdk. The rest of our time is
-  the CRCs and the system calls that write the file.
+- Writing beside foxglove-sdk: compression takes 72 % of our time, and a copy of the records takes a
+  fifth. A writer that did nothing else would be 4.3 times as fast as foxglove-sdk. The rest of our
+  time is the CRCs and the system calls that write the file.
 - Logs of images: the minimum of any reader and the copy of the images into new memory take three
   quarters of our time or more, and plain zstd 55 to 64 % (three runs). A reader that did nothing
   else would reach 72 to 76 %. Chunks of 200 images instead of 100 would save 7 % of the time, but a
@@ -74,8 +74,8 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
   the speed of one.
 - Recording one environment: assigning the values to NumPy arrays, without writing them, takes 47 to
   52 % of our time (eight runs), and compression a tenth. The rest is the messages, CRCs and indexes
-  at the end of an episode. In two runs, a recorder that checks no types, shapes and states took 75 %
-  of our time, which is just enough to be twice as fast as foxglove-sdk.
+  at the end of an episode. In two runs, a recorder that checks no types, shapes and states took
+  75 % of our time, which is just enough to be twice as fast as foxglove-sdk.
 - Recording 256 environments: the rows `least work of a recorder` only keep the arrays of each step,
   and copy, compress and write the records of the episodes that ended in it. Where episodes are
   short or a step is cheap, this alone exceeds the goal. Where episodes are long, as in Pendulum and
