@@ -197,10 +197,10 @@ def open_at_once(path: Path) -> int:
     return os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
 
 
-def is_at(descriptor: int, path: Path) -> bool:
+def is_at(descriptor: int, path: str | Path) -> bool:
     """Return whether a descriptor and a path refer to the same file or folder."""
     try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
+        return os.path.samestat(os.fstat(descriptor), os.stat(path))
     except (FileNotFoundError, NotADirectoryError):
         return False
 

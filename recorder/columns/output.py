@@ -38,7 +38,7 @@ class OutputFile:
         self.path, self._file = path, file
         self.position, self._crc, self._summary, self._data_end = 0, 0, Summary(), 0
 
-    def is_at(self, path: Path) -> bool:
+    def is_at(self, path: str | Path) -> bool:
         """Return whether `path` refers to the open file."""
         return is_at(self._file.fileno(), path)
 

@@ -33,11 +33,13 @@ class HoldSignals:
 
     def __enter__(self) -> None:
         """Start to delay signals."""
-        self._handlers: dict[int, Any] = {}
-        self._waiting: list[int] = []
-        self._holds = threading.current_thread() is threading.main_thread() and not self._is_held
+        self._holds = not self._is_held and (
+            threading.current_thread() is threading.main_thread()
+        )
         if not self._holds:
             return
+        self._handlers: dict[int, Any] = {}
+        self._waiting: list[int] = []
         try:
             HoldSignals._is_held = True
             for number in _HELD:
@@ -57,6 +59,8 @@ class HoldSignals:
         traceback: TracebackType | None,
     ) -> None:
         """Handle the delayed signals."""
+        if not self._holds:
+            return
         self._restore()
         for number in self._waiting:
             handler = self._handlers[number]
@@ -70,7 +74,6 @@ class HoldSignals:
         self._waiting.append(number)
 
     def _restore(self) -> None:
-        if self._holds:
-            HoldSignals._is_held = False
+        HoldSignals._is_held = False
         for number, handler in self._handlers.items():
             set_handler(number, handler)

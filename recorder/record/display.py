@@ -261,6 +261,8 @@ class Display:
             self._flush_messages()
 
     def _flush_messages(self) -> None:
+        if not self._messages:
+            return
         # Sorting by topic puts similar messages next to each other, which saves 10% of file size.
         self._messages.sort(key=itemgetter(0))
         # The static scene is written as a separate chunk, which is compressed at a higher level.

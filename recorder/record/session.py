@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import time
 from collections.abc import Iterable
@@ -69,7 +70,7 @@ class EpisodeLog:
         self._description = description
         # Relative paths are resolved in this folder, even if the process later changes to another
         # folder.
-        self._folder = Path.cwd()
+        self._folder = os.getcwd()
         self.step_ns = description.step_duration_ns
         if not isinstance(start_time_ns, int | np.integer | None):
             raise UsageError(f"start_time_ns is {start_time_ns}: it must be an integer")
@@ -201,7 +202,8 @@ class EpisodeLog:
             raise self._removed()
 
     def _is_in_place(self) -> bool:
-        return self.log.mcap.is_at(self._folder / self.log.mcap.path)
+        # Joining strings takes a third of the time of joining paths.
+        return self.log.mcap.is_at(os.path.join(self._folder, self.log.mcap.path))
 
     def _removed(self) -> LogError:
         return LogError(f"{self.log.mcap.path} was removed or replaced while it was being recorded")
