@@ -33,9 +33,7 @@ class HoldSignals:
 
     def __enter__(self) -> None:
         """Start to delay signals."""
-        self._holds = not self._is_held and (
-            threading.current_thread() is threading.main_thread()
-        )
+        self._holds = not self._is_held and (threading.current_thread() is threading.main_thread())
         if not self._holds:
             return
         self._handlers: dict[int, Any] = {}
