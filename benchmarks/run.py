@@ -73,15 +73,16 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
   if two threads write to new memory at the same time. Both together limit two threads to 1.6 times
   the speed of one.
 - Recording one environment: assigning the values to NumPy arrays, without writing them, takes 47 to
-  52 % of our time (eight runs), and compression a tenth. The rest is the messages, CRCs and indexes
+  54 % of our time (nine runs), and compression a tenth. The rest is the messages, CRCs and indexes
   at the end of an episode. In two runs, a recorder that checks no types, shapes and states took
   75 % of our time, which is just enough to be twice as fast as foxglove-sdk.
 - Recording 256 environments: the rows `least work of a recorder` only keep the arrays of each step,
-  and copy, compress and write the records of the episodes that ended in it. Where episodes are
-  short or a step is cheap, this alone exceeds the goal. Where episodes are long, as in Pendulum and
-  in the powerline sim without changes, it leaves up to 4 % of the time of stepping for everything
-  else. In the medians of 8 to 14 pairs of runs, recording added 3 to 7 % to Pendulum, and 5 to 7 %
-  to the powerline sim. In short episodes, most steps write a chunk of messages and a chunk of
+  and copy, compress and write the records of the episodes that ended in it. In three runs, this
+  alone added 8 to 12 % to CartPole, 4 to 6 % to random actions in the powerline sim, and twice the
+  time of stepping to the lane sim. In short episodes, merging the chunks would add 3 to 5 %. Where
+  episodes are long, as in Pendulum and in the powerline sim without changes, the least work leaves
+  up to 4 % of the time of stepping for everything else. In the medians of 8 to 14 pairs of runs,
+  recording added 3 to 7 % to Pendulum, and 5 to 7 % to the powerline sim. In short episodes, most steps write a chunk of messages and a chunk of
   records. In a profile of CartPole, we spend a quarter of the time that we add on compressing,
   indexing and writing chunks, a fifth on encoding five messages for each episode, a seventh on
   merging the chunks, and an eighth on copying rows.
