@@ -82,10 +82,10 @@ A missed goal stays in its table. What limits us, as far as these tables and pro
   time of stepping to the lane sim. In short episodes, merging the chunks would add 3 to 5 %. Where
   episodes are long, as in Pendulum and in the powerline sim without changes, the least work leaves
   up to 4 % of the time of stepping for everything else. In the medians of 8 to 14 pairs of runs,
-  recording added 3 to 7 % to Pendulum, and 5 to 7 % to the powerline sim. In short episodes, most steps write a chunk of messages and a chunk of
-  records. In a profile of CartPole, we spend a quarter of the time that we add on compressing,
-  indexing and writing chunks, a fifth on encoding five messages for each episode, a seventh on
-  merging the chunks, and an eighth on copying rows.
+  recording added 3 to 7 % to Pendulum, and 5 to 7 % to the powerline sim. In short episodes, most
+  steps write a chunk of messages and a chunk of records. In a profile of CartPole, we spend a
+  quarter of the time that we add on compressing, indexing and writing chunks, a fifth on encoding
+  five messages for each episode, a seventh on merging the chunks, and an eighth on copying rows.
 - A batch of 1,024 cars: three fifths of the time is the compiled step. Nearly half of that is the
   motion, which has a division and three square roots in each of five substeps. The infos take a
   seventh, a third of it the array of reasons, and starting the cars whose episodes ended a ninth.
