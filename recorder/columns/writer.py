@@ -174,9 +174,10 @@ class McapWriter(OutputFile):
         channel_id, size = int(rows["channel_id"][0]), rows.itemsize
         first = self._summary.counts[channel_id]
         rows["sequence"] = np.arange(first, first + len(rows)).astype(np.uint32)
+        rows["publish_time"] = rows["log_time"]
         index = np.empty(len(rows), INDEX_ENTRY)
         times = index["log_time"]
-        times[:] = rows["publish_time"] = rows["log_time"]
+        times[:] = rows["log_time"]
         index["offset"] = adjacent_offsets(0, size * (len(rows) - 1), size)
         self._store(
             rows.view(np.uint8).data,

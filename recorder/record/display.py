@@ -230,8 +230,8 @@ class Display:
         """Write the tracks so far, but limit their share of the log if episodes are short."""
         failed = self._log.metadata.is_failure(summary.reason)
         self._tracks.end(summary.episode, summary.total_reward, failed=failed)
-        # Encoding the tracks takes longer than all other messages of a short episode. They seldom
-        # become shorter.
+        # Encoding the tracks takes longer than encoding the rest of a short episode. Their message
+        # seldom becomes shorter, so its last size shows whether it can be written.
         if self._bytes_since_tracks < _BYTES_PER_TRACKS * self._tracks_bytes:
             return
         data = marker_array(self._tracks.shapes())
@@ -243,7 +243,7 @@ class Display:
     def _encode_static(self, scene: SceneSource) -> bytes:
         """Return the message of the static shapes, which are usually those of the last episode."""
         shapes = scene.static_scene()
-        # Other sequences may have changed without being replaced.
+        # The same list may contain other shapes than before.
         if not (isinstance(shapes, tuple) and shapes is self._static_scene[0]):
             self._static_scene = shapes, marker_array(shapes)
         return self._static_scene[1]
