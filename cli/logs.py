@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from mcaprl.texts import counted
 @integer_option(
     "--threads", "Number of threads that decompress chunks; useful for large logs.", least=1
 )
-@mapping_options
+@partial(mapping_options, has_strict=False)
 def info(
     data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool, **request: Any
 ) -> int:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, cast
 
 import click
 
@@ -28,19 +29,36 @@ origin_option = click.option(
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 
 
-def mapping_options(command: F) -> F:
-    """Add the options for bags of other robots."""
+def mapping_options(command: F, *, has_strict: bool = True) -> F:
+    """Add the options for bags of other robots; `has_strict` adds `--strict`."""
+
+    @functools.wraps(command)
+    def with_mapping(*args: Any, strict_mapping: bool = False, **request: Any) -> Any:
+        if strict_mapping:
+            from mcaprl.api.data import changed_mapping
+
+            request["mapping"] = changed_mapping(request["mapping"], {"strict": True})
+        return command(*args, **request)
+
+    strict = click.option(
+        "--strict",
+        "strict_mapping",
+        is_flag=True,
+        help="Refuse a bag with a message that cannot be decoded, instead of leaving it out.",
+    )
     code = click.option(
         "--trust-code",
         is_flag=True,
         help="Trust the mapping: import the Python function that it names.",
     )
-    return click.option(
+    mapping = click.option(
         "--mapping",
         type=click.Path(path_type=Path),
         metavar="FILE",
         help="Mapping that describes a bag; see docs/bags.md.",
-    )(code(command))
+    )
+    found = code(cast(F, with_mapping))
+    return mapping(strict(found) if has_strict else found)
 
 
 def sim_options(command: F) -> F:

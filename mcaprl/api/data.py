@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mcaprl.errors import NotMcapError, UnknownNameError, UsageError, import_extra
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -21,7 +22,16 @@ MAPPING_NAME = "mapping.json"
 """Name of the file in a run folder that contains a copy of the mapping used for training."""
 Data = Dataset | Paths
 """A dataset, or paths of logs."""
-MappingFile = str | Path | Mapping[str, Any]
+
+
+class ChangedMapping(NamedTuple):
+    """A mapping file with other values of some keys at its top level."""
+
+    source: str | Path | Mapping[str, Any]
+    changes: Mapping[str, Any]
+
+
+MappingFile = str | Path | Mapping[str, Any] | ChangedMapping
 """Path of a mapping file, or its keys and values."""
 
 
@@ -95,7 +105,10 @@ def open_data(
             raise UsageError(f"only logs may have several paths: pass one {other.name} dataset")
         return read_format(one, other)
     assert mapping is not None
-    return mapped(data, mapping, trust_code=trust_code).dataset
+    found = mapped(data, mapping, trust_code=trust_code)
+    for problem in found.report.left_out:
+        warnings.warn(str(problem), stacklevel=2)
+    return found.dataset
 
 
 def _only(data: Paths) -> str | Path | None:
@@ -122,14 +135,32 @@ def mapped(data: Paths, mapping: MappingFile, *, trust_code: bool = False) -> Ma
     import_extra("pydantic", "bags")
     from mcaprl.recorder.mapping.read import read_bag
 
-    return read_bag(data, mapping, trust_code=trust_code)
+    source, changes = mapping if isinstance(mapping, ChangedMapping) else (mapping, {})
+    return read_bag(data, source, changes=changes, trust_code=trust_code)
 
 
 def mapping_tree(mapping: MappingFile) -> dict[str, Any]:
     """Return the keys and values of a mapping, with defaults, as JSON types."""
     from mcaprl.recorder.mapping.config import load_mapping
 
-    return load_mapping(mapping)[0].model_dump(mode="json", by_alias=True)
+    source, changes = mapping if isinstance(mapping, ChangedMapping) else (mapping, {})
+    found = load_mapping(source)[0].model_copy(update=dict(changes))
+    return found.model_dump(mode="json", by_alias=True)
+
+
+def changed_mapping(
+    mapping: str | Path | Mapping[str, Any] | None, changes: Mapping[str, Any]
+) -> MappingFile | None:
+    """Return a mapping with other values of some keys.
+
+    Raises:
+        UsageError: There are changes, but no mapping.
+    """
+    if not changes:
+        return mapping
+    if mapping is None:
+        raise UsageError(f"{', '.join(changes)} needs a mapping")
+    return ChangedMapping(mapping, changes)
 
 
 def opened(

@@ -20,12 +20,20 @@ from mcaprl.recorder.bags.decoders import (
     merged,
     value_at,
 )
-from mcaprl.recorder.bags.files import find_bags, open_files
+from mcaprl.recorder.bags.files import find_bags, open_recordings
 from mcaprl.recorder.bags.mcap_file import McapFile
 from mcaprl.recorder.bags.rosbag_file import RosbagFile
 from mcaprl.recorder.bags.source import Definition, TopicSource
 
 _PUBLISH_TIME = "publish_time"
+
+
+class Failure(NamedTuple):
+    """A message that cannot be decoded: its index in `Bag.times`, its log_time, and why."""
+
+    row: int
+    log_time_ns: int
+    reason: str
 
 
 class Stream(NamedTuple):
@@ -35,10 +43,15 @@ class Stream(NamedTuple):
         log_time_ns: (N,) log_time of each message.
         columns: Column of each field by its dotted path: (N,) numbers, (N, K) numbers if all
             values are arrays of K numbers, otherwise (N,) objects (strings, bytes or lists).
+        rows: (N,) index of each message in `Bag.times`. Messages that cannot be decoded are left
+            out.
+        failures: Messages that were left out.
     """
 
     log_time_ns: NDArray[np.int64]
     columns: dict[str, NDArray[Any]]
+    rows: NDArray[np.int64]
+    failures: tuple[Failure, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -70,13 +83,17 @@ class TopicInfo:
 
 
 class Bag(Protocol):
-    """One or more files, read as one bag.
+    """One or more recordings, read as one bag.
+
+    A recording is a file, or the files that a `metadata.yaml` lists as the parts of a split bag.
 
     Attributes:
-        paths: Files of the bag.
+        paths: Files of the bag. The files of a recording follow each other.
+        recordings: Index of the recording of each file, not descending.
     """
 
     paths: tuple[Path, ...]
+    recordings: tuple[int, ...]
 
     @property
     def topics(self) -> Mapping[str, TopicInfo]:
@@ -94,7 +111,7 @@ class Bag(Protocol):
     def read(
         self, topic: str, fields: Sequence[str], rows: NDArray[np.int64] | None = None
     ) -> Stream:
-        """Read fields of a topic.
+        """Read fields of a topic; messages that cannot be decoded are left out.
 
         Args:
             topic: Name of the topic.
@@ -103,7 +120,8 @@ class Bag(Protocol):
             rows: Indices into `times` of the messages to read, in output order; default: all.
 
         Raises:
-            LogError: A message cannot be read.
+            LogError: The file is damaged, or no message of the topic can be decoded; if the bag is
+                strict: a message cannot be decoded.
             UnknownNameError: There is no such topic or field.
         """
 
@@ -191,24 +209,37 @@ class _Topic:
             problem=problem,
         )
 
-    def read(self, fields: Sequence[str], rows: NDArray[np.int64] | None) -> Stream:
-        times_ns = self.times_ns if rows is None else self.times_ns[rows]
+    def read(
+        self, fields: Sequence[str], rows: NDArray[np.int64] | None, *, strict: bool
+    ) -> Stream:
+        chosen = np.arange(len(self.times_ns)) if rows is None else rows
         if len(self._used) == 1 and _PUBLISH_TIME not in fields:
             columns = self._used[0][1].columns(fields, rows)
             if columns is not None:
-                return Stream(times_ns, {name: columns[name] for name in fields})
-        wanted, places = np.arange(len(self.times_ns)), None
-        if rows is not None:
-            wanted, places = np.unique(rows, return_inverse=True)
-        kinds, columns = {**self.info.fields, _PUBLISH_TIME: "time"}, {}
-        for name, values in self._values(fields, wanted).items():
-            used = values if places is None else [values[place] for place in places.tolist()]
-            columns[name] = column_of(used, kinds.get(name, ""))
-        return Stream(times_ns, columns)
+                return Stream(
+                    self.times_ns[chosen], {name: columns[name] for name in fields}, chosen
+                )
+        wanted, places = np.unique(chosen, return_inverse=True)
+        values, failures = self._values(fields, wanted)
+        if failures and (strict or (rows is None and len(failures) == len(wanted))):
+            row, time_ns, reason = failures[0]
+            raise LogError(f"{self.name}: message {row} at {time_ns} ns: {reason}")
+        if failures:
+            is_bad = np.isin(wanted, [each.row for each in failures])
+            chosen, places = chosen[~is_bad[places]], places[~is_bad[places]]
+        kinds = {**self.info.fields, _PUBLISH_TIME: "time"}
+        columns = {
+            name: column_of([column[place] for place in places.tolist()], kinds.get(name, ""))
+            for name, column in values.items()
+        }
+        return Stream(self.times_ns[chosen], columns, chosen, tuple(failures))
 
-    def _values(self, fields: Sequence[str], rows: NDArray[np.int64]) -> dict[str, list[Any]]:
+    def _values(
+        self, fields: Sequence[str], rows: NDArray[np.int64]
+    ) -> tuple[dict[str, list[Any]], list[Failure]]:
         """Return the values of fields in the messages `rows`, which are distinct and ascending."""
         values: dict[str, list[Any]] = {name: [None] * len(rows) for name in fields}
+        failures = []
         chosen = self._order[rows]
         for k, (_, source) in enumerate(self._used):
             decoder = self._decoders[source.definition]
@@ -217,11 +248,13 @@ class _Topic:
                 try:
                     message = decoder.decode(raw.data)
                 except LogError as error:
-                    raise LogError(f"{self.name}: {error}") from error
+                    number = int(rows[row])
+                    failures.append(Failure(number, int(self.times_ns[number]), str(error)))
+                    continue
                 for name, column in values.items():
                     is_time = name == _PUBLISH_TIME
                     column[row] = raw.publish_ns if is_time else value_at(message, name)
-        return values
+        return values, sorted(failures)
 
 
 class _Infos(Mapping[str, TopicInfo]):
@@ -241,14 +274,22 @@ class _Infos(Mapping[str, TopicInfo]):
 
 
 class _FileBag:
-    """Bag that consists of one or more open files."""
+    """Bag that consists of one or more open recordings."""
 
-    def __init__(self, files: Sequence[McapFile | RosbagFile], opened: ExitStack) -> None:
-        self._opened = opened
-        if len(files) > 1:
-            # The files of a split bag cover successive time ranges.
-            files = sorted(files, key=lambda file: file.first_ns)
+    def __init__(
+        self,
+        recordings: Sequence[Sequence[McapFile | RosbagFile]],
+        opened: ExitStack,
+        *,
+        strict: bool,
+    ) -> None:
+        self._opened, self._strict = opened, strict
+        # The parts of a split bag cover successive time ranges.
+        ordered = [sorted(files, key=_first_ns) for files in recordings]
+        ordered.sort(key=lambda files: _first_ns(files[0]))
+        files = [file for each in ordered for file in each]
         self.paths = tuple(file.path for file in files)
+        self.recordings = tuple(number for number, each in enumerate(ordered) for _ in each)
         names = dict.fromkeys(name for file in files for name in file.topics)
         self._topics = {
             name: _Topic(
@@ -275,7 +316,7 @@ class _FileBag:
         for field in fields:
             if known and field not in known and field != _PUBLISH_TIME:
                 raise UnknownNameError(f"field of {topic}", field, known)
-        return found.read(fields, rows)
+        return found.read(fields, rows, strict=self._strict)
 
     def close(self) -> None:
         self._opened.close()
@@ -286,19 +327,25 @@ class _FileBag:
         return self._topics[name]
 
 
-def open_bag(data: str | Path | Sequence[str | Path]) -> Bag:
+def _first_ns(file: McapFile | RosbagFile) -> int:
+    return file.first_ns
+
+
+def open_bag(data: str | Path | Sequence[str | Path], *, strict: bool = False) -> Bag:
     """Open a bag: MCAP files, rosbag2 folders and databases, and ROS 1 bags.
 
     Files that rosbag2 compressed as a whole are decompressed to a temporary folder. If a topic
     cannot be read, its `problem` is not empty; all other topics can still be read.
 
     Args:
-        data: A file, a folder, a glob, or a sequence of these. Files are read in the order of
+        data: A file, a folder, a glob, or a sequence of these. Recordings are read in the order of
             their first messages.
+        strict: Whether a message that cannot be decoded is an error; by default, it is left out
+            and reported in `Stream.failures`.
 
     Raises:
         LogError: A file is missing, damaged, or not a bag.
     """
     with ExitStack() as opened:
-        files = [file for path in find_bags(data) for file in open_files(path, opened)]
-        return _FileBag(files, opened.pop_all())
+        recordings = open_recordings(find_bags(data), opened)
+        return _FileBag(recordings, opened.pop_all(), strict=strict)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -35,51 +35,71 @@ def find_bags(data: str | Path | Sequence[str | Path]) -> list[Path]:
     return found
 
 
-def open_files(path: Path, opened: ExitStack) -> list[McapFile | RosbagFile]:
-    """Open a file, or the files of a folder in their order.
+def open_recordings(paths: Sequence[Path], opened: ExitStack) -> list[list[McapFile | RosbagFile]]:
+    """Open the files of bags, grouped by recording.
+
+    The files that a `metadata.yaml` lists are the parts of one recording, whether the folder or
+    some of its files are given. Every other file is a recording.
 
     Args:
-        path: Path of the file or folder.
+        paths: Paths of files and folders.
         opened: Stack that closes the files, and removes decompressed copies.
 
     Raises:
-        LogError: The path is not a bag, or the bag is damaged.
+        LogError: A path is not a bag, or a bag is damaged.
     """
+    parts: dict[Path, list[McapFile | RosbagFile]] = {}
+    for path in paths:
+        for key, file in _opened(path, opened):
+            parts.setdefault(key, []).append(file)
+    return list(parts.values())
+
+
+def _opened(path: Path, opened: ExitStack) -> Iterator[tuple[Path, McapFile | RosbagFile]]:
+    """Open a file, or the files of a folder; yield each with the path of its recording."""
     if not path.is_dir():
-        return [_open(path, "", opened)]
+        folder = path.parent
+        listed = _listed(folder, _metadata(folder, is_optional=True))
+        is_part = _plain_name(path) in map(_plain_name, listed)
+        yield (folder if is_part else path).resolve(), _open(path, "", opened)
+        return
     metadata = _metadata(path)
     if str(metadata.get("compression_mode") or "").lower() == "message":
         # Each message of this bag is compressed separately. `RosbagFile` decompresses the messages
         # only if it opens the folder instead of a file.
-        folder = RosbagFile(path)
-        opened.callback(folder.close)
-        return [folder]
-    names, distribution = _files_of(path, metadata)
-    if not names:
+        whole = RosbagFile(path)
+        opened.callback(whole.close)
+        yield path.resolve(), whole
+        return
+    distribution = str(metadata.get("ros_distro") or "")
+    listed = [_existing(part) for part in _listed(path, metadata)]
+    others = _unlisted(path, listed)
+    if not listed and not others:
         raise LogError(f"{path} has no {', '.join(_KINDS)} files")
-    return [_open(name, distribution, opened) for name in names]
+    for part in listed:
+        yield path.resolve(), _open(part, distribution, opened)
+    for part in others:
+        yield part.resolve(), _open(part, distribution, opened)
 
 
-def _files_of(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], str]:
-    """Return the bag files of a folder, and the ROS distribution that its metadata names.
+def _listed(folder: Path, metadata: dict[str, Any]) -> list[Path]:
+    """Return the files that the metadata of a folder lists."""
+    return [folder / Path(str(name)).name for name in metadata.get("relative_file_paths") or []]
 
-    Files that `metadata.yaml` lists come first, in the listed order. If the recorder was killed,
-    `metadata.yaml` is missing or does not list all files.
 
-    Raises:
-        LogError: A listed file is missing.
+def _unlisted(folder: Path, listed: Sequence[Path]) -> list[Path]:
+    """Return the bag files of a folder that its metadata does not list.
+
+    If the recorder was killed, `metadata.yaml` is missing or does not list all files.
     """
-    listed = metadata.get("relative_file_paths") or []
-    first = [_existing(folder / Path(str(name)).name) for name in listed]
     kinds = (*_KINDS, *(f"{kind}{_COMPRESSED}" for kind in _KINDS))
-    rest = sorted(path for path in folder.iterdir() if path.name.endswith(kinds))
     # A compressed file and its original may both exist; only one of them is opened.
-    known = {_plain_name(path) for path in first}
-    for path in rest:
+    known, found = {_plain_name(path) for path in listed}, []
+    for path in sorted(path for path in folder.iterdir() if path.name.endswith(kinds)):
         if _plain_name(path) not in known:
             known.add(_plain_name(path))
-            first.append(path)
-    return first, str(metadata.get("ros_distro") or "")
+            found.append(path)
+    return found
 
 
 def _existing(path: Path) -> Path:
@@ -102,7 +122,12 @@ def _plain_name(path: Path) -> str:
     return path.name.removesuffix(_COMPRESSED)
 
 
-def _metadata(folder: Path) -> dict[str, Any]:
+def _metadata(folder: Path, *, is_optional: bool = False) -> dict[str, Any]:
+    """Return the metadata of a rosbag2 folder; empty if there is none.
+
+    Raises:
+        LogError: The file is damaged, and not optional.
+    """
     path = folder / _METADATA
     if not path.exists():
         return {}
@@ -111,6 +136,8 @@ def _metadata(folder: Path) -> dict[str, Any]:
         found = yaml.YAML(typ="safe").load(path.read_text(encoding="utf-8"))
         return dict(found["rosbag2_bagfile_information"])
     except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+        if is_optional:
+            return {}
         raise LogError(f"{path} is not the metadata of a rosbag2 bag: {error}") from error
 
 

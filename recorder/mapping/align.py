@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -45,19 +46,27 @@ def last(
 
 
 def nearest(
-    times_ns: NDArray[np.int64], steps_ns: NDArray[np.int64], tolerance_s: float | None
+    times_ns: NDArray[np.int64],
+    steps_ns: NDArray[np.int64],
+    tolerance_s: float | None,
+    gap_s: float = math.inf,
 ) -> Matches:
     """Match each step with the message nearest in time.
 
-    Of two equally near messages, the earlier one matches.
+    Of two equally near messages, the earlier one matches. A message that comes more than `gap_s`
+    after the step never matches, because it belongs to the data after a gap.
     """
     if not len(times_ns):
         return _within(times_ns, steps_ns, np.full(len(steps_ns), NONE), tolerance_s)
     after = np.searchsorted(times_ns, steps_ns, side="right")
     before = np.maximum(after - 1, 0)
     after = np.minimum(after, len(times_ns) - 1)
-    is_after = np.abs(times_ns[after] - steps_ns) < np.abs(steps_ns - times_ns[before])
-    return _within(times_ns, steps_ns, np.where(is_after, after, before), tolerance_s)
+    wait_ns = times_ns[after] - steps_ns
+    is_after = np.abs(wait_ns) < np.abs(steps_ns - times_ns[before])
+    rows = np.where(is_after & (wait_ns <= gap_s * NS_PER_S), after, before)
+    # All messages may come after the step, and more than `gap_s` after it.
+    rows[times_ns[rows] - steps_ns > gap_s * NS_PER_S] = NONE
+    return _within(times_ns, steps_ns, rows, tolerance_s)
 
 
 def during(
@@ -79,10 +88,12 @@ def interpolated(
     values: NDArray[np.float64],
     steps_ns: NDArray[np.int64],
     tolerance_s: float | None,
+    gap_s: float = math.inf,
 ) -> tuple[NDArray[np.float64], Matches]:
     """Interpolate values (M,) or (M, K) linearly at the times of the steps.
 
-    A step before the first or after the last message has no value.
+    A step has no value before the first and after the last message, and between two messages that
+    are more than `gap_s` apart.
 
     Returns:
         Values (N,) or (N, K), which are NaN where missing, and the matches. `rows` of the matches
@@ -97,6 +108,7 @@ def interpolated(
     found = np.full((len(steps_ns), *values.shape[1:]), np.nan)
     if len(times_ns):
         before_s, after_s = steps_ns - times_ns[low], times_ns[high] - steps_ns
+        has_both &= times_ns[high] - times_ns[low] <= gap_s * NS_PER_S
         span = np.maximum(times_ns[high] - times_ns[low], 1)
         share = (before_s / span).reshape(-1, *[1] * (values.ndim - 1))
         found = values[low] + share * (values[high] - values[low])

@@ -133,7 +133,9 @@ def _step_ns(plan: Plan, times: list[NDArray[np.int64]]) -> int:
     rate_hz = plan.mapping.clock.rate_hz
     if rate_hz is not None:
         return round(NS_PER_S / rate_hz)
-    return max(1, int(np.median(np.concatenate([np.diff(each) for each in times]))))
+    durations = np.concatenate([np.diff(each) for each in times])
+    # Steps at equal times of a slow clock are one nanosecond apart; see `runs.distinct`.
+    return max(1, int(np.median(durations) if durations.min() > 1 else round(durations.mean())))
 
 
 def _observations(

@@ -10,7 +10,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
 from mcaprl.errors import UsageError, import_extra
 
@@ -27,16 +35,42 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class Stamp(_Part):
+    """Time of a message in one of its fields."""
+
+    field: str = Field(
+        description="Path of the field, such as `/imu.timestamp`, or its path in the message."
+    )
+    unit: Literal["s", "ms", "us", "ns"] = Field(
+        default="s", description="Unit of a number; a ROS or protobuf time needs none."
+    )
+
+
+def _form(value: Any) -> str:
+    return "<name>" if isinstance(value, str) else "<field>"
+
+
+MessageTime = Annotated[
+    Annotated[TimeSource, Tag("<name>")] | Annotated[Stamp, Tag("<field>")], Discriminator(_form)
+]
+"""Time of a message; errors have no position for the alternatives, whose tags have brackets."""
+
+
 class Clock(_Part):
     """Times of the steps: a fixed rate, or the messages of a topic."""
 
     rate_hz: Positive | None = Field(default=None, description="Steps per second.")
     topic: str | None = Field(default=None, description="Topic with one message for each step.")
+    time: MessageTime | None = Field(
+        default=None, description="Time of the topic's messages, if not that of the mapping."
+    )
 
     @model_validator(mode="after")
     def _has_one(self) -> Clock:
         if (self.rate_hz is None) == (self.topic is None):
             raise ValueError("give either rate_hz or topic")
+        if self.topic is None and self.time is not None:
+            raise ValueError("time is for a clock with a topic")
         return self
 
 
@@ -66,6 +100,9 @@ class Quantity(_Part):
     )
     tolerance_s: Positive | None = Field(
         default=None, description="Age in seconds beyond which a value is missing."
+    )
+    time: MessageTime | None = Field(
+        default=None, description="Time of the messages, if not that of the mapping."
     )
     missing: float | None = Field(
         default=None,
@@ -147,6 +184,9 @@ class Action(_Part):
     tolerance_s: Positive | None = Field(
         default=None, description="Age in seconds beyond which the command is missing."
     )
+    time: MessageTime | None = Field(
+        default=None, description="Time of the messages, if not that of the mapping."
+    )
 
     @model_validator(mode="after")
     def _has_one_kind(self) -> Action:
@@ -173,6 +213,11 @@ class Action(_Part):
 class Episodes(_Part):
     """Begin and end of the episodes; each condition is an expression, see `reward`."""
 
+    per: Literal["recording"] | None = Field(
+        default=None,
+        description="`recording`: at most one episode for each recording (a file, or the parts of a"
+        " split bag), its longest one. Without it, a recording may have several.",
+    )
     begin: str | None = Field(
         default=None,
         description="Condition whose rising edge begins an episode. Without it, an episode begins"
@@ -187,7 +232,9 @@ class Episodes(_Part):
         " episode determines the reason of the episode.",
     )
     gap_s: Positive = Field(
-        default=2.0, description="Longest gap, in seconds, in an observed topic within an episode."
+        default=2.0,
+        description="Longest gap, in seconds, in an observed topic within an episode. No value is"
+        " interpolated, or taken from a later message, across a longer gap.",
     )
     max_steps: Annotated[int, Field(ge=1)] | None = Field(
         default=None, description="Number of steps after which an episode is truncated."
@@ -209,8 +256,10 @@ class Meta(_Part):
 class Mapping(_Part):
     """Mapping of a bag's topics to transitions."""
 
-    time: TimeSource = Field(
-        default="log_time", description="Time of a message: `log_time`, `publish_time` or `header`."
+    time: MessageTime = Field(
+        default="log_time",
+        description="Time of a message: `log_time`, `publish_time`, `header`, or a field with its"
+        " unit, such as `{field: timestamp, unit: us}`.",
     )
     clock: Clock = Field(description="Times of the steps.")
     observation: dict[str, Quantity] = Field(description="Observed quantities by name.")
@@ -233,6 +282,11 @@ class Mapping(_Part):
         " Its `align` is that of the action by default.",
     )
     meta: Meta = Field(default=Meta(), description="Facts that the bag does not contain.")
+    strict: bool = Field(
+        default=False,
+        description="Whether a message that cannot be decoded is an error; without it, the message"
+        " is left out and reported.",
+    )
 
     @model_validator(mode="after")
     def _names_are_words(self) -> Mapping:
@@ -259,6 +313,7 @@ class Mapping(_Part):
 MAPPING_SECTIONS: dict[str, type[BaseModel]] = {
     "The file": Mapping,
     "clock": Clock,
+    "time, if it is a field": Stamp,
     "An entry of observation or fields, and behavior_prob": Quantity,
     "action": Action,
     "action.box": Limits,
@@ -345,7 +400,7 @@ def parse_mapping(tree: MappingOf[str, Any], place: Place | None = None) -> Mapp
 
 
 def _text(error: Any, place: Place) -> str:
-    keys = tuple(error["loc"])
+    keys = tuple(key for key in error["loc"] if str(key)[:1] != "<")
     if error["type"] == "extra_forbidden":
         known = _keys_of(keys[:-1])
         near = difflib.get_close_matches(str(keys[-1]), known, n=3, cutoff=0.4) or known
@@ -367,6 +422,7 @@ def _keys_of(parents: tuple[Any, ...]) -> list[str]:
 
 def _model_in(annotation: Any) -> Any:
     """Return the model in an annotation such as `dict[str, Quantity]`."""
-    parts = [annotation, *getattr(annotation, "__args__", ())]
-    models = [part for part in parts if isinstance(part, type) and issubclass(part, _Part)]
-    return models[0] if models else None
+    if isinstance(annotation, type) and issubclass(annotation, _Part):
+        return annotation
+    parts = map(_model_in, getattr(annotation, "__args__", ()))
+    return next((part for part in parts if part is not None), None)

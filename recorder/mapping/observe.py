@@ -13,7 +13,8 @@ from mcaprl.recorder.bags.bag import Bag
 from mcaprl.recorder.mapping.align import NONE, Matches, during, interpolated, last, nearest
 from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.paths import FieldPath, as_numbers, field_path, topic_of
-from mcaprl.recorder.mapping.streams import Run, TopicStream
+from mcaprl.recorder.mapping.runs import Messages
+from mcaprl.recorder.mapping.streams import TopicStream
 from mcaprl.recorder.mapping.transforms import TF, TF_STATIC, Transforms, yaw_of
 
 _QUATERNION = ("x", "y", "z", "w")
@@ -71,11 +72,13 @@ def source_of(bag: Bag, quantity: Quantity) -> Source:
     return Source(path.topic, (path.field,), path)
 
 
-def pose_of(quantity: Quantity, transforms: Transforms, steps_ns: NDArray[np.int64]) -> Values:
-    """Return the pose of a frame at the times of steps."""
+def pose_of(
+    quantity: Quantity, transforms: Transforms, steps_ns: NDArray[np.int64], gap_s: float
+) -> Values:
+    """Return the pose of a frame at the times of steps; see `values_of`."""
     assert quantity.transform is not None, "the quantity is a transform"
     found, age_s = transforms.planar(
-        quantity.transform, quantity.in_, steps_ns, quantity.align, quantity.tolerance_s
+        quantity.transform, quantity.in_, steps_ns, quantity.align, quantity.tolerance_s, gap_s
     )
     return _shaped(quantity, found, np.isnan(age_s), age_s)
 
@@ -84,9 +87,10 @@ def values_of(
     quantity: Quantity,
     source: Source,
     stream: TopicStream,
-    run: Run,
+    run: Messages,
     steps_ns: NDArray[np.int64],
     ends_ns: NDArray[np.int64] | None = None,
+    gap_s: float = math.inf,
 ) -> Values:
     """Return a field or an image at the times of steps.
 
@@ -94,10 +98,12 @@ def values_of(
         quantity: Quantity of the mapping.
         source: Topic and fields of the quantity.
         stream: Messages of the topic.
-        run: Messages of the topic between two resets of the clock.
+        run: Messages of the topic in one run.
         steps_ns: (N,) times of the steps.
         ends_ns: (N,) ends of the steps. If given, each step uses the last message before its end;
             if None, `quantity.align` applies.
+        gap_s: Longest gap, in seconds, across which a value is interpolated or taken from a later
+            message.
 
     Raises:
         UsageError: A field is not a number.
@@ -107,21 +113,22 @@ def values_of(
         nothing = np.zeros(len(counts), bool)
         return _shaped(quantity, counts, nothing, nothing.astype(np.float64))
     if quantity.image is not None:
-        match = _match(quantity, run, steps_ns, ends_ns)
+        match = _match(quantity, run, steps_ns, ends_ns, gap_s)
         rows = _rows(run, match)
-        return Values(rows, rows == NONE, match.age_s)
+        places = np.where(rows == NONE, NONE, stream.rows[rows]) if len(stream.rows) else rows
+        return Values(places, rows == NONE, match.age_s)
     column = _column(quantity, source, stream)
     if column.dtype.kind == "O":
-        match = _match(quantity, run, steps_ns, ends_ns)
+        match = _match(quantity, run, steps_ns, ends_ns, gap_s)
         rows = _rows(run, match)
         texts = np.full(len(rows), None, object)
         texts[rows != NONE] = column[rows[rows != NONE]]
         return Values(texts, rows == NONE, match.age_s)
     if quantity.align == "linear" and ends_ns is None:
         column = _unwrapped(quantity, column[run.rows])
-        found, match = interpolated(run.times_ns, column, steps_ns, quantity.tolerance_s)
+        found, match = interpolated(run.times_ns, column, steps_ns, quantity.tolerance_s, gap_s)
     else:
-        match = _match(quantity, run, steps_ns, ends_ns)
+        match = _match(quantity, run, steps_ns, ends_ns, gap_s)
         rows = _rows(run, match)
         found = np.full((len(rows), *column.shape[1:]), np.nan)
         found[rows != NONE] = column[rows[rows != NONE]]
@@ -130,18 +137,20 @@ def values_of(
 
 def _match(
     quantity: Quantity,
-    run: Run,
+    run: Messages,
     steps_ns: NDArray[np.int64],
     ends_ns: NDArray[np.int64] | None,
+    gap_s: float,
 ) -> Matches:
     if ends_ns is not None:
         return during(run.times_ns, steps_ns, ends_ns, quantity.tolerance_s)
-    align = nearest if quantity.align == "nearest" else last
-    return align(run.times_ns, steps_ns, quantity.tolerance_s)
+    if quantity.align == "nearest":
+        return nearest(run.times_ns, steps_ns, quantity.tolerance_s, gap_s)
+    return last(run.times_ns, steps_ns, quantity.tolerance_s)
 
 
-def _rows(run: Run, match: Matches) -> NDArray[np.int64]:
-    """Return the index in the topic of each step's message.
+def _rows(run: Messages, match: Matches) -> NDArray[np.int64]:
+    """Return the index in the stream of each step's message.
 
     For a step without a message, the index is `NONE`.
     """

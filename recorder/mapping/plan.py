@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from collections.abc import Mapping as MappingOf
 from typing import Any, NamedTuple
 
@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
-from mcaprl.recorder.mapping.config import Mapping, Place, Quantity
+from mcaprl.recorder.mapping.config import (
+    Clock,
+    Mapping,
+    Place,
+    Quantity,
+    Stamp,
+    TimeSource,
+)
 from mcaprl.recorder.mapping.expression import Expression
 from mcaprl.recorder.mapping.observe import Source, source_of
 from mcaprl.recorder.mapping.paths import topic_of
@@ -30,12 +37,14 @@ class Wanted(NamedTuple):
         keys: Keys of the quantity in the mapping.
         quantity: Quantity of the mapping.
         source: Topic and fields of the quantity.
+        stream: Name of the stream with the messages; not used for transforms.
         is_during: Whether each step uses the last message before the next step.
     """
 
     keys: tuple[str, ...]
     quantity: Quantity
     source: Source
+    stream: str
     is_during: bool = False
 
 
@@ -52,7 +61,8 @@ class Plan:
         conditions: Conditions of the episodes: `begin`, `end`, `terminated`, `truncated`.
         reasons: Conditions of the end reasons, by reason.
         reward: Function that computes the rewards.
-        streams: Messages of the used topics, without those of transforms.
+        streams: Messages of the used topics by the name of the stream, without those of transforms.
+        clock: Name of the stream with a message for each step; None for a fixed rate.
         constants: Constants of the message types, by name; names with several values are omitted.
     """
 
@@ -75,7 +85,7 @@ class Plan:
         self.commands = [
             self._wanted(
                 ("action",),
-                Quantity(field=path, align=align, tolerance_s=action.tolerance_s),
+                Quantity(field=path, align=align, tolerance_s=action.tolerance_s, time=action.time),
                 is_during=is_during,
             )
             for path in paths
@@ -83,9 +93,10 @@ class Plan:
         self.behavior_prob = None
         if (prob := mapping.behavior_prob) is not None:
             has_align = "align" in prob.model_fields_set
+            same = {} if has_align else {"align": align}
             self.behavior_prob = self._wanted(
                 ("behavior_prob",),
-                prob if has_align else prob.model_copy(update={"align": align}),
+                prob.model_copy(update={**same, "time": prob.time or action.time}),
                 is_during=is_during and not has_align,
             )
         episodes = mapping.episodes
@@ -100,14 +111,22 @@ class Plan:
         }
         with place.named("reward"):
             self.reward = _reward_of(mapping.reward, trust_code=trust_code)
-        self.streams = self._opened()
+        self.streams: dict[str, TopicStream] = {}
+        self.clock: str | None = None
+        self._open_streams()
         self.constants = self._constants()
 
     def _wanted(
         self, keys: tuple[str, ...], quantity: Quantity, *, is_during: bool = False
     ) -> Wanted:
         with self.place.named(*keys):
-            return Wanted(keys, quantity, source_of(self.bag, quantity), is_during)
+            source = source_of(self.bag, quantity)
+            return Wanted(keys, quantity, source, self._name(source.topic, quantity), is_during)
+
+    def _name(self, topic: str, part: Quantity | Clock) -> str:
+        """Return the name of the stream of a topic, whose times a part of the mapping chooses."""
+        time = part.time or self.mapping.time
+        return topic if time == self.mapping.time else f"{topic} by {_text(time)}"
 
     def _expression(self, keys: tuple[str, ...], text: str) -> Expression:
         with self.place.named(*keys):
@@ -115,24 +134,43 @@ class Plan:
 
     def _constants(self) -> dict[str, NDArray[Any]]:
         found: dict[str, set[int]] = {}
-        for topic in self.streams:
-            for name, value in self.bag.topics[topic].constants.items():
+        for stream in self.streams.values():
+            for name, value in self.bag.topics[stream.topic].constants.items():
                 found.setdefault(name, set()).add(value)
         return {name: np.array(min(each)) for name, each in found.items() if len(each) == 1}
 
-    def _opened(self) -> dict[str, TopicStream]:
-        fields: dict[str, set[str]] = {}
+    def _open_streams(self) -> None:
         prob = [] if self.behavior_prob is None else [self.behavior_prob]
-        for wanted in (*self.quantities.values(), *self.commands, *prob):
+        every = [*self.quantities.values(), *self.commands, *prob]
+        fields: dict[str, set[str]] = {}
+        for wanted in every:
+            fields.setdefault(wanted.stream, set()).update(wanted.source.fields)
+        for wanted in every:
             if wanted.quantity.transform is None:
-                fields.setdefault(wanted.source.topic, set()).update(wanted.source.fields)
-        if self.mapping.clock.topic is not None:
+                names = fields[wanted.stream]
+                self._open(wanted.keys, wanted.stream, wanted.source.topic, wanted.quantity, names)
+        clock = self.mapping.clock
+        if clock.topic is not None:
             with self.place.named("clock", "topic"):
-                fields.setdefault(topic_of(self.bag, self.mapping.clock.topic), set())
-        return {
-            topic: TopicStream(self.bag, topic, wanted, self.mapping.time)
-            for topic, wanted in fields.items()
-        }
+                self.clock = self._name(topic_of(self.bag, clock.topic), clock)
+            self._open(("clock",), self.clock, clock.topic, clock, ())
+
+    def _open(
+        self,
+        keys: tuple[str, ...],
+        name: str,
+        topic: str,
+        part: Quantity | Clock,
+        fields: Iterable[str],
+    ) -> None:
+        if name not in self.streams:
+            with self.place.named(*keys):
+                time = part.time or self.mapping.time
+                self.streams[name] = TopicStream(self.bag, topic, fields, time)
+
+
+def _text(time: TimeSource | Stamp) -> str:
+    return f"{time.field} in {time.unit}" if isinstance(time, Stamp) else time
 
 
 def _reward_of(text: str, *, trust_code: bool) -> Reward:

@@ -13,15 +13,18 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
+from mcaprl.problem import Problem
 from mcaprl.recorder.bags.bag import Bag, open_bag
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.mapping.actions import Actions
 from mcaprl.recorder.mapping.assemble import assembled
 from mcaprl.recorder.mapping.config import Mapping, Place, load_mapping
 from mcaprl.recorder.mapping.plan import Plan
+from mcaprl.recorder.mapping.runs import Runs
 from mcaprl.recorder.mapping.segments import Segment
 from mcaprl.recorder.mapping.steps import StepReader, Steps
 from mcaprl.recorder.mapping.summary import FieldReport, MappingReport
+from mcaprl.texts import counted
 
 
 class MappedBag(NamedTuple):
@@ -40,6 +43,7 @@ def read_bag(
     data: str | Path | Sequence[str | Path],
     mapping: Mapping | str | Path | MappingOf[str, Any],
     *,
+    changes: MappingOf[str, Any] | None = None,
     trust_code: bool = False,
 ) -> MappedBag:
     """Read a bag as a dataset.
@@ -47,6 +51,7 @@ def read_bag(
     Args:
         data: MCAP file, rosbag2 folder, ROS 1 bag, or several; see `bags.bag.open_bag`.
         mapping: Mapping, path of a mapping file, or its keys and values.
+        changes: Values that replace those of the mapping's keys.
         trust_code: Whether `reward` may name a function of a Python module, which is imported.
 
     Raises:
@@ -57,7 +62,8 @@ def read_bag(
     place = Place()
     if not isinstance(mapping, Mapping):
         mapping, place = load_mapping(mapping)
-    with closing(open_bag(data)) as bag:
+    mapping = mapping.model_copy(update=dict(changes or {}))
+    with closing(open_bag(data, strict=mapping.strict)) as bag:
         return read_open_bag(bag, mapping, place, trust_code=trust_code)
 
 
@@ -70,7 +76,10 @@ def read_open_bag(
     runs = [reader.read(number) for number in range(reader.count)]
     least = mapping.episodes.min_steps
     kept = [[each for each in run.episodes if each.length >= least] for run in runs]
-    report = _report(plan, runs, kept)
+    recordings = [run.recording for run in reader.runs.runs]
+    if mapping.episodes.per == "recording":
+        kept = _longest(kept, recordings)
+    report = _report(plan, reader.runs, runs, kept)
     if not any(kept):
         raise LogError(
             f"{', '.join(map(str, bag.paths))}: the mapping finds no episode of {least} or"
@@ -79,7 +88,22 @@ def read_open_bag(
     return MappedBag(assembled(plan, runs, kept), report)
 
 
-def _report(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> MappingReport:
+def _longest(kept: list[list[Segment]], recordings: list[int]) -> list[list[Segment]]:
+    """Keep only the longest episode of each recording; `recordings` has the one of each run."""
+    best: dict[int, Segment] = {}
+    for recording, episodes in zip(recordings, kept, strict=True):
+        for each in episodes:
+            if recording not in best or each.length > best[recording].length:
+                best[recording] = each
+    return [
+        [each for each in episodes if each is best[recording]]
+        for recording, episodes in zip(recordings, kept, strict=True)
+    ]
+
+
+def _report(
+    plan: Plan, found_runs: Runs, runs: list[Steps], kept: list[list[Segment]]
+) -> MappingReport:
     fields = {}
     for name, wanted in plan.quantities.items():
         values = [run.quantities[name] for run in runs]
@@ -99,14 +123,55 @@ def _report(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> Mapping
         clock_steps=offsets[-1],
         steps=len(rows),
         episodes=len(taken),
-        dropped=[e.length for e in found if e.length < plan.mapping.episodes.min_steps],
+        dropped=_dropped(found, kept),
         ends=_counts(each.reason or "condition" for episodes in kept for each in episodes),
-        clock_resets=len(runs) - 1,
+        recordings=len(set(plan.bag.recordings)),
+        clock_resets=len(runs) - len({run.recording for run in found_runs.runs}),
+        left_out=_left_out(plan, found_runs),
         fields=fields,
         missing_actions=_share(np.concatenate([each.missing for each in actions])),
         far_actions=_share(np.concatenate([each.far for each in actions])[rows]),
         action_counts=_action_counts(actions, rows),
     )
+
+
+def _dropped(found: list[Segment], kept: list[list[Segment]]) -> list[int]:
+    """Return the lengths of the episodes that are not kept."""
+    known = {id(each) for episodes in kept for each in episodes}
+    return [each.length for each in found if id(each) not in known]
+
+
+def _left_out(plan: Plan, runs: Runs) -> list[Problem]:
+    """Return one problem for each kind of messages that were not used, by topic."""
+    found = []
+    for name, stream in plan.streams.items():
+        count = len(plan.bag.times(stream.topic))
+        if stream.failures:
+            row, time_ns, reason = stream.failures[0]
+            found.append(
+                Problem(
+                    f"{len(stream.failures)} of {counted(count, 'message')} cannot be decoded and"
+                    f" are left out; the first is message {row} at {time_ns} ns: {reason}",
+                    stream.topic,
+                    next="--strict refuses such bags",
+                )
+            )
+        if stream.bad_stamps:
+            what = f"{stream.bad_stamps} of {counted(count, 'message')} have no valid stamp"
+            found.append(Problem(f"{what}, and are left out", name, next="use another `time`"))
+    for name, outliers in runs.outliers.items():
+        what = f"{counted(outliers, 'message')} left out: times far from those around them"
+        found.append(Problem(what, name, next="use another `time` if they are valid"))
+    found += [
+        Problem(
+            "the clock goes back by less than `gap_s`, that of other topics does not; the messages"
+            " were sorted by time",
+            name,
+            next="set a smaller `gap_s`, use another `time`, or split the bag",
+        )
+        for name in runs.mixed
+    ]
+    return found
 
 
 def _counts(names: Iterable[str]) -> dict[str, int]:

@@ -23,6 +23,7 @@ class Marks(NamedTuple):
         begin: Condition whose rising edge begins an episode; None if every step may begin one.
         terminated: Whether the step is a terminal state.
         truncated: Whether the step truncates an episode.
+        gap_after: Whether there is a gap after the last step.
     """
 
     usable: Flags
@@ -31,6 +32,7 @@ class Marks(NamedTuple):
     begin: Flags | None
     terminated: Flags
     truncated: Flags
+    gap_after: bool = False
 
 
 class Segment(NamedTuple):
@@ -101,7 +103,8 @@ def _segment(marks: Marks, first: int, last: int, cut: int, limit: int) -> Segme
     if not marks.acted[last]:
         return Segment(first, last, False, True, NO_ACTION)
     if cut == len(marks.usable):
-        return Segment(first, last, False, True, END_OF_DATA)
+        reason = GAP if marks.gap_after else END_OF_DATA
+        return Segment(first, last, False, True, reason)
     is_gap = marks.gap_before[cut] or not marks.usable[cut]
     return Segment(first, last, False, True, GAP if is_gap else RESTARTED)
 

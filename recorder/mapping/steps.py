@@ -1,4 +1,7 @@
-"""Steps of a bag: their quantities, actions and rewards, and the episodes that they form."""
+"""Steps of a bag: their quantities, actions and rewards, and the episodes that they form.
+
+Steps exist only within the stretches of a run; see `clock`.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +12,28 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.mapping.actions import Actions, actions_of
+from mcaprl.recorder.mapping.clock import (
+    Ticks,
+    distinct,
+    stretches,
+    ticks_at_rate,
+    ticks_of_topic,
+)
+from mcaprl.recorder.mapping.config import Stamp, TimeSource
 from mcaprl.recorder.mapping.expression import Expression
 from mcaprl.recorder.mapping.observe import Values, pose_of, values_of
 from mcaprl.recorder.mapping.paths import as_numbers
 from mcaprl.recorder.mapping.plan import Plan, Wanted
+from mcaprl.recorder.mapping.runs import (
+    Recorded,
+    Run,
+    Runs,
+    runs_of,
+)
 from mcaprl.recorder.mapping.segments import Marks, Segment, segments
-from mcaprl.recorder.mapping.streams import Recorded, last_file, runs_of
 from mcaprl.recorder.mapping.transforms import Transforms
 
 NS_PER_S = 10**9
-_MAX_STEPS = 50_000_000
 
 
 class Steps(NamedTuple):
@@ -44,28 +59,40 @@ class Steps(NamedTuple):
 
 
 class StepReader:
-    """Reader that returns the steps of a bag run by run; a run is the time between clock resets."""
+    """Reader that returns the steps of a bag run by run.
+
+    Attributes:
+        runs: Runs of the bag, and the messages that were left out.
+    """
 
     def __init__(self, plan: Plan) -> None:
         """Find the runs, and read the transforms if the mapping uses them.
 
         Raises:
-            UsageError: The clocks of two topics were not reset together.
+            UsageError: The clock of a topic was reset while that of another topic went on.
         """
         self._plan, self._mapping = plan, plan.mapping
         self._transforms: Transforms | None = None
-        self._streams: dict[str, Recorded] = dict(plan.streams)
-        for keys, quantity, *_ in plan.quantities.values():
+        self._streams: dict[str, Recorded] = {**plan.streams}
+        # Names of the streams of each transform.
+        self._frames: dict[str, list[str]] = {}
+        for name, (keys, quantity, *_) in plan.quantities.items():
             if quantity.transform is not None:
-                self._transforms = self._transforms or Transforms(plan.bag, plan.mapping.time)
                 with plan.place.named(*keys):
-                    self._streams |= self._transforms.streams(quantity.transform, quantity.in_)
-        self._runs = runs_of(self._streams, plan.mapping.episodes.gap_s, plan.bag.paths)
+                    self._transforms = self._transforms or Transforms(
+                        plan.bag, self._transform_time()
+                    )
+                    found = self._transforms.streams(quantity.transform, quantity.in_)
+                    self._streams |= found
+                    self._frames[name] = list(found)
+        self.runs: Runs = runs_of(
+            self._streams, plan.mapping.episodes.gap_s, plan.bag.paths, plan.bag.recordings
+        )
 
     @property
     def count(self) -> int:
         """Number of runs."""
-        return len(self._runs)
+        return len(self.runs.runs)
 
     def read(self, number: int) -> Steps:
         """Return the steps of one run; `number` is its index.
@@ -73,14 +100,16 @@ class StepReader:
         Raises:
             UsageError: The mapping does not fit the messages.
         """
-        plan, times_ns = self._plan, self._times(number)
+        plan, run = self._plan, self.runs.runs[number]
+        ticks = self._ticks(run)
+        times_ns = ticks.times_ns
         quantities = {
-            name: self._values(wanted, number, times_ns) for name, wanted in plan.quantities.items()
+            name: self._values(wanted, run, ticks) for name, wanted in plan.quantities.items()
         }
-        actions = self._actions(number, times_ns)
+        actions = self._actions(run, ticks)
         probs = np.full(len(times_ns), np.nan, np.float32)
         if plan.behavior_prob is not None:
-            found = self._values(plan.behavior_prob, number, times_ns)
+            found = self._values(plan.behavior_prob, run, ticks)
             probs = self._scalars(plan.behavior_prob, found).astype(np.float32)
         columns = {
             **plan.constants,
@@ -100,11 +129,11 @@ class StepReader:
         truncated = conditions.get("truncated", nothing) | conditions.get("end", nothing)
         # For rewards: a transition is terminal if the step that it leads to is terminal.
         columns |= {"terminated": terminated[following], "truncated": truncated[following]}
-        gap_ns = self._mapping.episodes.gap_s * NS_PER_S
         marks = Marks(
             usable=self._usable(quantities, len(times_ns)),
             acted=~actions.missing,
-            gap_before=np.diff(times_ns, prepend=times_ns[:1]) > gap_ns,
+            gap_before=ticks.gap_before,
+            gap_after=ticks.gap_after,
             begin=conditions.get("begin"),
             terminated=terminated,
             truncated=truncated,
@@ -114,41 +143,68 @@ class StepReader:
         episodes = segments(marks, self._mapping.episodes.max_steps)
         return Steps(times_ns, quantities, actions, probs, rewards, episodes, reasons)
 
-    def _times(self, number: int) -> NDArray[np.int64]:
-        """Return the times of the steps of a run."""
-        clock, topics = self._mapping.clock, self._runs[number]
-        if clock.topic is not None:
-            found: NDArray[np.int64] = np.unique(topics[clock.topic].times_ns)
-            return found
-        assert clock.rate_hz is not None, "the mapping was validated"
-        found_ns = [run.times_ns for run in topics.values() if len(run.times_ns)]
-        if not found_ns:
-            return np.empty(0, np.int64)
-        first, last = min(int(t[0]) for t in found_ns), max(int(t[-1]) for t in found_ns)
-        # If the duration is a whole number of periods, rounding must not remove the last step.
-        count = int((last - first) * clock.rate_hz / NS_PER_S + 1e-6) + 1
-        if count > _MAX_STEPS:
-            raise UsageError(
-                f"{self._plan.place.of('clock', 'rate_hz')}: {count} steps between {first} and"
-                f" {last} ns are too many: use another `time` or a lower rate"
-            )
-        since_ns: NDArray[np.int64] = np.rint(np.arange(count) * (NS_PER_S / clock.rate_hz)).astype(
-            np.int64
-        )
-        since_ns += first
-        return since_ns
+    def _transform_time(self) -> TimeSource:
+        """Return the time of the transforms.
 
-    def _values(self, wanted: Wanted, number: int, times_ns: NDArray[np.int64]) -> Values:
-        keys, quantity, source, is_during = wanted
-        runs = self._runs[number]
-        with self._plan.place.named(*keys):
+        Raises:
+            UsageError: The mapping gives different times, or a field.
+        """
+        quantities = self._mapping.quantities.values()
+        times = {q.time or self._mapping.time for q in quantities if q.transform is not None}
+        time = times.pop()
+        if times or isinstance(time, Stamp):
+            raise UsageError(
+                "all transforms need the same time: log_time, publish_time or header (the stamp of"
+                " each transform)"
+            )
+        return time
+
+    def _ticks(self, run: Run) -> Ticks:
+        """Return the times of the steps of a run."""
+        plan, mapping = self._plan, self._mapping
+        if plan.clock is not None:
+            distinct(run.streams, plan.clock, self._streams)
+        parts = stretches(
+            [each for name in self._required() for each in self._of(name, run)],
+            [each for name in mapping.observation for each in self._of(name, run)],
+            [each.times_ns for each in run.streams.values()],
+            mapping.episodes.gap_s,
+        )
+        if plan.clock is not None:
+            ticks_ns = run.streams[plan.clock].times_ns
+            return ticks_of_topic(ticks_ns, parts, mapping.episodes.gap_s)
+        assert mapping.clock.rate_hz is not None, "the mapping was validated"
+        count = sum(len(each.times_ns) for each in run.streams.values())
+        with plan.place.named("clock", "rate_hz"):
+            return ticks_at_rate(mapping.clock.rate_hz, parts, count, mapping.episodes.gap_s)
+
+    def _of(self, name: str, run: Run) -> list[NDArray[np.int64]]:
+        """Return the times of the messages of a quantity, for each of its streams."""
+        wanted = self._plan.quantities[name]
+        names = self._frames.get(name, [wanted.stream])
+        return [run.streams[each].times_ns for each in names]
+
+    def _required(self) -> list[str]:
+        """Return the names of the observed quantities without which there is no step."""
+        found = self._mapping.observation.items()
+        return [name for name, each in found if each.missing is None or each.image is not None]
+
+    def _values(
+        self,
+        wanted: Wanted,
+        run: Run,
+        ticks: Ticks,
+    ) -> Values:
+        quantity, gap_s = wanted.quantity, self._mapping.episodes.gap_s
+        with self._plan.place.named(*wanted.keys):
             if quantity.transform is not None:
                 assert self._transforms is not None, "they are read if a quantity uses them"
-                transforms = self._transforms.within(runs, last_file(self._streams, runs))
-                return pose_of(quantity, transforms, times_ns)
-            stream, run = self._plan.streams[source.topic], runs[source.topic]
-            ends_ns = _ends(times_ns) if is_during else None
-            return values_of(quantity, source, stream, run, times_ns, ends_ns)
+                return pose_of(quantity, self._transforms.within(run), ticks.times_ns, gap_s)
+            stream, messages = self._plan.streams[wanted.stream], run.streams[wanted.stream]
+            ends_ns = ticks.ends_ns if wanted.is_during else None
+            return values_of(
+                quantity, wanted.source, stream, messages, ticks.times_ns, ends_ns, gap_s
+            )
 
     def _scalars(self, wanted: Wanted, found: Values) -> NDArray[np.float64]:
         """Return values as numbers, one for each step.
@@ -165,9 +221,9 @@ class StepReader:
                 )
             return numbers
 
-    def _actions(self, number: int, times_ns: NDArray[np.int64]) -> Actions:
+    def _actions(self, run: Run, ticks: Ticks) -> Actions:
         action = self._mapping.action
-        found = [self._values(wanted, number, times_ns) for wanted in self._plan.commands]
+        found = [self._values(wanted, run, ticks) for wanted in self._plan.commands]
         missing = np.logical_or.reduce([each.missing for each in found])
         columns = [
             # Only a single discrete field may be a text.
@@ -197,17 +253,9 @@ class StepReader:
     def _usable(self, quantities: dict[str, Values], count: int) -> NDArray[np.bool_]:
         """Return a mask of the steps that have all observations, each at most `gap_s` old."""
         usable = np.ones(count, bool)
-        for name, quantity in self._mapping.observation.items():
-            if quantity.missing is None or quantity.image is not None:
-                values = quantities[name]
-                with np.errstate(invalid="ignore"):
-                    is_stale = np.abs(values.age_s) > self._mapping.episodes.gap_s
-                usable &= ~values.missing & ~is_stale
+        for name in self._required():
+            values = quantities[name]
+            with np.errstate(invalid="ignore"):
+                is_stale = np.abs(values.age_s) > self._mapping.episodes.gap_s
+            usable &= ~values.missing & ~is_stale
         return usable
-
-
-def _ends(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the end of each step: the next step's time. The last step has the median duration."""
-    if len(times_ns) < 2:
-        return times_ns + NS_PER_S
-    return np.append(times_ns[1:], times_ns[-1] + int(np.median(np.diff(times_ns))))

@@ -62,10 +62,13 @@ class MappingReport:
         clock_steps: Number of steps of the clock.
         steps: Number of transitions.
         episodes: Number of episodes.
-        dropped: Number of transitions of each episode that was too short.
+        dropped: Number of transitions of each episode that was left out, because it is too short or
+            not the longest of its recording.
         ends: Number of episodes by end reason; `condition` counts the episodes that a condition of
             the mapping ended.
-        clock_resets: Number of times that the clock went back by more than `gap_s`.
+        recordings: Number of recordings: files, or split bags with their parts.
+        clock_resets: Number of times that the clock of a recording was reset.
+        left_out: Messages that were not used: damaged ones, and those with impossible times.
         fields: Statistics of each quantity, by name.
         missing_actions: Share of the steps of the clock without an action.
         far_actions: Share of the transitions whose command is far from every named action, or
@@ -78,7 +81,9 @@ class MappingReport:
     episodes: int
     dropped: list[int]
     ends: dict[str, int]
+    recordings: int
     clock_resets: int
+    left_out: list[Problem]
     fields: dict[str, FieldReport]
     missing_actions: float
     far_actions: float
@@ -90,11 +95,12 @@ class MappingReport:
         for field in found["fields"].values():
             for name in ("median_age_s", "max_age_s"):
                 field[name] = field[name] if np.isfinite(field[name]) else None
-        return found
+        return {**found, "left_out": [each.to_json() for each in self.left_out]}
 
     def problems(self) -> list[Problem]:
         """Return problems that reduce the quality or the number of the transitions."""
-        found = [
+        found = [*self.left_out]
+        found += [
             Problem(
                 f"{name} is missing at {field.missing:.0%} of the steps",
                 field.topic,
@@ -123,6 +129,7 @@ class MappingReport:
             ("episodes", str(self.episodes)),
             ("ends", ends or "none"),
             ("episodes left out", _dropped(self.dropped)),
+            ("recordings", str(self.recordings)),
             ("resets of the clock", str(self.clock_resets)),
         ]
         rows += [(name, str(field)) for name, field in self.fields.items()]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator
 from copy import copy
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
 from mcaprl.recorder.mapping.align import NONE, NS_PER_S, last, nearest, time_order
 from mcaprl.recorder.mapping.config import TimeSource
-from mcaprl.recorder.mapping.streams import Recorded, Run
+from mcaprl.recorder.mapping.runs import Recorded, Run
 
 Floats = NDArray[np.float64]
 
@@ -87,22 +88,16 @@ class Transforms:
             if not self._recorded[child].is_static
         }
 
-    def within(self, run: Mapping[str, Run], last_file: int) -> Transforms:
-        """Return the transforms of a run.
-
-        Args:
-            run: Messages of each stream, by the names of `streams`.
-            last_file: Index of the last file of the run. A static transform is the last one up to
-                this file.
-        """
+    def within(self, run: Run) -> Transforms:
+        """Return the transforms of a run; a static transform is the last one of its recording."""
         found = copy(self)
         found._edges = {}
         for child, edge in self._recorded.items():
-            if _name(child) in run:
-                found._edges[child] = edge.at(run[_name(child)].rows)
+            if _name(child) in run.streams:
+                found._edges[child] = edge.at(run.streams[_name(child)].rows)
             else:
-                known = np.flatnonzero(edge.places[:, 0] <= last_file)
-                found._edges[child] = edge.at(known[-1:] if len(known) else np.zeros(1, np.int64))
+                first, stop = np.searchsorted(edge.places[:, 0], run.files)
+                found._edges[child] = edge.at(np.arange(first, stop)[-1:])
         return found
 
     def planar(
@@ -112,6 +107,7 @@ class Transforms:
         steps_ns: NDArray[np.int64],
         align: str,
         tolerance_s: float | None,
+        gap_s: float = math.inf,
     ) -> tuple[Floats, Floats]:
         """Return the planar pose of a frame in another frame at the times of steps.
 
@@ -124,6 +120,8 @@ class Transforms:
             steps_ns: (N,) times of the steps.
             align: Selection of each transform: `last`, `nearest` or `linear` (interpolated).
             tolerance_s: Maximum age of a transform in seconds; older transforms count as missing.
+            gap_s: Longest gap, in seconds, across which a transform is interpolated or taken from a
+                later message.
 
         Returns:
             (N, 3) x, y and yaw, NaN where missing; and (N,) age in seconds of the transform that is
@@ -138,7 +136,7 @@ class Transforms:
         for part in self._path(frame, fixed):
             position, turn = np.zeros((count, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
             for name in part:
-                at, rotation, age = _at(self._edges[name], steps_ns, align, tolerance_s)
+                at, rotation, age = _at(self._edges[name], steps_ns, align, tolerance_s, gap_s)
                 position, turn = at + _rotated(rotation, position), _product(rotation, turn)
                 is_older = np.isnan(age) | (np.abs(age) > np.abs(age_s))
                 age_s = np.where(is_older, age, age_s)
@@ -186,7 +184,8 @@ def _name(child: str) -> str:
 def _poses(bag: Bag, topic: str, time: TimeSource) -> Iterator[tuple[str, _Pose]]:
     """Yield each frame and its pose, in the order of recording."""
     fields = ["transforms", *(["publish_time"] if time == "publish_time" else [])]
-    stream, places = bag.read(topic, fields), bag.places(topic)
+    stream = bag.read(topic, fields)
+    places = bag.places(topic)[stream.rows]
     times_ns = stream.columns.get("publish_time", stream.log_time_ns)
     is_static = topic == TF_STATIC
     for time_ns, place, transforms in zip(
@@ -221,17 +220,24 @@ def _edge(child: str, poses: list[_Pose]) -> _Edge:
 
 
 def _at(
-    edge: _Edge, steps_ns: NDArray[np.int64], align: str, tolerance_s: float | None
+    edge: _Edge,
+    steps_ns: NDArray[np.int64],
+    align: str,
+    tolerance_s: float | None,
+    gap_s: float,
 ) -> tuple[Floats, Floats, Floats]:
     """Return the pose of a frame in its parent at the times of steps: position, rotation, age."""
+    if not len(edge.times_ns):
+        nothing = np.full((len(steps_ns), 4), np.nan)
+        return nothing[:, :3], nothing, nothing[:, 0]
     if edge.is_static:
         count = len(steps_ns)
         still = (np.tile(each[-1], (count, 1)) for each in (edge.positions, edge.quaternions))
         return (*still, np.zeros(count))  # type: ignore[return-value]
-    if not len(edge.times_ns):
-        nothing = np.full((len(steps_ns), 4), np.nan)
-        return nothing[:, :3], nothing, nothing[:, 0]
-    match = (nearest if align == "nearest" else last)(edge.times_ns, steps_ns, tolerance_s)
+    if align == "nearest":
+        match = nearest(edge.times_ns, steps_ns, tolerance_s, gap_s)
+    else:
+        match = last(edge.times_ns, steps_ns, tolerance_s)
     rows, is_none = np.maximum(match.rows, 0), match.rows == NONE
     positions, turns = edge.positions[rows], edge.quaternions[rows]
     age_s = match.age_s
@@ -240,7 +246,7 @@ def _at(
         span = np.maximum(edge.times_ns[after] - edge.times_ns[rows], 1)
         share = np.clip((steps_ns - edge.times_ns[rows]) / span, 0.0, 1.0)[:, np.newaxis]
         is_between = edge.times_ns[rows] != steps_ns
-        is_none |= is_between & (after == rows)
+        is_none |= is_between & ((after == rows) | (span > gap_s * NS_PER_S))
         wait_s = (edge.times_ns[after] - steps_ns) / NS_PER_S
         if tolerance_s is not None:
             is_none |= is_between & (wait_s > tolerance_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ class MemoryBag:
     """Bag whose topics are given as times in seconds and columns."""
 
     paths: tuple[Path, ...] = (Path("memory.bag"),)
+    recordings: tuple[int, ...] = (0,)
 
     def __init__(
         self,
@@ -31,6 +33,7 @@ class MemoryBag:
         """
         self._times: dict[str, NDArray[np.int64]] = {}
         self._columns: dict[str, dict[str, NDArray[Any]]] = {}
+        self._files: dict[str, NDArray[np.int64]] = {}
         self.topics: dict[str, TopicInfo] = {}
         for name, (times_s, columns) in topics.items():
             times_ns = np.rint(np.array(times_s, np.float64) * SECOND_NS).astype(np.int64)
@@ -41,19 +44,36 @@ class MemoryBag:
             kind = (types or {}).get(name, "memory")
             self.topics[name] = TopicInfo(name, kind, "cdr", len(times_ns), *ends, fields, {})
 
+    @classmethod
+    def together(cls, *bags: MemoryBag) -> MemoryBag:
+        """Return the bags as separate recordings; all bags must have the same topics and fields."""
+        found = cls({})
+        found.paths = tuple(Path(f"{k}.bag") for k in range(len(bags)))
+        found.recordings = tuple(range(len(bags)))
+        for name, info in bags[0].topics.items():
+            parts = [bag._times[name] for bag in bags]
+            found._times[name] = np.concatenate(parts)
+            found._columns[name] = {
+                key: np.concatenate([bag._columns[name][key] for bag in bags])
+                for key in bags[0]._columns[name]
+            }
+            found._files[name] = np.repeat(np.arange(len(bags)), [len(part) for part in parts])
+            found.topics[name] = dataclasses.replace(info, count=len(found._times[name]))
+        return found
+
     def times(self, topic: str) -> NDArray[np.int64]:
         return self._times[topic]
 
     def places(self, topic: str) -> NDArray[np.int64]:
         rows = np.arange(len(self._times[topic]))
-        return np.column_stack([np.zeros_like(rows), rows])
+        return np.column_stack([self._files.get(topic, np.zeros_like(rows)), rows])
 
     def read(
         self, topic: str, fields: Sequence[str], rows: NDArray[np.int64] | None = None
     ) -> Stream:
-        chosen = slice(None) if rows is None else rows
+        chosen = np.arange(len(self._times[topic])) if rows is None else rows
         columns = {name: self._columns[topic][name][chosen] for name in fields}
-        return Stream(self._times[topic][chosen], columns)
+        return Stream(self._times[topic][chosen], columns, chosen)
 
     def close(self) -> None:
         """Do nothing."""

@@ -15,14 +15,33 @@ from tests.support.memory_bag import MemoryBag
 
 GAP_S, RATE_HZ, MAX_STEPS = 3.0, 2, 4
 Messages = list[tuple[float, float]]
+Recording = tuple[Messages, Messages]
 Episode = tuple[list[float], list[int], list[float], bool, str]
 
 
-def slow(odom: Messages, mode: Messages) -> list[Episode]:
+def steps(odom: Messages, mode: Messages, clock: str) -> list[list[float]]:
+    """Return the times of the steps of a recording, one list for each part without a gap."""
+    seen = [time for time, _ in odom]
+    every = sorted([*seen, *(time for time, _ in mode)])
+    parts: list[list[float]] = []
+    for time, before in zip(seen, [every[0], *seen], strict=False):
+        if not parts or time - before > GAP_S:
+            parts.append([time])
+        parts[-1].append(time)
+    if seen[0] - every[0] <= GAP_S:
+        parts[0].insert(0, every[0])
+    found = []
+    for part, after in zip(parts, [*parts[1:], [every[-1] + 1e-9]], strict=True):
+        ticks = {"rate": [part[0] + k / RATE_HZ for k in range(1000)], "odom": seen}
+        ticks["mode"] = [time for time, _ in mode]
+        times = [time for time in ticks[clock] if part[0] <= time < after[0]]
+        late = [time for time in times if time >= part[-1]]
+        found.append([time for time in times if not late or time <= late[0]])
+    return found
+
+
+def slow(odom: Messages, mode: Messages, clock: str) -> list[Episode]:
     """Return observations, actions, rewards, termination and end reason of each episode."""
-    every = [time for time, _ in odom + mode]
-    count = int((max(every) - min(every)) * RATE_HZ + 1e-6) + 1
-    times = [min(every) + k / RATE_HZ for k in range(count)]
     episodes: list[Episode] = []
     observations: list[float] = []
     actions: list[int] = []
@@ -35,44 +54,60 @@ def slow(odom: Messages, mode: Messages) -> list[Episode]:
         observations.clear()
         actions.clear()
 
-    for time in times:
-        speeds = [message for message in odom if message[0] <= time]
-        modes = [message for message in mode if message[0] < time + 1 / RATE_HZ]
-        if not speeds or time - speeds[-1][0] > GAP_S:
-            end(False, "gap")
-            continue
-        speed, is_acted = speeds[-1][1], bool(modes)
-        is_terminal = speed == 5
-        if not observations and (is_terminal or not is_acted):
-            continue
-        observations.append(speed)
-        actions.append(int(modes[-1][1]) if is_acted else -1)
-        if is_terminal or len(observations) > MAX_STEPS:
-            end(is_terminal, "terminated" if is_terminal else "time_limit")
-    end(False, "end_of_data")
+    # Steps that are far apart are not in the same episode either.
+    parts = list[list[float]]()
+    for part in steps(odom, mode, clock):
+        for time, before in zip(part, [-GAP_S - 1, *part], strict=False):
+            if time - before > GAP_S:
+                parts.append([])
+            parts[-1].append(time)
+    for part in parts:
+        for time, until in zip(part, [*part[1:], part[-1] + 1 / RATE_HZ], strict=True):
+            speeds = [message for message in odom if message[0] <= time]
+            modes = [message for message in mode if message[0] < until]
+            if not speeds or time - speeds[-1][0] > GAP_S:
+                end(False, "gap")
+                continue
+            speed, is_acted = speeds[-1][1], bool(modes)
+            is_terminal = speed == 5
+            if not observations and (is_terminal or not is_acted):
+                continue
+            observations.append(speed)
+            actions.append(int(modes[-1][1]) if is_acted else -1)
+            if is_terminal or len(observations) > MAX_STEPS:
+                end(is_terminal, "terminated" if is_terminal else "time_limit")
+        is_end = part is parts[-1] and max(odom + mode)[0] - odom[-1][0] <= GAP_S
+        end(False, "end_of_data" if is_end else "gap")
     return episodes
 
 
 def messages(values: int) -> Any:
     # Multiples of 0.25 s are exact in nanoseconds and as floats.
-    one = st.tuples(st.integers(0, 60).map(lambda k: k / 4), st.integers(0, values).map(float))
-    return st.lists(one, min_size=1, max_size=25).map(
-        lambda found: sorted(found, key=lambda m: m[0])
-    )
+    one = st.tuples(st.integers(0, 80).map(lambda k: k / 4), st.integers(0, values).map(float))
+    return st.lists(one, min_size=1, max_size=25, unique_by=lambda each: each[0]).map(sorted)
 
 
-@settings(deadline=None)
-@given(messages(6), messages(2))
-def test_columns_equal_a_reading_message_by_message(odom: Messages, mode: Messages) -> None:
-    bag = MemoryBag(
+def bag_of(odom: Messages, mode: Messages) -> MemoryBag:
+    return MemoryBag(
         {
             "/odom": ([t for t, _ in odom], {"speed": [value for _, value in odom]}),
             "/mode": ([t for t, _ in mode], {"data": [value for _, value in mode]}),
         }
     )
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.tuples(messages(6), messages(2)), min_size=1, max_size=3),
+    st.sampled_from(["rate", "odom", "mode"]),
+)
+def test_columns_equal_a_reading_message_by_message(
+    recordings: list[Recording], clock: str
+) -> None:
+    ticks = {"rate_hz": RATE_HZ} if clock == "rate" else {"topic": f"/{clock}"}
     mapping = parse_mapping(
         {
-            "clock": {"rate_hz": RATE_HZ},
+            "clock": ticks,
             "observation": {"speed": {"field": "/odom.speed"}},
             "action": {"field": "/mode.data"},
             "reward": "next(speed) - speed + action",
@@ -84,8 +119,9 @@ def test_columns_equal_a_reading_message_by_message(odom: Messages, mode: Messag
             },
         }
     )
-    expected = slow(odom, mode)
+    expected = [episode for each in recordings for episode in slow(*each, clock)]
     try:
+        bag = MemoryBag.together(*(bag_of(*each) for each in recordings))
         data = read_open_bag(bag, mapping).dataset
     except LogError:
         assert expected == []
@@ -101,4 +137,5 @@ def test_columns_equal_a_reading_message_by_message(odom: Messages, mode: Messag
         for e in data.episodes
     ]
     assert found == expected
-    assert all(np.diff(e.log_time_ns).min() == 1e9 / RATE_HZ for e in data.episodes)
+    if clock == "rate":
+        assert all(np.diff(e.log_time_ns).min() == 1e9 / RATE_HZ for e in data.episodes)

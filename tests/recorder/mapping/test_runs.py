@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 from mcap.writer import Writer
 
-from mcaprl.errors import UsageError
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.mapping.config import parse_mapping
 from mcaprl.recorder.mapping.read import MappedBag, read_bag
-from tests.support.bags import Channel, integer, integers, number, numbers, write_channels
+from tests.support.bags import START_NS, Channel, integer, integers, number, numbers, write_channels
 
 
 def read(paths: Any, **parts: Any) -> MappedBag:
@@ -74,7 +77,7 @@ def test_files_that_overlap_are_separate_recordings(tmp_path: Path) -> None:
     )
     found = read([one, late])
     assert observed(found) == [([4, 5], {0}), ([1000, 1001], {1})]
-    assert found.report.clock_resets == 1
+    assert (found.report.recordings, found.report.clock_resets) == (2, 0)
 
 
 def test_a_topic_that_a_file_lacks_does_not_shift_the_others(tmp_path: Path) -> None:
@@ -88,7 +91,7 @@ def test_a_topic_that_a_file_lacks_does_not_shift_the_others(tmp_path: Path) -> 
     assert observed(read(paths)) == [([0, 1], {0}), ([200, 201], {2})]
 
 
-def test_files_that_follow_each_other_are_one_run(tmp_path: Path) -> None:
+def test_only_the_parts_that_metadata_lists_are_one_recording(tmp_path: Path) -> None:
     odom, cmd = seconds(0, 60, 0), commands(0, 60, 1)
     paths = [
         write_channels(
@@ -102,9 +105,123 @@ def test_files_that_follow_each_other_are_one_run(tmp_path: Path) -> None:
         )
         for first in (40, 0, 20)
     ]
-    found = read(paths, fields={"other": {"field": "/other.data"}})
+    other = {"other": {"field": "/other.data", "missing": -1}}
+    found = read(paths, fields=other)
+    assert [episode.length for episode in found.dataset.episodes] == [19, 19, 19]
+    listed = ", ".join(path.name for path in paths)
+    metadata = f"rosbag2_bagfile_information: {{relative_file_paths: [{listed}]}}"
+    (tmp_path / "metadata.yaml").write_text(metadata)
+    for data in (tmp_path, str(tmp_path / "*.mcap"), paths):
+        found = read(data, fields=other)
+        assert [episode.length for episode in found.dataset.episodes] == [59]
+        assert found.dataset.observations.ravel().tolist() == list(range(59))
+        assert found.report.recordings == 1
+    # A file that the metadata does not list is another recording.
+    write_channels(
+        tmp_path / "more.mcap",
+        [numbers("/odom", seconds(6, 20, 60)), integers("/cmd", commands(6, 20, 0))],
+    )
+    found = read(tmp_path)
+    assert [episode.length for episode in found.dataset.episodes] == [59, 19]
+
+
+def test_jitter_between_the_parts_of_a_split_bag_is_sorted(tmp_path: Path) -> None:
+    odom, cmd = seconds(0, 60, 0), commands(0.01, 60, 1)
+    # The first message of the second part is 5 ms before the last one of the first part.
+    odom[30] = (odom[29][0] - 0.005, 30)
+    for name, part in (("a", slice(30)), ("b", slice(30, 60))):
+        channels = [numbers("/odom", odom[part]), integers("/cmd", cmd[part])]
+        write_channels(tmp_path / f"{name}.mcap", channels)
+    metadata = "rosbag2_bagfile_information: {relative_file_paths: [a.mcap, b.mcap]}"
+    (tmp_path / "metadata.yaml").write_text(metadata)
+    found = read(tmp_path)
     assert [episode.length for episode in found.dataset.episodes] == [59]
-    assert found.dataset.observations.ravel().tolist() == list(range(59))
+    # At 2.9 s, the last message is number 29.
+    assert found.dataset.observations[28:32].ravel().tolist() == [28, 29, 29, 31]
+
+
+CLOCKS = ({"rate_hz": 10}, {"topic": "/odom"})
+
+
+@pytest.mark.parametrize("clock", CLOCKS, ids=str)
+@pytest.mark.parametrize("align", ["last", "nearest", "linear"])
+@pytest.mark.parametrize("pause_s", [1.1, 5.0, 864_000.0])
+def test_recordings_have_the_same_steps_together_as_apart(
+    tmp_path: Path, clock: Any, align: str, pause_s: float
+) -> None:
+    parts = []
+    for name, start, first in (("a", 0.0, 0), ("b", 2.9 + pause_s, 100)):
+        odom, cmd = seconds(start, 30, first), commands(start, 30, 1)
+        channels = [numbers("/odom", odom), integers("/cmd", cmd)]
+        parts.append(write_channels(tmp_path / f"{name}.mcap", channels))
+    parts_read = {"clock": clock, "observation": {"x": {"field": "/odom.data", "align": align}}}
+    found = read(parts, **parts_read)
+    assert [episode.length for episode in found.dataset.episodes] == [29, 29]
+    assert found.dataset.frames.ravel().tolist() == [*range(30), *range(100, 130)]
+    assert found.report.clock_steps == 60
+    apart = [read(path, **parts_read).dataset for path in parts]
+    for k, episode in enumerate(found.dataset.episodes):
+        assert episode.log_time_ns.tolist() == apart[k].episodes[0].log_time_ns.tolist()
+
+
+@pytest.mark.parametrize("clock", CLOCKS, ids=str)
+@pytest.mark.parametrize("align", ["last", "nearest", "linear"])
+def test_a_pause_of_a_recording_has_no_steps(tmp_path: Path, clock: Any, align: str) -> None:
+    odom, cmd = seconds(0, 30, 0), commands(0, 30, 1)
+    odom, cmd = odom + seconds(22.9, 30, 100), cmd + commands(22.9, 30, 1)
+    path = write_channels(
+        tmp_path / "pause.mcap",
+        # Nothing is observed between the drives, though the commands go on.
+        [numbers("/odom", odom), integers("/cmd", cmd), integers("/on", commands(0, 259, 7))],
+    )
+    tree = {"clock": clock, "observation": {"x": {"field": "/odom.data", "align": align}}}
+    for more in ({}, {"fields": {"on": {"field": "/on.data"}}}):
+        found = read(path, **tree, **more)
+        assert [episode.length for episode in found.dataset.episodes] == [29, 29]
+        assert found.dataset.frames.ravel().tolist() == [*range(30), *range(100, 130)]
+        assert (found.report.recordings, found.report.ends) == (1, {"gap": 1, "end_of_data": 1})
+
+
+def test_nothing_is_carried_from_one_recording_to_the_next(tmp_path: Path) -> None:
+    one = write_channels(
+        tmp_path / "a.mcap",
+        [
+            numbers("/odom", seconds(0, 30, 0)),
+            integers("/cmd", commands(0, 30, 2)),
+            numbers("/goal", [(0.0, 5.0)]),
+        ],
+    )
+    # A day later, the first command comes after one second, and the goal after 1.5 s.
+    day = 86_400.0
+    two = write_channels(
+        tmp_path / "b.mcap",
+        [
+            numbers("/odom", seconds(day, 30, 0)),
+            integers("/cmd", commands(day + 1, 20, 1)),
+            numbers("/goal", [(day + 1.5, 6.0)]),
+        ],
+    )
+    observation = {"x": {"field": "/odom.data"}, "g": {"field": "/goal.data", "missing": -1}}
+    found = read([one, two], observation=observation)
+    first, second = found.dataset.episodes
+    assert set(first.observations[:, 1].tolist()) == {5.0}
+    assert (second.length, set(second.actions.tolist())) == (19, {1})
+    assert second.observations[:, 1].tolist() == [-1.0] * 5 + [6.0] * 14
+
+
+def test_an_episode_for_each_recording(tmp_path: Path) -> None:
+    paths = []
+    for name, start in (("a", 0.0), ("b", 100.0)):
+        # The first part of each recording is shorter than the second one.
+        odom = seconds(start, 10, 0) + seconds(start + 10, 20, 100)
+        cmd = commands(start, 10, 0) + commands(start + 10, 20, 1)
+        channels = [numbers("/odom", odom), integers("/cmd", cmd)]
+        paths.append(write_channels(tmp_path / f"{name}.mcap", channels))
+    assert [each.length for each in read(paths).dataset.episodes] == [9, 19, 9, 19]
+    found = read(paths, episodes={"per": "recording"})
+    assert [each.length for each in found.dataset.episodes] == [19, 19]
+    assert found.report.dropped == [9, 9]
+    assert any("2 short episodes" in each.what for each in found.report.problems())
 
 
 def recorded(path: Path, rows: list[tuple[str, float, float]]) -> Path:
@@ -157,9 +274,157 @@ def test_clocks_that_are_not_reset_together_are_refused(tmp_path: Path) -> None:
         UsageError, match=r"some.mcap: the clocks of /odom and /cmd go back at different places"
     ):
         read(path)
+    # All commands were recorded after the second run.
     path = recorded(tmp_path / "one.mcap", [*odom, *cmd[:40]])
-    with pytest.raises(UsageError, match="the clock of /odom goes back 1 times, that of /cmd 0"):
+    with pytest.raises(UsageError, match="the clocks of /odom and /cmd go back at different"):
         read(path)
+    # The clock of the commands goes on.
+    rows = drive(40, 0, 0) + [(topic, time + 4, value) for topic, time, value in drive(40, 40, 1)]
+    rows = [(t, time - 4 * (t == "/odom" and k >= 80), v) for k, (t, time, v) in enumerate(rows)]
+    path = recorded(tmp_path / "other.mcap", rows)
+    with pytest.raises(UsageError, match=r"the clock of /odom goes back at 3.900 s, that of /cmd"):
+        read(path)
+
+
+def test_a_topic_with_few_messages_belongs_to_runs_by_its_place(tmp_path: Path) -> None:
+    runs = [drive(40, 0, 0), drive(50, 1000, 1)]
+    for goal_s in ((1.0, 1.5), (1.0, 3.0), (3.0, 0.5)):
+        rows = []
+        for run, at_s, value in zip(runs, goal_s, (7.0, 8.0), strict=True):
+            at = next(k for k, row in enumerate(run) if row[1] >= at_s)
+            rows += [*run[:at], ("/goal", at_s, value), *run[at:]]
+        path = recorded(tmp_path / "goals.mcap", rows)
+        goal = {"g": {"field": "/goal.data", "missing": -1}}
+        found = read(path, observation={"x": {"field": "/odom.data"}, **goal})
+        assert found.report.clock_resets == 1
+        first, second = found.dataset.episodes
+        assert set(first.observations[:, 1].tolist()) == {-1.0, 7.0}
+        assert set(second.observations[:, 1].tolist()) == {-1.0, 8.0}
+
+
+def test_a_reset_by_less_than_the_gap_divides_the_recording(tmp_path: Path) -> None:
+    # The first run has 15 steps: its clock goes back by 1.4 s.
+    found = read(recorded(tmp_path / "short.mcap", [*drive(15, 0, 0), *drive(50, 100, 1)]))
+    assert found.report.clock_resets == 1
+    assert observed(found) == [([0, 1], {0}), ([100, 101], {1})]
+    assert [episode.length for episode in found.dataset.episodes] == [14, 49]
+
+
+@pytest.mark.parametrize("bad_s", [0.0, 900.0, 1e6, 1050.0])
+@pytest.mark.parametrize("row", [0, 20, 39])
+def test_single_messages_with_impossible_times_are_left_out(
+    tmp_path: Path, bad_s: float, row: int
+) -> None:
+    rows = [(topic, time_s + 1000, value) for topic, time_s, value in drive(40, 0, 1)]
+    rows[2 * row] = ("/odom", bad_s, rows[2 * row][2])
+    found = read(recorded(tmp_path / "bad.mcap", rows))
+    values = [float(k) for k in range(40) if k != row]
+    seen = found.dataset.frames.ravel().tolist()
+    assert sorted(set(seen)) == values
+    assert seen == sorted(seen)
+    assert [episode.length for episode in found.dataset.episodes] == [39 - (row in (0, 39))]
+    # A message before the others, or after them, may be right; it has no steps around it.
+    is_between = 0 < row < 39 or (row == 0) == (bad_s > 1000)
+    count = [each for each in found.report.left_out if each.where == "/odom"]
+    assert [each.what[:9] for each in count] == (["1 message"] if is_between else [])
+
+
+def test_a_topic_that_was_written_out_of_order_is_sorted(tmp_path: Path) -> None:
+    rows = drive(100, 0, 1)
+    odom, cmd = rows[::2], rows[1::2]
+    # The chunks of /odom: 0 s to 2 s, 5 s to 7 s, 2 s to 5 s, 7 s to 10 s.
+    odom = odom[:20] + odom[50:70] + odom[20:50] + odom[70:]
+    rows = [row for pair in zip(odom, cmd, strict=True) for row in pair]
+    found = read(recorded(tmp_path / "chunks.mcap", rows))
+    assert found.dataset.frames.ravel().tolist() == list(range(100))
+    assert found.report.clock_resets == 0
+
+
+def test_each_message_of_a_clock_is_a_step_also_with_equal_times(tmp_path: Path) -> None:
+    # A simulation whose clock has 20 ticks, with three messages of each topic in each tick.
+    rows = [
+        (topic, k // 3 / 10, float(k % 2 if topic == "/cmd" else k))
+        for k in range(60)
+        for topic in ("/odom", "/cmd")
+    ]
+    path = recorded(tmp_path / "slow.mcap", rows)
+    found = read(path, clock={"topic": "/odom"})
+    assert [episode.length for episode in found.dataset.episodes] == [59]
+    assert found.dataset.frames.ravel().tolist() == list(range(60))
+    assert found.dataset.actions.tolist() == [k % 2 for k in range(59)]
+    assert found.report.clock_steps == 60
+    (episode,) = found.dataset.episodes
+    since_ns = episode.log_time_ns - episode.log_time_ns[0]
+    assert since_ns.tolist() == [k // 3 * 100_000_000 + k % 3 for k in range(60)]
+    assert found.dataset.metadata["step_duration_ns"] == str(round(1.9e9 / 59))
+
+
+STAMPED = "float64 data\nuint64 timestamp"
+
+
+def test_each_quantity_may_have_its_own_time(tmp_path: Path) -> None:
+    # The sensor is 0.3 s late: its stamp, in microseconds, says when it measured.
+    odom = [
+        (k / 10 + 0.3, number(k) + (START_NS // 1000 + k * 100_000).to_bytes(8, "little"))
+        for k in range(40)
+    ]
+    path = write_channels(
+        tmp_path / "late.mcap",
+        [
+            Channel("/odom", "acme_msgs/msg/Stamped", STAMPED, odom),
+            integers("/cmd", commands(0, 40, 0)),
+            integers("/mode", [(k / 10, k) for k in range(40)]),
+        ],
+    )
+    action = {"field": "/mode.data", "align": "last"}
+    for time in ("timestamp", "/odom.timestamp"):
+        stamp = {"field": time, "unit": "us"}
+        observation = {"x": {"field": "/odom.data", "time": stamp}}
+        found = read(path, observation=observation, action=action).dataset
+        assert found.observations[:, 0].tolist() == found.actions.tolist() == list(range(39))
+    late = read(path, action=action).dataset
+    assert set((late.actions - late.observations[:, 0])[:-3].tolist()) == {3}
+    with pytest.raises(
+        UsageError, match=r"action: /mode \(std_msgs/msg/Int32\) has no header.stamp"
+    ):
+        read(path, action={**action, "time": "header"})
+    with pytest.raises(
+        UsageError, match="action: time is a field of /odom, expected a field of /m"
+    ):
+        read(path, action={**action, "time": {"field": "/odom.timestamp", "unit": "us"}})
+    with pytest.raises(UsageError, match=r"observation.x.time.unit: Input should be 's'"):
+        read(path, observation={"x": {"field": "/odom.data", "time": {"field": "a", "unit": "h"}}})
+
+
+def test_a_damaged_message_costs_one_message(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    odom, cmd = numbers("/odom", seconds(0, 30, 0)), integers("/cmd", commands(0, 30, 1))
+    odom.messages[10] = (odom.messages[10][0], b"abc")
+    path = write_channels(tmp_path / "bad.mcap", [odom, cmd])
+    found = read(path)
+    assert found.dataset.frames.ravel().tolist() == [*range(10), 9, *range(11, 30)]
+    (problem,) = found.report.left_out
+    assert problem.where == "/odom"
+    assert problem.what.startswith(
+        "1 of 30 messages cannot be decoded and are left out; the first is message 10 at"
+        f" {START_NS + 10**9} ns: cannot decode 7 bytes as std_msgs/msg/Float64"
+    )
+    tree = {
+        "clock": {"rate_hz": 10},
+        "observation": {"x": {"field": "/odom.data"}},
+        "action": {"field": "/cmd.data"},
+    }
+    with pytest.raises(LogError, match=f"/odom: message 10 at {START_NS + 10**9} ns: cannot"):
+        read_bag(path, {**tree, "strict": True})
+    with pytest.warns(UserWarning, match="1 of 30 messages cannot be decoded"):
+        assert len(mcaprl.open(path, mapping=tree)) == 29
+    (tmp_path / "robot.yaml").write_text(json.dumps(tree))
+    command = ["convert", str(path), "--dry-run", "--mapping", str(tmp_path / "robot.yaml")]
+    assert run(command) == 0
+    assert "1 of 30 messages cannot be decoded" in " ".join(capsys.readouterr().out.split())
+    assert run([*command, "--strict"]) == 1
+    assert "/odom: message 10 at" in capsys.readouterr().err
 
 
 def test_arrays_of_bytes_are_numbers(tmp_path: Path) -> None:

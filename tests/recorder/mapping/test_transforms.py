@@ -12,6 +12,7 @@ import pytest
 from mcaprl.errors import UsageError
 from mcaprl.recorder.mapping.config import parse_mapping
 from mcaprl.recorder.mapping.read import MappedBag, read_open_bag
+from mcaprl.recorder.mapping.runs import Run
 from mcaprl.recorder.mapping.transforms import Transforms
 from tests.support.memory_bag import SECOND_NS, MemoryBag
 
@@ -113,17 +114,20 @@ def read(bag: MemoryBag, **parts: Any) -> MappedBag:
     return read_open_bag(bag, parse_mapping(tree))
 
 
-def test_a_static_transform_is_the_last_one_up_to_the_files_of_the_run() -> None:
-    class TwoFiles(MemoryBag):
+def test_a_static_transform_is_the_last_one_of_its_recording() -> None:
+    class ThreeFiles(MemoryBag):
         def places(self, topic: str) -> Any:
             return np.array([[0, 0], [1, 0]])
 
     static = [[transform("base", "camera", x, 0.0)] for x in (1.0, 2.0)]
-    transforms = Transforms(TwoFiles({"/tf_static": ([0.0, 0.0], {"transforms": objects(static)})}))
+    transforms = Transforms(
+        ThreeFiles({"/tf_static": ([0.0, 0.0], {"transforms": objects(static)})})
+    )
     steps_ns = np.array([5 * SECOND_NS])
-    for file, x in ((0, 1.0), (1, 2.0)):
-        found, _ = transforms.within({}, file).planar("camera", "base", steps_ns, "last", None)
-        assert found.tolist() == [[x, 0, 0]]
+    for files, x in (((0, 1), 1.0), ((1, 2), 2.0), ((0, 2), 2.0), ((2, 3), math.nan)):
+        within = transforms.within(Run(0, files, {}))
+        found, _ = within.planar("camera", "base", steps_ns, "last", None)
+        np.testing.assert_equal(found[0, 0], x)
 
 
 def test_poses_are_those_of_the_run() -> None:
@@ -173,20 +177,21 @@ def test_stamps_of_transforms_are_times() -> None:
 
 def test_a_pose_in_the_far_future_ends_an_episode() -> None:
     times = [float(k) for k in range(40)]
-    poses = [[transform("map", "base", time, 0.0)] for time in (0.0, 39.0)]
+    at = [0.0, 1.0, 2.0, 39.0, 40.0]
+    poses = [[transform("map", "base", time, 0.0)] for time in at]
     found = read(
         MemoryBag(
             {
-                "/tf": ([0.0, 39.0], {"transforms": objects(poses)}),
+                "/tf": (at, {"transforms": objects(poses)}),
                 "/odom": (times, {"data": times}),
                 "/cmd": (times, {"data": [0.0] * 40}),
             }
         ),
         observation={"p": {"transform": "base", "align": "nearest"}},
     )
-    # With the default `gap_s` of 2, the steps 3 to 36 have no pose.
-    assert found.dataset.observations[:, 0].tolist() == [0, 0, 39, 39]
-    assert found.report.fields["p"].max_age_s == 19
+    # With the default `gap_s` of 2, there are no steps between 2 s and 39 s.
+    assert found.dataset.frames[:, 0].tolist() == [0, 1, 2]
+    assert found.report.clock_steps == 5
 
 
 def test_wrong_trees_are_clear_errors() -> None:
