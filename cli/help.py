@@ -110,7 +110,7 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         **_BAGS,
         **_RAY,
     },
-    "info": _BAGS,
+    "info": {"Bags of other robots": ("mapping", "trust_code")},
     "check": _BAGS,
     "annotate": {
         "Values": ("policy", "gamma"),

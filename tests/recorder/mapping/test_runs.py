@@ -290,9 +290,9 @@ def test_a_topic_with_few_messages_belongs_to_runs_by_its_place(tmp_path: Path) 
     runs = [drive(40, 0, 0), drive(50, 1000, 1)]
     for goal_s in ((1.0, 1.5), (1.0, 3.0), (3.0, 0.5)):
         rows = []
-        for run, at_s, value in zip(runs, goal_s, (7.0, 8.0), strict=True):
-            at = next(k for k, row in enumerate(run) if row[1] >= at_s)
-            rows += [*run[:at], ("/goal", at_s, value), *run[at:]]
+        for part, at_s, value in zip(runs, goal_s, (7.0, 8.0), strict=True):
+            at = next(k for k, row in enumerate(part) if row[1] >= at_s)
+            rows += [*part[:at], ("/goal", at_s, value), *part[at:]]
         path = recorded(tmp_path / "goals.mcap", rows)
         goal = {"g": {"field": "/goal.data", "missing": -1}}
         found = read(path, observation={"x": {"field": "/odom.data"}, **goal})
