@@ -48,7 +48,8 @@ class Plan:
         place: Positions of the mapping's keys in its file, for error messages.
         quantities: Observed and other quantities, by name.
         behavior_prob: Probability of the action; None if unknown.
-        commands: Fields of the action.
+        commands: Fields of the action; empty if it consists of expressions.
+        expressions: Expressions of the action.
         conditions: Conditions of the episodes: `begin`, `end`, `terminated`, `truncated`.
         reasons: Conditions of the end reasons, by reason.
         reward: Function that computes the rewards.
@@ -75,10 +76,20 @@ class Plan:
         self.commands = [
             self._wanted(
                 ("action",),
-                Quantity(field=path, align=align, tolerance_s=action.tolerance_s),
+                Quantity(
+                    field=path,
+                    align=align,
+                    tolerance_s=action.tolerance_s,
+                    names=action.selected,
+                    names_from=action.names_from,
+                ),
                 is_during=is_during,
             )
             for path in paths
+        ]
+        self.expressions = [
+            self._expression(("action", "expressions", number), text)
+            for number, text in enumerate(action.expressions)
         ]
         self.behavior_prob = None
         if (prob := mapping.behavior_prob) is not None:
@@ -109,7 +120,7 @@ class Plan:
         with self.place.named(*keys):
             return Wanted(keys, quantity, source_of(self.bag, quantity), is_during)
 
-    def _expression(self, keys: tuple[str, ...], text: str) -> Expression:
+    def _expression(self, keys: tuple[str | int, ...], text: str) -> Expression:
         with self.place.named(*keys):
             return Expression(text)
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
-from mcaprl.recorder.bags.bag import Bag
+from mcaprl.recorder.bags.bag import Bag, Stream
 from mcaprl.recorder.mapping.align import NS_PER_S, time_order
 from mcaprl.recorder.mapping.config import TimeSource
 
@@ -52,9 +52,18 @@ class TopicStream:
         self._fields = sorted(set(fields))
 
     @cached_property
+    def _read(self) -> Stream:
+        return self._bag.read(self._topic, self._fields)
+
+    @property
     def columns(self) -> dict[str, NDArray[Any]]:
         """Columns of the fields, in the order of recording."""
-        return self._bag.read(self._topic, self._fields).columns if self._fields else {}
+        return self._read.columns if self._fields else {}
+
+    @property
+    def absent(self) -> Mapping[str, NDArray[np.bool_]]:
+        """(M,) flags of the messages that omit a field; see `Stream.absent`."""
+        return self._read.absent if self._fields else {}
 
     @cached_property
     def times_ns(self) -> NDArray[np.int64]:
@@ -71,7 +80,13 @@ class TopicStream:
                 f"{self._topic} ({self._bag.topics[self._topic].type_name}) has no header.stamp:"
                 " use `time: log_time`"
             )
-        return self._bag.read(self._topic, [field]).columns[field].astype(np.int64)
+        column = self._bag.read(self._topic, [field]).columns[field]
+        if column.dtype.kind != "i":
+            row = int(np.flatnonzero(column != column)[0]) if column.dtype.kind == "f" else 0
+            raise UsageError(
+                f"{self._topic}: message {row} has no time in {field}: use `time: log_time`"
+            )
+        return column.astype(np.int64)
 
     @property
     def places(self) -> NDArray[np.int64]:

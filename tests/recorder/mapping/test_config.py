@@ -47,7 +47,7 @@ def test_a_good_mapping_has_defaults(tmp_path: Path) -> None:
         ("rate_hz: 10", "rate_hz: -1", ":1: clock.rate_hz: Input should be greater than 0"),
         ("rate_hz: 10", "rate_hz: 10, topic: /a", ":1: clock: give either rate_hz or topic"),
         ("{field: /mode.data}", "{fields: [/a.b]}", "action: fields need one of actions, edges"),
-        ("{field: /mode.data}", "{fields: [/a.b], edges: [[1], [2]]}", "need 1 entries, one for"),
+        ("{field: /mode.data}", "{fields: [/a.b, /a.c], edges: [[1]]}", "needs 2 entries, one"),
         ("{field: /mode.data}", "{fields: [/a.b], edges: [[2, 1]]}", "action: edges must rise"),
         ("  speed:", "  a-b:", "observation has"),
         ("speed:", "action:", "'action' has another meaning in expressions: use another name"),
