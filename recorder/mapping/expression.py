@@ -44,7 +44,8 @@ FUNCTIONS: Final[dict[str, tuple[Callable[..., Any], int]]] = {
 NEXT: Final = "next"
 """Name of the function that evaluates its argument at the next step."""
 _MAX_CHARACTERS, _MAX_DEPTH, _MAX_SHOWN = 4000, 50, 200
-_LARGEST_NUMBER = 2**63
+_MAX_BITS = 1023
+"""Bits of the largest integer that float64 can represent."""
 _STRING = "a string can only be compared with a string, using == or !="
 
 _BINARY: Final[dict[type[ast.operator], Callable[..., Any]]] = {
@@ -152,8 +153,8 @@ class Expression:
                 raise UsageError(f"'{self._shown}': {name} is a function; call it as {name}(...)")
             case ast.Constant(value=value) if not isinstance(value, bool | int | float | str):
                 raise self._refused(node)
-            case ast.Constant(value=int(value)) if value > _LARGEST_NUMBER:
-                raise UsageError(f"'{self._shown}' has a number of {value.bit_length()} bits")
+            case ast.Constant(value=int(value)) if value.bit_length() > _MAX_BITS:
+                raise UsageError(f"'{self._shown}' has a number that is too large")
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
                 count = 1 if name == NEXT else FUNCTIONS.get(name, (None, -1))[1]
                 if count < 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,7 +70,7 @@ def _beside(info: TopicInfo, path: FieldPath) -> str:
     steps = steps_of(path.field)
     kind = info.fields.get(path.field)
     if kind is None or info.encoding == "json":
-        return f"{path_text(path.steps)}{NAMES}"
+        return f"{path.field}{NAMES}"
     if "[" not in kind:
         return ""
     for count in range(len(steps) - 1, -1, -1):
@@ -179,38 +180,40 @@ def _elements(path: FieldPath, column: NDArray[Any], rows: list[int], place: int
     return found
 
 
-def check_order(path: FieldPath, column: NDArray[Any], texts: NDArray[Any], field: str) -> None:
+def check_order(path: FieldPath, column: NDArray[Any], texts: NDArray[Any]) -> None:
     """Check that the names of the elements that a path selects do not change.
+
+    Names of which a message has another number than it has elements are not those of the elements.
 
     Args:
         path: Path of the field.
         column: Values of the whole field.
-        texts: (M,) names in each message.
-        field: Field that contains the names.
+        texts: (M,) names of its elements.
 
     Raises:
         UsageError: The names of two messages differ.
     """
-    is_own = field.endswith(NAMES)
-    elements = None if is_own else path.elements
-    first: tuple[int, Any] | None = None
+    orders: dict[tuple[str, ...], int] = {}
     for row, names in enumerate(texts):
-        listed = _flat_texts(names)
-        if not listed or (not is_own and len(listed) != _length(column[row])):
+        count = _length(column[row])
+        if count < 1:
             continue
-        if elements is not None:
-            found = element_of(listed, elements)
+        listed = _flat_texts(names)
+        if listed is None or len(listed) != count:
+            return
+        if path.elements is not None:
+            found = element_of(listed, path.elements)
             listed = [] if isinstance(found, Lack) else _flat_texts(found) or []
-        if first is None:
-            first = row, listed
-        if listed != first[1]:
-            one, other = (_listed(each) for each in (first[1], listed))
-            wanted = _listed(list(dict.fromkeys([*first[1], *listed])))
-            raise UsageError(
-                f"{path}: the names of the elements change: [{one}] in message {first[0]},"
-                f" [{other}] in message {row}: select them by `names: [{wanted}]`"
-            )
+        if listed:
+            orders.setdefault(tuple(listed), row)
+    if len(orders) > 1:
+        (one, first), (other, second) = list(orders.items())[:2]
+        wanted = _listed(dict.fromkeys([*one, *other]))
+        raise UsageError(
+            f"{path}: the names of the elements change: [{_listed(one)}] in message {first},"
+            f" [{_listed(other)}] in message {second}: select them by `names: [{wanted}]`"
+        )
 
 
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+def _listed(names: Collection[str]) -> str:
+    return ", ".join(list(names)[:12]) + (", ..." if len(names) > 12 else "")

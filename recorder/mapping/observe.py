@@ -240,7 +240,7 @@ def _updates(quantity: Quantity, source: Source, stream: TopicStream) -> Named:
         check_lacks(path, column.tolist(), optional=optional)
         column = without_lacks(column)
     if source.names:
-        check_order(path, column, stream.columns[source.names], source.names)
+        check_order(path, column, stream.columns[source.names])
     column = path.select(column, optional=optional)
     if column.dtype.kind == "O" and _are_texts(column):
         return Named(column, present)
