@@ -478,7 +478,7 @@ def _bytes_of(value: Any) -> Any:
         return value
     try:
         if isinstance(value, str):
-            return base64.b64decode(value)
+            return base64.b64decode("".join(value.split()), validate=True)
         if _is_array(value) or isinstance(value, bytearray | memoryview):
             return bytes(value)
     except (TypeError, ValueError):

@@ -300,3 +300,15 @@ def test_sectors_and_padding_equal_a_slow_reference(values: list[list[float]], c
 def test_impossible_elements_are_refused(observation: dict[str, Any], expected: str) -> None:
     with pytest.raises(UsageError, match=re.escape(expected)):
         mapping({"field": "/low.r", **observation})
+
+
+def test_arrays_of_arrays_are_read_by_row(tmp_path: Path) -> None:
+    for rows in ([[1, 2], [3, 4]], [[1, 2], [3]], [[[1]]]):
+        path = write_json(tmp_path / "grid.mcap", [{"grid": rows, "command": 0}] * 3)
+        with pytest.raises(UsageError, match=r"/low.grid is not a number, but an array of arrays"):
+            read_bag(path, mapping({"field": "/low.grid"}))
+    path = write_json(tmp_path / "grid.mcap", [{"grid": [[1, 2], [3]], "command": 0}] * 3)
+    data = read_bag(path, mapping({"field": "/low.grid[0]"})).dataset
+    assert data.frames.tolist() == [[1, 2]] * 3
+    data = read_bag(path, mapping({"field": "/low.grid[1][0]"})).dataset
+    assert data.frames.ravel().tolist() == [3] * 3
