@@ -25,6 +25,7 @@ from mcaprl.recorder.bags.values import (
     NUMBERS,
     column_of,
     general_path,
+    kind_at,
     steps_of,
     value_at,
 )
@@ -239,7 +240,7 @@ class _Topic:
         kinds, columns, absent = {**self.info.fields, _PUBLISH_TIME: "time"}, {}, {}
         for name, values in self._values(fields, wanted).items():
             used = values if places is None else [values[place] for place in places.tolist()]
-            columns[name] = column_of(used, kinds.get(general_path(name), ""))
+            columns[name] = column_of(used, kind_at(kinds, name))
             is_absent = np.array([value is ABSENT for value in used], bool)
             if is_absent.any():
                 absent[name] = is_absent

@@ -55,6 +55,8 @@ PARALLEL = ("name", "names", "joint_names", "joint_name", "interface_names")
 """Arrays of names beside an array of values, or in a message that contains it."""
 _OWN = ("name", "joint_name", "interface_name", "child_frame_id", "key")
 """Fields with the name of an element of an array of messages."""
+_ENTRY = ("key", "value")
+"""Fields of an entry of a map that is recorded as an array."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,19 @@ def general_path(path: str) -> str:
     return found
 
 
+def kind_at(fields: Mapping[str, str], path: str) -> str:
+    """Return the kind of the values of a path by `TopicInfo.fields`; empty if unknown.
+
+    The kind of a field in the elements of arrays has a `[]` for each of these arrays.
+    """
+    steps = steps_of(path)
+    are_several = any(is_mapped(steps, number) for number in range(len(steps)))
+    if path.endswith(NAMES) or are_several or not steps or not isinstance(steps[-1], str):
+        return ""
+    general = general_path(path)
+    return fields.get(general, "").removesuffix("[]" * general.count("[]"))
+
+
 def value_at(message: Any, path: str) -> Any:
     """Return a field of a decoded message by its path.
 
@@ -167,9 +182,9 @@ def value_at(message: Any, path: str) -> Any:
 def _walked(value: Any, steps: Sequence[Step]) -> Any:
     for number, step in enumerate(steps):
         if isinstance(step, str):
-            if _is_array(value):
+            if _is_array(value) and not _are_entries(value, step):
                 return _joined([_walked(each, steps[number:]) for each in value])
-            value = _member(value, step)
+            value = _entry_of(value, step) if _is_array(value) else _member(value, step)
         else:
             value = element_of(value, step)
             if is_mapped(steps, number) and not isinstance(value, Lack):
@@ -204,6 +219,26 @@ def _entry(value: Mapping[Any, Any], key: str | int) -> Any:
         except (TypeError, ValueError):
             continue
     return ABSENT
+
+
+def _are_entries(array: Any, name: str) -> bool:
+    """Return whether the elements of an array are entries with a key and a value, as of a map."""
+    if name in _ENTRY or not len(array) or _is_number(array[0]) or isinstance(array[0], str):
+        return False
+    return all(_is_present(_member(array[0], part)) for part in _ENTRY)
+
+
+def _entry_of(array: Any, key: str) -> Any:
+    """Return the value of the entry with a key."""
+    for each in array:
+        found = _member(each, "key")
+        if found == key or (_is_number(found) and str(found) == key):
+            return _member(each, "value")
+    return ABSENT
+
+
+def _is_present(value: Any) -> bool:
+    return value is not None and not isinstance(value, Lack)
 
 
 def element_of(value: Any, index: int | slice) -> Any:

@@ -33,7 +33,7 @@ class Actions(NamedTuple):
     meanings: tuple[str, ...]
 
 
-class Command(NamedTuple):
+class CommandPart(NamedTuple):
     """A part of the command of N steps.
 
     Attributes:
@@ -56,7 +56,7 @@ class Command(NamedTuple):
         return self.names or tuple(f"{self.name}[{k}]" for k in range(self.values.shape[1]))
 
 
-def actions_of(action: Action, commands: Sequence[Command]) -> Actions:
+def actions_of(action: Action, commands: Sequence[CommandPart]) -> Actions:
     """Convert commands to actions.
 
     Args:

@@ -180,7 +180,9 @@ def _aligned(
     """Return the values at the steps, NaN where missing, and their messages."""
     if quantity.align == "linear" and ends_ns is None:
         values = _unwrapped(quantity, _finite(quantity, column[run.rows]))
-        return interpolated(run.times_ns, values, steps_ns, quantity.tolerance_s)
+        # What is between infinite values is missing.
+        with np.errstate(invalid="ignore", over="ignore"):
+            return interpolated(run.times_ns, values, steps_ns, quantity.tolerance_s)
     match = _match(quantity, run, steps_ns, ends_ns)
     rows = _rows(run, match)
     found = np.full((len(rows), *column.shape[1:]), np.nan)
@@ -265,7 +267,7 @@ def _vector(quantity: Quantity, path: FieldPath, column: NDArray[Any]) -> NDArra
             found = padded(rows, quantity.pad or 0)
         else:
             found = pooled(rows, quantity.pool, quantity.to or 0)
-    if found.ndim > 1 and not found.shape[1] and len(found) and quantity.missing is None:
+    if found.ndim > 1 and not found.shape[1] and len(found):
         raise UsageError(f"{path}: no elements; the field has 0 elements in all messages")
     return found
 

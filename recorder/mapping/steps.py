@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
-from mcaprl.recorder.mapping.actions import Actions, Command, actions_of
+from mcaprl.recorder.mapping.actions import Actions, CommandPart, actions_of
 from mcaprl.recorder.mapping.expression import Expression
 from mcaprl.recorder.mapping.observe import Values, pose_of, values_of
 from mcaprl.recorder.mapping.paths import as_numbers
@@ -188,7 +188,7 @@ class StepReader:
         for place, expression in enumerate(plan.expressions):
             with plan.place.named("action", "expressions", place):
                 values = expression.evaluate(columns, following).astype(np.float64)
-            commands.append(Command(expression.text, values, np.isnan(values)))
+            commands.append(CommandPart(expression.text, values, np.isnan(values)))
         with plan.place.named("action"):
             return actions_of(action, commands)
 
@@ -219,13 +219,13 @@ class StepReader:
         return usable
 
 
-def _command(wanted: Wanted, found: Values) -> Command:
+def _command(wanted: Wanted, found: Values) -> CommandPart:
     """Return a field of the command, named by the last part of its path."""
     path, names = wanted.source.path, wanted.quantity.names
     assert path is not None, "commands are fields"
     whole = path._replace(elements=None) if isinstance(path.elements, slice) else path
     word = str(whole).rpartition(".")[2]
-    return Command(word, found.values, found.missing, tuple(names or ()))
+    return CommandPart(word, found.values, found.missing, tuple(names or ()))
 
 
 def _ends(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -19,6 +19,7 @@ from mcaprl.recorder.bags.values import (
     ABSENT,
     Lack,
     column_of,
+    kind_at,
     path_text,
     steps_of,
     value_at,
@@ -144,6 +145,45 @@ def test_values_by_hand() -> None:
     np.testing.assert_array_equal(value_at(message, "c[:].d"), [1, np.nan, np.nan])
     np.testing.assert_array_equal(value_at(message, "c.d"), [1, np.nan, np.nan])
     assert value_at(message, "c[3:].d").shape == (0,)
+
+
+def test_entries_of_maps_that_are_arrays_are_read_by_their_keys() -> None:
+    gains = [
+        {"key": "left", "value": 2},
+        {"key": 3, "value": {"x": 4}},
+        {"key": "n", "value": None},
+    ]
+    message = {"gains": gains}
+    for path, expected in (
+        ("gains[left]", 2),
+        ("gains.left", 2),
+        ("gains['3'].x", 4),
+        ("gains.n", None),
+        ("gains.right", ABSENT),
+    ):
+        assert value_at(message, path) == expected, path
+    assert value_at(message, "gains.key") == ["left", 3, "n"]
+
+
+def test_the_kind_of_a_field_in_arrays() -> None:
+    fields = {
+        "m": "demo/Motor[]",
+        "m[].mode": "uint8[]",
+        "m[].raw": "uint8[][]",
+        "m[].at": "time[]",
+        "raw": "uint8[]",
+    }
+    for path, expected in (
+        ("m[0].mode", "uint8"),
+        ("m[0].raw", "uint8[]"),
+        ("m[0].at", "time"),
+        ("m[:].mode", ""),
+        ("raw", "uint8[]"),
+        ("raw[@]", ""),
+        ("raw[0]", ""),
+        ("none", ""),
+    ):
+        assert kind_at(fields, path) == expected, path
 
 
 @pytest.mark.parametrize(

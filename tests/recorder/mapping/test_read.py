@@ -188,7 +188,7 @@ def test_commands_are_expressions() -> None:
     assert data.action_names[1] == "next(arm[0]) - speed 0 to 1"
     assert report.missing_actions == 0.4
     named = {"expressions": deltas, "actions": {"stay": [0, 0], "up": [3, 4]}}
-    assert read(bag, **quantities, action=named).dataset.actions.tolist() == [0, 0, 1, 1]
+    assert read(bag, **quantities, action=named).dataset.actions.tolist() == [0, 0, 1, 0]
     with pytest.raises(UsageError, match=r"action.expressions.1: unknown name .* 'spe'"):
         read(bag, **quantities, action={**boxed, "expressions": ["speed", "spe"]})
     with pytest.raises(UsageError, match=r"expressions.0: 'arm' must be one number for each row"):
