@@ -194,10 +194,14 @@ def check_order(path: FieldPath, column: NDArray[Any], texts: NDArray[Any]) -> N
         UsageError: The names of two messages differ.
     """
     orders: dict[tuple[str, ...], int] = {}
+    length = column.shape[1] if column.ndim > 1 else None
+    last: Any = None
     for row, names in enumerate(texts):
-        count = _length(column[row])
-        if count < 1:
+        count = _length(column[row]) if length is None else length
+        # Nearly always, the names are those of the message before.
+        if count < 1 or (length is not None and names == last):
             continue
+        last = names
         listed = _flat_texts(names)
         if listed is None or len(listed) != count:
             return

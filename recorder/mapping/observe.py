@@ -56,6 +56,7 @@ class Source(NamedTuple):
         path: Path of the field; None for images and transforms.
         names: Field with the names of the elements; empty if they have none.
         unlisted: Error if no message has the field; None if the type lists it.
+        cache: Columns that were read, and the values that were made of them for all runs.
     """
 
     topic: str
@@ -63,6 +64,7 @@ class Source(NamedTuple):
     path: FieldPath | None
     names: str = ""
     unlisted: UsageError | None = None
+    cache: list[tuple[Any, Named]] | None = None
 
 
 def source_of(bag: Bag, quantity: Quantity) -> Source:
@@ -86,7 +88,7 @@ def source_of(bag: Bag, quantity: Quantity) -> Source:
         )
         if not all(map(info.may_have, fields)):
             raise UsageError(f"{path} is not a quaternion with x, y, z and w")
-        return Source(path.topic, fields, path)
+        return Source(path.topic, fields, path, cache=[])
     names = names_field(info, path, quantity)
     is_unlisted = bool(info.fields) and not info.lists(path.field)
     return Source(
@@ -95,6 +97,7 @@ def source_of(bag: Bag, quantity: Quantity) -> Source:
         path,
         names,
         unknown_field(bag, path) if is_unlisted else None,
+        [],
     )
 
 
@@ -222,6 +225,13 @@ def _rows(run: Run, match: Matches) -> NDArray[np.int64]:
 
 def _updates(quantity: Quantity, source: Source, stream: TopicStream) -> Named:
     """Return the field's column: numbers (M,) or (M, K), or texts (M,), and which are updates."""
+    columns, cache = stream.columns, source.cache if source.cache is not None else []
+    if not cache or cache[0][0] is not columns:
+        cache[:] = [(columns, _new_updates(quantity, source, stream))]
+    return cache[0][1]
+
+
+def _new_updates(quantity: Quantity, source: Source, stream: TopicStream) -> Named:
     path = source.path
     assert path is not None, "the quantity is a field"
     absent = [stream.absent[name] for name in source.fields if name in stream.absent]
