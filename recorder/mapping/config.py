@@ -457,6 +457,9 @@ def load_mapping(source: str | Path | MappingOf[str, Any]) -> tuple[Mapping, Pla
         mark = getattr(error, "problem_mark", None)
         where = f"{path}:{mark.line + 1}" if mark else str(path)
         raise UsageError(f"{where}: not YAML: {getattr(error, 'problem', error)}") from error
+    # ruamel.yaml converts numbers and dates that are impossible, and nesting has no limit.
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{path}: a value cannot be read: {str(error)[:200]}") from error
     place = Place(str(path), tree)
     if not isinstance(tree, dict):
         raise UsageError(f"{path}: a mapping has keys and values, such as `clock: {{rate_hz: 10}}`")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
@@ -16,6 +16,11 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 Message = dict[str, Any]
+
+descriptor_pb2, descriptor_pool, message_factory = (
+    importlib.import_module(f"google.protobuf.{name}")
+    for name in ("descriptor_pb2", "descriptor_pool", "message_factory")
+)
 
 SECOND_NS = 10**9
 TEXT = """\
@@ -91,7 +96,7 @@ def _field(message: Any, name: str, number: int, kind: str, *, repeated: bool = 
         field.type, field.type_name = 11, f".demo.{kind}"
 
 
-def _file_of_types() -> descriptor_pb2.FileDescriptorSet:
+def _file_of_types() -> Any:
     file = descriptor_pb2.FileDescriptorProto(name="low.proto", package="demo", syntax="proto3")
     motor, point, low = (file.message_type.add(name=name) for name in ("Motor", "Point", "Low"))
     _field(motor, "name", 1, "string")

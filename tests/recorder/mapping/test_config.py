@@ -132,6 +132,18 @@ def test_files_that_are_not_mappings_are_refused(tmp_path: Path) -> None:
         load_mapping(tmp_path / "robot.yaml")
 
 
+@pytest.mark.parametrize(
+    "value",
+    ["2024-13-45", "!!int abc", "!!float abc", "9" * 5000, "[" * 900, "{a: " * 900],
+)
+def test_values_that_yaml_cannot_convert_are_one_line(tmp_path: Path, value: str) -> None:
+    path = written(tmp_path, GOOD.replace("rate_hz: 10", f"rate_hz: {value}"))
+    with pytest.raises(UsageError) as error:
+        load_mapping(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
 def test_yaml_tags_make_no_objects(tmp_path: Path) -> None:
     tagged = GOOD.replace("{rate_hz: 10}", "!!python/object/apply:os.system ['true']")
     with pytest.raises(UsageError, match="clock"):

@@ -217,8 +217,8 @@ def test_a_message_that_omits_a_key_keeps_the_last_value(tmp_path: Path, schema:
 
 def test_fields_that_no_message_has_are_refused_if_there_is_a_schema(tmp_path: Path) -> None:
     path = write_json(tmp_path / "typo.mcap", [{"command": 0, "more": 1}] * 3, SCHEMA)
-    with pytest.raises(UsageError, match=r"has no field 'commnds'; nearest: command"):
-        read_bag(path, mapping({"field": "/low.commnds"}))
+    with pytest.raises(UsageError, match=r"has no field 'commandd'; nearest: command"):
+        read_bag(path, mapping({"field": "/low.commandd"}))
     # The schema does not list this field, but the messages have it.
     assert (
         read_bag(path, mapping({"field": "/low.more"})).dataset.frames.ravel().tolist() == [1] * 3
