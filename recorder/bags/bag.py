@@ -7,23 +7,28 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, UnknownNameError, UsageError
-from mcaprl.recorder.bags.decoders import (
-    MessageDecoder,
-    column_of,
-    decoder_of,
-    merged,
-    value_at,
-)
+from mcaprl.recorder.bags.decoders import MessageDecoder, decoder_of, merged
 from mcaprl.recorder.bags.files import find_bags, open_recordings
 from mcaprl.recorder.bags.mcap_file import McapFile
 from mcaprl.recorder.bags.rosbag_file import RosbagFile
 from mcaprl.recorder.bags.source import Definition, TopicSource
+from mcaprl.recorder.bags.values import (
+    ABSENT,
+    NAMES,
+    NUMBERS,
+    column_of,
+    general_path,
+    kind_at,
+    steps_of,
+    value_at,
+)
 
 _PUBLISH_TIME = "publish_time"
 
@@ -41,17 +46,20 @@ class Stream(NamedTuple):
 
     Attributes:
         log_time_ns: (N,) log_time of each message.
-        columns: Column of each field by its dotted path: (N,) numbers, (N, K) numbers if all
+        columns: Column of each field by its path: (N,) numbers, (N, K) numbers if all
             values are arrays of K numbers, otherwise (N,) objects (strings, bytes or lists).
         rows: (N,) index of each message in `Bag.times`. Messages that cannot be decoded are left
             out.
         failures: Messages that were left out.
+        absent: (N,) flags of the messages that omit a field, as JSON can, by its path; without
+            the fields that no message omits.
     """
 
     log_time_ns: NDArray[np.int64]
     columns: dict[str, NDArray[Any]]
     rows: NDArray[np.int64]
     failures: tuple[Failure, ...] = ()
+    absent: Mapping[str, NDArray[np.bool_]] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -80,6 +88,35 @@ class TopicInfo:
     fields: dict[str, str]
     constants: dict[str, int]
     problem: str = ""
+
+    def may_have(self, path: str) -> bool:
+        """Return whether messages may have a field.
+
+        Messages in JSON may have other fields than their schema lists.
+        """
+        return not self.fields or self.encoding == "json" or self.lists(path)
+
+    def lists(self, path: str) -> bool:
+        """Return whether the type has a field, as far as it is known."""
+        # Slices of arrays can be omitted.
+        wanted = general_path(path).replace("[]", "")
+        known = {name.replace("[]", ""): kind for name, kind in self.fields.items()}
+        if wanted in known:
+            return True
+        names = [step for step in steps_of(path.removesuffix(NAMES)) if isinstance(step, str)]
+        outer = [".".join(names[:count]) for count in range(1, len(names))]
+        return any(_is_open(name, known) for name in outer)
+
+
+def _is_open(name: str, known: Mapping[str, str]) -> bool:
+    """Return whether a field contains fields that are not known."""
+    kind = known.get(name, "string")
+    element = kind.partition("[")[0]
+    if element.rstrip("0123456789") in NUMBERS or element in ("string", "bytes", "time"):
+        return False
+    # Keys of maps are not known.
+    is_map = element.endswith("Entry")
+    return is_map or not any(each.startswith(f"{name}.") for each in known)
 
 
 class Bag(Protocol):
@@ -115,7 +152,7 @@ class Bag(Protocol):
 
         Args:
             topic: Name of the topic.
-            fields: Dotted paths of fields; `publish_time` is the time of publication in
+            fields: Paths of fields, see `values`; `publish_time` is the time of publication in
                 nanoseconds.
             rows: Indices into `times` of the messages to read, in output order; default: all.
 
@@ -227,12 +264,14 @@ class _Topic:
         if failures:
             is_bad = np.isin(wanted, [each.row for each in failures])
             chosen, places = chosen[~is_bad[places]], places[~is_bad[places]]
-        kinds = {**self.info.fields, _PUBLISH_TIME: "time"}
-        columns = {
-            name: column_of([column[place] for place in places.tolist()], kinds.get(name, ""))
-            for name, column in values.items()
-        }
-        return Stream(self.times_ns[chosen], columns, chosen, tuple(failures))
+        kinds, columns, absent = {**self.info.fields, _PUBLISH_TIME: "time"}, {}, {}
+        for name, column in values.items():
+            used = [column[place] for place in places.tolist()]
+            columns[name] = column_of(used, kind_at(kinds, name))
+            is_absent = np.array([value is ABSENT for value in used], bool)
+            if is_absent.any():
+                absent[name] = is_absent
+        return Stream(self.times_ns[chosen], columns, chosen, tuple(failures), absent)
 
     def _values(
         self, fields: Sequence[str], rows: NDArray[np.int64]
@@ -312,10 +351,9 @@ class _FileBag:
         found = self._topic(topic)
         if found.info.problem:
             raise LogError(f"{topic} cannot be read: {found.info.problem}")
-        known = found.info.fields
         for field in fields:
-            if known and field not in known and field != _PUBLISH_TIME:
-                raise UnknownNameError(f"field of {topic}", field, known)
+            if field != _PUBLISH_TIME and not found.info.may_have(field):
+                raise UnknownNameError(f"field of {topic}", field, found.info.fields)
         return found.read(fields, rows, strict=self._strict)
 
     def close(self) -> None:

@@ -1,33 +1,17 @@
-"""Decoders of messages to objects, and conversion of their fields to columns."""
+"""Decoders of messages to objects."""
 
 from __future__ import annotations
 
-import base64
 import json
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, import_extra
 from mcaprl.recorder.bags.ros import RosDecoder
+from mcaprl.recorder.bags.values import NUMBERS, are_bytes
+from mcaprl.recorder.bags.values import column_of as column_of
+from mcaprl.recorder.bags.values import value_at as value_at
 
-_NS_PER_S = 10**9
-_NUMBERS = (
-    "int",
-    "uint",
-    "float",
-    "double",
-    "bool",
-    "byte",
-    "char",
-    "sint",
-    "fixed",
-    "sfixed",
-    "enum",
-)
 _JSON_KINDS = {"number": "float64", "integer": "int64", "boolean": "bool", "string": "string"}
 
 
@@ -113,12 +97,8 @@ def merged(decoders: Sequence[MessageDecoder]) -> tuple[dict[str, str], dict[str
 def _shape(kind: str) -> tuple[str, bool]:
     """Return what decides how `column_of` reads a kind: numbers of all sizes are equal."""
     element, bracket, _ = kind.partition("[")
-    is_number = element.rstrip("0123456789") in _NUMBERS and not _are_bytes(kind)
+    is_number = element.rstrip("0123456789") in NUMBERS and not are_bytes(kind)
     return "number" if is_number else element, bool(bracket)
-
-
-def _are_bytes(kind: str) -> bool:
-    return kind == "bytes" or kind.startswith(("uint8[", "byte[", "octet["))
 
 
 class ProtobufDecoder:
@@ -218,72 +198,3 @@ class JsonDecoder:
             else:
                 is_bytes = each.get("contentEncoding") == "base64"
                 self.fields[path] = "bytes" if is_bytes else _JSON_KINDS.get(str(kind), "object")
-
-
-def value_at(message: Any, path: str) -> Any:
-    """Return a field of a decoded message by its dotted path; None if it is missing.
-
-    Times and durations are converted to nanoseconds.
-    """
-    found = message
-    for name in path.split("."):
-        found = found.get(name) if isinstance(found, dict) else getattr(found, name, None)
-        if found is None:
-            return None
-    return _nanoseconds(found)
-
-
-def _nanoseconds(value: Any) -> Any:
-    """Convert a time to nanoseconds; return any other value unchanged."""
-    for second, rest in (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec")):
-        if isinstance(value, dict):
-            if value.keys() == {second, rest}:
-                return int(value[second]) * _NS_PER_S + int(value[rest])
-        elif hasattr(value, second) and hasattr(value, rest):
-            return int(getattr(value, second)) * _NS_PER_S + int(getattr(value, rest))
-    return value
-
-
-def column_of(values: Sequence[Any], kind: str) -> NDArray[Any]:
-    """Return the values of a field as a column; see `bag.Stream`.
-
-    Args:
-        values: Value of the field in each message; None if a message lacks the field.
-        kind: Kind of the field as in `bag.TopicInfo`; empty if unknown.
-    """
-    if _are_bytes(kind):
-        return _objects([_bytes_of(value) for value in values])
-    if kind == "time":
-        return np.array([0 if value is None else value for value in values], np.int64)
-    if all(isinstance(value, bool | int | np.integer | np.bool_) for value in values):
-        return np.array(values) if len(values) else np.empty(0)
-    if all(value is None or isinstance(value, bool | int | float | np.number) for value in values):
-        return np.array([math.nan if value is None else value for value in values], np.float64)
-    if any(value is None or isinstance(value, str | bytes | dict) for value in values):
-        return _objects(values)
-    return _vectors(values)
-
-
-def _vectors(values: Sequence[Any]) -> NDArray[Any]:
-    """Return arrays of K numbers as one (N, K) array, and all other values as objects."""
-    try:
-        arrays = [np.asarray(value) for value in values]
-    except (ValueError, TypeError):
-        return _objects(values)
-    shapes = {array.shape for array in arrays}
-    if len(shapes) == 1 and arrays[0].ndim == 1 and all(a.dtype.kind in "biuf" for a in arrays):
-        return np.stack(arrays)
-    return _objects(values)
-
-
-def _bytes_of(value: Any) -> Any:
-    if isinstance(value, str):
-        return base64.b64decode(value)
-    return value if value is None else bytes(value)
-
-
-def _objects(values: Iterable[Any]) -> NDArray[Any]:
-    values = list(values)
-    column = np.empty(len(values), object)
-    column[:] = values
-    return column

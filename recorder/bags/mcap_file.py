@@ -133,10 +133,10 @@ class _McapTopic:
 def _is_column(kind: str) -> bool:
     """Return whether a field is read as a column.
 
-    Columns are numbers, strings, times and arrays of numbers. Messages with other fields, such as
-    bytes and lists of strings, are decoded one by one.
+    Columns are numbers, strings, times, and arrays of numbers or strings. Messages with other
+    fields, such as bytes and lists of messages, are decoded one by one.
     """
     element, bracket, _ = kind.partition("[")
     if bracket:
-        return element in ROS_TO_NUMPY and element not in _BYTES
+        return element == "string" or (element in ROS_TO_NUMPY and element not in _BYTES)
     return element in ROS_TO_NUMPY or element in ("string", "time")

@@ -33,38 +33,66 @@ class Actions(NamedTuple):
     meanings: tuple[str, ...]
 
 
-def actions_of(
-    action: Action, columns: Sequence[NDArray[Any]], missing: NDArray[np.bool_]
-) -> Actions:
+class CommandPart(NamedTuple):
+    """A part of the command of N steps.
+
+    Attributes:
+        name: Name of the field or expression.
+        values: (N,) or (N, K) numbers, or (N,) texts of a discrete field.
+        missing: (N,) bool: whether there is no value.
+        names: Names of the K elements; empty if they have none.
+    """
+
+    name: str
+    values: NDArray[Any]
+    missing: NDArray[np.bool_]
+    names: tuple[str, ...] = ()
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """Names of the elements, or of the single value."""
+        if self.values.ndim == 1:
+            return (self.name,)
+        return self.names or tuple(f"{self.name}[{k}]" for k in range(self.values.shape[1]))
+
+
+def actions_of(action: Action, commands: Sequence[CommandPart]) -> Actions:
     """Convert commands to actions.
 
     Args:
         action: Action of the mapping.
-        columns: (N,) values of each field: numbers, or texts of a discrete field.
-        missing: (N,) bool: whether there is no command.
+        commands: Parts of the command: its fields or expressions.
 
     Raises:
-        UsageError: A value is not a whole number, or is a text that `names` does not contain.
+        UsageError: A value is not a whole number, or is a text that `names` does not contain, or
+            the mapping does not have an entry for each element.
     """
+    missing = np.logical_or.reduce([each.missing for each in commands])
     none = np.zeros(len(missing), bool)
     if action.field is not None:
-        values, meanings = _discrete(action, columns[0], missing)
+        values, meanings = _discrete(action, commands[0].values, missing)
         count = max(len(meanings), int(values.max(initial=0)) + 1)
         return Actions(spaces.Discrete(count), values, missing, none, meanings)
-    commands = np.column_stack(columns).astype(np.float64)
-    missing = missing | ~np.isfinite(commands).all(axis=1)
-    commands = np.where(missing[:, np.newaxis], 0.0, commands)
+    numbers = np.column_stack([each.values for each in commands]).astype(np.float64)
+    action.check_count(numbers.shape[1])
+    missing = missing | ~np.isfinite(numbers).all(axis=1)
+    numbers = np.where(missing[:, np.newaxis], 0.0, numbers)
     if action.box is not None:
-        low, high = (np.array(each, np.float32) for each in (action.box.low, action.box.high))
-        far = ((commands < low) | (commands > high)).any(axis=1) & ~missing
-        kept = np.clip(commands.astype(np.float32), low, high)
-        return Actions(spaces.Box(low, high), kept, missing, far, ())
+        low, high = (
+            np.broadcast_to(np.array(each, np.float32), numbers.shape[1])
+            for each in (action.box.low, action.box.high)
+        )
+        far = ((numbers < low) | (numbers > high)).any(axis=1) & ~missing
+        kept = np.clip(numbers, low, high).astype(np.float32)
+        return Actions(spaces.Box(low.copy(), high.copy()), kept, missing, far, ())
     if action.actions:
-        values, distance = _nearest(commands, np.array(list(action.actions.values()), np.float64))
+        values, distance = _nearest(numbers, np.array(list(action.actions.values()), np.float64))
         far = (distance > action.far) & ~missing
         space = spaces.Discrete(len(action.actions))
         return Actions(space, values, missing, far, tuple(action.actions))
-    values, meanings = _binned(action, commands)
+    values, meanings = _binned(
+        action, numbers, [each for part in commands for each in part.elements]
+    )
     return Actions(spaces.Discrete(len(meanings)), values, missing, none, meanings)
 
 
@@ -75,8 +103,8 @@ def _discrete(
     present = np.flatnonzero(~missing)
     if column.dtype.kind == "O":
         texts = [str(text) for text in column[present]]
-        _check_named(action, set(texts), set(action.names))
-        values[present] = [action.names[text] for text in texts]
+        _check_named(action, set(texts), set(action.numbers))
+        values[present] = [action.numbers[text] for text in texts]
     else:
         numbers = column[present]
         wrong = numbers[(numbers != np.rint(numbers)) | (numbers < 0)]
@@ -91,9 +119,9 @@ def _discrete(
                 f" {MAX_ACTIONS}"
             )
         values[present] = numbers.astype(np.int64)
-        if action.names:
-            _check_named(action, set(values[present].tolist()), set(action.names.values()))
-    by_number = {number: name for name, number in action.names.items()}
+        if action.numbers:
+            _check_named(action, set(values[present].tolist()), set(action.numbers.values()))
+    by_number = {number: name for name, number in action.numbers.items()}
     if sorted(by_number) != list(range(len(by_number))):
         return values, ()
     return values, tuple(by_number[number] for number in range(len(by_number)))
@@ -102,7 +130,7 @@ def _discrete(
 def _check_named(action: Action, found: set[Any], named: set[Any]) -> None:
     unknown = sorted(found - named)
     if unknown:
-        names = ", ".join(f"{name}: {number}" for name, number in action.names.items())
+        names = ", ".join(f"{name}: {number}" for name, number in action.numbers.items())
         raise UsageError(
             f"{action.field} has the value {unknown[0]!r}, which `names` does not contain; names:"
             f" {names or 'none'}"
@@ -125,17 +153,16 @@ def _nearest(
 
 
 def _binned(
-    action: Action, commands: NDArray[np.float64]
+    action: Action, commands: NDArray[np.float64], words: Sequence[str]
 ) -> tuple[NDArray[np.int64], tuple[str, ...]]:
     """Return the action of each command and all action names.
 
-    An action is a combination of bins, one for each field.
+    An action is a combination of bins, one for each element; `words` are the elements' names.
     """
     values = np.zeros(len(commands), np.int64)
     names = []
-    for field, edges, column in zip(action.fields, action.edges, commands.T, strict=True):
+    for word, edges, column in zip(words, action.edges, commands.T, strict=True):
         values = values * (len(edges) + 1) + np.digitize(column, edges)
-        word = field.rpartition(".")[2]
         limits = [f"{edge:g}" for edge in edges]
         between = [f"{low} to {high}" for low, high in itertools.pairwise(limits)]
         parts = [f"below {limits[0]}", *between, f"from {limits[-1]}"] if limits else ["any"]

@@ -203,6 +203,8 @@ def _limits(quantity: Quantity) -> tuple[float, float]:
 def _names(name: str, quantity: Quantity, count: int) -> list[str]:
     if quantity.transform is not None:
         return [f"{name}_{part}" for part in ("x", "y", "yaw")]
+    if isinstance(quantity.names, list) and quantity.names:
+        return [f"{name}_{element}" for element in quantity.names]
     return [name] if count == 1 else [f"{name}_{k}" for k in range(count)]
 
 

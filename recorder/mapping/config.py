@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import keyword
+import math
 from collections.abc import Iterator
 from collections.abc import Mapping as MappingOf
 from contextlib import contextmanager
@@ -21,12 +22,19 @@ from pydantic import (
 )
 
 from mcaprl.errors import UsageError, import_extra
+from mcaprl.recorder.format.spaces import MAX_ACTIONS
 
 TimeSource = Literal["log_time", "publish_time", "header"]
 Alignment = Literal["last", "nearest", "linear"]
 _EXPRESSION_NAMES = ("action", "terminated", "truncated")
 """Names in expressions that are not quantities."""
 Positive = Annotated[float, Field(gt=0)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+LARGEST = 3.4028234663852886e38
+"""Largest number of float32, in which observations and actions are stored."""
+Stored = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
+_Count = Annotated[int, Field(ge=1, le=2**16)]
+_MAX_RATE_HZ, _MAX_STACK = 1e9, 1024
 
 
 class _Part(BaseModel):
@@ -59,7 +67,9 @@ MessageTime = Annotated[
 class Clock(_Part):
     """Times of the steps: a fixed rate, or the messages of a topic."""
 
-    rate_hz: Positive | None = Field(default=None, description="Steps per second.")
+    rate_hz: Annotated[float, Field(gt=0, le=_MAX_RATE_HZ)] | None = Field(
+        default=None, description="Steps per second."
+    )
     topic: str | None = Field(default=None, description="Topic with one message for each step.")
     time: MessageTime | None = Field(
         default=None, description="Time of the topic's messages, if not that of the mapping."
@@ -78,8 +88,34 @@ class Quantity(_Part):
     """A named quantity: a field, an image or a transform, aligned with the steps."""
 
     field: str | None = Field(
-        default=None, description="Path of a field, such as `/odom.twist.twist.linear.x`."
+        default=None,
+        description="Path of a field, such as `/odom.twist.twist.linear.x`, `/scan.ranges[::10]`,"
+        " `/low.motors[3].q` or, for a vector, `/low.motors[0:12].q`.",
     )
+    names: str | list[str] | None = Field(
+        default=None,
+        description="Names of the elements to select, such as joints. Each element has the value of"
+        " the last message that contains its name. Names of arrays in arrays are joined, as in"
+        " `hip/position`. One name without brackets selects a number. Without `names`, the names"
+        " must not change; `[]` selects by position, whatever the names are.",
+    )
+    names_from: str | None = Field(
+        default=None,
+        description="Field of the message that contains the names, such as `joint_names` or"
+        " `items[:].id`. By default, it is found next to the field.",
+    )
+    pad: _Count | None = Field(
+        default=None,
+        description="Number of elements to which an array of any length is cut, or filled with the"
+        " number in `missing`.",
+    )
+    pool: Literal["min", "max", "mean"] | None = Field(
+        default=None,
+        description="How an array of any length is reduced to `to` elements, as scans are: each is"
+        " the `min`, `max` or `mean` of one of `to` equal sectors. NaN is ignored; `mean` ignores"
+        " infinite elements, too.",
+    )
+    to: _Count | None = Field(default=None, description="Number of sectors of `pool`.")
     image: str | None = Field(
         default=None, description="Topic of Image or CompressedImage messages."
     )
@@ -104,14 +140,17 @@ class Quantity(_Part):
     time: MessageTime | None = Field(
         default=None, description="Time of the messages, if not that of the mapping."
     )
-    missing: float | None = Field(
+    missing: Stored | None = Field(
         default=None,
-        description="Number that replaces missing values. Without it, a step is left out if an"
-        " observed value is missing.",
+        description="Number that replaces missing values, and each element that is NaN or infinite."
+        " Without it, a step is left out if an observed value or element is missing.",
     )
-    scale: float = Field(default=1.0, description="Factor of the value.")
-    offset: float = Field(default=0.0, description="Number added after scaling.")
-    clip: tuple[float, float] | None = Field(default=None, description="Lowest and highest value.")
+    scale: Finite = Field(default=1.0, description="Factor of the value.")
+    offset: Finite = Field(default=0.0, description="Number added after scaling.")
+    clip: tuple[float, float] | None = Field(
+        default=None,
+        description="Lowest and highest value. Infinite values are clipped, too; NaN is missing.",
+    )
     wrap_angle: bool = Field(default=False, description="Whether to wrap radians into [-pi, pi).")
     crop: tuple[int, int, int, int] | None = Field(
         default=None, description="Left, top, width and height of the cropped image, pixels."
@@ -133,39 +172,95 @@ class Quantity(_Part):
                 raise ValueError(f"{name} is for images only")
         if given == ["image"] and self.align == "linear":
             raise ValueError("images cannot be interpolated: use last or nearest")
-        if self.clip is not None and self.clip[0] >= self.clip[1]:
+        if self.clip is not None and not (_are_stored(*self.clip) and self.clip[0] < self.clip[1]):
             raise ValueError("clip must be the lowest value, then the highest value")
+        self._check_elements(is_field=given == ["field"] and self.as_ is None)
         return self
+
+    def _check_elements(self, *, is_field: bool) -> None:
+        for name in ("names", "names_from", "pad", "pool", "to"):
+            if getattr(self, name) is not None and not is_field:
+                raise ValueError(f"{name} is for a `field` without `as` only")
+        if (self.pool is None) != (self.to is None):
+            raise ValueError("give both pool and to")
+        if sum(bool(each) for each in (self.names, self.pad, self.pool)) > 1:
+            raise ValueError("give one of names, pad and pool")
+        if self.pad is not None and self.missing is None:
+            raise ValueError("pad needs `missing`, the number that fills the array")
+        _check_names(self.names, self.names_from)
+
+
+def _are_stored(*numbers: float) -> bool:
+    """Return whether float32 can represent the numbers, which may be infinite."""
+    return all(math.isinf(each) or abs(each) <= LARGEST for each in numbers)
+
+
+def _check_names(names: str | list[str] | None, names_from: str | None) -> None:
+    if isinstance(names, list) and len(set(names)) < len(names):
+        raise ValueError(f"the name '{max(names, key=names.count)}' is given twice")
+    if names_from is not None and not names:
+        raise ValueError("names_from needs `names`")
 
 
 class Limits(_Part):
     """Limits of continuous actions."""
 
-    low: list[float] = Field(description="Lowest value of each field.")
-    high: list[float] = Field(description="Highest value of each field.")
+    low: float | list[float] = Field(
+        description="Lowest value of each element of the command, or of all of them."
+    )
+    high: float | list[float] = Field(
+        description="Highest value of each element of the command, or of all of them."
+    )
+
+    @model_validator(mode="after")
+    def _are_in_order(self) -> Limits:
+        low, high = (each if isinstance(each, list) else [each] for each in (self.low, self.high))
+        if min(len(low), len(high)) != 1 and len(low) != len(high):
+            raise ValueError(f"low has {len(low)} entries, but high has {len(high)}")
+        count = max(len(low), len(high))
+        low, high = (each * (count // len(each)) for each in (low, high))
+        for number, (least, most) in enumerate(zip(low, high, strict=True)):
+            # Gymnasium needs finite numbers between the limits.
+            is_open = least < math.inf and most > -math.inf
+            if not (_are_stored(least, most) and least <= most and is_open):
+                raise ValueError(
+                    f"low must not be above high: entry {number} is {least:g}, {most:g}"
+                )
+        return self
 
 
 class Action(_Part):
-    """The action of each step: a discrete field, or fields with `actions`, `edges` or `box`."""
+    """The action of each step: a discrete field, or a command with `actions`, `edges` or `box`."""
 
     field: str | None = Field(
         default=None, description="Path of an integer, boolean or string field."
     )
     fields: list[str] = Field(
-        default=[], description="Paths of the fields of a continuous command."
+        default=[],
+        description="Paths of the fields of a continuous command. A path may select several"
+        " elements, such as `/cmd.position` or `/cmd.position[0:14]`.",
     )
-    names: dict[str, Annotated[int, Field(ge=0)]] = Field(
+    expressions: list[str] = Field(
+        default=[],
+        description="Elements of a continuous command as expressions of the quantities, such as"
+        " `next(x) - x`; see `reward`. A step without a value of all of them has no action.",
+    )
+    names: dict[str, Annotated[int, Field(ge=0)]] | list[str] = Field(
         default={},
-        description="Number of each action by its name. For a string field, the names are the"
-        " values of the field.",
+        description="Number of each action by its name; for a string field, the names are the"
+        " values of the field. For `fields`, a list: names of the elements to select, such as"
+        " joints; see the entries of observation.",
     )
-    actions: dict[str, list[float]] = Field(
+    names_from: str | None = Field(
+        default=None, description="Field of the message that contains the names of the elements."
+    )
+    actions: dict[str, list[Finite]] = Field(
         default={}, description="Named commands. The action is the nearest named command."
     )
-    edges: list[list[float]] = Field(
+    edges: list[list[Finite]] = Field(
         default=[],
-        description="Bin edges of each field, increasing. An action is a combination of bins, one"
-        " for each field.",
+        description="Bin edges of each element of the command, increasing. An action is a"
+        " combination of bins, one for each element.",
     )
     box: Limits | None = Field(
         default=None, description="Limits of a Box action; commands are clipped to them."
@@ -190,24 +285,62 @@ class Action(_Part):
 
     @model_validator(mode="after")
     def _has_one_kind(self) -> Action:
-        if bool(self.field) == bool(self.fields):
-            raise ValueError("give either field or fields")
+        given = [name for name in ("field", "fields", "expressions") if getattr(self, name)]
+        if len(given) != 1:
+            raise ValueError("give either field or fields, or expressions")
         kinds = [bool(self.actions), bool(self.edges), self.box is not None]
-        if self.fields and sum(kinds) != 1:
-            raise ValueError("fields need one of actions, edges and box")
-        if self.field and any(kinds):
+        if given != ["field"] and sum(kinds) != 1:
+            raise ValueError(f"{given[0]} need one of actions, edges and box")
+        if given == ["field"] and any(kinds):
             raise ValueError("use actions, edges and box with `fields`, not with `field`")
-        count = len(self.fields)
-        lengths = [len(command) for command in self.actions.values()]
-        lengths += [len(self.edges)] if self.edges else []
-        lengths += [len(self.box.low), len(self.box.high)] if self.box else []
-        if any(length != count for length in lengths):
-            raise ValueError(
-                f"each command, low, high and edges need {count} entries, one for each field"
-            )
+        if self.selected is not None and given != ["fields"]:
+            raise ValueError("a list of names is for `fields`")
+        _check_names(self.selected, self.names_from)
+        least = len(self.fields or self.expressions)
+        for name, length in self._lengths():
+            # The elements of a field are counted when the bag is known.
+            if length < least or (self.expressions and length > least):
+                raise ValueError(f"{name} needs {least} entries, one for each of {given[0]}")
         if any(sorted(set(each)) != each for each in self.edges):
             raise ValueError("edges must rise")
+        count = math.prod(len(each) + 1 for each in self.edges)
+        if count > MAX_ACTIONS:
+            raise ValueError(f"edges have {count} combinations; at most {MAX_ACTIONS} are possible")
         return self
+
+    @property
+    def numbers(self) -> dict[str, int]:
+        """Number of each discrete action by its name."""
+        return self.names if isinstance(self.names, dict) else {}
+
+    @property
+    def selected(self) -> list[str] | None:
+        """Names of the selected elements of `fields`; None if they are not selected by name."""
+        return self.names if isinstance(self.names, list) else None
+
+    def _lengths(self) -> list[tuple[str, int]]:
+        """Return the number of elements that each command, the edges and the limits have."""
+        found = [(f"the command '{name}'", len(each)) for name, each in self.actions.items()]
+        if self.edges:
+            found.append(("edges", len(self.edges)))
+        for name in ("low", "high"):
+            limit = getattr(self.box, name, None)
+            if isinstance(limit, list):
+                found.append((name, len(limit)))
+        return found
+
+    def check_count(self, count: int) -> None:
+        """Check that commands, edges and limits have an entry for each of `count` elements.
+
+        Raises:
+            UsageError: One of them has another length.
+        """
+        for name, length in self._lengths():
+            if length != count:
+                raise UsageError(
+                    f"{name} needs {count} entries, one for each element of the command, not"
+                    f" {length}"
+                )
 
 
 class Episodes(_Part):
@@ -263,7 +396,7 @@ class Mapping(_Part):
     )
     clock: Clock = Field(description="Times of the steps.")
     observation: dict[str, Quantity] = Field(description="Observed quantities by name.")
-    stack: Annotated[int, Field(ge=1)] = Field(
+    stack: Annotated[int, Field(ge=1, le=_MAX_STACK)] = Field(
         default=1, description="Number of observations that are stacked, the oldest first."
     )
     fields: dict[str, Quantity] = Field(
@@ -379,6 +512,9 @@ def load_mapping(source: str | Path | MappingOf[str, Any]) -> tuple[Mapping, Pla
         mark = getattr(error, "problem_mark", None)
         where = f"{path}:{mark.line + 1}" if mark else str(path)
         raise UsageError(f"{where}: not YAML: {getattr(error, 'problem', error)}") from error
+    # ruamel.yaml converts numbers and dates that are impossible, and nesting has no limit.
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{path}: a value cannot be read: {str(error)[:200]}") from error
     place = Place(str(path), tree)
     if not isinstance(tree, dict):
         raise UsageError(f"{path}: a mapping has keys and values, such as `clock: {{rate_hz: 10}}`")

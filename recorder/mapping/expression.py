@@ -43,7 +43,9 @@ FUNCTIONS: Final[dict[str, tuple[Callable[..., Any], int]]] = {
 """By name: a function that expressions can call, and the number of its arguments."""
 NEXT: Final = "next"
 """Name of the function that evaluates its argument at the next step."""
-_MAX_CHARACTERS, _MAX_DEPTH = 4000, 50
+_MAX_CHARACTERS, _MAX_DEPTH, _MAX_SHOWN = 4000, 50, 200
+_MAX_BITS = 1023
+"""Bits of the largest integer that float64 can represent."""
 _STRING = "a string can only be compared with a string, using == or !="
 
 _BINARY: Final[dict[type[ast.operator], Callable[..., Any]]] = {
@@ -88,7 +90,7 @@ class Expression:
         try:
             self._tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-            raise UsageError(f"'{text}' is not an expression: {error}") from error
+            raise UsageError(f"'{self._shown}' is not an expression: {error}") from error
         self._check(self._tree, 0)
         self.names = frozenset(
             node.id
@@ -115,10 +117,10 @@ class Expression:
         try:
             with np.errstate(all="ignore"):
                 found = np.asarray(self._value(self._tree, columns, following))
-        except (TypeError, ValueError, IndexError) as error:
-            raise UsageError(f"'{self.text}' cannot be evaluated: {error}") from error
+        except (TypeError, ValueError, IndexError, OverflowError) as error:
+            raise UsageError(f"'{self._shown}' cannot be evaluated: {error}") from error
         if found.ndim > 1 or found.dtype.kind not in "biuf":
-            raise UsageError(f"'{self.text}' must be one number for each row")
+            raise UsageError(f"'{self._shown}' must be one number for each row")
         return np.broadcast_to(found, following.shape)
 
     def is_condition(self, columns: Mapping[str, Column]) -> bool:
@@ -141,22 +143,24 @@ class Expression:
 
     def _check(self, node: ast.AST, depth: int) -> None:
         if depth > _MAX_DEPTH:
-            raise UsageError(f"'{self.text[:60]}...' is nested too deeply")
+            raise UsageError(f"'{self._shown}' is nested too deeply")
         allowed: tuple[type[ast.AST], ...] = (ast.Name, ast.Constant, ast.BinOp, ast.UnaryOp)
         allowed += (ast.BoolOp, ast.Compare, ast.IfExp, ast.Call, ast.Subscript)
         if not isinstance(node, allowed):
             raise self._refused(node)
         match node:
             case ast.Name(id=name) if name in FUNCTIONS or name == NEXT:
-                raise UsageError(f"'{self.text}': {name} is a function; call it as {name}(...)")
+                raise UsageError(f"'{self._shown}': {name} is a function; call it as {name}(...)")
             case ast.Constant(value=value) if not isinstance(value, bool | int | float | str):
                 raise self._refused(node)
+            case ast.Constant(value=int(value)) if value.bit_length() > _MAX_BITS:
+                raise UsageError(f"'{self._shown}' has a number that is too large")
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
                 count = 1 if name == NEXT else FUNCTIONS.get(name, (None, -1))[1]
                 if count < 0:
                     raise UnknownNameError("function", name, [*FUNCTIONS, NEXT])
                 if len(args) != count:
-                    raise UsageError(f"'{self.text}': {name} needs {count} arguments")
+                    raise UsageError(f"'{self._shown}': {name} needs {count} arguments")
                 parts = args
             case ast.Call():
                 raise self._refused(node)
@@ -179,10 +183,19 @@ class Expression:
         for part in parts:
             self._check(part, depth + 1)
 
+    @property
+    def _shown(self) -> str:
+        """Text for error messages."""
+        return _shortened(self.text)
+
     def _refused(self, node: ast.AST) -> UsageError:
-        part = ast.unparse(node)
+        try:
+            part = _shortened(ast.unparse(node))
+        # The expression may be nested more deeply than `_MAX_DEPTH`.
+        except RecursionError:
+            part = self._shown
         return UsageError(
-            f"'{self.text}': '{part}' is not allowed; use names, numbers, operators, and"
+            f"'{self._shown}': '{part}' is not allowed; use names, numbers, operators, and"
             f" {', '.join([*FUNCTIONS, NEXT])}"
         )
 
@@ -232,6 +245,10 @@ class Expression:
                 return FUNCTIONS[name][0](*(_number(value(part)) for part in args))
             case _:
                 raise AssertionError(f"{ast.dump(node)} was checked")
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
 
 
 def _is_integer(node: ast.AST) -> bool:

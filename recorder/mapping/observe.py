@@ -10,9 +10,22 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
+from mcaprl.recorder.bags.values import path_text, without_lacks
 from mcaprl.recorder.mapping.align import NONE, Matches, during, interpolated, last, nearest
-from mcaprl.recorder.mapping.config import Quantity
-from mcaprl.recorder.mapping.paths import FieldPath, as_numbers, field_path, topic_of
+from mcaprl.recorder.mapping.config import LARGEST, Quantity
+from mcaprl.recorder.mapping.names import Named, by_names, check_order, names_field
+from mcaprl.recorder.mapping.paths import (
+    FieldPath,
+    as_numbers,
+    check_lacks,
+    field_path,
+    padded,
+    path_in,
+    pooled,
+    rows_of,
+    topic_of,
+    unknown_field,
+)
 from mcaprl.recorder.mapping.runs import Messages
 from mcaprl.recorder.mapping.streams import TopicStream
 from mcaprl.recorder.mapping.transforms import TF, TF_STATIC, Transforms, yaw_of
@@ -42,11 +55,17 @@ class Source(NamedTuple):
         topic: Topic that contains the quantity.
         fields: Fields to read; empty for images and transforms.
         path: Path of the field; None for images and transforms.
+        names: Field with the names of the elements; empty if they have none.
+        unlisted: Error if no message has the field; None if the type lists it.
+        cache: Columns that were read, and the values that were made of them for all runs.
     """
 
     topic: str
     fields: tuple[str, ...]
     path: FieldPath | None
+    names: str = ""
+    unlisted: UsageError | None = None
+    cache: list[tuple[Any, Named]] | None = None
 
 
 def source_of(bag: Bag, quantity: Quantity) -> Source:
@@ -63,13 +82,24 @@ def source_of(bag: Bag, quantity: Quantity) -> Source:
     if quantity.as_ == "count":
         return Source(topic_of(bag, quantity.field), (), None)
     path = field_path(bag, quantity.field)
+    info = bag.topics[path.topic]
     if quantity.as_ == "yaw":
-        fields = tuple(f"{path.field}.{axis}" for axis in _QUATERNION)
-        known = bag.topics[path.topic].fields
-        if known and not set(fields) <= set(known):
+        fields = tuple(
+            path_in(path.topic, path_text((*path.steps, axis))).field for axis in _QUATERNION
+        )
+        if not all(map(info.may_have, fields)):
             raise UsageError(f"{path} is not a quaternion with x, y, z and w")
-        return Source(path.topic, fields, path)
-    return Source(path.topic, (path.field,), path)
+        return Source(path.topic, fields, path, cache=[])
+    names = names_field(info, path, quantity)
+    is_unlisted = bool(info.fields) and not info.lists(path.field)
+    return Source(
+        path.topic,
+        (path.field, *([names] if names else [])),
+        path,
+        names,
+        unknown_field(bag, path) if is_unlisted else None,
+        [],
+    )
 
 
 def pose_of(
@@ -117,22 +147,66 @@ def values_of(
         rows = _rows(run, match)
         places = np.where(rows == NONE, NONE, stream.rows[rows]) if len(stream.rows) else rows
         return Values(places, rows == NONE, match.age_s)
-    column = _column(quantity, source, stream)
-    if column.dtype.kind == "O":
+    updates = _updates(quantity, source, stream)
+    if updates.values.dtype.kind == "O":
+        run = _within(run, updates.present)
         match = _match(quantity, run, steps_ns, ends_ns, gap_s)
         rows = _rows(run, match)
         texts = np.full(len(rows), None, object)
-        texts[rows != NONE] = column[rows[rows != NONE]]
-        return Values(texts, rows == NONE, match.age_s)
+        texts[rows != NONE] = updates.values[rows[rows != NONE]]
+        return Values(texts, np.array([text is None for text in texts], bool), match.age_s)
+    if updates.present is None or updates.present.ndim == 1:
+        part = _within(run, updates.present)
+        found, match = _aligned(quantity, updates.values, part, steps_ns, ends_ns, gap_s)
+        return _shaped(quantity, found, match.rows == NONE, match.age_s)
+    # Each element is in other messages than the others.
+    parts = [
+        _aligned(quantity, column, _within(run, present), steps_ns, ends_ns, gap_s)
+        for column, present in zip(updates.values.T, updates.present.T, strict=True)
+    ]
+    found = np.column_stack([values for values, _ in parts])
+    missing = np.any([match.rows == NONE for _, match in parts], axis=0)
+    ages_s = np.stack([match.age_s for _, match in parts])
+    oldest = np.nan_to_num(np.abs(ages_s), nan=-1.0).argmax(axis=0)
+    age_s = ages_s[oldest, np.arange(len(steps_ns))]
+    return _shaped(quantity, found, missing, age_s)
+
+
+def _within(run: Messages, present: NDArray[np.bool_] | None) -> Messages:
+    """Return the messages of a run that are updates of a field."""
+    if present is None:
+        return run
+    kept = present[run.rows]
+    return run._replace(times_ns=run.times_ns[kept], rows=run.rows[kept])
+
+
+def _aligned(
+    quantity: Quantity,
+    column: NDArray[np.float64],
+    run: Messages,
+    steps_ns: NDArray[np.int64],
+    ends_ns: NDArray[np.int64] | None,
+    gap_s: float,
+) -> tuple[NDArray[np.float64], Matches]:
+    """Return the values at the steps, NaN where missing, and their messages."""
     if quantity.align == "linear" and ends_ns is None:
-        column = _unwrapped(quantity, column[run.rows])
-        found, match = interpolated(run.times_ns, column, steps_ns, quantity.tolerance_s, gap_s)
-    else:
-        match = _match(quantity, run, steps_ns, ends_ns, gap_s)
-        rows = _rows(run, match)
-        found = np.full((len(rows), *column.shape[1:]), np.nan)
-        found[rows != NONE] = column[rows[rows != NONE]]
-    return _shaped(quantity, found, match.rows == NONE, match.age_s)
+        values = _unwrapped(quantity, _finite(quantity, column[run.rows]))
+        # What is between infinite values is missing.
+        with np.errstate(invalid="ignore", over="ignore"):
+            return interpolated(run.times_ns, values, steps_ns, quantity.tolerance_s, gap_s)
+    match = _match(quantity, run, steps_ns, ends_ns, gap_s)
+    rows = _rows(run, match)
+    found = np.full((len(rows), *column.shape[1:]), np.nan)
+    found[rows != NONE] = column[rows[rows != NONE]]
+    return found, match
+
+
+def _finite(quantity: Quantity, column: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Clip infinite values, because interpolation between them would be NaN."""
+    if quantity.clip is None or not quantity.scale:
+        return column
+    ends = (np.array(quantity.clip) - quantity.offset) / quantity.scale
+    return np.where(np.isinf(column), np.clip(column, ends.min(), ends.max()), column)
 
 
 def _match(
@@ -159,16 +233,63 @@ def _rows(run: Messages, match: Matches) -> NDArray[np.int64]:
     return rows
 
 
-def _column(quantity: Quantity, source: Source, stream: TopicStream) -> NDArray[Any]:
-    """Return the field's column: numbers (M,) or (M, K), or texts (M,)."""
-    assert source.path is not None, "the quantity is a field"
+def _updates(quantity: Quantity, source: Source, stream: TopicStream) -> Named:
+    """Return the field's column: numbers (M,) or (M, K), or texts (M,), and which are updates."""
+    columns, cache = stream.columns, source.cache if source.cache is not None else []
+    if not cache or cache[0][0] is not columns:
+        cache[:] = [(columns, _new_updates(quantity, source, stream))]
+    return cache[0][1]
+
+
+def _new_updates(quantity: Quantity, source: Source, stream: TopicStream) -> Named:
+    path = source.path
+    assert path is not None, "the quantity is a field"
+    absent = [stream.absent[name] for name in source.fields if name in stream.absent]
     if quantity.as_ == "yaw":
-        parts = [as_numbers(stream.columns[name], str(source.path)) for name in source.fields]
-        return yaw_of(np.column_stack(parts))
-    column = stream.columns[source.path.field]
-    if column.dtype.kind == "O" and all(isinstance(value, str) for value in column.tolist()):
-        return column
-    return source.path.select(as_numbers(column, str(source.path)))
+        parts = [as_numbers(stream.columns[name], str(path)) for name in source.fields]
+        if any(part.ndim > 1 for part in parts):
+            raise UsageError(f"{path} is not one quaternion; choose one of them by an index")
+        present = ~np.logical_or.reduce(absent) if absent else None
+        return Named(yaw_of(np.column_stack(parts)), present)
+    column = stream.columns[path.field]
+    present = ~stream.absent[path.field] if path.field in stream.absent else None
+    if source.unlisted is not None and present is not None and not present.any():
+        raise source.unlisted
+    if source.names and quantity.names:
+        return by_names(path, column, stream.columns[source.names], quantity.names)
+    optional = quantity.missing is not None
+    if column.dtype.kind == "O":
+        check_lacks(path, column.tolist(), optional=optional)
+        column = without_lacks(column)
+    if source.names:
+        check_order(path, column, stream.columns[source.names])
+    column = path.select(column, optional=optional)
+    if column.dtype.kind == "O" and _are_texts(column):
+        return Named(column, present)
+    return Named(_vector(quantity, path, column), present)
+
+
+def _are_texts(column: NDArray[Any]) -> bool:
+    """Return whether all values are strings, except missing ones."""
+    values = [value for value in column.tolist() if value is not None]
+    return bool(values) and all(isinstance(value, str) for value in values)
+
+
+def _vector(quantity: Quantity, path: FieldPath, column: NDArray[Any]) -> NDArray[np.float64]:
+    """Return a column as numbers, with arrays of equal length."""
+    if quantity.pad is None and quantity.pool is None:
+        found = as_numbers(column, str(path), is_filled=path.is_bounded)
+    else:
+        rows = list(column) if column.ndim > 1 else rows_of(column, str(path))
+        if any(row is not None and np.ndim(row) == 0 for row in rows):
+            raise UsageError(f"{path} is not an array: remove `pad` or `pool`")
+        if quantity.pool is None:
+            found = padded(rows, quantity.pad or 0)
+        else:
+            found = pooled(rows, quantity.pool, quantity.to or 0)
+    if found.ndim > 1 and not found.shape[1] and len(found):
+        raise UsageError(f"{path}: no elements; the field has 0 elements in all messages")
+    return found
 
 
 def _unwrapped(quantity: Quantity, column: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -189,8 +310,13 @@ def _shaped(
         found = (found + math.pi) % (2 * math.pi) - math.pi
     if quantity.clip is not None:
         found = np.clip(found, *quantity.clip)
-    has_gap = ~np.isfinite(found)
-    missing = missing | (has_gap.any(axis=1) if found.ndim > 1 else has_gap)
+    # Observations are float32, in which larger numbers are infinite.
+    has_gap = is_missing = ~(np.abs(found) <= LARGEST)
+    if found.ndim > 1:
+        # If a number replaces missing elements, a vector is missing only as a whole.
+        over = np.any if quantity.missing is None else np.all
+        has_gap = over(has_gap, axis=1)
+    missing = missing | has_gap
     if quantity.missing is not None:
-        found = np.where(np.isfinite(found), found, quantity.missing)
+        found = np.where(is_missing, quantity.missing, found)
     return Values(found, missing, age_s)

@@ -57,7 +57,8 @@ class Plan:
         place: Positions of the mapping's keys in its file, for error messages.
         quantities: Observed and other quantities, by name.
         behavior_prob: Probability of the action; None if unknown.
-        commands: Fields of the action.
+        commands: Fields of the action; empty if it consists of expressions.
+        expressions: Expressions of the action.
         conditions: Conditions of the episodes: `begin`, `end`, `terminated`, `truncated`.
         reasons: Conditions of the end reasons, by reason.
         reward: Function that computes the rewards.
@@ -85,10 +86,21 @@ class Plan:
         self.commands = [
             self._wanted(
                 ("action",),
-                Quantity(field=path, align=align, tolerance_s=action.tolerance_s, time=action.time),
+                Quantity(
+                    field=path,
+                    align=align,
+                    tolerance_s=action.tolerance_s,
+                    time=action.time,
+                    names=action.selected,
+                    names_from=action.names_from,
+                ),
                 is_during=is_during,
             )
             for path in paths
+        ]
+        self.expressions = [
+            self._expression(("action", "expressions", number), text)
+            for number, text in enumerate(action.expressions)
         ]
         self.behavior_prob = None
         if (prob := mapping.behavior_prob) is not None:
@@ -128,7 +140,7 @@ class Plan:
         time = part.time or self.mapping.time
         return topic if time == self.mapping.time else f"{topic} by {_text(time)}"
 
-    def _expression(self, keys: tuple[str, ...], text: str) -> Expression:
+    def _expression(self, keys: tuple[str | int, ...], text: str) -> Expression:
         with self.place.named(*keys):
             return Expression(text)
 

@@ -109,7 +109,9 @@ def _report(
         values = [run.quantities[name] for run in runs]
         missing = np.concatenate([each.missing for each in values])
         ages_s = np.concatenate([each.age_s for each in values])
-        fields[name] = FieldReport.of(wanted.source.topic, missing, ages_s)
+        fields[name] = FieldReport.of(
+            wanted.source.topic, missing, ages_s, [each.values for each in values]
+        )
     offsets = np.cumsum([0, *(len(run.times_ns) for run in runs)]).tolist()
     taken = [
         offset + np.arange(each.first, each.last)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
-from mcaprl.recorder.mapping.actions import Actions, actions_of
+from mcaprl.recorder.mapping.actions import Actions, CommandPart, actions_of
 from mcaprl.recorder.mapping.clock import (
     Ticks,
     distinct,
@@ -106,7 +106,6 @@ class StepReader:
         quantities = {
             name: self._values(wanted, run, ticks) for name, wanted in plan.quantities.items()
         }
-        actions = self._actions(run, ticks)
         probs = np.full(len(times_ns), np.nan, np.float32)
         if plan.behavior_prob is not None:
             found = self._values(plan.behavior_prob, run, ticks)
@@ -119,9 +118,10 @@ class StepReader:
                 if plan.quantities[name].quantity.image is None
             },
         }
+        following = np.minimum(np.arange(len(times_ns)) + 1, max(len(times_ns) - 1, 0))
+        actions = self._actions(run, ticks, columns, following)
         if actions.values.ndim == 1:
             columns["action"] = actions.values
-        following = np.minimum(np.arange(len(times_ns)) + 1, max(len(times_ns) - 1, 0))
         conditions = self._conditions(("episodes",), plan.conditions, columns, following)
         reasons = self._conditions(("episodes", "reasons"), plan.reasons, columns, following)
         nothing = np.zeros(len(times_ns), bool)
@@ -215,25 +215,38 @@ class StepReader:
         with self._plan.place.named(*wanted.keys):
             numbers = as_numbers(found.values, str(wanted.source.path))
             if numbers.ndim > 1:
+                assert wanted.source.path is not None, "only fields have elements"
                 raise UsageError(
                     f"{wanted.source.path} has {numbers.shape[1]} elements; choose one of them,"
-                    f" such as {wanted.source.path}[0]"
+                    f" such as {wanted.source.path.first}"
                 )
             return numbers
 
-    def _actions(self, run: Run, ticks: Ticks) -> Actions:
-        action = self._mapping.action
-        found = [self._values(wanted, run, ticks) for wanted in self._plan.commands]
-        missing = np.logical_or.reduce([each.missing for each in found])
-        columns = [
-            # Only a single discrete field may be a text.
-            each.values
-            if action.field is not None and each.values.dtype.kind == "O"
-            else self._scalars(wanted, each)
-            for wanted, each in zip(self._plan.commands, found, strict=True)
-        ]
-        with self._plan.place.named("action"):
-            return actions_of(action, columns, missing)
+    def _actions(
+        self,
+        run: Run,
+        ticks: Ticks,
+        columns: dict[str, NDArray[Any]],
+        following: NDArray[np.int64],
+    ) -> Actions:
+        action, plan = self._mapping.action, self._plan
+        commands = []
+        for wanted in plan.commands:
+            found = self._values(wanted, run, ticks)
+            # Only a single discrete field may be a text, and only other fields have elements.
+            if action.field is None:
+                with plan.place.named(*wanted.keys):
+                    numbers = as_numbers(found.values, str(wanted.source.path))
+                found = found._replace(values=numbers)
+            elif found.values.dtype.kind != "O":
+                found = found._replace(values=self._scalars(wanted, found))
+            commands.append(_command(wanted, found))
+        for place, expression in enumerate(plan.expressions):
+            with plan.place.named("action", "expressions", place):
+                values = expression.evaluate(columns, following).astype(np.float64)
+            commands.append(CommandPart(expression.text, values, np.isnan(values)))
+        with plan.place.named("action"):
+            return actions_of(action, commands)
 
     def _conditions(
         self,
@@ -259,3 +272,12 @@ class StepReader:
                 is_stale = np.abs(values.age_s) > self._mapping.episodes.gap_s
             usable &= ~values.missing & ~is_stale
         return usable
+
+
+def _command(wanted: Wanted, found: Values) -> CommandPart:
+    """Return a field of the command, named by the last part of its path."""
+    path, names = wanted.source.path, wanted.quantity.names
+    assert path is not None, "commands are fields"
+    whole = path._replace(elements=None) if isinstance(path.elements, slice) else path
+    word = str(whole).rpartition(".")[2]
+    return CommandPart(word, found.values, found.missing, tuple(names or ()))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -55,10 +55,18 @@ class TopicStream:
         keep = ~np.isin(found.rows, self._left_out)
         if self._stamp is not None:
             keep &= _is_time(self._stamp.select(found.columns[self._stamp.field]), self._unit_ns)
+            if len(keep) and not keep.any():
+                raise UsageError(
+                    f"{self.topic}: no message has a time in {self._stamp.field}: use"
+                    " `time: log_time`"
+                )
         if keep.all():
             return found
-        columns = {name: column[keep] for name, column in found.columns.items()}
-        return Stream(found.log_time_ns[keep], columns, found.rows[keep], found.failures)
+        columns, absent = (
+            {name: column[keep] for name, column in part.items()}
+            for part in (found.columns, found.absent)
+        )
+        return Stream(found.log_time_ns[keep], columns, found.rows[keep], found.failures, absent)
 
     def leave_out(self, failures: Iterable[Failure]) -> None:
         """Leave out more messages, such as those with damaged images."""
@@ -72,6 +80,11 @@ class TopicStream:
     def columns(self) -> dict[str, NDArray[Any]]:
         """Columns of the fields, in the order of recording."""
         return self._read.columns
+
+    @property
+    def absent(self) -> Mapping[str, NDArray[np.bool_]]:
+        """(M,) flags of the messages that omit a field; see `Stream.absent`."""
+        return self._read.absent
 
     @property
     def rows(self) -> NDArray[np.int64]:
@@ -128,12 +141,8 @@ def _stamp_of(bag: Bag, topic: str, time: TimeSource | Stamp) -> tuple[FieldPath
 
 
 def _is_time(stamps: NDArray[Any], unit_ns: int) -> NDArray[np.bool_]:
-    """Return whether stamps are numbers that are times in nanoseconds.
-
-    Raises:
-        UsageError: The stamps are not numbers.
-    """
-    if stamps.ndim != 1 or stamps.dtype.kind not in "iuf":
-        raise UsageError("the stamps are not numbers: use another field as `time`")
+    """Return whether stamps are numbers that are times in nanoseconds."""
+    if stamps.dtype.kind not in "iuf" or stamps.ndim != 1:
+        return np.zeros(len(stamps), bool)
     found: NDArray[np.bool_] = np.abs(stamps.astype(np.float64)) * unit_ns < _MAX_NS
     return found

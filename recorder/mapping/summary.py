@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -24,21 +25,30 @@ class FieldReport:
         missing: Share of the steps without a value.
         median_age_s: Median age of the value at its step, seconds; NaN if no step has a value.
         max_age_s: Largest age, seconds; NaN if no step has a value.
+        elements: Indexes of the elements that are missing at steps at which others are not.
     """
 
     topic: str
     missing: float
     median_age_s: float
     max_age_s: float
+    elements: tuple[int, ...] = ()
 
     @classmethod
-    def of(cls, topic: str, missing: NDArray[np.bool_], ages_s: NDArray[np.float64]) -> FieldReport:
-        """Summarize flags `missing` and ages `ages_s` of N steps."""
+    def of(
+        cls,
+        topic: str,
+        missing: NDArray[np.bool_],
+        ages_s: NDArray[np.float64],
+        values: Sequence[NDArray[Any]] = (),
+    ) -> FieldReport:
+        """Summarize flags `missing`, ages `ages_s` and `values` of N steps."""
         known = np.abs(ages_s[np.isfinite(ages_s)])
         median, largest = (np.nan, np.nan)
         if len(known):
             median, largest = float(np.median(known)), float(known.max())
-        return cls(topic, float(missing.mean()) if len(missing) else 1.0, median, largest)
+        share = float(missing.mean()) if len(missing) else 1.0
+        return cls(topic, share, median, largest, _missing_elements(values))
 
     def __str__(self) -> str:
         """Return the statistics as text for a table."""
@@ -47,7 +57,26 @@ class FieldReport:
             if np.isnan(self.median_age_s)
             else (f", {self.median_age_s:.3f} s old (median), at most {self.max_age_s:.3f} s")
         )
-        return f"{self.topic}, missing {self.missing:.1%}{age}"
+        return f"{self.topic}, missing {self.missing:.1%}{self.which}{age}"
+
+    @property
+    def which(self) -> str:
+        """Which elements are missing, as text; empty if it is the whole value."""
+        if not self.elements:
+            return ""
+        some = ", ".join(map(str, self.elements[:8]))
+        word = "element" if len(self.elements) == 1 else "elements"
+        return f" ({word} {some}{', ...' if len(self.elements) > 8 else ''})"
+
+
+def _missing_elements(values: Sequence[NDArray[Any]]) -> tuple[int, ...]:
+    """Return the indexes of the elements that are missing where others are not."""
+    found: set[int] = set()
+    for each in values:
+        if each.ndim == 2 and each.dtype.kind == "f":
+            is_gap = ~np.isfinite(each)
+            found |= set(np.flatnonzero(is_gap[~is_gap.all(axis=1)].any(axis=0)).tolist())
+    return tuple(sorted(found))
 
 
 def _dropped(lengths: list[int]) -> str:
@@ -102,7 +131,7 @@ class MappingReport:
         found = [*self.left_out]
         found += [
             Problem(
-                f"{name} is missing at {field.missing:.0%} of the steps",
+                f"{name} is missing at {field.missing:.0%} of the steps{field.which}",
                 field.topic,
                 next="set `missing` or a larger `tolerance_s`, or remove the quantity",
             )
@@ -148,8 +177,13 @@ class MappingReport:
         if self.missing_actions == 1.0:
             return "no step has an action"
         if share == 1.0:
-            return f"{worst} ({self.fields[worst].topic}) has no value at any step"
+            what = f"{worst} ({self.fields[worst].topic}) has no value at any step"
+            which = self.fields[worst].which
+            return f"{what}{which}: set `missing` or `clip`" if which else what
         if self.dropped:
             longest = counted(max(self.dropped), "step")
             return f"the longest of {counted(len(self.dropped), 'episode')} has {longest}"
-        return f"no episode begins; {worst} is missing at {share:.0%} of {self.clock_steps} steps"
+        return (
+            f"no episode begins; {worst} is missing at {share:.0%} of {self.clock_steps} steps"
+            f"{self.fields[worst].which}"
+        )

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.recorder.bags.bag import Stream, TopicInfo
+from mcaprl.recorder.bags.values import ABSENT, column_of, value_at
 
 SECOND_NS = 10**9
 
@@ -29,7 +30,8 @@ class MemoryBag:
     ) -> None:
         """Store the `(times_s, columns)` of each topic.
 
-        A column of lists with different lengths becomes an array with dtype `object`.
+        A column of lists with different lengths, or of dicts and lists of dicts, becomes an array
+        with dtype `object`. Paths such as `motors[3].q` are read from it.
         """
         self._times: dict[str, NDArray[np.int64]] = {}
         self._columns: dict[str, dict[str, NDArray[Any]]] = {}
@@ -72,8 +74,19 @@ class MemoryBag:
         self, topic: str, fields: Sequence[str], rows: NDArray[np.int64] | None = None
     ) -> Stream:
         chosen = np.arange(len(self._times[topic])) if rows is None else rows
-        columns = {name: self._columns[topic][name][chosen] for name in fields}
-        return Stream(self._times[topic][chosen], columns, chosen)
+        columns, absent = {}, {}
+        for name in fields:
+            column = self._columns[topic].get(name)
+            if column is None:
+                every = self._columns[topic]
+                values = [
+                    value_at({key: each[row] for key, each in every.items()}, name)
+                    for row in range(len(self._times[topic]))
+                ]
+                column = column_of(values, "")
+                absent[name] = np.array([value is ABSENT for value in values], bool)[chosen]
+            columns[name] = column[chosen]
+        return Stream(self._times[topic][chosen], columns, chosen, (), absent)
 
     def close(self) -> None:
         """Do nothing."""
@@ -82,10 +95,8 @@ class MemoryBag:
 def _column(values: Any) -> NDArray[Any]:
     if isinstance(values, np.ndarray):
         return values
-    is_text = bool(values) and isinstance(values[0], str | bytes)
-    is_list = bool(values) and isinstance(values[0], list) and len(set(map(len, values))) > 1
-    if is_text or is_list:
-        column = np.empty(len(values), object)
-        column[:] = values
-        return column
-    return np.array(values, np.float64)
+    flat = [item for value in values for item in (value if isinstance(value, list) else [value])]
+    lengths = {len(value) if isinstance(value, list) else -1 for value in values}
+    if all(isinstance(item, int | float) for item in flat) and len(lengths) < 2:
+        return np.array(values, np.float64)
+    return np.fromiter(values, object, len(values))

@@ -47,7 +47,7 @@ def test_a_good_mapping_has_defaults(tmp_path: Path) -> None:
         ("rate_hz: 10", "rate_hz: -1", ":1: clock.rate_hz: Input should be greater than 0"),
         ("rate_hz: 10", "rate_hz: 10, topic: /a", ":1: clock: give either rate_hz or topic"),
         ("{field: /mode.data}", "{fields: [/a.b]}", "action: fields need one of actions, edges"),
-        ("{field: /mode.data}", "{fields: [/a.b], edges: [[1], [2]]}", "need 1 entries, one for"),
+        ("{field: /mode.data}", "{fields: [/a.b, /a.c], edges: [[1]]}", "needs 2 entries, one"),
         ("{field: /mode.data}", "{fields: [/a.b], edges: [[2, 1]]}", "action: edges must rise"),
         ("  speed:", "  a-b:", "observation has"),
         ("speed:", "action:", "'action' has another meaning in expressions: use another name"),
@@ -56,6 +56,49 @@ def test_a_good_mapping_has_defaults(tmp_path: Path) -> None:
         ("clock:", "clocks:", ":1: clocks: unknown key; nearest: clock"),
         ("clip: [0, 1]", "resize: [4, 4]", "observation.speed: resize is for images only"),
         ("{rate_hz: 10}", "{rate_hz: 10", "not YAML"),
+        ("rate_hz: 10", "rate_hz: .inf", ":1: clock.rate_hz: Input should be less than or equal"),
+        ("rate_hz: 10", "rate_hz: 1e300", ":1: clock.rate_hz: Input should be less than or equal"),
+        ("clock:", f"stack: {10**9}\nclock:", ":1: stack: Input should be less than or equal to 1"),
+        ("clock:", f"stack: {2**63}\nclock:", ":1: stack: Input should be less than or equal to 1"),
+        ("clip: [0, 1]", "missing: .nan", ":5: observation.speed.missing: Input should be a fin"),
+        ("clip: [0, 1]", "clip: [.nan, 1]", "clip must be the lowest value"),
+        ("clip: [0, 1]", "clip: [0, 1e300]", "clip must be the lowest value"),
+        ("{field: /mode.data}", "{}", "action: give either field or fields, or expressions"),
+        ("{field: /mode.data}", "{field: /a.b, expressions: [x]}", "action: give either field or"),
+        ("{field: /mode.data}", "{expressions: [x]}", "expressions need one of actions, edges"),
+        ("{field: /mode.data}", "{field: /a.b, names: [x]}", "a list of names is for `fields`"),
+        (
+            "{field: /mode.data}",
+            "{expressions: [x], edges: [[1], [2]]}",
+            "edges needs 1 entries, one for each of expressions",
+        ),
+        (
+            "{field: /mode.data}",
+            f"{{fields: [/a.b], edges: {[[*range(10)]] * 8}}}",
+            "action: edges have 214358881 combinations; at most 1048576 are possible",
+        ),
+        ("{field: /mode.data}", "{fields: [/a.b], edges: [[.nan]]}", "Input should be a finite"),
+        (
+            "{field: /mode.data}",
+            "{fields: [/a.b], box: {low: 1, high: 0}}",
+            ":6: action.box: low must not be above high: entry 0 is 1, 0",
+        ),
+        (
+            "{field: /mode.data}",
+            "{fields: [/a.b, /a.c], box: {low: [0, .nan], high: 1}}",
+            "low must not be above high: entry 1 is nan, 1",
+        ),
+        (
+            "{field: /mode.data}",
+            "{fields: [/a.b], box: {low: [0, 0], high: [1, 1, 1]}}",
+            "low has 2 entries, but high has 3",
+        ),
+        (
+            "{field: /mode.data}",
+            "{fields: [/a.b], box: {low: [], high: 1}}",
+            "low has 0 entries, but high has 1",
+        ),
+        ("{field: /mode.data}", "{fields: [/a.b], box: {low: .inf, high: .inf}}", "entry 0 is inf"),
     ],
 )
 def test_errors_name_file_line_and_key(tmp_path: Path, old: str, new: str, expected: str) -> None:
@@ -87,6 +130,18 @@ def test_files_that_are_not_mappings_are_refused(tmp_path: Path) -> None:
     (tmp_path / "robot.yaml").write_bytes(b"\xff\xfe")
     with pytest.raises(UsageError, match="is not UTF-8 text"):
         load_mapping(tmp_path / "robot.yaml")
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["2024-13-45", "!!int abc", "!!float abc", "9" * 5000, "[" * 900, "{a: " * 900],
+)
+def test_values_that_yaml_cannot_convert_are_one_line(tmp_path: Path, value: str) -> None:
+    path = written(tmp_path, GOOD.replace("rate_hz: 10", f"rate_hz: {value}"))
+    with pytest.raises(UsageError) as error:
+        load_mapping(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 def test_yaml_tags_make_no_objects(tmp_path: Path) -> None:

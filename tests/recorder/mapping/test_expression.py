@@ -122,3 +122,13 @@ def test_no_text_does_anything_but_evaluate_or_fail_clearly(text: str) -> None:
     except UsageError:
         return
     assert found.shape == (4,)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["1" * 400, f"-{'9' * 400}", f"x{'.b' * 1900}", f"x{'()' * 1900}", f"{'x[' * 900}0{']' * 900}"],
+)
+def test_large_numbers_and_deep_nesting_are_one_short_line(text: str) -> None:
+    with pytest.raises(UsageError) as error:
+        Expression(text)
+    assert len(str(error.value)) < 700

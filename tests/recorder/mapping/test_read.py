@@ -163,6 +163,38 @@ def test_commands_become_named_actions_and_bins_and_boxes() -> None:
     assert report.far_actions == pytest.approx(1 / 3)
 
 
+def test_commands_are_expressions() -> None:
+    times = [0, 1, 2, 3, 4]
+    bag = MemoryBag(
+        {
+            "/odom": (times, {"speed": [0.0, 1.0, 3.0, 6.0, 10.0]}),
+            "/arm": ([0, 1, 3, 4], {"q": [[0.0, 5.0], [1.0, 5.0], [1.0, 9.0], [math.nan, 2.0]]}),
+        }
+    )
+    quantities = {
+        "observation": {"speed": {"field": "/odom.speed"}},
+        "fields": {"arm": {"field": "/arm.q"}},
+    }
+    deltas = ["next(speed) - speed", "next(arm[1]) - arm[1]"]
+    boxed = {"expressions": deltas, "box": {"low": -1, "high": [2, 3]}}
+    data, report = read(bag, **quantities, action=boxed, reward="speed")
+    assert data.actions.tolist() == [[1, 0], [2, 0], [2, 3], [2, -1]]
+    assert report.far_actions == 0.5
+    # The last value of arm[0] is missing, and there is no action where the result is.
+    data, report = read(
+        bag, **quantities, action={"expressions": ["next(arm[0]) - speed"], "edges": [[0, 1]]}
+    )
+    assert data.actions.tolist() == [2, 1, 0]
+    assert data.action_names[1] == "next(arm[0]) - speed 0 to 1"
+    assert report.missing_actions == 0.4
+    named = {"expressions": deltas, "actions": {"stay": [0, 0], "up": [3, 4]}}
+    assert read(bag, **quantities, action=named).dataset.actions.tolist() == [0, 0, 1, 0]
+    with pytest.raises(UsageError, match=r"action.expressions.1: unknown name .* 'spe'"):
+        read(bag, **quantities, action={**boxed, "expressions": ["speed", "spe"]})
+    with pytest.raises(UsageError, match=r"expressions.0: 'arm' must be one number for each row"):
+        read(bag, **quantities, action={"expressions": ["arm"], "box": {"low": 0, "high": 1}})
+
+
 def test_episodes_end_by_conditions_gaps_and_limits() -> None:
     times = [0, 1, 2, 3, 4, 5, 6, 7, 20, 21, 22]
     bag = MemoryBag(
