@@ -28,6 +28,14 @@ from mcaprl.recorder.bags.source import Definition, TopicSource
 _PUBLISH_TIME = "publish_time"
 
 
+class Failure(NamedTuple):
+    """A message that cannot be decoded: its index in `Bag.times`, its log_time, and why."""
+
+    row: int
+    log_time_ns: int
+    reason: str
+
+
 class Stream(NamedTuple):
     """Messages of a topic as columns.
 

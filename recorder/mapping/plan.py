@@ -14,6 +14,7 @@ from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
 from mcaprl.recorder.mapping.config import Mapping, Place, Quantity
 from mcaprl.recorder.mapping.expression import Expression
+from mcaprl.recorder.mapping.images import ImageReader
 from mcaprl.recorder.mapping.observe import Source, source_of
 from mcaprl.recorder.mapping.paths import topic_of
 from mcaprl.recorder.mapping.streams import TopicStream
@@ -47,6 +48,7 @@ class Plan:
         mapping: Mapping of the bag's topics.
         place: Positions of the mapping's keys in its file, for error messages.
         quantities: Observed and other quantities, by name.
+        images: Readers of the observed images, by name.
         behavior_prob: Probability of the action; None if unknown.
         commands: Fields of the action.
         conditions: Conditions of the episodes: `begin`, `end`, `terminated`, `truncated`.
@@ -56,17 +58,31 @@ class Plan:
         constants: Constants of the message types, by name; names with several values are omitted.
     """
 
-    def __init__(self, bag: Bag, mapping: Mapping, place: Place, *, trust_code: bool) -> None:
+    def __init__(
+        self, bag: Bag, mapping: Mapping, place: Place, *, trust_code: bool, strict: bool = False
+    ) -> None:
         """Resolve all paths and parse all expressions.
+
+        Args:
+            bag: Bag to read.
+            mapping: Mapping of the bag's topics.
+            place: Positions of the mapping's keys in its file.
+            trust_code: Whether `reward` may name a Python function.
+            strict: Whether an image that cannot be decoded is an error.
 
         Raises:
             UsageError: A topic, field or name is unknown, or an expression is wrong.
         """
-        self.bag, self.mapping, self.place = bag, mapping, place
+        self.bag, self.mapping, self.place, self.strict = bag, mapping, place, strict
         self.quantities = {
             name: self._wanted((section, name), quantity)
             for section in ("observation", "fields")
             for name, quantity in getattr(mapping, section).items()
+        }
+        self.images = {
+            name: self._image_reader(name)
+            for name, quantity in mapping.observation.items()
+            if quantity.image is not None
         }
         action = mapping.action
         is_during = action.align == "during"
@@ -108,6 +124,16 @@ class Plan:
     ) -> Wanted:
         with self.place.named(*keys):
             return Wanted(keys, quantity, source_of(self.bag, quantity), is_during)
+
+    def unreadable(self, topic: str) -> NDArray[np.int64]:
+        """Return the positions of the messages without a readable image, as far as known."""
+        rows = {row for each in self.images.values() if each.topic == topic for row in each.failures}
+        return np.array(sorted(rows), np.int64)
+
+    def _image_reader(self, name: str) -> ImageReader:
+        _, quantity, source, _ = self.quantities[name]
+        with self.place.named("observation", name):
+            return ImageReader(self.bag, source.topic, quantity, name=name, strict=self.strict)
 
     def _expression(self, keys: tuple[str, ...], text: str) -> Expression:
         with self.place.named(*keys):

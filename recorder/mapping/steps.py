@@ -60,7 +60,11 @@ class StepReader:
                 self._transforms = self._transforms or Transforms(plan.bag, plan.mapping.time)
                 with plan.place.named(*keys):
                     self._streams |= self._transforms.streams(quantity.transform, quantity.in_)
-        self._runs = runs_of(self._streams, plan.mapping.episodes.gap_s, plan.bag.paths)
+        runs = runs_of(self._streams, plan.mapping.episodes.gap_s, plan.bag.paths)
+        self._runs = [
+            {name: part.without(plan.unreadable(name)) for name, part in run.items()}
+            for run in runs
+        ]
 
     @property
     def count(self) -> int:

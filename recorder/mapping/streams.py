@@ -42,6 +42,11 @@ class Run(NamedTuple):
     times_ns: NDArray[np.int64]
     rows: NDArray[np.int64]
 
+    def without(self, rows: NDArray[np.int64]) -> Run:
+        """Return the run without the messages at these positions in the stream."""
+        keep = ~np.isin(self.rows, rows)
+        return Run(self.times_ns[keep], self.rows[keep])
+
 
 class TopicStream:
     """Messages of one topic: times, and the fields that a mapping uses."""

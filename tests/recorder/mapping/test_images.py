@@ -109,8 +109,8 @@ def test_damaged_and_unknown_images_are_clear_errors() -> None:
     bag = MemoryBag({"/camera": ([0], {"format": ["jpeg"], "data": [b"no image"]})}, KINDS)
     with pytest.raises(LogError, match=r"/camera: a compressed image \(jpeg\) cannot be read"):
         read(bag, [0])
-    with pytest.raises(LogError, match="encoding 'yuv422'; supported: rgb8"):
-        read(raw_bag([COLORS], "yuv422"), [0])
+    with pytest.raises(LogError, match="encoding 'jpeg2000'; supported: rgb8"):
+        read(raw_bag([COLORS], "jpeg2000"), [0])
     short = raw_bag([COLORS], "rgb8")
     short._columns["/camera"]["data"][0] = b"123"
     with pytest.raises(LogError, match="an image of 6 x 4 rgb8 with 18 bytes per row has 3 bytes"):
