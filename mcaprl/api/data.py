@@ -59,8 +59,8 @@ def open_data(
             returned in the logs' order. Default: all episodes.
         images: Storage of image observations: `memory`, `mapped` or `auto`. `mapped` leaves images
             on disk and reads them when they are indexed. For a compressed log or a bag, `mapped`
-            writes an uncompressed copy of the images beside it once. `auto` is `mapped` if the images
-            would take more than half of the free memory, else `memory`.
+            writes an uncompressed copy of the images beside it once. `auto` is `mapped` if the
+            images would take more than half of the free memory, else `memory`.
         threads: Number of threads that read chunks of a file.
 
     Raises:
@@ -89,7 +89,9 @@ def open_data(
         raise UsageError(f"columns and episodes are for logs, not for {what}")
     if other is not None:
         if images == "mapped":
-            raise UsageError(f"mapped images are for logs and bags, not for the format {other.name}")
+            raise UsageError(
+                f"mapped images are for logs and bags, not for the format {other.name}"
+            )
         from mcaprl.recorder.dataset.formats.registry import read_format
 
         one = _only(data)

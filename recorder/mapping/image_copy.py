@@ -64,7 +64,7 @@ def copied_images(
     description = {
         "bag": _fingerprint(reader.bag.paths),
         "topic": reader.topic,
-        "options": reader.options,
+        "options": reader.options.to_json(),
         "image": f"{like.shape} {like.dtype}",
         "version": _VERSION,
     }

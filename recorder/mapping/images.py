@@ -1,23 +1,20 @@
-"""Images of a bag as observations: decoded, cropped, resized and converted to gray.
+"""Images of a bag as observations, in memory or on disk.
 
-Raw and compressed images of ROS and Foxglove are supported; see `pixels` and `compressed`. Colors
-become uint8 (H, W, 3) or, if gray, (H, W, 1). Depth becomes float32 meters (H, W, 1), with the
-value 0 where there is no surface, or uint8 if the mapping sets `range_m`. With `as: intensity`,
-images of 16 bits or floats become float32 (H, W, 1) with the values of the messages, or uint8 if
-the mapping sets `range`; values that are not finite become 0.
+Raw and compressed images of ROS and Foxglove are supported; see `pixels` and `compressed`.
+`image_options` describes what they become.
 """
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, UsageError, import_extra
+from mcaprl.errors import LogError, UsageError
 from mcaprl.problem import Problem
 from mcaprl.recorder.bags.bag import Bag, Failure, TopicInfo
 from mcaprl.recorder.dataset.image_cache import Storage, is_mapped
@@ -25,15 +22,14 @@ from mcaprl.recorder.dataset.mapped import Frames
 from mcaprl.recorder.mapping.compressed import compressed_pixels, is_video
 from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.image_copy import copied_images
-from mcaprl.recorder.mapping.pixels import Pixels, raw_pixels
-from mcaprl.texts import counted, shortened, size
+from mcaprl.recorder.mapping.image_options import ImageOptions
+from mcaprl.recorder.mapping.pixels import Pixels, one_line, raw_pixels
+from mcaprl.texts import counted, size
 
 Image = NDArray[Any]
 
 _BLOCK_ROWS, _BLOCK_BYTES = 32, 1 << 24
 """Largest number and size of the messages that are in memory at a time."""
-_GRAY_WEIGHTS = np.array([0.299, 0.587, 0.114])
-"""ITU-R BT.601 weights of red, green and blue."""
 # foxglove.RawImage has no is_bigendian: its pixels are little-endian.
 _RAW_FIELDS, _BIG_ENDIAN = ("height", "width", "encoding", "step", "data"), "is_bigendian"
 _COMPRESSED_FIELDS = ("format", "data")
@@ -62,6 +58,7 @@ class ImageReader:
         bag: Bag that has the topic.
         topic: Topic of the images.
         name: Name of the quantity, which is part of the name of a copy on disk.
+        options: Options of the mapping.
         failures: Messages without a readable image, by their index in the topic, as far as `read`
             found any. They are to be treated as if they did not exist.
     """
@@ -88,10 +85,9 @@ class ImageReader:
             UsageError: The topic has no images.
         """
         self.bag, self.topic, self.name = bag, topic, name
-        self._quantity, self._strict = quantity, strict
+        self.options, self._strict = ImageOptions(topic, quantity), strict
         self._fields = _image_fields(bag, bag.topics[topic])
         self.failures: dict[int, Failure] = {}
-        self._ambiguous = ""
 
     def read(self, rows: NDArray[np.int64], storage: Storage = "memory") -> Frames | None:
         """Return the images of N messages as (N, H, W, C); repeated messages are decoded only once.
@@ -161,17 +157,14 @@ class ImageReader:
             yield numbers[:filled], images[:filled]
 
     def space(self, images: Frames) -> spaces.Box:
-        """Return the space of one image or stack."""
-        if images.dtype == np.uint8:
-            return spaces.Box(0, 255, images.shape[1:], np.uint8)
-        low = -np.inf if self._quantity.as_ == "intensity" else 0.0
-        return spaces.Box(low, np.inf, images.shape[1:], np.float32)
+        """Return the space of one of the images (N, H, W, C)."""
+        return self.options.space(images)
 
     def problems(self) -> list[Problem]:
         """Return problems of the images that `read` decoded."""
         found = []
-        if self._ambiguous:
-            what = f"images '{self._ambiguous}' are read as depth, but may have other values"
+        if self.options.ambiguous:
+            what = f"images '{self.options.ambiguous}' are read as depth, but may have other values"
             action = "set `as: depth`, or `as: intensity` for infrared and thermal images"
             found.append(Problem(what, self.topic, next=action))
         if self.failures:
@@ -181,12 +174,6 @@ class ImageReader:
             action = "they are left out: the image before is used"
             found.append(Problem(what, self.topic, effect=first.reason, next=action))
         return found
-
-    @property
-    def options(self) -> str:
-        """Options of the mapping that determine the pixels, as JSON."""
-        names = {"crop", "resize", "gray", "range_m", "range", "as_"}
-        return self._quantity.model_dump_json(include=names)
 
     def leave_out(self, failure: Failure) -> None:
         """Add a message to `failures`.
@@ -238,20 +225,17 @@ class ImageReader:
                 if isinstance(message, Failure):
                     self.leave_out(message)
                     continue
-                data = message["data"]
-                largest = max(largest, len(data) if data is not None else 1)
+                largest = max(largest, _length(message["data"]))
                 try:
                     pixels = self._decoded(message)
                 except LogError as error:
                     time_ns = int(self.bag.times(self.topic)[row])
                     self.leave_out(Failure(row, time_ns, str(error)))
                     continue
-                yield row, self._prepared(pixels)
+                yield row, self.options.applied(pixels)
             at, count = at + len(block), min(_BLOCK_ROWS, max(1, _BLOCK_BYTES // largest))
 
-    def _messages(
-        self, rows: NDArray[np.int64]
-    ) -> Iterator[tuple[int, dict[str, Any] | Failure]]:
+    def _messages(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, dict[str, Any] | Failure]]:
         """Yield the fields of each message, or why the message cannot be decoded."""
         reason = "the message cannot be decoded"
         try:
@@ -270,81 +254,20 @@ class ImageReader:
                 yield from self._messages(rows[k : k + 1])
 
     def _decoded(self, message: dict[str, Any]) -> Pixels:
-        data = message["data"]
-        try:
-            data = base64.b64decode(data, validate=True) if isinstance(data, str) else bytes(data)
-        except (TypeError, ValueError) as error:
-            raise LogError(f"the image has no bytes: {error}") from error
         kind = str(message["encoding" if "encoding" in message else "format"])
         if is_video(kind):
             raise UsageError(
-                f"{self.topic} has video ({shortened(kind, 40)}): video topics are not supported"
+                f"{self.topic} has video ({one_line(kind)}): video topics are not supported"
                 " yet; convert it to JPEG images (sensor_msgs/msg/CompressedImage)"
             )
         if "encoding" in message:
-            return raw_pixels({**message, "data": data})
+            return raw_pixels({**message, "data": _bytes_of(message["data"])})
         try:
-            return compressed_pixels(kind, data)
+            return compressed_pixels(kind, _bytes_of(message["data"]))
         except LogError as error:
             raise LogError(
-                f"a compressed image ({shortened(kind, 40)}) cannot be read: {error}"
+                f"a compressed image ({one_line(kind)}) cannot be read: {error}"
             ) from error
-
-    def _prepared(self, pixels: Pixels) -> Image:
-        quantity, is_depth = self._quantity, self._is_depth(pixels)
-        image, is_number = pixels.image, pixels.units_per_m > 0
-        if is_number:
-            image = _meters(image, pixels.units_per_m) if is_depth else _finite(image)
-        if quantity.crop is not None:
-            image = self._cropped(image, *quantity.crop)
-        if quantity.resize is not None:
-            image = _resized(image, *quantity.resize, is_depth=is_depth)
-        values: Image = np.asarray(image)
-        if quantity.gray and values.ndim == 3:
-            values = np.rint(values @ _GRAY_WEIGHTS).astype(np.uint8)
-        limits = quantity.range_m if is_depth else quantity.range
-        if limits is not None:
-            share = np.clip((values - limits[0]) / (limits[1] - limits[0]), 0.0, 1.0)
-            codes = np.rint(255 * share)
-            # Pixels without a surface get the largest value, as in the depth images of the sims.
-            values = (np.where(values > 0, codes, 255) if is_depth else codes).astype(np.uint8)
-        return values if values.ndim == 3 else values[..., np.newaxis]
-
-    def _is_depth(self, pixels: Pixels) -> bool:
-        """Return whether the pixels are read as depth.
-
-        Raises:
-            UsageError: The mapping says that they are, but they have 8 bits.
-        """
-        wanted, kind = self._quantity.as_, shortened(pixels.encoding, 40)
-        if wanted == "intensity":
-            return False
-        if pixels.has_lost_depth:
-            raise UsageError(
-                f"{self.topic}: images '{kind}' have 8 bits per pixel, so they have lost the depth:"
-                " use a raw, PNG or compressedDepth topic, or `as: intensity` to read them as gray"
-            )
-        if not pixels.units_per_m:
-            for key in ("range_m", "as: depth"):
-                if self._quantity.range_m is not None if key == "range_m" else wanted == "depth":
-                    raise UsageError(
-                        f"{self.topic}: images '{kind}' are not depth: remove {key} from the mapping"
-                    )
-            return False
-        if not pixels.is_certain and wanted is None and self._quantity.range_m is None:
-            self._ambiguous = kind
-        return True
-
-    def _cropped(self, image: Any, left: int, top: int, width: int, height: int) -> Any:
-        full_width, full_height = _size(image)
-        if min(left, top) < 0 or left + width > full_width or top + height > full_height:
-            raise UsageError(
-                f"{self.topic}: crop {[left, top, width, height]} is outside of the image of"
-                f" {full_width} x {full_height} pixels"
-            )
-        if isinstance(image, np.ndarray):
-            return image[top : top + height, left : left + width]
-        return image.crop((left, top, left + width, top + height))
 
 
 def _image_fields(bag: Bag, topic: TopicInfo) -> tuple[str, ...]:
@@ -370,41 +293,30 @@ def _image_fields(bag: Bag, topic: TopicInfo) -> tuple[str, ...]:
     )
 
 
+def _length(data: Any) -> int:
+    return len(data) if isinstance(data, bytes | str) else int(np.size(data))
+
+
+def _bytes_of(data: Any) -> bytes:
+    """Return the bytes of an image; in JSON, they are base64 or a list of numbers.
+
+    Raises:
+        LogError: The data is something else.
+    """
+    if isinstance(data, bytes):
+        return data
+    try:
+        if isinstance(data, str):
+            return base64.b64decode(data, validate=True)
+        values = np.asarray(data)
+        if values.ndim == 1 and values.dtype.kind in "iu" and not (values & ~0xFF).any():
+            return values.astype(np.uint8).tobytes()
+    except ValueError as error:
+        raise LogError(f"the data of the image cannot be read: {error}") from error
+    raise LogError("the data of the image are not bytes")
+
+
 def _is_given(column: NDArray[Any]) -> bool:
     """Return whether the first message has the field."""
     value = column[0] if len(column) else None
     return value is not None and value == value
-
-
-def _meters(depth: Image, units_per_m: float) -> Image:
-    meters = depth.astype(np.float32)
-    if units_per_m != 1:
-        # A division, unlike a multiplication by 0.001, is exact to the last bit: 1500 is 1.5.
-        meters /= np.float32(units_per_m)
-    return np.where(np.isfinite(meters) & (meters > 0), meters, np.float32(0))
-
-
-def _finite(image: Image) -> Image:
-    values = image.astype(np.float32)
-    return np.where(np.isfinite(values), values, np.float32(0))
-
-
-def _size(image: Any) -> tuple[int, int]:
-    """Return width and height of a Pillow image or a NumPy array."""
-    if isinstance(image, np.ndarray):
-        return image.shape[1], image.shape[0]
-    width, height = image.size
-    return width, height
-
-
-def _resized(image: Any, width: int, height: int, *, is_depth: bool) -> Any:
-    """Resize an image by averaging.
-
-    Depth is resized by the nearest pixel: the mean of two depths may not be on any surface.
-    """
-    if _size(image) == (width, height):
-        return image
-    pillow = import_extra("PIL.Image", "bags")
-    method = pillow.Resampling.NEAREST if is_depth else pillow.Resampling.BOX
-    image = pillow.fromarray(image) if isinstance(image, np.ndarray) else image
-    return image.resize((width, height), method)

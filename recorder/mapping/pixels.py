@@ -93,6 +93,15 @@ ENCODINGS: Final = (*_PLAIN, *_PACKED, *_PLANAR, *_BAYER)
 _PLAIN_BY_NAME: Final = {name.lower(): layout for name, layout in _PLAIN.items()}
 
 
+def one_line(text: str) -> str:
+    """Return a name that a message contains, in one short line.
+
+    >>> one_line("16UC1; jpeg compressed ")
+    '16UC1; jpeg compressed'
+    """
+    return shortened(" ".join(text.split()), 40)
+
+
 def raw_pixels(message: dict[str, Any]) -> Pixels:
     """Decode a raw image message: its fields height, width, encoding, step, data, is_bigendian.
 
@@ -113,9 +122,7 @@ def raw_pixels(message: dict[str, Any]) -> Pixels:
     if name in _BAYER:
         pattern, dtype = _BAYER[name]
         return Pixels(_demosaiced(_plain(sizes, _Layout(1, dtype, _GRAY)), pattern), encoding)
-    raise LogError(
-        f"encoding '{shortened(encoding, 40)}'; supported: {', '.join(ENCODINGS)}"
-    )
+    raise LogError(f"encoding '{one_line(encoding)}'; supported: {', '.join(ENCODINGS)}")
 
 
 class _Sizes(NamedTuple):
@@ -159,8 +166,8 @@ class _Sizes(NamedTuple):
         stop = first + count * step
         if step < used or stop > len(self.data):
             raise LogError(
-                f"an image of {self.width} x {self.height} {self.encoding} with {self.step} bytes"
-                f" per row has {len(self.data)} bytes, which do not match"
+                f"an image of {self.width} x {self.height} {one_line(self.encoding)} with"
+                f" {self.step} bytes per row has {len(self.data)} bytes, which do not match"
             )
         return self.data[first:stop].reshape(count, step)[:, :used]
 
@@ -172,8 +179,8 @@ class _Sizes(NamedTuple):
         """
         if self.width % 2 or (rows and self.height % 2):
             raise LogError(
-                f"an image of {self.width} x {self.height} {self.encoding}: its pixels share their"
-                " colors, so its size must be even"
+                f"an image of {self.width} x {self.height} {one_line(self.encoding)}: its pixels"
+                " share their colors, so its size must be even"
             )
 
 

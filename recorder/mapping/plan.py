@@ -127,7 +127,9 @@ class Plan:
 
     def unreadable(self, topic: str) -> NDArray[np.int64]:
         """Return the positions of the messages without a readable image, as far as known."""
-        rows = {row for each in self.images.values() if each.topic == topic for row in each.failures}
+        rows = {
+            row for each in self.images.values() if each.topic == topic for row in each.failures
+        }
         return np.array(sorted(rows), np.int64)
 
     def _image_reader(self, name: str) -> ImageReader:

@@ -1,8 +1,8 @@
 """Decoder of RVL, the lossless compression of depth images.
 
 A. D. Wilson, "Fast Lossless Depth Image Compression", ISS 2017,
-https://doi.org/10.1145/3132272.3134144. compressed_depth_image_transport uses it for `compressedDepth
-rvl`.
+https://doi.org/10.1145/3132272.3134144. compressed_depth_image_transport uses it for
+`compressedDepth rvl`.
 
 The stream is a sequence of nibbles, eight in each little-endian 32-bit word, the highest first. A
 number has three bits in each nibble, the lowest first; the fourth bit is set if another nibble

@@ -186,9 +186,7 @@ def image_file(values: NDArray[Any]) -> bytes:
     return file.getvalue()
 
 
-def image_of(
-    name: str, file: bytes | None, *, max_pixels: int = MAX_IMAGE_PIXELS
-) -> NDArray[Any]:
+def image_of(name: str, file: bytes | None, *, max_pixels: int = MAX_IMAGE_PIXELS) -> NDArray[Any]:
     """Decode an image file to (height, width, channels): uint8, or uint16 or float32 for depth.
 
     Args:
