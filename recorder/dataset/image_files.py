@@ -41,15 +41,15 @@ def decoded_file(
     pillow = import_extra("PIL.Image", extra)
     try:
         with warnings.catch_warnings():
-            # Pillow warns about sizes above a limit of its own.
-            warnings.simplefilter("ignore", pillow.DecompressionBombWarning)
+            # Pillow warns about sizes above a limit of its own, and about damaged EXIF data.
+            warnings.simplefilter("ignore")
             image = pillow.open(BytesIO(data), formats=list(formats))
-        width, height = image.size
-        if width * height > max_pixels:
-            raise LogError(
-                f"it declares {width} x {height} pixels; at most {max_pixels} can be read"
-            )
-        image.load()
+            width, height = image.size
+            if width * height > max_pixels:
+                raise LogError(
+                    f"it declares {width} x {height} pixels; at most {max_pixels} can be read"
+                )
+            image.load()
     except LogError:
         raise
     except pillow.UnidentifiedImageError as error:

@@ -7,6 +7,7 @@ Raw and compressed images of ROS and Foxglove are supported; see `pixels` and `c
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -319,4 +320,4 @@ def _bytes_of(data: Any) -> bytes:
 def _is_given(column: NDArray[Any]) -> bool:
     """Return whether the first message has the field."""
     value = column[0] if len(column) else None
-    return value is not None and value == value
+    return value is not None and not (isinstance(value, float) and math.isnan(value))

@@ -49,7 +49,9 @@ def rvl_encoded(pixels: list[int]) -> bytes:
             put((delta << 1) ^ (delta >> 31))
             previous = value
     nibbles += [0] * (-len(nibbles) % 8)
-    words = [int("".join(f"{n:x}" for n in nibbles[k : k + 8]), 16) for k in range(0, len(nibbles), 8)]
+    words = [
+        int("".join(f"{n:x}" for n in nibbles[k : k + 8]), 16) for k in range(0, len(nibbles), 8)
+    ]
     return struct.pack(f"<{len(words)}I", *words)
 
 
