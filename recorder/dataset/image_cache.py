@@ -87,6 +87,7 @@ def write_cache(
     leaf: Leaf,
     blocks: Blocks,
     *,
+    most: int = IMAGES_PER_CHUNK,
     notes: dict[str, str] | None = None,
 ) -> McapReader:
     """Write the uncompressed copy of images, and open it.
@@ -96,6 +97,7 @@ def write_cache(
         description: Origin of the images.
         leaf: Leaf of the images, with their encoding.
         blocks: Images.
+        most: Largest number of images in a chunk.
         notes: Metadata that `blocks` fills while it is iterated; stored as `CACHE_NOTES`.
 
     Raises:
@@ -109,7 +111,7 @@ def write_cache(
             writer.add_metadata(CACHE_METADATA, description)
             channel = writer.add_channel(leaf.topic, IMAGE_TYPE, messages.definition(IMAGE_TYPE))
             rows = ImageRows.of_shape(
-                leaf.shape, leaf.encoding or "", channel, IMAGES_PER_CHUNK, writer.write_rows
+                leaf.shape, leaf.encoding or "", channel, most, writer.write_rows
             )
             for times, images in blocks:
                 rows.write_columns(times, {"data": np.ascontiguousarray(images).view(np.uint8)})

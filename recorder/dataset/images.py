@@ -51,7 +51,10 @@ def mapped_images(cache: McapReader, leaf: Leaf, times: NDArray[np.int64]) -> Ma
     images = _Images(cache, leaf)
     if not (images.are_mappable and np.isin(times, images.topic.times).all()):
         return None
-    return images.mapped(images.order_at(times))
+    found = images.mapped(images.order_at(times))
+    # The positions of the images were read from all over the file.
+    found.release()
+    return found
 
 
 class _Images:

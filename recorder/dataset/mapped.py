@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 # Windows has no `madvise`.
 _WILL_NEED = getattr(mmap, "MADV_WILLNEED", None)
+_DONT_NEED = getattr(mmap, "MADV_DONTNEED", None)
 _UINT8 = np.dtype(np.uint8)
 _BLOCK_BYTES = 1 << 24
 _PREFETCHED_BYTES = 1 << 30
@@ -58,6 +59,11 @@ class ImageFile:
         """Let the system start to load the pages of a range of bytes from the disk."""
         if self._map is not None and _WILL_NEED is not None:
             self._map.madvise(_WILL_NEED, start, stop - start)
+
+    def release(self) -> None:
+        """Let the system take back the memory of the file; it is read again when it is needed."""
+        if self._map is not None and _DONT_NEED is not None:
+            self._map.madvise(_DONT_NEED)
 
     def read(self, offsets: NDArray[np.int64], chunks: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Copy K images, given their byte offsets (K,) and the indexes (K,) of their chunks.
@@ -124,6 +130,11 @@ class MappedImages:
         """Names of the files."""
         return tuple(file.name for file in self._files)
 
+    def release(self) -> None:
+        """Let the system take back the memory of the files."""
+        for file in self._files:
+            file.release()
+
     def rows(self, rows: Any) -> MappedImages:
         """Select images without reading them; `rows` (N, K) selects N stacks of K images."""
         return MappedImages(self._files, self._image_shape, self._places[rows], self.dtype)
@@ -156,8 +167,11 @@ class MappedImages:
         if places.ndim == 2:
             return self._images(places)
         count, stack, _ = places.shape
-        images = self._images(places.reshape(-1, 3)).reshape(count, stack, *self._image_shape)
-        return np.moveaxis(images, 1, -2).reshape(count, *self.shape[1:])
+        pixels = as_pixels(self._images(places.reshape(-1, 3)))
+        found = np.empty((count, *pixels.shape[1:], stack), pixels.dtype)
+        for k in range(stack):
+            found[..., k] = pixels[k::stack]
+        return found.view(self.dtype).reshape(count, *self.shape[1:])
 
     def _images(self, places: NDArray[np.int64]) -> NDArray[Any]:
         """Read images (M, *image_shape) at places (M, 3)."""
@@ -196,6 +210,16 @@ class MappedImages:
         ranges = (number[begins], first[begins], stop[ends])
         for index, start, end in zip(*(part.tolist() for part in ranges), strict=True):
             self._files[index].prefetch(start, end)
+
+
+def as_pixels(images: NDArray[Any]) -> NDArray[Any]:
+    """Return images (..., H, W, C) as an array (..., H, W), whose items are the C values of a pixel.
+
+    Copying such items is two to three times as fast as copying channels.
+    """
+    channels = images.shape[-1]
+    item = np.dtype((np.void, channels * images.itemsize)) if channels > 1 else images.dtype
+    return np.ascontiguousarray(images).view(item)[..., 0]
 
 
 Frames = NDArray[Any] | MappedImages

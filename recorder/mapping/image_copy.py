@@ -31,7 +31,7 @@ from mcaprl.recorder.dataset.images import mapped_images
 from mcaprl.recorder.dataset.mapped import MappedImages
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.format.spaces import IMAGE_ENCODINGS, Leaf
-from mcaprl.recorder.format.topics import BYTES_PER_CHUNK, IMAGES_PER_CHUNK
+from mcaprl.recorder.format.topics import IMAGES_PER_CHUNK
 from mcaprl.texts import size
 
 if TYPE_CHECKING:
@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 _VERSION = "1"
 """Version of the decoders. It changes if they decode the same message to other pixels."""
 _FAILURES = "failures"
+_BLOCK_BYTES = 1 << 20
+"""Size of the images that are in memory at a time, but for one that is larger."""
 
 
 def copied_images(
@@ -87,7 +89,7 @@ def _existing(
     if cache is None:
         return None
     try:
-        failed = _failures(cache.metadata.get(CACHE_NOTES, {}).get(_FAILURES, "[]"))
+        failed = _failures(cache, reader.bag.times(reader.topic))
         is_failed = np.isin(rows, [each.row for each in failed])
         found = mapped_images(cache, leaf, rows[~is_failed])
     except (LogError, ValueError, TypeError):
@@ -98,16 +100,19 @@ def _existing(
     return found
 
 
-def _failures(text: str) -> list[Failure]:
-    """Read failures from JSON.
+def _failures(cache: McapReader, times_ns: NDArray[np.int64]) -> list[Failure]:
+    """Return the failures that a copy lists.
 
     Raises:
-        ValueError: The text is not JSON, or has other values.
-        TypeError: The text has values of other types.
+        ValueError: The list is damaged, or names other messages than those of the topic.
+        TypeError: The list has values of other types.
     """
-    return [
-        Failure(int(row), int(time_ns), str(reason)) for row, time_ns, reason in parse_json(text)
-    ]
+    found = []
+    for row, reason in parse_json(cache.metadata.get(CACHE_NOTES, {}).get(_FAILURES, "[]")):
+        if not isinstance(row, int) or not 0 <= row < len(times_ns):
+            raise ValueError(row)
+        found.append(Failure(row, int(times_ns[row]), str(reason)))
+    return found
 
 
 def _write(
@@ -129,14 +134,16 @@ def _write(
             f"cannot write {path}: the images need {size(needed)}, {size(free)} are free; {remedy}"
         )
 
+    most = max(1, min(IMAGES_PER_CHUNK, _BLOCK_BYTES // image_bytes))
+
     def blocks() -> Blocks:
-        count = max(1, min(IMAGES_PER_CHUNK, BYTES_PER_CHUNK // image_bytes))
-        yield from reader.blocks(rows, leaf.shape, leaf.dtype, count)
+        yield from reader.blocks(rows, leaf.shape, leaf.dtype, most)
         if reader.failures:
-            notes[_FAILURES] = json.dumps(list(reader.failures.values()))
+            failed = [(each.row, each.reason) for each in reader.failures.values()]
+            notes[_FAILURES] = json.dumps(failed)
 
     try:
-        write_cache(path, description, leaf, blocks(), notes=notes)
+        write_cache(path, description, leaf, blocks(), most=most, notes=notes)
     except LogError as error:
         if isinstance(error.__cause__, OSError):
             raise LogError(f"{error}; images are copied there: {remedy}") from error

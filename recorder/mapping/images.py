@@ -19,7 +19,7 @@ from mcaprl.errors import LogError, UsageError
 from mcaprl.problem import Problem
 from mcaprl.recorder.bags.bag import Bag, Failure, TopicInfo
 from mcaprl.recorder.dataset.image_cache import Storage, is_mapped
-from mcaprl.recorder.dataset.mapped import Frames
+from mcaprl.recorder.dataset.mapped import Frames, as_pixels
 from mcaprl.recorder.mapping.compressed import compressed_pixels, is_video
 from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.image_copy import copied_images
@@ -29,7 +29,7 @@ from mcaprl.texts import counted, size
 
 Image = NDArray[Any]
 
-_BLOCK_ROWS, _BLOCK_BYTES = 32, 1 << 24
+_BLOCK_ROWS, _BLOCK_BYTES = 8, 1 << 22
 """Largest number and size of the messages that are in memory at a time."""
 # foxglove.RawImage has no is_bigendian: its pixels are little-endian.
 _RAW_FIELDS, _BIG_ENDIAN = ("height", "width", "encoding", "step", "data"), "is_bigendian"
@@ -192,7 +192,7 @@ class ImageReader:
         stack = places.shape[1] if places.ndim > 1 else 1
         *edges, channels = like.shape
         try:
-            found = np.empty((len(places), *edges, stack, channels), like.dtype)
+            found = np.empty((len(places), *edges, stack), as_pixels(like).dtype)
         except MemoryError as error:
             raise LogError(
                 f"{self.topic}: the images need {size(places.size * like.nbytes)} of memory: set"
@@ -204,8 +204,8 @@ class ImageReader:
         for rows, images in self.blocks(wanted, like.shape, like.dtype, 1):
             k = int(np.searchsorted(wanted, rows[0]))
             frame, position = np.divmod(order[bounds[k] : bounds[k + 1]], stack)
-            found[frame, :, :, position] = images[0]
-        return found.reshape(len(places), *edges, stack * channels)
+            found[frame, :, :, position] = as_pixels(images[0])
+        return found.view(like.dtype).reshape(len(places), *edges, stack * channels)
 
     def _why_none(self, rows: NDArray[np.int64]) -> str:
         first = self.failures[int(rows[0])]

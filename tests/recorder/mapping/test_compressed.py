@@ -71,9 +71,10 @@ def test_rvl_streams_are_decoded_as_they_were_encoded(pixels: list[int]) -> None
 @given(st.binary(max_size=64), st.integers(1, 100))
 def test_a_damaged_rvl_stream_is_an_error(data: bytes, count: int) -> None:
     try:
-        assert rvl_decoded(data, count).shape == (count,)
-    except LogError as error:
-        assert "RVL stream" in str(error)
+        found = rvl_decoded(data, count)
+    except LogError:
+        return
+    assert found.shape == (count,)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +179,7 @@ def test_image_columns_of_lerobot_open_the_same_formats(ghostscript: Path) -> No
     from mcaprl.recorder.dataset.formats.lerobot.features import image_of
 
     for data in (POSTSCRIPT, file_of("GIF"), file_of("PPM")):
-        with pytest.raises(LogError, match="an image of front is damaged: .* are not JPEG, PNG"):
+        with pytest.raises(LogError, match=r"an image of front is damaged: .* are not JPEG, PNG"):
             image_of("front", data)
     assert image_of("front", file_of("PNG")).shape == (8, 8, 3)
     with pytest.raises(LogError, match=r"it declares 8 x 8 pixels; at most 63 can be read"):
