@@ -68,9 +68,9 @@ def open_data(
         episodes: Index, slice or indexes of the episodes to read, counted over all logs and
             returned in the logs' order. Default: all episodes.
         images: Storage of image observations: `memory`, `mapped` or `auto`. `mapped` leaves images
-            on disk and reads them when they are indexed. For a compressed log, `mapped` writes an
-            uncompressed copy of the images beside the log once. `auto` is `mapped` if the images
-            would take more than half of the free memory, else `memory`.
+            on disk and reads them when they are indexed. For a compressed log or a bag, `mapped`
+            writes an uncompressed copy of the images beside it once. `auto` is `mapped` if the
+            images would take more than half of the free memory, else `memory`.
         threads: Number of threads that read chunks of a file.
 
     Raises:
@@ -94,10 +94,14 @@ def open_data(
             raise NotMcapError(
                 f"{error}, nor is it a dataset of one of the formats {', '.join(FORMATS)}"
             ) from error
-    if columns is not None or episodes is not None or images == "mapped":
+    if columns is not None or episodes is not None:
         what = f"the format {other.name}" if other is not None else "a mapping"
-        raise UsageError(f"columns, episodes and mapped images are for logs, not for {what}")
+        raise UsageError(f"columns and episodes are for logs, not for {what}")
     if other is not None:
+        if images == "mapped":
+            raise UsageError(
+                f"mapped images are for logs and bags, not for the format {other.name}"
+            )
         from mcaprl.recorder.dataset.formats.registry import read_format
 
         one = _only(data)
@@ -105,8 +109,8 @@ def open_data(
             raise UsageError(f"only logs may have several paths: pass one {other.name} dataset")
         return read_format(one, other)
     assert mapping is not None
-    found = mapped(data, mapping, trust_code=trust_code)
-    for problem in found.report.left_out:
+    found = mapped(data, mapping, trust_code=trust_code, images=images)
+    for problem in (*found.report.left_out, *found.report.images):
         warnings.warn(str(problem), stacklevel=2)
     return found.dataset
 
@@ -130,13 +134,19 @@ def _other_format(data: Paths, name: str | None) -> Format | None:
     return None if one is None else other_format(one)
 
 
-def mapped(data: Paths, mapping: MappingFile, *, trust_code: bool = False) -> MappedBag:
+def mapped(
+    data: Paths,
+    mapping: MappingFile,
+    *,
+    trust_code: bool = False,
+    images: Storage = "auto",
+) -> MappedBag:
     """Read a bag by a mapping; raise the same errors as `open_data`."""
     import_extra("pydantic", "bags")
     from mcaprl.recorder.mapping.read import read_bag
 
     source, changes = mapping if isinstance(mapping, ChangedMapping) else (mapping, {})
-    return read_bag(data, source, changes=changes, trust_code=trust_code)
+    return read_bag(data, source, changes=changes, trust_code=trust_code, images=images)
 
 
 def mapping_tree(mapping: MappingFile) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, SpaceError, UnknownNameError, UsageError
 from mcaprl.recorder.dataset.conversions import Conversions
 from mcaprl.recorder.dataset.episode import Episode, shapes
-from mcaprl.recorder.dataset.mapped import MappedImages, rows_of
+from mcaprl.recorder.dataset.mapped import MappedImages, blocks_of, rows_of
 from mcaprl.recorder.dataset.statistics import Statistics, describe_columns
 from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, TransitionBatch, Transitions
 from mcaprl.recorder.format.metadata import ESTIMATED, LogMetadata
@@ -25,10 +25,6 @@ from mcaprl.recorder.format.spaces import nest, space_to_json
 if TYPE_CHECKING:
     import pandas
     import pyarrow
-
-
-# Number of rows hashed at a time, so that images on disk need not fit into memory.
-_BLOCK_ROWS = 1024
 
 
 class Dataset(Conversions):
@@ -274,8 +270,8 @@ class Dataset(Conversions):
         digest.update(space_to_json(self.action_space).encode())
         steps = [getattr(columns, name) for name in STEP_COLUMNS]
         for array in (*columns.frames, *steps, columns.lengths):
-            for start in range(0, len(array), _BLOCK_ROWS):
-                digest.update(np.ascontiguousarray(array[start : start + _BLOCK_ROWS]).data)
+            for block in blocks_of(array):
+                digest.update(block.data)
         return digest.hexdigest()
 
     @cached_property

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterator
-from typing import Final, Literal, get_args
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ Storage = Literal["auto", "memory", "mapped"]
 
 STORAGES: Final[tuple[str, ...]] = get_args(Storage)
 IMAGE_TYPE = "sensor_msgs/msg/Image"
-CACHE_METADATA = "mcaprl.images"
+CACHE_METADATA, CACHE_NOTES = "mcaprl.images", "mcaprl.images.notes"
 MEMORY_SHARE = 0.5
 
 
@@ -45,27 +46,63 @@ def free_memory_bytes() -> float:
         return float("inf")
 
 
-def image_cache(
-    reader: McapReader, leaf: Leaf, blocks: Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]
-) -> McapReader:
+Blocks = Iterator[tuple[NDArray[np.int64], NDArray[Any]]]
+"""Log_times (K,) and images (K, *shape), block by block."""
+
+
+def image_cache(reader: McapReader, leaf: Leaf, blocks: Blocks) -> McapReader:
     """Open the uncompressed copy of a log's images; write the copy beside the log if needed.
 
-    `blocks` yields the log_times and (K, *shape) images of the whole topic. It is iterated only if
-    the copy is written.
+    `blocks` yields the images of the whole topic. It is iterated only if the copy is written.
 
     Raises:
         LogError: The copy cannot be written.
     """
-    path = reader.path.with_name(f"{reader.path.name}.{leaf.name}.images")
+    path = cache_path(reader.path, leaf)
     description = {"fingerprint": fingerprint(reader), "topic": leaf.topic}
-    if path.exists():
-        try:
-            cache = McapReader(path)
-            if cache.complete and cache.metadata.get(CACHE_METADATA) == description:
-                return cache
-        except LogError:
-            # The existing file is not a readable log: replace it.
-            pass
+    return open_cache(path, description) or write_cache(path, description, leaf, blocks)
+
+
+def cache_path(path: Path, leaf: Leaf) -> Path:
+    """Return the path of the copy of a leaf's images, beside the file that they come from."""
+    return path.with_name(f"{path.name}.{leaf.name}.images")
+
+
+def open_cache(path: Path, description: dict[str, str]) -> McapReader | None:
+    """Open a copy of images; return None if there is none, or if it has another description."""
+    if not path.exists():
+        return None
+    try:
+        cache = McapReader(path)
+    except LogError:
+        # The existing file is not a readable log: replace it.
+        return None
+    is_wanted = cache.complete and cache.metadata.get(CACHE_METADATA) == description
+    return cache if is_wanted else None
+
+
+def write_cache(
+    path: Path,
+    description: dict[str, str],
+    leaf: Leaf,
+    blocks: Blocks,
+    *,
+    most: int = IMAGES_PER_CHUNK,
+    notes: dict[str, str] | None = None,
+) -> McapReader:
+    """Write the uncompressed copy of images, and open it.
+
+    Args:
+        path: Path of the copy.
+        description: Origin of the images.
+        leaf: Leaf of the images, with their encoding.
+        blocks: Images.
+        most: Largest number of images in a chunk.
+        notes: Metadata that `blocks` fills while it is iterated; stored as `CACHE_NOTES`.
+
+    Raises:
+        LogError: The copy cannot be written.
+    """
     from mcaprl.recorder.format.writing import McapWriter
 
     with replacing(path, LogError, concurrent=True) as unfinished:
@@ -74,10 +111,12 @@ def image_cache(
             writer.add_metadata(CACHE_METADATA, description)
             channel = writer.add_channel(leaf.topic, IMAGE_TYPE, messages.definition(IMAGE_TYPE))
             rows = ImageRows.of_shape(
-                leaf.shape, leaf.encoding or "", channel, IMAGES_PER_CHUNK, writer.write_rows
+                leaf.shape, leaf.encoding or "", channel, most, writer.write_rows
             )
             for times, images in blocks:
-                rows.write_columns(times, {"data": images})
+                rows.write_columns(times, {"data": np.ascontiguousarray(images).view(np.uint8)})
+            if notes:
+                writer.add_metadata(CACHE_NOTES, notes)
             writer.close()
         finally:
             writer.abandon()

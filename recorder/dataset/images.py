@@ -42,6 +42,21 @@ def read_images(
     return images.mapped(images.order_at(times))
 
 
+def mapped_images(cache: McapReader, leaf: Leaf, times: NDArray[np.int64]) -> MappedImages | None:
+    """Return the images of a copy at these log_times (F,); None if it lacks some of them.
+
+    Raises:
+        CorruptLogError: The copy is damaged, or has images of another size or encoding.
+    """
+    images = _Images(cache, leaf)
+    if not (images.are_mappable and np.isin(times, images.topic.times).all()):
+        return None
+    found = images.mapped(images.order_at(times))
+    # The positions of the images were read from all over the file.
+    found.release()
+    return found
+
+
 class _Images:
     """The topic with the images of one leaf, in one file."""
 
@@ -135,10 +150,15 @@ class _Images:
             places[start:stop, 2] = index["offset"].astype(np.int64) + data.start + first
             checks.append(self._check_of(decoder, messages, first))
             start = stop
-        reader = self._reader
-        name, image_bytes = str(reader.path), self._leaf.size
-        file = ImageFile(name, reader.view, image_bytes, checks, reader.check_unchanged)
-        return MappedImages([file], self._leaf.shape, places[order])
+        reader, leaf = self._reader, self._leaf
+        file = ImageFile(
+            str(reader.path), reader.view, self._image_bytes, checks, reader.check_unchanged
+        )
+        return MappedImages([file], leaf.shape, places[order], leaf.dtype)
+
+    @property
+    def _image_bytes(self) -> int:
+        return self._leaf.size * self._leaf.dtype.itemsize
 
     def _data_offset(self) -> int:
         """Return the offset of the image data in the first message record."""
@@ -171,10 +191,10 @@ class _Images:
         height, width = self._leaf.shape[:2]
         encoding = self._leaf.encoding or ""
         as_stored = encoding.encode() if columns["encoding"].dtype.kind == "S" else encoding
-        expected = (height, width, as_stored, self._leaf.size // height)
+        expected = (height, width, as_stored, self._image_bytes // height)
         found = [columns[name] for name in _FIELDS[:-1]]
         wrong = np.logical_or.reduce([a != b for a, b in zip(found, expected, strict=True)])
-        if wrong.any() or columns["data"].shape[1:] != (self._leaf.size,):
+        if wrong.any() or columns["data"].shape[1:] != (self._image_bytes,):
             row = int(np.argmax(wrong))
             found_text = ", ".join(
                 f"{name} {column[row]}" for name, column in zip(_FIELDS, found, strict=False)

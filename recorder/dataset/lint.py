@@ -16,6 +16,7 @@ from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.dataset.mapped import blocks_of
 from mcaprl.recorder.format.probability import is_impossible
 from mcaprl.recorder.format.spaces import Leaf, bounds_of, observation_leaves, outside
 
@@ -97,7 +98,8 @@ def _duplicates(dataset: Dataset) -> Iterator[Problem]:
     for episode in dataset.episodes:
         digest = sha256()
         for part in (*_arrays(episode.observations), episode.actions, episode.rewards):
-            digest.update(np.ascontiguousarray(part).data)
+            for block in blocks_of(part):
+                digest.update(block.data)
         alike[digest.digest()].append(episode.index)
     copies = [indexes for indexes in alike.values() if len(indexes) > 1]
     if copies:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.recorder.dataset.mapped import Frames
+from mcaprl.recorder.dataset.mapped import Frames, MappedImages, blocks_of
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.spaces import Leaf
 
@@ -89,22 +89,29 @@ def describe_columns(columns: Transitions, leaves: Sequence[Leaf]) -> Statistics
 def _describe(leaf: Leaf, frames: Frames) -> Column:
     if leaf.encoding is not None:
         return _describe_image(frames)
-    values = np.asarray(frames).reshape(len(frames), leaf.size).astype(np.float64)
-    finite = np.isfinite(values)
-    kept = np.where(finite, values, 0.0)
+    counts, total, squares = (np.zeros(leaf.size) for _ in range(3))
+    low, high = np.full((2, leaf.size), np.nan)
     # An element without finite values has the mean 0 / 0 = NaN.
     with np.errstate(all="ignore"):
-        counts = finite.sum(axis=0)
-        mean = kept.sum(axis=0) / counts
-        squares = np.where(finite, (values - mean) ** 2, 0.0)
-        std = np.sqrt(squares.sum(axis=0) / counts)
-    return Column(
-        mean=mean,
-        std=std,
-        low=np.fmin.reduce(values, axis=0, initial=np.nan),
-        high=np.fmax.reduce(values, axis=0, initial=np.nan),
-        not_finite=int((~finite).sum()),
-    )
+        for values in _values(leaf, frames):
+            finite = np.isfinite(values)
+            counts += finite.sum(axis=0)
+            total += np.where(finite, values, 0.0).sum(axis=0)
+            low = np.fmin(low, np.fmin.reduce(values, axis=0, initial=np.nan))
+            high = np.fmax(high, np.fmax.reduce(values, axis=0, initial=np.nan))
+        mean = total / counts
+        for values in _values(leaf, frames):
+            finite = np.isfinite(values)
+            squares += np.where(finite, (values - mean) ** 2, 0.0).sum(axis=0)
+        std = np.sqrt(squares / counts)
+    not_finite = leaf.size * len(frames) - int(counts.sum())
+    return Column(mean=mean, std=std, low=low, high=high, not_finite=not_finite)
+
+
+def _values(leaf: Leaf, frames: Frames) -> Iterator[NDArray[np.float64]]:
+    """Yield the values (F, size): those on disk in blocks, those in memory at once."""
+    for block in blocks_of(frames) if isinstance(frames, MappedImages) else [frames]:
+        yield block.reshape(len(block), leaf.size).astype(np.float64)
 
 
 def _describe_image(frames: Frames) -> Column:

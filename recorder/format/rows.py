@@ -168,7 +168,7 @@ class ImageRows(TopicRows):
     ) -> Self:
         """Preallocate rows for images of one shape; see `TopicRows.of_text` and `image_rows`."""
         height, width, channels = (*shape, 1)[:3]
-        item_bytes = 2 if encoding == "16UC1" else 1
+        item_bytes = {"16UC1": 2, "32FC1": 4}.get(encoding, 1)
         dtype = image_dtype(height, width, channels, encoding, IMAGE_FRAME, item_bytes)
         rows = message_rows(_count(most, dtype), dtype, channel_id)
         fill_image_constants(rows["payload"], height, width, encoding, IMAGE_FRAME)

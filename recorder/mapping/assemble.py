@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.image_cache import Storage
+from mcaprl.recorder.dataset.mapped import Frames
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of
 from mcaprl.recorder.mapping.config import Quantity
-from mcaprl.recorder.mapping.images import ImageReader
 from mcaprl.recorder.mapping.paths import as_numbers
 from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.segments import Segment
@@ -30,17 +31,22 @@ _STATE = "state"
 class _Observations(NamedTuple):
     """Observation frames by leaf path, their space, and the names of the vector's elements."""
 
-    frames: dict[tuple[str, ...], Array]
+    frames: dict[tuple[str, ...], Frames]
     space: spaces.Space[Any]
     names: tuple[str, ...]
 
 
-def assembled(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> Dataset:
+def assembled(
+    plan: Plan, runs: list[Steps], kept: list[list[Segment]], images: Storage
+) -> Dataset | None:
     """Return the dataset of the kept episodes of all runs; `kept` must not be empty.
+
+    Returns:
+        The dataset; None if images cannot be decoded. `plan.unreadable` lists their messages then.
 
     Raises:
         UsageError: A reward or probability is impossible, or an observation is a text.
-        LogError: An image cannot be read.
+        LogError: No image can be decoded, or the images differ in size.
     """
     summaries: list[EpisodeSummary] = []
     times: list[NDArray[np.int64]] = []
@@ -55,7 +61,9 @@ def assembled(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> Datas
         offset += len(run.times_ns)
     steps = np.concatenate(taken)
     lengths = np.array([each.length for each in summaries])
-    observed = _observations(plan, runs, np.concatenate(frames), lengths)
+    observed = _observations(plan, runs, np.concatenate(frames), lengths, images)
+    if observed is None:
+        return None
     metadata = LogMetadata(
         observation_space=observed.space,
         action_space=_common_space([run.actions.space for run in runs]),
@@ -139,32 +147,43 @@ def _step_ns(plan: Plan, times: list[NDArray[np.int64]]) -> int:
 
 
 def _observations(
-    plan: Plan, runs: list[Steps], rows: NDArray[np.int64], lengths: NDArray[np.int64]
-) -> _Observations:
-    arrays: dict[str, Array] = {}
+    plan: Plan,
+    runs: list[Steps],
+    rows: NDArray[np.int64],
+    lengths: NDArray[np.int64],
+    images: Storage,
+) -> _Observations | None:
+    """Return the observations; None if images cannot be decoded."""
+    vectors: dict[str, Array] = {}
     parts: dict[str, spaces.Space[Any]] = {}
-    names = _put_vector(plan, runs, rows, arrays, parts)
-    for name, quantity in plan.mapping.observation.items():
-        if quantity.image is not None:
-            places = np.concatenate([run.quantities[name].values for run in runs])[rows]
-            with plan.place.named("observation", name):
-                reader = ImageReader(plan.bag, quantity.image, quantity)
-                arrays[name] = reader.read(places)
-            parts[name] = reader.space(arrays[name])
+    names = _put_vector(plan, runs, rows, vectors, parts)
     count = plan.mapping.stack
+    stacked = _stacked(lengths, count) if count > 1 else np.arange(len(rows))
     if count > 1:
-        stacked = _stacked(lengths, count)
-        arrays = {
+        vectors = {
             name: np.concatenate([array[each] for each in stacked.T], axis=-1)
-            for name, array in arrays.items()
+            for name, array in vectors.items()
         }
         parts = {name: _repeated(space, count) for name, space in parts.items()}
         ages = [f"_{age}_ago" if age else "" for age in range(count - 1, -1, -1)]
         names = [f"{name}{age}" for age in ages for name in names]
+    arrays: dict[str, Frames] = dict(vectors)
+    is_complete = True
+    for name, reader in plan.images.items():
+        places = np.concatenate([run.quantities[name].values for run in runs])[rows]
+        with plan.place.named("observation", name):
+            found = reader.read(places[stacked], images)
+        if found is None:
+            # The other images are read all the same, to find all that cannot be decoded.
+            is_complete = False
+        else:
+            arrays[name], parts[name] = found, reader.space(found)
+    if not is_complete:
+        return None
     if len(parts) == 1:
         (name,) = parts
         return _Observations({(): arrays[name]}, parts[name], tuple(names))
-    by_path: dict[tuple[str, ...], Array] = {(name,): array for name, array in arrays.items()}
+    by_path: dict[tuple[str, ...], Frames] = {(name,): array for name, array in arrays.items()}
     return _Observations(by_path, spaces.Dict(parts), ())
 
 

@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 from mcaprl.errors import UsageError, import_extra
+from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.format.spaces import MAX_ACTIONS
 
 TimeSource = Literal["log_time", "publish_time", "header"]
@@ -123,11 +124,13 @@ class Quantity(_Part):
         default=None, description="Frame whose pose is looked up in `/tf`."
     )
     in_: str = Field(default="map", alias="in", description="Frame in which the pose is given.")
-    as_: Literal["yaw", "count"] | None = Field(
+    as_: Literal["yaw", "count", "depth", "intensity"] | None = Field(
         default=None,
         alias="as",
         description="`yaw` converts a quaternion to its angle about z, radians; `count` counts the"
-        " messages so far on the topic that `field` names, for example a topic of events.",
+        " messages so far on the topic that `field` names, for example a topic of events. For"
+        " images: `depth` are distances, `intensity` is brightness or temperature. Without it,"
+        " images of 16 bits per pixel (`mono16`, PNG) and of floats are depth.",
     )
     align: Alignment = Field(
         default="last",
@@ -152,14 +155,21 @@ class Quantity(_Part):
         description="Lowest and highest value. Infinite values are clipped, too; NaN is missing.",
     )
     wrap_angle: bool = Field(default=False, description="Whether to wrap radians into [-pi, pi).")
-    crop: tuple[int, int, int, int] | None = Field(
+    crop: tuple[int, int, _Count, _Count] | None = Field(
         default=None, description="Left, top, width and height of the cropped image, pixels."
     )
-    resize: tuple[int, int] | None = Field(default=None, description="Width and height, pixels.")
+    resize: tuple[_Count, _Count] | None = Field(
+        default=None, description="Width and height, pixels."
+    )
     gray: bool = Field(default=False, description="Whether to convert colors to gray.")
-    range_m: tuple[float, float] | None = Field(
+    range_m: tuple[Finite, Finite] | None = Field(
         default=None,
         description="Depths in meters that become 0 and 255; without it, depth stays in meters.",
+    )
+    range: tuple[Finite, Finite] | None = Field(
+        default=None,
+        description="Values of an image with `as: intensity` that become 0 and 255; without it,"
+        " values of 16 bits and floats stay as they are, in float32.",
     )
 
     @model_validator(mode="after")
@@ -167,11 +177,21 @@ class Quantity(_Part):
         given = [name for name in ("field", "image", "transform") if getattr(self, name)]
         if len(given) != 1:
             raise ValueError("give one of field, image and transform")
-        for name in ("crop", "resize", "range_m", "gray"):
+        for name in ("crop", "resize", "range_m", "range", "gray"):
             if getattr(self, name) and given != ["image"]:
                 raise ValueError(f"{name} is for images only")
+        if self.as_ is not None and (self.as_ in ("depth", "intensity")) != (given == ["image"]):
+            raise ValueError(f"as: {self.as_} is not for {given[0]}")
         if given == ["image"] and self.align == "linear":
             raise ValueError("images cannot be interpolated: use last or nearest")
+        if self.range is not None and self.as_ != "intensity":
+            raise ValueError("range is for images with `as: intensity`; for depth, use range_m")
+        if self.range_m is not None and self.as_ == "intensity":
+            raise ValueError("range_m is for depth; with `as: intensity`, use range")
+        if any(ends is not None and ends[0] == ends[1] for ends in (self.range, self.range_m)):
+            raise ValueError("range and range_m need two different values")
+        if self.resize is not None and math.prod(self.resize) > MAX_IMAGE_PIXELS:
+            raise ValueError(f"resize is limited to {MAX_IMAGE_PIXELS} pixels")
         if self.clip is not None and not (_are_stored(*self.clip) and self.clip[0] < self.clip[1]):
             raise ValueError("clip must be the lowest value, then the highest value")
         self._check_elements(is_field=given == ["field"] and self.as_ is None)

@@ -1,216 +1,313 @@
-"""Images of a bag as observations: decoded, cropped, resized and converted to gray.
+"""Images of a bag as observations, in memory or on disk.
 
-Raw `sensor_msgs/Image` messages of the encodings in `_RAW` and compressed images of every format
-that Pillow reads are supported. Colors become uint8 (H, W, 3) or, if gray, (H, W, 1). Depth
-becomes float32 meters (H, W, 1), with the value 0 where there is no surface. If the mapping sets
-`range_m`, depth becomes uint8 instead.
+Raw and compressed images of ROS and Foxglove are supported; see `pixels` and `compressed`.
+`image_options` describes what they become.
 """
 
 from __future__ import annotations
 
-import struct
-from io import BytesIO
+import base64
+import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, UsageError, import_extra
-from mcaprl.recorder.bags.bag import Bag, TopicInfo
+from mcaprl.errors import LogError, UsageError
+from mcaprl.problem import Problem
+from mcaprl.recorder.bags.bag import Bag, Failure, TopicInfo
+from mcaprl.recorder.dataset.image_cache import Storage, is_mapped
+from mcaprl.recorder.dataset.mapped import Frames, as_pixels
+from mcaprl.recorder.mapping.compressed import compressed_pixels, is_video
 from mcaprl.recorder.mapping.config import Quantity
+from mcaprl.recorder.mapping.image_copy import copied_images
+from mcaprl.recorder.mapping.image_options import ImageOptions
+from mcaprl.recorder.mapping.pixels import Pixels, one_line, raw_pixels
+from mcaprl.texts import counted, size
 
 Image = NDArray[Any]
 
-_BLOCK_ROWS = 32
-_GRAY_WEIGHTS = np.array([0.299, 0.587, 0.114])
-"""ITU-R BT.601 weights of red, green and blue."""
-# Raw encodings: channels per pixel, dtype, and channel indexes of red, green and blue.
-_RAW: dict[str, tuple[int, str, tuple[int, ...]]] = {
-    "rgb8": (3, "u1", (0, 1, 2)),
-    "bgr8": (3, "u1", (2, 1, 0)),
-    "rgba8": (4, "u1", (0, 1, 2)),
-    "bgra8": (4, "u1", (2, 1, 0)),
-    "8UC3": (3, "u1", (2, 1, 0)),
-    "mono8": (1, "u1", (0,)),
-    "8UC1": (1, "u1", (0,)),
-    "mono16": (1, "u2", (0,)),
-    "16UC1": (1, "u2", (0,)),
-    "32FC1": (1, "f4", (0,)),
-}
-_METERS_PER_UNIT = {"16UC1": 1e-3, "mono16": 1e-3, "32FC1": 1.0}
-"""Depth encodings (REP 118), with their units in meters."""
-# compressed_depth_image_transport puts format, A and B before the PNG.
-_DEPTH_HEADER = struct.Struct("<iff")
-_RAW_FIELDS = ("height", "width", "encoding", "is_bigendian", "step", "data")
+_BLOCK_ROWS, _BLOCK_BYTES = 8, 1 << 22
+"""Largest number and size of the messages that are in memory at a time."""
+# foxglove.RawImage has no is_bigendian: its pixels are little-endian.
+_RAW_FIELDS, _BIG_ENDIAN = ("height", "width", "encoding", "step", "data"), "is_bigendian"
 _COMPRESSED_FIELDS = ("format", "data")
+_TYPES = ("Image", "CompressedImage", "RawImage")
+_PACKAGES = ("sensor_msgs", "foxglove", "foxglove_msgs")
+
+
+def is_image_type(type_name: str) -> bool:
+    """Return whether messages of a type are images that can be read.
+
+    ROS 1 names, which have no `/msg/`, and those of Foxglove are known.
+
+    >>> is_image_type("sensor_msgs/msg/Image"), is_image_type("sensor_msgs/Image")
+    (True, True)
+    >>> is_image_type("foxglove.RawImage"), is_image_type("sensor_msgs/msg/Imu")
+    (True, False)
+    """
+    package, *_, name = type_name.replace(".", "/").split("/") * 2
+    return package in _PACKAGES and name in _TYPES
 
 
 class ImageReader:
-    """Reader that decodes, crops and resizes the images of one topic as a mapping specifies."""
+    """Reader that decodes, crops and resizes the images of one topic as a mapping specifies.
 
-    def __init__(self, bag: Bag, topic: str, quantity: Quantity) -> None:
+    Attributes:
+        bag: Bag that has the topic.
+        topic: Topic of the images.
+        name: Name of the quantity, which is part of the name of a copy on disk.
+        options: Options of the mapping.
+        failures: Messages without a readable image, by their index in the topic, as far as `read`
+            found any. They are to be treated as if they did not exist.
+    """
+
+    def __init__(
+        self,
+        bag: Bag,
+        topic: str,
+        quantity: Quantity,
+        *,
+        name: str = "image",
+        strict: bool = False,
+    ) -> None:
         """Find out whether the images are raw or compressed.
+
+        Args:
+            bag: Bag that has the topic.
+            topic: Topic of the images.
+            quantity: Options of the mapping.
+            name: Name of the quantity.
+            strict: Whether an image that cannot be decoded is an error.
 
         Raises:
             UsageError: The topic has no images.
         """
-        self._bag, self.topic, self._quantity = bag, topic, quantity
-        self._fields = _image_fields(bag.topics[topic])
+        self.bag, self.topic, self.name = bag, topic, name
+        self.options, self._strict = ImageOptions(topic, quantity), strict
+        self._fields = _image_fields(bag, bag.topics[topic])
+        self.failures: dict[int, Failure] = {}
 
-    def read(self, rows: NDArray[np.int64]) -> Image:
+    def read(self, rows: NDArray[np.int64], storage: Storage = "memory") -> Frames | None:
         """Return the images of N messages as (N, H, W, C); repeated messages are decoded only once.
 
         Args:
-            rows: (N,) positions of the messages in the topic.
+            rows: (N,) positions of the messages in the topic; or (N, K) to join K images along the
+                last axis, (N, H, W, K * C).
+            storage: Where the images are stored. If they are `mapped`, they are decoded into a file
+                beside the bag, and read when they are indexed.
+
+        Returns:
+            The images; None if a message has no readable image. All such messages among `rows` are
+            in `failures` then: choose other rows, and read again.
 
         Raises:
-            LogError: An image is damaged or of an unknown encoding, or sizes differ.
+            LogError: No image can be decoded, or sizes differ; if the reader is strict: an image
+                cannot be decoded.
+            UsageError: The options of the mapping do not fit the images.
         """
         wanted, places = np.unique(rows, return_inverse=True)
-        found: Image | None = None
-        for first in range(0, len(wanted), _BLOCK_ROWS):
-            block = wanted[first : first + _BLOCK_ROWS]
-            columns = self._bag.read(self.topic, self._fields, block).columns
-            for k in range(len(block)):
-                message = {name: column[k] for name, column in columns.items()}
-                image = self._prepared(self._decoded(message))
-                if found is None:
-                    found = np.empty((len(wanted), *image.shape), image.dtype)
-                if image.shape != found.shape[1:] or image.dtype != found.dtype:
-                    raise LogError(
-                        f"{self.topic}: image {block[k]} is {image.shape} {image.dtype}, but the"
-                        f" first is {found.shape[1:]} {found.dtype}: set `resize` in the mapping"
-                    )
-                found[first + k] = image
-        assert found is not None, "there is at least one image"
-        return found if len(places) == len(wanted) and (np.diff(rows) > 0).all() else found[places]
+        first = next(self._images(wanted), None)
+        if first is None:
+            raise LogError(f"{self.topic}: {self._why_none(wanted)}")
+        image = first[1]
+        if not is_mapped(storage, rows.size * image.nbytes):
+            found: Frames | None = self._in_memory(wanted, places.reshape(rows.shape), image)
+        elif (mapped := copied_images(self, wanted, image)) is not None:
+            found = mapped.rows(places.reshape(rows.shape))
+        else:
+            found = None
+        return None if self.failures.keys() & set(wanted.tolist()) else found
 
-    def space(self, images: Image) -> spaces.Box:
-        """Return the space of one image."""
-        if images.dtype == np.uint8:
-            return spaces.Box(0, 255, images.shape[1:], np.uint8)
-        return spaces.Box(0.0, np.inf, images.shape[1:], np.float32)
+    def blocks(
+        self,
+        rows: NDArray[np.int64],
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        count: int,
+    ) -> Iterator[tuple[NDArray[np.int64], Image]]:
+        """Yield positions (K,) and images (K, H, W, C) of the messages with readable images.
 
-    def _decoded(self, message: dict[str, Any]) -> Any:
-        """Return colors or gray as a uint8 image (Pillow or NumPy), or depth as float32 meters."""
-        if "encoding" in message:
-            return _raw_image(self.topic, message)
-        return _compressed_image(self.topic, str(message["format"]), bytes(message["data"]))
+        The arrays are used again for the next block.
 
-    def _prepared(self, image: Any) -> Image:
-        quantity = self._quantity
-        if quantity.crop is not None:
-            image = self._cropped(image, *quantity.crop)
-        if quantity.resize is not None:
-            image = _resized(image, *quantity.resize)
-        pixels: Image = np.asarray(image)
-        if quantity.gray and pixels.ndim == 3:
-            pixels = np.rint(pixels @ _GRAY_WEIGHTS).astype(np.uint8)
-        if quantity.range_m is not None and pixels.dtype == np.float32:
-            low, high = quantity.range_m
-            share = np.clip((pixels - low) / (high - low), 0.0, 1.0)
-            # Pixels without a surface get the largest value, as in the depth images of the sims.
-            pixels = np.where(pixels > 0, np.rint(255 * share), 255).astype(np.uint8)
-        return pixels if pixels.ndim == 3 else pixels[..., np.newaxis]
+        Args:
+            rows: Ascending positions of messages in the topic.
+            shape: Expected shape of an image.
+            dtype: Expected dtype.
+            count: Largest number of images in a block.
 
-    def _cropped(self, image: Any, left: int, top: int, width: int, height: int) -> Any:
-        full_width, full_height = _size(image)
-        if min(left, top) < 0 or left + width > full_width or top + height > full_height:
+        Raises:
+            LogError: An image has another shape or dtype.
+        """
+        numbers, images = np.empty(count, np.int64), np.empty((count, *shape), dtype)
+        filled = 0
+        for row, image in self._images(rows):
+            if image.shape != shape or image.dtype != dtype:
+                raise LogError(
+                    f"{self.topic}: image {row} is {image.shape} {image.dtype}, but the"
+                    f" first is {shape} {dtype}: set `resize` in the mapping"
+                )
+            numbers[filled], images[filled] = row, image
+            filled += 1
+            if filled == count:
+                yield numbers, images
+                filled = 0
+        if filled:
+            yield numbers[:filled], images[:filled]
+
+    def space(self, images: Frames) -> spaces.Box:
+        """Return the space of one of the images (N, H, W, C)."""
+        return self.options.space(images)
+
+    def problems(self) -> list[Problem]:
+        """Return problems of the images that `read` decoded."""
+        found = []
+        if self.options.ambiguous:
+            what = f"images '{self.options.ambiguous}' are read as depth, but may have other values"
+            action = "set `as: depth`, or `as: intensity` for infrared and thermal images"
+            found.append(Problem(what, self.topic, next=action))
+        if self.failures:
+            first = self.failures[min(self.failures)]
+            what = f"{counted(len(self.failures), 'image')} cannot be decoded"
+            what += f", the first is message {first.row} at {first.log_time_ns} ns"
+            action = "they are left out: the image before is used"
+            found.append(Problem(what, self.topic, effect=first.reason, next=action))
+        return found
+
+    def leave_out(self, failure: Failure) -> None:
+        """Add a message to `failures`.
+
+        Raises:
+            LogError: The reader is strict.
+        """
+        if self._strict:
+            row, time_ns, reason = failure
+            raise LogError(f"{self.topic}: message {row} at {time_ns} ns: {reason}")
+        self.failures[failure.row] = failure
+
+    def _in_memory(self, wanted: NDArray[np.int64], places: NDArray[np.intp], like: Image) -> Image:
+        """Return the images at `places` (N,) or (N, K), which are indexes of `wanted`."""
+        stack = places.shape[1] if places.ndim > 1 else 1
+        *edges, channels = like.shape
+        try:
+            found = np.empty((len(places), *edges, stack), as_pixels(like).dtype)
+        except MemoryError as error:
+            raise LogError(
+                f"{self.topic}: the images need {size(places.size * like.nbytes)} of memory: set"
+                " `resize` or `crop` in the mapping, or open the bag with images='mapped'"
+            ) from error
+        # Places of each message in the result, message by message.
+        order = np.argsort(places, axis=None, kind="stable")
+        bounds = np.searchsorted(places.ravel()[order], np.arange(len(wanted) + 1))
+        for rows, images in self.blocks(wanted, like.shape, like.dtype, 1):
+            k = int(np.searchsorted(wanted, rows[0]))
+            frame, position = np.divmod(order[bounds[k] : bounds[k + 1]], stack)
+            found[frame, :, :, position] = as_pixels(images[0])
+        return found.view(like.dtype).reshape(len(places), *edges, stack * channels)
+
+    def _why_none(self, rows: NDArray[np.int64]) -> str:
+        first = self.failures[int(rows[0])]
+        if len(rows) == 1:
+            return first.reason
+        return (
+            f"none of the {len(rows)} images can be decoded; message {first.row} at"
+            f" {first.log_time_ns} ns: {first.reason}"
+        )
+
+    def _images(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, Image]]:
+        """Yield the messages with readable images: index in the topic, and pixels."""
+        at, count = 0, 1
+        while at < len(rows):
+            block = rows[at : at + count]
+            largest = 1
+            for row, message in self._messages(block):
+                if isinstance(message, Failure):
+                    self.leave_out(message)
+                    continue
+                largest = max(largest, _length(message["data"]))
+                try:
+                    pixels = self._decoded(message)
+                except LogError as error:
+                    time_ns = int(self.bag.times(self.topic)[row])
+                    self.leave_out(Failure(row, time_ns, str(error)))
+                    continue
+                yield row, self.options.applied(pixels)
+            at, count = at + len(block), min(_BLOCK_ROWS, max(1, _BLOCK_BYTES // largest))
+
+    def _messages(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, dict[str, Any] | Failure]]:
+        """Yield the fields of each message, or why the message cannot be decoded."""
+        found = self.bag.read(self.topic, self._fields, rows)
+        messages: dict[int, dict[str, Any] | Failure] = {each.row: each for each in found.failures}
+        for k, row in enumerate(found.rows.tolist()):
+            messages[row] = {name: column[k] for name, column in found.columns.items()}
+        yield from sorted(messages.items(), key=lambda each: each[0])
+
+    def _decoded(self, message: dict[str, Any]) -> Pixels:
+        kind = str(message["encoding" if "encoding" in message else "format"])
+        if is_video(kind):
             raise UsageError(
-                f"{self.topic}: crop {[left, top, width, height]} is outside of the image of"
-                f" {full_width} x {full_height} pixels"
+                f"{self.topic} has video ({one_line(kind)}): video topics are not supported"
+                " yet; convert it to JPEG images (sensor_msgs/msg/CompressedImage)"
             )
-        if isinstance(image, np.ndarray):
-            return image[top : top + height, left : left + width]
-        return image.crop((left, top, left + width, top + height))
+        if "encoding" in message:
+            return raw_pixels({**message, "data": _bytes_of(message["data"])})
+        try:
+            return compressed_pixels(kind, _bytes_of(message["data"]))
+        except LogError as error:
+            raise LogError(
+                f"a compressed image ({one_line(kind)}) cannot be read: {error}"
+            ) from error
 
 
-def _image_fields(topic: TopicInfo) -> tuple[str, ...]:
+def _image_fields(bag: Bag, topic: TopicInfo) -> tuple[str, ...]:
+    """Return the fields of an image message to read."""
+    if is_video(topic.type_name):
+        raise UsageError(
+            f"{topic.name} has video ({topic.type_name}): video topics are not supported yet;"
+            " convert it to JPEG images (sensor_msgs/msg/CompressedImage)"
+        )
+    every = (*_RAW_FIELDS, _BIG_ENDIAN, *_COMPRESSED_FIELDS)
     known = {name.split("[")[0] for name in topic.fields}
-    for fields in (_RAW_FIELDS, _COMPRESSED_FIELDS):
-        if known.issuperset(fields):
-            return fields
+    if not topic.fields and topic.count:
+        # JSON without a schema: the first message shows the fields.
+        columns = bag.read(topic.name, every, np.zeros(1, np.int64)).columns
+        known = {name for name, column in columns.items() if _is_given(column)}
+    if known.issuperset(_RAW_FIELDS):
+        return (*_RAW_FIELDS, *({_BIG_ENDIAN} & known))
+    if known.issuperset(_COMPRESSED_FIELDS):
+        return _COMPRESSED_FIELDS
     raise UsageError(
         f"{topic.name} has {topic.type_name}, not images: expected sensor_msgs/Image or"
-        " CompressedImage"
+        " CompressedImage, or foxglove.RawImage or CompressedImage"
     )
 
 
-def _raw_image(topic: str, message: dict[str, Any]) -> Image:
-    encoding = str(message["encoding"])
-    if encoding not in _RAW:
-        raise LogError(f"{topic}: encoding '{encoding}'; supported: {', '.join(_RAW)}")
-    channels, code, order = _RAW[encoding]
-    height, width, step = (int(message[name]) for name in ("height", "width", "step"))
-    dtype = np.dtype(code).newbyteorder(">" if message["is_bigendian"] else "<")
-    used = width * channels * dtype.itemsize
-    data = np.frombuffer(bytes(message["data"]), np.uint8)
-    if step < used or len(data) < step * height or not height * width:
-        raise LogError(
-            f"{topic}: an image of {width} x {height} {encoding} with {step} bytes per row has"
-            f" {len(data)} bytes, which do not match"
-        )
-    rows = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :used])
-    pixels = rows.view(dtype).reshape(height, width, channels)[..., list(order)]
-    if encoding in _METERS_PER_UNIT:
-        return _meters(pixels[..., 0], _METERS_PER_UNIT[encoding])
-    return pixels if channels > 1 else pixels[..., 0]
+def _length(data: Any) -> int:
+    return len(data) if isinstance(data, bytes | str) else int(np.size(data))
 
 
-def _compressed_image(topic: str, kind: str, data: bytes) -> Any:
-    """Return colors or gray as a Pillow image, or depth as float32 meters."""
-    pillow = import_extra("PIL.Image", "bags")
-    is_depth = "compressedDepth" in kind
+def _bytes_of(data: Any) -> bytes:
+    """Return the bytes of an image; in JSON, they are base64 or a list of numbers.
+
+    Raises:
+        LogError: The data is something else.
+    """
+    if isinstance(data, bytes):
+        return data
     try:
-        image = pillow.open(BytesIO(data[_DEPTH_HEADER.size :] if is_depth else data))
-        image.load()
-        if is_depth and kind.startswith("32FC1"):
-            return _meters_of_code(np.asarray(image), data)
-        if image.mode in ("I;16", "I", "F"):
-            return _meters(np.asarray(image), 1.0 if image.mode == "F" else 1e-3)
-        wanted = "L" if image.mode in ("L", "1") else "RGB"
-        # Do not convert an image that has this mode, because the conversion would copy it.
-        return image if image.mode == wanted else image.convert(wanted)
-    # Pillow raises errors of many types for damaged images.
-    except Exception as error:
-        raise LogError(f"{topic}: a compressed image ({kind}) cannot be read: {error}") from error
+        if isinstance(data, str):
+            return base64.b64decode(data, validate=True)
+        values = np.asarray(data)
+        if values.ndim == 1 and values.dtype.kind in "iu" and not (values & ~0xFF).any():
+            return values.astype(np.uint8).tobytes()
+    except ValueError as error:
+        raise LogError(f"the data of the image cannot be read: {error}") from error
+    raise LogError("the data of the image are not bytes")
 
 
-def _meters_of_code(code: Image, data: bytes) -> Image:
-    """Return the depth of a coded float image.
-
-    compressed_depth_image_transport stores the integer part of A / depth + B, or 0 where there is
-    no depth.
-    """
-    _, a, b = _DEPTH_HEADER.unpack_from(data)
-    with np.errstate(divide="ignore"):
-        depth = a / (code.astype(np.float64) - b)
-    return _meters(np.where(code > 0, depth, 0.0), 1.0)
-
-
-def _meters(depth: Image, unit_m: float) -> Image:
-    meters = depth.astype(np.float32) * np.float32(unit_m)
-    return np.where(np.isfinite(meters) & (meters > 0), meters, np.float32(0))
-
-
-def _size(image: Any) -> tuple[int, int]:
-    """Return width and height of a Pillow image or a NumPy array."""
-    if isinstance(image, np.ndarray):
-        return image.shape[1], image.shape[0]
-    width, height = image.size
-    return width, height
-
-
-def _resized(image: Any, width: int, height: int) -> Any:
-    """Resize an image by averaging.
-
-    Depth is resized by the nearest pixel: the mean of two depths may not be on any surface.
-    """
-    if _size(image) == (width, height):
-        return image
-    pillow = import_extra("PIL.Image", "bags")
-    is_array = isinstance(image, np.ndarray)
-    is_depth = is_array and image.dtype == np.float32
-    method = pillow.Resampling.NEAREST if is_depth else pillow.Resampling.BOX
-    return (pillow.fromarray(image) if is_array else image).resize((width, height), method)
+def _is_given(column: NDArray[Any]) -> bool:
+    """Return whether the first message has the field."""
+    value = column[0] if len(column) else None
+    return value is not None and not (isinstance(value, float) and math.isnan(value))

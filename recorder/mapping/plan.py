@@ -21,6 +21,7 @@ from mcaprl.recorder.mapping.config import (
     TimeSource,
 )
 from mcaprl.recorder.mapping.expression import Expression
+from mcaprl.recorder.mapping.images import ImageReader
 from mcaprl.recorder.mapping.observe import Source, source_of
 from mcaprl.recorder.mapping.paths import topic_of
 from mcaprl.recorder.mapping.streams import TopicStream
@@ -56,6 +57,7 @@ class Plan:
         mapping: Mapping of the bag's topics.
         place: Positions of the mapping's keys in its file, for error messages.
         quantities: Observed and other quantities, by name.
+        images: Readers of the observed images, by name.
         behavior_prob: Probability of the action; None if unknown.
         commands: Fields of the action; empty if it consists of expressions.
         expressions: Expressions of the action.
@@ -70,6 +72,12 @@ class Plan:
     def __init__(self, bag: Bag, mapping: Mapping, place: Place, *, trust_code: bool) -> None:
         """Resolve all paths and parse all expressions.
 
+        Args:
+            bag: Bag to read.
+            mapping: Mapping of the bag's topics.
+            place: Positions of the mapping's keys in its file.
+            trust_code: Whether `reward` may name a Python function.
+
         Raises:
             UsageError: A topic, field or name is unknown, or an expression is wrong.
         """
@@ -78,6 +86,11 @@ class Plan:
             name: self._wanted((section, name), quantity)
             for section in ("observation", "fields")
             for name, quantity in getattr(mapping, section).items()
+        }
+        self.images = {
+            name: self._image_reader(name)
+            for name, quantity in mapping.observation.items()
+            if quantity.image is not None
         }
         action = mapping.action
         is_during = action.align == "during"
@@ -139,6 +152,18 @@ class Plan:
         """Return the name of the stream of a topic, whose times a part of the mapping chooses."""
         time = part.time or self.mapping.time
         return topic if time == self.mapping.time else f"{topic} by {_text(time)}"
+
+    def leave_out_images(self) -> None:
+        """Leave out the messages without a readable image, as far as known."""
+        for name, reader in self.images.items():
+            self.streams[self.quantities[name].stream].leave_out(reader.failures)
+
+    def _image_reader(self, name: str) -> ImageReader:
+        keys, quantity, source, *_ = self.quantities[name]
+        with self.place.named(*keys):
+            return ImageReader(
+                self.bag, source.topic, quantity, name=name, strict=self.mapping.strict
+            )
 
     def _expression(self, keys: tuple[str | int, ...], text: str) -> Expression:
         with self.place.named(*keys):

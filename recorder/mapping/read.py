@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from collections.abc import Mapping as MappingOf
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from mcaprl.errors import LogError
 from mcaprl.problem import Problem
 from mcaprl.recorder.bags.bag import Bag, open_bag
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.mapping.actions import Actions
 from mcaprl.recorder.mapping.assemble import assembled
 from mcaprl.recorder.mapping.config import Mapping, Place, load_mapping
@@ -45,6 +47,7 @@ def read_bag(
     *,
     changes: MappingOf[str, Any] | None = None,
     trust_code: bool = False,
+    images: Storage = "auto",
 ) -> MappedBag:
     """Read a bag as a dataset.
 
@@ -53,10 +56,11 @@ def read_bag(
         mapping: Mapping, path of a mapping file, or its keys and values.
         changes: Values that replace those of the mapping's keys.
         trust_code: Whether `reward` may name a function of a Python module, which is imported.
+        images: Storage of images: `memory`, `mapped`, or `auto`; see `mcaprl.open`.
 
     Raises:
         UsageError: The mapping does not fit the bag; the message names file, line and key.
-        LogError: The bag cannot be read, or has no episode.
+        LogError: The bag cannot be read, or has no episode; or no image can be decoded.
         MissingExtraError: The packages of the `bags` extra are not installed.
     """
     place = Place()
@@ -64,15 +68,30 @@ def read_bag(
         mapping, place = load_mapping(mapping)
     mapping = mapping.model_copy(update=dict(changes or {}))
     with closing(open_bag(data, strict=mapping.strict)) as bag:
-        return read_open_bag(bag, mapping, place, trust_code=trust_code)
+        return read_open_bag(bag, mapping, place, trust_code=trust_code, images=images)
 
 
 def read_open_bag(
-    bag: Bag, mapping: Mapping, place: Place | None = None, *, trust_code: bool = False
+    bag: Bag,
+    mapping: Mapping,
+    place: Place | None = None,
+    *,
+    trust_code: bool = False,
+    images: Storage = "auto",
 ) -> MappedBag:
     """Read an open bag; see `read_bag`. In errors, `place` locates the keys of the mapping."""
     plan = Plan(bag, mapping, place or Place(), trust_code=trust_code)
-    reader = StepReader(plan)
+    # Without the messages of images that cannot be decoded, steps use other messages, whose images
+    # may be damaged as well.
+    while (found := _read(plan, images)) is None:
+        pass
+    return found
+
+
+def _read(plan: Plan, images: Storage) -> MappedBag | None:
+    """Read the bag of a plan; return None if images turned out to be unreadable."""
+    plan.leave_out_images()
+    bag, mapping, reader = plan.bag, plan.mapping, StepReader(plan)
     runs = [reader.read(number) for number in range(reader.count)]
     least = mapping.episodes.min_steps
     kept = [[each for each in run.episodes if each.length >= least] for run in runs]
@@ -85,7 +104,11 @@ def read_open_bag(
             f"{', '.join(map(str, bag.paths))}: the mapping finds no episode of {least} or"
             f" more steps: {report.why_empty()}"
         )
-    return MappedBag(assembled(plan, runs, kept), report)
+    dataset = assembled(plan, runs, kept, images)
+    if dataset is None:
+        return None
+    problems = [problem for each in plan.images.values() for problem in each.problems()]
+    return MappedBag(dataset, replace(report, images=problems))
 
 
 def _longest(kept: list[list[Segment]], recordings: list[int]) -> list[list[Segment]]:

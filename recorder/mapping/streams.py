@@ -68,13 +68,11 @@ class TopicStream:
         )
         return Stream(found.log_time_ns[keep], columns, found.rows[keep], found.failures, absent)
 
-    def leave_out(self, failures: Iterable[Failure]) -> None:
-        """Leave out more messages, such as those with damaged images."""
-        failures = tuple(failures)
-        self._left_out = np.union1d(self._left_out, [each.row for each in failures])
-        known = self._read.failures
-        del self._read
-        self._read = self._read._replace(failures=(*known, *failures))
+    def leave_out(self, rows: Iterable[int]) -> None:
+        """Leave out more messages, such as those with damaged images, by their index."""
+        self._left_out = np.union1d(self._left_out, list(rows)).astype(np.int64)
+        self.__dict__.pop("_read", None)
+        self.__dict__.pop("times_ns", None)
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
@@ -100,7 +98,7 @@ class TopicStream:
     def bad_stamps(self) -> int:
         """Number of messages that were left out because their stamp is not a time."""
         count = len(self._bag.times(self.topic))
-        return count - len(self.rows) - len(self.failures)
+        return count - len(self.rows) - len(self.failures) - len(self._left_out)
 
     @cached_property
     def times_ns(self) -> NDArray[np.int64]:

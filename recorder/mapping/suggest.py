@@ -14,6 +14,7 @@ from mcaprl.errors import LogError
 from mcaprl.recorder.bags.bag import Bag, TopicInfo
 from mcaprl.recorder.format.topics import STEP_TOPIC
 from mcaprl.recorder.mapping.align import NS_PER_S
+from mcaprl.recorder.mapping.images import is_image_type
 from mcaprl.texts import printable
 
 # If the name of a topic or type contains one of these words, the topic is likely to have commands.
@@ -23,7 +24,6 @@ _MAX_OBSERVED = 12
 _SIZES = (8, 16, 32, 64)
 _NUMBERS = {"float32", "float64", "bool", *(f"{u}int{bits}" for u in ("", "u") for bits in _SIZES)}
 _SKIPPED = ("/rosout", "/parameter_events", "/tf", "/tf_static", "/diagnostics", "/clock")
-_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _LIKELY = {
     "nav_msgs/msg/Odometry": (
         "twist.twist.linear.x",
@@ -96,7 +96,7 @@ def suggested(bag: Bag) -> str:
     lines += [
         f"  # camera: {{image: {_quoted(topic.info.name)}, resize: [84, 84]}}  # {topic}"
         for topic in usable
-        if topic.info.type_name in _IMAGES
+        if is_image_type(topic.info.type_name)
     ]
     lines += [
         f"  # other: {{field: {_quoted(path)}}}  # {remark}"
@@ -122,9 +122,9 @@ def _observations(bag: Bag, topics: Iterable[_Topic]) -> Iterator[_Entry]:
     names: set[str] = set()
     for topic in topics:
         info = topic.info
-        if info.name in _SKIPPED or info.type_name in _IMAGES:
+        if info.name in _SKIPPED or is_image_type(info.type_name):
             continue
-        fields = _LIKELY.get(info.type_name) or _numbers(info)[:3]
+        fields = _LIKELY.get(_ros2_name(info.type_name)) or _numbers(info)[:3]
         for field in fields:
             plain = field.split("[")[0]
             if plain not in info.fields or len(names) == _MAX_OBSERVED:
@@ -134,6 +134,12 @@ def _observations(bag: Bag, topics: Iterable[_Topic]) -> Iterator[_Entry]:
             name = _name(info.name, plain, names)
             names.add(name)
             yield _Entry(name, f"{info.name}.{field}", str(topic))
+
+
+def _ros2_name(type_name: str) -> str:
+    """Return the name of a type with `/msg/`, which names of ROS 1 lack."""
+    package, slash, name = type_name.partition("/")
+    return f"{package}/msg/{name}" if slash and "/" not in name else type_name
 
 
 def _first_length(bag: Bag, info: TopicInfo, field: str) -> int:
@@ -146,7 +152,7 @@ def _others(topics: Iterable[_Topic], observed: list[_Entry]) -> Iterator[tuple[
     known = {entry.path.split("[")[0] for entry in observed}
     for topic in topics:
         info = topic.info
-        if info.name not in _SKIPPED and info.type_name not in _IMAGES:
+        if info.name not in _SKIPPED and not is_image_type(info.type_name):
             for field in _numbers(info):
                 path = f"{info.name}.{field}"
                 if path not in known:

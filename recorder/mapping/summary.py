@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -103,6 +103,7 @@ class MappingReport:
         far_actions: Share of the transitions whose command is far from every named action, or
             beyond the limits of the Box.
         action_counts: Number of transitions of each discrete action, by name or number.
+        images: Problems of the images: messages that were left out, and guesses of their meaning.
     """
 
     clock_steps: int
@@ -117,13 +118,14 @@ class MappingReport:
     missing_actions: float
     far_actions: float
     action_counts: dict[str, int]
+    images: list[Problem] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
         """Return the report as JSON types; ages that are not finite become None."""
         found = asdict(self)
-        for field in found["fields"].values():
+        for each in found["fields"].values():
             for name in ("median_age_s", "max_age_s"):
-                field[name] = field[name] if np.isfinite(field[name]) else None
+                each[name] = each[name] if np.isfinite(each[name]) else None
         return {**found, "left_out": [each.to_json() for each in self.left_out]}
 
     def problems(self) -> list[Problem]:
@@ -131,12 +133,12 @@ class MappingReport:
         found = [*self.left_out]
         found += [
             Problem(
-                f"{name} is missing at {field.missing:.0%} of the steps{field.which}",
-                field.topic,
+                f"{name} is missing at {each.missing:.0%} of the steps{each.which}",
+                each.topic,
                 next="set `missing` or a larger `tolerance_s`, or remove the quantity",
             )
-            for name, field in self.fields.items()
-            if field.missing > _MUCH
+            for name, each in self.fields.items()
+            if each.missing > _MUCH
         ]
         if self.missing_actions > _MUCH:
             what = f"{self.missing_actions:.0%} of the steps have no action"
@@ -148,7 +150,7 @@ class MappingReport:
             episodes = counted(len(self.dropped), "short episode")
             what = f"{episodes} with {counted(sum(self.dropped), 'step')} left out"
             found.append(Problem(what, "episodes", next="check `gap_s`, the ends and `min_steps`"))
-        return found
+        return [*found, *self.images]
 
     def rows(self) -> list[tuple[str, str]]:
         """Return the rows of a table: name and text of each result."""
@@ -161,7 +163,7 @@ class MappingReport:
             ("recordings", str(self.recordings)),
             ("resets of the clock", str(self.clock_resets)),
         ]
-        rows += [(name, str(field)) for name, field in self.fields.items()]
+        rows += [(name, str(each)) for name, each in self.fields.items()]
         rows.append(("steps without action", f"{self.missing_actions:.1%}"))
         if self.action_counts:
             actions = ", ".join(f"{count} {name}" for name, count in self.action_counts.items())

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, import_extra
+from mcaprl.limits import MAX_IMAGE_PIXELS
+from mcaprl.recorder.dataset.image_files import decoded_file
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf
 
 STATE, IMAGE, IMAGES = "observation.state", "observation.image", "observation.images."
@@ -117,7 +119,10 @@ class Feature:
         """
         if self.dtype == "image":
             files = [file for chunk in column.chunks for file in chunk.field("bytes").to_pylist()]
-            return _stack(self.name, [image_of(self.name, file) for file in files])
+            # The declared shape limits the memory, in whichever order it has its dimensions.
+            most = min(math.prod(self.shape), MAX_IMAGE_PIXELS)
+            images = [image_of(self.name, file, max_pixels=most) for file in files]
+            return _stack(self.name, images)
         parts = [_numbers(self.name, chunk) for chunk in column.chunks if len(chunk)]
         flat = np.concatenate(parts) if parts else np.zeros(0, self.dtype)
         if flat.size != len(column) * math.prod(self.shape):
@@ -181,21 +186,25 @@ def image_file(values: NDArray[Any]) -> bytes:
     return file.getvalue()
 
 
-def image_of(name: str, file: bytes | None) -> NDArray[Any]:
+def image_of(name: str, file: bytes | None, *, max_pixels: int = MAX_IMAGE_PIXELS) -> NDArray[Any]:
     """Decode an image file to (height, width, channels): uint8, or uint16 or float32 for depth.
 
+    Args:
+        name: Name of the feature, for messages.
+        file: Content of the file; None if the data files do not contain it.
+        max_pixels: Maximum number of pixels.
+
     Raises:
-        LogError: The file is missing or damaged.
+        LogError: The file is missing, damaged, of another format, or has too many pixels.
     """
-    images = import_extra("PIL.Image", "video")
     if file is None:
         raise LogError(f"an image of {name} is not in the data files: only its path is stored")
     try:
-        with images.open(BytesIO(file)) as image:
-            kept = image.mode in ("L", "RGB", "RGBA", "F") or image.mode.startswith("I;16")
-            pixels = np.asarray(image if kept else image.convert("RGB"))
-    except (OSError, ValueError, SyntaxError) as error:
+        image = decoded_file(file, "video", max_pixels=max_pixels)
+    except LogError as error:
         raise LogError(f"an image of {name} is damaged: {error}") from error
+    kept = image.mode in ("L", "RGB", "RGBA", "F") or image.mode.startswith("I;16")
+    pixels = np.asarray(image if kept else image.convert("RGB"))
     return pixels if pixels.ndim == 3 else pixels[:, :, None]
 
 
