@@ -22,6 +22,8 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
                         estimated afterwards; otherwise absent
     about               JSON object: description of the source dataset, such as its author, if the
                         log was converted from another tool's format; otherwise absent
+    times               "none" if the data has no times, so that its times only count the steps;
+                        always absent in a log, in which data without times has the times of writing
 """
 
 from __future__ import annotations
@@ -52,6 +54,7 @@ from mcaprl.texts import encodable
 
 FORMAT_VERSION = "1"
 ESTIMATED = "estimated"
+NO_TIMES = "none"
 # With more actions than this, a plot that labels them by numbers is not readable.
 MAX_NUMBERED_ACTIONS = 1_000
 METADATA_NAME = "mcaprl.dataset"
@@ -105,6 +108,8 @@ class LogMetadata:
             empty.
         about: Description of the source dataset if the log was converted from another tool's
             format; JSON types only.
+        times: `NO_TIMES` if the data has no times, such as arrays; otherwise empty. The times of
+            such data start at 0, but data with times may start at 0 too.
     """
 
     observation_space: spaces.Space[Any]
@@ -122,6 +127,7 @@ class LogMetadata:
     versions: Mapping[str, str] = field(default_factory=dict)
     behavior_prob: str = ""
     about: Mapping[str, Any] = field(default_factory=dict)
+    times: str = ""
 
     @cached_property
     def leaves(self) -> tuple[Leaf, ...]:
@@ -182,6 +188,7 @@ class LogMetadata:
             "versions": json.dumps(dict(self.versions)),
             **({"behavior_prob": self.behavior_prob} if self.behavior_prob else {}),
             **({"about": json.dumps(dict(self.about))} if self.about else {}),
+            **({"times": self.times} if self.times else {}),
         }
 
     @classmethod
@@ -218,6 +225,7 @@ class LogMetadata:
                 versions=_object(strings, "versions"),
                 behavior_prob=strings.get("behavior_prob", ""),
                 about=_object(strings, "about"),
+                times=strings.get("times", ""),
             )
         except (KeyError, ValueError, TypeError, MemoryError) as error:
             raise LogError(
@@ -228,8 +236,8 @@ class LogMetadata:
     def common(cls, parts: Sequence[LogMetadata]) -> LogMetadata:
         """Return metadata that describes several logs; fields that differ have the default value.
 
-        The spaces of all logs must be equal. `behavior_prob` is `ESTIMATED` if any of the logs has
-        this value.
+        The spaces of all logs must be equal. `behavior_prob` is `ESTIMATED`, and `times` is
+        `NO_TIMES`, if any of the logs has this value.
         """
         first, *others = parts
         blank = cls(first.observation_space, first.action_space)
@@ -238,8 +246,14 @@ class LogMetadata:
             for field_ in fields(cls)
             if any(getattr(other, field_.name) != getattr(first, field_.name) for other in others)
         }
-        estimated = any(part.behavior_prob for part in parts)
-        return replace(first, **{**differing, "behavior_prob": ESTIMATED if estimated else ""})
+        estimated, no_times = (
+            any(getattr(part, name) for part in parts) for name in ("behavior_prob", "times")
+        )
+        differing |= {
+            "behavior_prob": ESTIMATED if estimated else "",
+            "times": NO_TIMES if no_times else "",
+        }
+        return replace(first, **differing)
 
     @classmethod
     def of_env(
