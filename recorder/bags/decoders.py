@@ -28,6 +28,8 @@ _NUMBERS = (
     "sfixed",
     "enum",
 )
+# Names of the parts of a time in ROS 2, protobuf, Foxglove's JSON, and JSON of ROS 1.
+_TIMES = (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec"), ("secs", "nsecs"))
 _JSON_KINDS = {"number": "float64", "integer": "int64", "boolean": "bool", "string": "string"}
 
 
@@ -235,7 +237,7 @@ def value_at(message: Any, path: str) -> Any:
 
 def _nanoseconds(value: Any) -> Any:
     """Convert a time to nanoseconds; return any other value unchanged."""
-    for second, rest in (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec")):
+    for second, rest in _TIMES:
         if isinstance(value, dict):
             if value.keys() == {second, rest}:
                 return int(value[second]) * _NS_PER_S + int(value[rest])

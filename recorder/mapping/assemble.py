@@ -200,7 +200,7 @@ def _limits(quantity: Quantity) -> tuple[float, float]:
 
 def _names(name: str, quantity: Quantity, count: int) -> list[str]:
     if quantity.transform is not None:
-        return [f"{name}_{part}" for part in ("x", "y", "yaw")]
+        return [f"{name}_{part}" for part in quantity.parts]
     return [name] if count == 1 else [f"{name}_{k}" for k in range(count)]
 
 

@@ -19,6 +19,7 @@ Alignment = Literal["last", "nearest", "linear"]
 _EXPRESSION_NAMES = ("action", "terminated", "truncated")
 """Names in expressions that are not quantities."""
 Positive = Annotated[float, Field(gt=0)]
+PosePart = Literal["x", "y", "z", "roll", "pitch", "yaw", "qx", "qy", "qz", "qw"]
 
 
 class _Part(BaseModel):
@@ -50,9 +51,23 @@ class Quantity(_Part):
         default=None, description="Topic of Image or CompressedImage messages."
     )
     transform: str | None = Field(
-        default=None, description="Frame whose pose is looked up in `/tf`."
+        default=None,
+        description="Frame whose pose is looked up in the transforms. A leading `/` of a frame is"
+        " ignored.",
     )
     in_: str = Field(default="map", alias="in", description="Frame in which the pose is given.")
+    parts: Annotated[list[PosePart], Field(min_length=1)] = Field(
+        default=["x", "y", "yaw"],
+        description="Parts of the pose, in this order: `x`, `y`, `z` in meters; `roll`, `pitch`,"
+        " `yaw` in radians, about the fixed axes x, y, z in this order (REP 103), with a yaw of 0"
+        " if the pitch is 90 degrees up or down; `qx`, `qy`, `qz`, `qw`, the unit quaternion with"
+        " qw >= 0.",
+    )
+    tf: str | None = Field(
+        default=None,
+        description="Topic of the transforms, such as `/robot1/tf`; `/robot1/tf_static` is used,"
+        " too. Default: `/tf`, or else the only topic of transforms in the bag.",
+    )
     as_: Literal["yaw", "count"] | None = Field(
         default=None,
         alias="as",
@@ -94,6 +109,11 @@ class Quantity(_Part):
         for name in ("crop", "resize", "range_m", "gray"):
             if getattr(self, name) and given != ["image"]:
                 raise ValueError(f"{name} is for images only")
+        for name in ("parts", "tf"):
+            if name in self.model_fields_set and given != ["transform"]:
+                raise ValueError(f"{name} is for transforms only")
+        if len(set(self.parts)) < len(self.parts):
+            raise ValueError("parts has a part twice")
         if given == ["image"] and self.align == "linear":
             raise ValueError("images cannot be interpolated: use last or nearest")
         if self.clip is not None and self.clip[0] >= self.clip[1]:

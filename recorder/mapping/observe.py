@@ -13,10 +13,12 @@ from mcaprl.recorder.bags.bag import Bag
 from mcaprl.recorder.mapping.align import NONE, Matches, during, interpolated, last, nearest
 from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.paths import FieldPath, as_numbers, field_path, topic_of
+from mcaprl.recorder.mapping.rotations import yaw_of
 from mcaprl.recorder.mapping.streams import Run, TopicStream
-from mcaprl.recorder.mapping.transforms import TF, TF_STATIC, Transforms, yaw_of
+from mcaprl.recorder.mapping.transforms import Transforms, transform_topic
 
 _QUATERNION = ("x", "y", "z", "w")
+_ANGLES = ("roll", "pitch", "yaw")
 
 
 class Values(NamedTuple):
@@ -57,7 +59,7 @@ def source_of(bag: Bag, quantity: Quantity) -> Source:
     if quantity.image is not None:
         return Source(topic_of(bag, quantity.image), (), None)
     if quantity.transform is not None:
-        return Source(topic_of(bag, TF if TF in bag.topics else TF_STATIC), (), None)
+        return Source(transform_topic(bag, quantity.tf), (), None)
     assert quantity.field is not None, "the mapping was validated"
     if quantity.as_ == "count":
         return Source(topic_of(bag, quantity.field), (), None)
@@ -74,8 +76,13 @@ def source_of(bag: Bag, quantity: Quantity) -> Source:
 def pose_of(quantity: Quantity, transforms: Transforms, steps_ns: NDArray[np.int64]) -> Values:
     """Return the pose of a frame at the times of steps."""
     assert quantity.transform is not None, "the quantity is a transform"
-    found, age_s = transforms.planar(
-        quantity.transform, quantity.in_, steps_ns, quantity.align, quantity.tolerance_s
+    found, age_s = transforms.pose(
+        quantity.transform,
+        quantity.in_,
+        steps_ns,
+        quantity.align,
+        quantity.tolerance_s,
+        quantity.parts,
     )
     return _shaped(quantity, found, np.isnan(age_s), age_s)
 
@@ -177,7 +184,9 @@ def _shaped(
     """Scale, wrap and clip values, and replace missing values."""
     found = found * quantity.scale + quantity.offset
     if quantity.wrap_angle or (quantity.as_ == "yaw" and quantity.align == "linear"):
-        found = (found + math.pi) % (2 * math.pi) - math.pi
+        wrapped = (found + math.pi) % (2 * math.pi) - math.pi
+        is_angle = quantity.transform is None or np.isin(quantity.parts, _ANGLES)
+        found = np.where(is_angle, wrapped, found)
     if quantity.clip is not None:
         found = np.clip(found, *quantity.clip)
     has_gap = ~np.isfinite(found)

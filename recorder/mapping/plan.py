@@ -53,6 +53,7 @@ class Plan:
         reasons: Conditions of the end reasons, by reason.
         reward: Function that computes the rewards.
         streams: Messages of the used topics, without those of transforms.
+        frames: Coordinate frames of the transforms, by topic.
         constants: Constants of the message types, by name; names with several values are omitted.
     """
 
@@ -101,6 +102,11 @@ class Plan:
         with place.named("reward"):
             self.reward = _reward_of(mapping.reward, trust_code=trust_code)
         self.streams = self._opened()
+        self.frames: dict[str, set[str]] = {}
+        for _, quantity, source, _ in self.quantities.values():
+            if quantity.transform is not None:
+                frames = self.frames.setdefault(source.topic, set())
+                frames |= {quantity.transform, quantity.in_}
         self.constants = self._constants()
 
     def _wanted(

@@ -53,13 +53,16 @@ class StepReader:
             UsageError: The clocks of two topics were not reset together.
         """
         self._plan, self._mapping = plan, plan.mapping
-        self._transforms: Transforms | None = None
         self._streams: dict[str, Recorded] = dict(plan.streams)
-        for keys, quantity, *_ in plan.quantities.values():
+        self._transforms: dict[str, Transforms] = {
+            topic: Transforms(plan.bag, plan.mapping.time, topic=topic, frames=frames)
+            for topic, frames in plan.frames.items()
+        }
+        for keys, quantity, source, _ in plan.quantities.values():
             if quantity.transform is not None:
-                self._transforms = self._transforms or Transforms(plan.bag, plan.mapping.time)
+                transforms = self._transforms[source.topic]
                 with plan.place.named(*keys):
-                    self._streams |= self._transforms.streams(quantity.transform, quantity.in_)
+                    self._streams |= transforms.streams(quantity.transform, quantity.in_)
         self._runs = runs_of(self._streams, plan.mapping.episodes.gap_s, plan.bag.paths)
 
     @property
@@ -143,8 +146,8 @@ class StepReader:
         runs = self._runs[number]
         with self._plan.place.named(*keys):
             if quantity.transform is not None:
-                assert self._transforms is not None, "they are read if a quantity uses them"
-                transforms = self._transforms.within(runs, last_file(self._streams, runs))
+                transforms = self._transforms[source.topic]
+                transforms = transforms.within(runs, last_file(self._streams, runs))
                 return pose_of(quantity, transforms, times_ns)
             stream, run = self._plan.streams[source.topic], runs[source.topic]
             ends_ns = _ends(times_ns) if is_during else None
