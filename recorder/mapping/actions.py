@@ -24,6 +24,7 @@ class Actions(NamedTuple):
         missing: (N,) bool: whether there is no command.
         far: (N,) bool: whether the command is far from every named command, or outside the Box.
         meanings: Names of the discrete actions; empty if they have none.
+        commands: (N, K) float64 values of the K `fields`, 0 where missing; (N, 0) for a `field`.
     """
 
     space: spaces.Space[Any]
@@ -31,6 +32,7 @@ class Actions(NamedTuple):
     missing: NDArray[np.bool_]
     far: NDArray[np.bool_]
     meanings: tuple[str, ...]
+    commands: NDArray[np.float64]
 
 
 def actions_of(
@@ -50,7 +52,8 @@ def actions_of(
     if action.field is not None:
         values, meanings = _discrete(action, columns[0], missing)
         count = max(len(meanings), int(values.max(initial=0)) + 1)
-        return Actions(spaces.Discrete(count), values, missing, none, meanings)
+        nothing = np.empty((len(missing), 0))
+        return Actions(spaces.Discrete(count), values, missing, none, meanings, nothing)
     commands = np.column_stack(columns).astype(np.float64)
     missing = missing | ~np.isfinite(commands).all(axis=1)
     commands = np.where(missing[:, np.newaxis], 0.0, commands)
@@ -58,14 +61,14 @@ def actions_of(
         low, high = (np.array(each, np.float32) for each in (action.box.low, action.box.high))
         far = ((commands < low) | (commands > high)).any(axis=1) & ~missing
         kept = np.clip(commands.astype(np.float32), low, high)
-        return Actions(spaces.Box(low, high), kept, missing, far, ())
+        return Actions(spaces.Box(low, high), kept, missing, far, (), commands)
     if action.actions:
         values, distance = _nearest(commands, np.array(list(action.actions.values()), np.float64))
         far = (distance > action.far) & ~missing
         space = spaces.Discrete(len(action.actions))
-        return Actions(space, values, missing, far, tuple(action.actions))
+        return Actions(space, values, missing, far, tuple(action.actions), commands)
     values, meanings = _binned(action, commands)
-    return Actions(spaces.Discrete(len(meanings)), values, missing, none, meanings)
+    return Actions(spaces.Discrete(len(meanings)), values, missing, none, meanings, commands)
 
 
 def _discrete(

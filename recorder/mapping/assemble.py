@@ -179,15 +179,29 @@ def _put_vector(
         if quantity.image is None:
             values = np.concatenate([run.quantities[name].values for run in runs])[rows]
             with plan.place.named("observation", name):
-                numbers = as_numbers(values, name).astype(np.float32).reshape(len(rows), -1)
+                numbers = _as_float32(as_numbers(values, name), name).reshape(len(rows), -1)
             vectors.append(numbers)
-            names += _names(name, quantity, numbers.shape[1])
+            names += element_names(name, quantity, numbers.shape[1])
             limits += [_limits(quantity)] * numbers.shape[1]
     if vectors:
         arrays[_STATE] = np.concatenate(vectors, axis=1)
         low, high = np.array(limits, np.float32).T
         parts[_STATE] = spaces.Box(low, high)
     return names
+
+
+def _as_float32(values: NDArray[np.float64], name: str) -> NDArray[np.float32]:
+    """Round values to float32.
+
+    Raises:
+        UsageError: A finite value becomes infinite.
+    """
+    with np.errstate(over="ignore"):
+        found = values.astype(np.float32)
+    lost = values[np.isinf(found) & np.isfinite(values)]
+    if len(lost):
+        raise UsageError(f"{name} has the value {lost[0]:g}, too large for float32: use `scale`")
+    return found
 
 
 def _limits(quantity: Quantity) -> tuple[float, float]:
@@ -198,7 +212,8 @@ def _limits(quantity: Quantity) -> tuple[float, float]:
     return min(*quantity.clip, *missing), max(*quantity.clip, *missing)
 
 
-def _names(name: str, quantity: Quantity, count: int) -> list[str]:
+def element_names(name: str, quantity: Quantity, count: int) -> list[str]:
+    """Return the names of the `count` elements of a quantity in the vector of observations."""
     if quantity.transform is not None:
         return [f"{name}_{part}" for part in quantity.parts]
     return [name] if count == 1 else [f"{name}_{k}" for k in range(count)]

@@ -110,7 +110,9 @@ class Quantity(_Part):
             if getattr(self, name) and given != ["image"]:
                 raise ValueError(f"{name} is for images only")
         for name in ("parts", "tf"):
-            if name in self.model_fields_set and given != ["transform"]:
+            # A saved mapping has the default values of all keys.
+            default = type(self).model_fields[name].default
+            if getattr(self, name) != default and given != ["transform"]:
                 raise ValueError(f"{name} is for transforms only")
         if len(set(self.parts)) < len(self.parts):
             raise ValueError("parts has a part twice")

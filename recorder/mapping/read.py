@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from collections.abc import Mapping as MappingOf
 from contextlib import closing
@@ -16,9 +17,10 @@ from mcaprl.errors import LogError
 from mcaprl.recorder.bags.bag import Bag, open_bag
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.mapping.actions import Actions
-from mcaprl.recorder.mapping.assemble import assembled
+from mcaprl.recorder.mapping.assemble import assembled, element_names
 from mcaprl.recorder.mapping.config import Mapping, Place, load_mapping
 from mcaprl.recorder.mapping.plan import Plan
+from mcaprl.recorder.mapping.precision import Rounding, rounding_of
 from mcaprl.recorder.mapping.segments import Segment
 from mcaprl.recorder.mapping.steps import StepReader, Steps
 from mcaprl.recorder.mapping.summary import FieldReport, MappingReport
@@ -106,7 +108,27 @@ def _report(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> Mapping
         missing_actions=_share(np.concatenate([each.missing for each in actions])),
         far_actions=_share(np.concatenate([each.far for each in actions])[rows]),
         action_counts=_action_counts(actions, rows),
+        rounded=_rounded(plan, runs),
     )
+
+
+def _rounded(plan: Plan, runs: list[Steps]) -> dict[str, Rounding]:
+    """Return the digits that observed quantities, and a Box action, lose as float32."""
+    found = {}
+    for name, quantity in plan.mapping.observation.items():
+        parts = [run.quantities[name] for run in runs]
+        values = [each.values[~each.missing] for each in parts]
+        if quantity.image is None and all(each.dtype.kind == "f" for each in values):
+            names = element_names(name, quantity, math.prod(values[0].shape[1:]))
+            topic = plan.quantities[name].source.topic
+            found[name] = rounding_of(values, names, topic, quantity.offset)
+    if plan.mapping.action.box is not None:
+        commands = [run.actions.commands[~run.actions.missing] for run in runs]
+        fields = plan.mapping.action.fields
+        rounding = rounding_of(commands, fields, plan.commands[0].source.topic)
+        # An action has no key `offset`.
+        found["action"] = rounding and rounding._replace(offset=None)
+    return {name: each for name, each in found.items() if each is not None}
 
 
 def _counts(names: Iterable[str]) -> dict[str, int]:

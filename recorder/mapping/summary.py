@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.problem import Problem
+from mcaprl.recorder.mapping.precision import Rounding
 from mcaprl.texts import counted
 
 _MUCH = 0.1
@@ -71,6 +72,7 @@ class MappingReport:
         far_actions: Share of the transitions whose command is far from every named action, or
             beyond the limits of the Box.
         action_counts: Number of transitions of each discrete action, by name or number.
+        rounded: Digits that observed quantities and the action lose as float32, by name.
     """
 
     clock_steps: int
@@ -83,25 +85,30 @@ class MappingReport:
     missing_actions: float
     far_actions: float
     action_counts: dict[str, int]
+    rounded: dict[str, Rounding] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return the report as JSON types; ages that are not finite become None."""
         found = asdict(self)
-        for field in found["fields"].values():
+        for each in found["fields"].values():
             for name in ("median_age_s", "max_age_s"):
-                field[name] = field[name] if np.isfinite(field[name]) else None
+                each[name] = each[name] if np.isfinite(each[name]) else None
+        found["rounded"] = {name: each._asdict() for name, each in self.rounded.items()}
         return found
 
     def problems(self) -> list[Problem]:
         """Return problems that reduce the quality or the number of the transitions."""
         found = [
             Problem(
-                f"{name} is missing at {field.missing:.0%} of the steps",
-                field.topic,
+                f"{name} is missing at {each.missing:.0%} of the steps",
+                each.topic,
                 next="set `missing` or a larger `tolerance_s`, or remove the quantity",
             )
-            for name, field in self.fields.items()
-            if field.missing > _MUCH
+            for name, each in self.fields.items()
+            if each.missing > _MUCH
+        ]
+        found += [
+            Problem(str(each), each.topic, next=each.advice()) for each in self.rounded.values()
         ]
         if self.missing_actions > _MUCH:
             what = f"{self.missing_actions:.0%} of the steps have no action"
@@ -125,7 +132,7 @@ class MappingReport:
             ("episodes left out", _dropped(self.dropped)),
             ("resets of the clock", str(self.clock_resets)),
         ]
-        rows += [(name, str(field)) for name, field in self.fields.items()]
+        rows += [(name, str(each)) for name, each in self.fields.items()]
         rows.append(("steps without action", f"{self.missing_actions:.1%}"))
         if self.action_counts:
             actions = ", ".join(f"{count} {name}" for name, count in self.action_counts.items())
