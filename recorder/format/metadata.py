@@ -13,6 +13,9 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
                         derived from the space by `spaces.observation_leaves`
     observation_names   JSON list: names of the elements of a vector observation; may be empty
     action_meanings     JSON list: names of the discrete actions; may be empty
+    action_commands     JSON object: "fields", the paths of the fields of a command in another
+                        program's messages, and "commands", a list with the values of the fields for
+                        each discrete action, or null; absent if unknown
     success_reasons     JSON list of the end reasons of successful episodes; empty if unknown
     view                JSON object of numbers for viewers; see `LogMetadata.view`
     step_duration_ns    simulated time between two records
@@ -42,6 +45,7 @@ from gymnasium import spaces
 from mcaprl._version import __version__
 from mcaprl.errors import LogError, UsageError
 from mcaprl.files import parse_json
+from mcaprl.recorder.format.action_commands import ActionCommands
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.spaces import (
     Leaf,
@@ -94,6 +98,7 @@ class LogMetadata:
         env_kwargs: Keyword arguments of `gymnasium.make`; JSON types only.
         observation_names: Names of a vector observation's elements; empty if unknown.
         action_meanings: Names of the discrete actions; empty if unknown.
+        action_commands: Commands that the discrete actions stand for; None if unknown.
         success_reasons: End reasons of successful episodes; empty if unknown.
         view: Numbers for viewers, empty if unknown. `distance_m` and `tilt_deg` place the follow
             camera; `world_m`, `world_x_m` and `world_y_m` are the size and the center of the world;
@@ -128,6 +133,7 @@ class LogMetadata:
     behavior_prob: str = ""
     about: Mapping[str, Any] = field(default_factory=dict)
     times: str = ""
+    action_commands: ActionCommands | None = None
 
     @cached_property
     def leaves(self) -> tuple[Leaf, ...]:
@@ -163,6 +169,7 @@ class LogMetadata:
 
     def to_strings(self) -> dict[str, str]:
         """Return the map that is written to the file."""
+        commands = self.action_commands
         fields = [
             {
                 "path": leaf.path,
@@ -189,6 +196,7 @@ class LogMetadata:
             **({"behavior_prob": self.behavior_prob} if self.behavior_prob else {}),
             **({"about": json.dumps(dict(self.about))} if self.about else {}),
             **({"times": self.times} if self.times else {}),
+            **({"action_commands": json.dumps(commands.to_json())} if commands else {}),
         }
 
     @classmethod
@@ -226,6 +234,7 @@ class LogMetadata:
                 behavior_prob=strings.get("behavior_prob", ""),
                 about=_object(strings, "about"),
                 times=strings.get("times", ""),
+                action_commands=_commands(strings, action_space),
             )
         except (KeyError, ValueError, TypeError, MemoryError) as error:
             raise LogError(
@@ -237,7 +246,8 @@ class LogMetadata:
         """Return metadata that describes several logs; fields that differ have the default value.
 
         The spaces of all logs must be equal. `behavior_prob` is `ESTIMATED`, and `times` is
-        `NO_TIMES`, if any of the logs has this value.
+        `NO_TIMES`, if any of the logs has this value. The commands of the actions are those of the
+        first log that has them, if those of the others have the same fields.
         """
         first, *others = parts
         blank = cls(first.observation_space, first.action_space)
@@ -246,12 +256,15 @@ class LogMetadata:
             for field_ in fields(cls)
             if any(getattr(other, field_.name) != getattr(first, field_.name) for other in others)
         }
+        commands = [part.action_commands for part in parts if part.action_commands is not None]
+        same = len({one.fields for one in commands}) == 1
         estimated, no_times = (
             any(getattr(part, name) for part in parts) for name in ("behavior_prob", "times")
         )
         differing |= {
             "behavior_prob": ESTIMATED if estimated else "",
             "times": NO_TIMES if no_times else "",
+            "action_commands": commands[0] if same else None,
         }
         return replace(first, **differing)
 
@@ -333,6 +346,19 @@ def _object(strings: Mapping[str, str], name: str) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise ValueError(f"{name} is not a JSON object")
     return found
+
+
+def _commands(strings: Mapping[str, str], space: spaces.Space[Any]) -> ActionCommands | None:
+    """Return the commands of the actions; None if there are none.
+
+    Raises:
+        ValueError: They do not fit the action space.
+    """
+    if "action_commands" not in strings:
+        return None
+    if not isinstance(space, spaces.Discrete):
+        raise ValueError("action_commands are for a Discrete action space")
+    return ActionCommands.from_json(parse_json(strings["action_commands"]), int(space.n))
 
 
 def _numbers(values: Any) -> dict[str, float]:

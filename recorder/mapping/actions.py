@@ -24,7 +24,7 @@ class Actions(NamedTuple):
         missing: (N,) bool: whether there is no command.
         far: (N,) bool: whether the command is far from every named command, or outside the Box.
         meanings: Names of the discrete actions; empty if they have none.
-        commands: (N, K) float64 values of the K `fields`, 0 where missing; (N, 0) for a `field`.
+        commands: (N, K) values of the K fields: float64, 0 where missing, or texts of a `field`.
     """
 
     space: spaces.Space[Any]
@@ -32,7 +32,7 @@ class Actions(NamedTuple):
     missing: NDArray[np.bool_]
     far: NDArray[np.bool_]
     meanings: tuple[str, ...]
-    commands: NDArray[np.float64]
+    commands: NDArray[Any]
 
 
 def actions_of(
@@ -52,8 +52,8 @@ def actions_of(
     if action.field is not None:
         values, meanings = _discrete(action, columns[0], missing)
         count = max(len(meanings), int(values.max(initial=0)) + 1)
-        nothing = np.empty((len(missing), 0))
-        return Actions(spaces.Discrete(count), values, missing, none, meanings, nothing)
+        commands = columns[0][:, np.newaxis]
+        return Actions(spaces.Discrete(count), values, missing, none, meanings, commands)
     commands = np.column_stack(columns).astype(np.float64)
     missing = missing | ~np.isfinite(commands).all(axis=1)
     commands = np.where(missing[:, np.newaxis], 0.0, commands)

@@ -18,6 +18,7 @@ from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.images import ImageReader
 from mcaprl.recorder.mapping.paths import as_numbers
 from mcaprl.recorder.mapping.plan import Plan
+from mcaprl.recorder.mapping.representatives import action_commands
 from mcaprl.recorder.mapping.segments import Segment
 from mcaprl.recorder.mapping.steps import NS_PER_S, Steps
 
@@ -56,19 +57,25 @@ def assembled(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> Datas
     steps = np.concatenate(taken)
     lengths = np.array([each.length for each in summaries])
     observed = _observations(plan, runs, np.concatenate(frames), lengths)
+    actions = np.concatenate([run.actions.values for run in runs])[steps]
+    space, meanings = _common_space([run.actions.space for run in runs]), runs[0].actions.meanings
+    with plan.place.named("action", "representatives"):
+        logged = np.concatenate([run.actions.commands for run in runs])[steps]
+        commands = action_commands(plan.mapping.action, space, meanings, actions, logged)
     metadata = LogMetadata(
         observation_space=observed.space,
-        action_space=_common_space([run.actions.space for run in runs]),
+        action_space=space,
         env_id=plan.mapping.meta.env_id,
         observation_names=observed.names,
-        action_meanings=runs[0].actions.meanings,
+        action_meanings=meanings,
+        action_commands=commands,
         step_duration_ns=_step_ns(plan, times),
         policy=plan.mapping.meta.policy,
     )
     transitions = Transitions(
         frames=tuple(observed.frames[leaf.path] for leaf in leaves_of(observed.space)),
         log_time_ns=np.concatenate(times),
-        actions=np.concatenate([run.actions.values for run in runs])[steps],
+        actions=actions,
         rewards=np.concatenate([run.rewards for run in runs])[steps],
         terminated=_at_ends(lengths, [each.terminated for each in summaries]),
         truncated=_at_ends(lengths, [each.truncated for each in summaries]),

@@ -19,6 +19,7 @@ Alignment = Literal["last", "nearest", "linear"]
 _EXPRESSION_NAMES = ("action", "terminated", "truncated")
 """Names in expressions that are not quantities."""
 Positive = Annotated[float, Field(gt=0)]
+CommandValue = int | Annotated[float, Field(allow_inf_nan=False)] | str
 PosePart = Literal["x", "y", "z", "roll", "pitch", "yaw", "qx", "qy", "qz", "qw"]
 
 
@@ -155,6 +156,16 @@ class Action(_Part):
     box: Limits | None = Field(
         default=None, description="Limits of a Box action; commands are clipped to them."
     )
+    representatives: (
+        dict[str, CommandValue | list[CommandValue]] | list[CommandValue | list[CommandValue]]
+    ) = Field(
+        default={},
+        description="Command of each discrete action, by the name of the action, or as"
+        " a list in the order of the actions; several fields have a list of values. Default: the"
+        " named command, the value of the `field`, or with `edges` the median of the logged"
+        " commands of the action, field by field. For an action that was never logged, it is the"
+        " median of each field's bin, or else the middle of the bin, or the edge of an open bin.",
+    )
     far: Positive = Field(
         default=0.25,
         description="Distance to the nearest named command above which a command is counted as far."
@@ -179,6 +190,8 @@ class Action(_Part):
             raise ValueError("fields need one of actions, edges and box")
         if self.field and any(kinds):
             raise ValueError("use actions, edges and box with `fields`, not with `field`")
+        if self.representatives and self.box is not None:
+            raise ValueError("representatives are for discrete actions, not for box")
         count = len(self.fields)
         lengths = [len(command) for command in self.actions.values()]
         lengths += [len(self.edges)] if self.edges else []

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from collections.abc import Mapping as MappingOf
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -78,7 +79,10 @@ def read_open_bag(
             f"{', '.join(map(str, bag.paths))}: the mapping finds no episode of {least} or"
             f" more steps: {report.why_empty()}"
         )
-    return MappedBag(assembled(plan, runs, kept), report)
+    dataset = assembled(plan, runs, kept)
+    if (commands := dataset.action_commands) is not None:
+        report = replace(report, commands=commands.by_name(dataset.action_names))
+    return MappedBag(dataset, report)
 
 
 def _report(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> MappingReport:
