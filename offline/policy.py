@@ -33,6 +33,7 @@ from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import allowed_only, likely_actions, mean_values
 from mcaprl.offline.batches.buffer import discrete_actions
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
+from mcaprl.recorder.format.action_commands import ActionCommands
 from mcaprl.recorder.format.spaces import (
     check_elements,
     observation_leaves,
@@ -92,6 +93,7 @@ class Policy:
         scores: Networks that score actions.
         reward_scale: Divisor of the rewards in the training. `q_values` returns values in units of
             the logged rewards, without this divisor.
+        action_commands: Commands of a robot that the actions stand for; None if unknown.
     """
 
     name: str
@@ -104,6 +106,7 @@ class Policy:
     encoder: ObservationEncoder = field(repr=False)
     scores: Scores = field(repr=False)
     reward_scale: float = 1.0
+    action_commands: ActionCommands | None = None
     _seen: deque[Observations] = field(default_factory=deque, init=False, repr=False)
 
     def begin(self) -> None:
@@ -200,7 +203,12 @@ class Policy:
 
 
 def save_policy(
-    folder: Path, learner: Learner, seed: int, env_id: str, env_kwargs: dict[str, Any]
+    folder: Path,
+    learner: Learner,
+    seed: int,
+    env_id: str,
+    env_kwargs: dict[str, Any],
+    action_commands: ActionCommands | None = None,
 ) -> None:
     """Write the current policy of a seed into a folder."""
     buffer = learner.buffer
@@ -234,6 +242,7 @@ def save_policy(
         "env_kwargs": env_kwargs,
         "observation_space": json.loads(space_to_json(buffer.encoder.space)),
         "action_space": json.loads(space_to_json(buffer.action_space)),
+        **({"action_commands": action_commands.to_json()} if action_commands else {}),
     }
     write_json(folder / POLICY_NAME, description, TrainingError)
 
@@ -282,6 +291,7 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
     }
     scores = Scores(networks, description["acts_by"], float(description["threshold"]))
     scores.networks.load_state_dict(weights)
+    commands = description.get("action_commands")
     return Policy(
         name=f"{folder.resolve().parent.name}/{folder.resolve().name}",
         algo=description["algo"],
@@ -293,6 +303,9 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
         encoder=encoder,
         scores=scores.eval(),
         reward_scale=float(description.get("reward_scale", 1.0)),
+        action_commands=None
+        if commands is None
+        else ActionCommands.from_json(commands, int(action_space.n)),
     )
 
 

@@ -85,6 +85,10 @@ class OnlinePolicy:
     network: BasePolicy
     _memory: FrameMemory | None
 
+    @property
+    def action_commands(self) -> None:
+        """None, because the actions of an environment are not commands of a robot."""
+
     def begin(self) -> None:
         """Drop the stored observations; the next observations start new episodes."""
         if self._memory is not None:

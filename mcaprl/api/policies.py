@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import PolicyError, UnknownNameError, UsageError
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.format.action_commands import ActionCommands
 from mcaprl.runs import BEST_NAME, CONFIG_NAME, POLICY_NAME, policy_files
 from mcaprl.sims.evaluation.rollout import Policy, check_fit, same_form
 
@@ -61,6 +62,10 @@ class TrainedPolicy(Policy, Protocol):
     @property
     def frame_stack(self) -> int:
         """Number of successive observations that the networks receive."""
+
+    @property
+    def action_commands(self) -> ActionCommands | None:
+        """Commands of a robot that the actions stand for, `fields` and `commands`; else None."""
 
     def begin(self) -> None:
         """Drop the stored observations at the start of an episode."""

@@ -194,7 +194,11 @@ def train(
             request |= {"other_data": other_data or follow, "follow": growing}
             summaries = train_dataset(dataset, config, out, **request)
     if mapping is not None:
-        write_json(out / MAPPING_NAME, mapping_tree(mapping), TrainingError)
+        tree = mapping_tree(mapping)
+        commands = dataset.action_commands
+        if commands is not None and None not in commands.commands:
+            tree["action"]["representatives"] = commands.to_json()["commands"]
+        write_json(out / MAPPING_NAME, tree, TrainingError)
     with suppress(MissingExtraError):
         draw_curves(out)
     return summaries

@@ -7,6 +7,7 @@ A block has one row for each transition, with the columns of `Dataset.to_arrow`:
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,7 +21,7 @@ from mcaprl.recorder.dataset.arrays import columns_of_arrays
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.tables import observation_names, step_columns
 from mcaprl.recorder.dataset.transitions import Transitions
-from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of, nest
 
 Columns = dict[str, NDArray[Any]]
@@ -129,7 +130,7 @@ def dataset_of(columns: Columns, description: LogMetadata, where: str) -> Datase
             f"{where}: a next observation differs from the observation of the next step, so a log"
             " cannot hold both: change both columns in the same way"
         )
-    return Dataset(transitions, description)
+    return Dataset(transitions, dataclasses.replace(description, times=NO_TIMES))
 
 
 def _lengths(columns: Columns, where: str) -> NDArray[np.int64]:

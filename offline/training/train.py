@@ -316,7 +316,8 @@ class _Run:
         """
         for seed in learner.seeds:
             folder = seed_folder(self.folder, seed)
-            save_policy(folder, learner, seed, self.dataset.env_id, self.dataset.env_kwargs)
+            data = self.dataset
+            save_policy(folder, learner, seed, data.env_id, data.env_kwargs, data.action_commands)
             save_checkpoint(folder, learner, seed, self.identity)
 
     def _update(self, learner: Learner) -> dict[str, Tensor]:

@@ -44,6 +44,8 @@ NUMBERS = (
 """Kinds of numbers, without their sizes."""
 
 _NS_PER_S = 10**9
+# Names of the parts of a time in ROS 2, protobuf, Foxglove's JSON, and JSON of ROS 1.
+_TIMES = (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec"), ("secs", "nsecs"))
 _INT64 = np.iinfo(np.int64)
 _MAX_STEPS = 64
 # A name, or brackets with a quoted key or anything else.
@@ -424,7 +426,7 @@ def _nanoseconds(value: Any) -> Any:
     """Convert a time to nanoseconds; return any other value unchanged."""
     if isinstance(value, int | float | str | bytes | list | np.ndarray | np.generic):
         return value
-    for second, rest in (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec")):
+    for second, rest in _TIMES:
         if isinstance(value, dict):
             if value.keys() == {second, rest}:
                 return _sum_ns(value[second], value[rest])

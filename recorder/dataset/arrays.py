@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
-from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
+from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata, installed_versions
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
 
 _END_FLAGS = ("terminated", "truncated")
@@ -43,13 +43,14 @@ def description_of(
         action_space=action_space or registered[1] or action_space_of(np.asarray(actions)),
         env_id=env_id,
         versions=installed_versions(),
+        times=NO_TIMES,
     )
 
 
 def columns_of_arrays(
     description: LogMetadata, observations: Any, next_observations: Any, given: Mapping[str, Any]
 ) -> Transitions:
-    """Convert arrays to columns; `given` maps the names in `STEP_COLUMNS` to arrays.
+    """Convert arrays to columns without times; `given` maps the `STEP_COLUMNS` to arrays.
 
     Raises:
         SpaceError: Lengths or shapes do not agree with each other or with the spaces.

@@ -19,6 +19,7 @@ from mcaprl.recorder.dataset.episode import Episode, shapes
 from mcaprl.recorder.dataset.mapped import MappedImages, blocks_of, rows_of
 from mcaprl.recorder.dataset.statistics import Statistics, describe_columns
 from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, TransitionBatch, Transitions
+from mcaprl.recorder.format.action_commands import ActionCommands
 from mcaprl.recorder.format.metadata import ESTIMATED, LogMetadata
 from mcaprl.recorder.format.spaces import nest, space_to_json
 
@@ -232,6 +233,15 @@ class Dataset(Conversions):
     def action_meanings(self) -> tuple[str, ...]:
         """Names of the discrete actions; empty if unknown."""
         return self._description.action_meanings
+
+    @property
+    def action_commands(self) -> ActionCommands | None:
+        """Commands that the discrete actions stand for, if the data is from a bag; else None.
+
+        `fields` has the paths of the K fields of a command, and `commands` has K values for each
+        action.
+        """
+        return self._description.action_commands
 
     @property
     def action_names(self) -> dict[int, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,7 +16,7 @@ from mcaprl.recorder.dataset.mapped import Frames
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.info_topics import InfoTopics, info_array
 from mcaprl.recorder.format.log_writer import LogWriter
-from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 from mcaprl.recorder.format.topics import STEPS_PER_CHUNK
 
@@ -30,18 +31,23 @@ def save_log(
 ) -> None:
     """Write columns as a log.
 
-    If the log_times start at 0 or do not increase from frame to frame, they are replaced by times
-    that start at the current time. Episodes are numbered from 0.
+    If the data has no times, or if they do not increase from frame to frame, they are replaced by
+    times that start at the current time. Episodes are numbered from 0.
 
     Raises:
         OutputExistsError: The file exists and `overwrite` is not set.
-        LogError: The file cannot be written, or there are no episodes.
+        LogError: The file cannot be written, there are no episodes, or a time is negative.
     """
     if not columns.episodes:
         raise LogError(f"nothing to write to {path}: the dataset has no episodes")
-    # Data from arrays has no timestamps: its first time is 0.
-    if columns.log_time_ns[0] == 0 or (np.diff(columns.log_time_ns) <= 0).any():
+    if metadata.times == NO_TIMES or (np.diff(columns.log_time_ns) <= 0).any():
         columns = with_fresh_times(columns, time.time_ns(), metadata.step_duration_ns)
+        metadata = dataclasses.replace(metadata, times="")
+    if columns.log_time_ns[0] < 0:
+        raise LogError(
+            f"{path}: the first time is {columns.log_time_ns[0]} ns; a log cannot have times before"
+            " 1970: correct the times, or use another `time` in the mapping"
+        )
     path = Path(path)
     # The old log is replaced at the end, because images of the dataset may be read from it.
     with replacing(path, LogError, overwrite=overwrite) as unfinished:

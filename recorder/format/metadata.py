@@ -13,6 +13,9 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
                         derived from the space by `spaces.observation_leaves`
     observation_names   JSON list: names of the elements of a vector observation; may be empty
     action_meanings     JSON list: names of the discrete actions; may be empty
+    action_commands     JSON object: "fields", the paths of the fields of a command in another
+                        program's messages, and "commands", a list with the values of the fields for
+                        each discrete action, or null; absent if unknown
     success_reasons     JSON list of the end reasons of successful episodes; empty if unknown
     view                JSON object of numbers for viewers; see `LogMetadata.view`
     step_duration_ns    simulated time between two records
@@ -22,6 +25,8 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
                         estimated afterwards; otherwise absent
     about               JSON object: description of the source dataset, such as its author, if the
                         log was converted from another tool's format; otherwise absent
+    times               "none" if the data has no times, so that its times only count the steps;
+                        always absent in a log, in which data without times has the times of writing
 """
 
 from __future__ import annotations
@@ -40,6 +45,7 @@ from gymnasium import spaces
 from mcaprl._version import __version__
 from mcaprl.errors import LogError, UsageError
 from mcaprl.files import parse_json
+from mcaprl.recorder.format.action_commands import ActionCommands
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.spaces import (
     Leaf,
@@ -52,6 +58,7 @@ from mcaprl.texts import encodable
 
 FORMAT_VERSION = "1"
 ESTIMATED = "estimated"
+NO_TIMES = "none"
 # With more actions than this, a plot that labels them by numbers is not readable.
 MAX_NUMBERED_ACTIONS = 1_000
 METADATA_NAME = "mcaprl.dataset"
@@ -91,6 +98,7 @@ class LogMetadata:
         env_kwargs: Keyword arguments of `gymnasium.make`; JSON types only.
         observation_names: Names of a vector observation's elements; empty if unknown.
         action_meanings: Names of the discrete actions; empty if unknown.
+        action_commands: Commands that the discrete actions stand for; None if unknown.
         success_reasons: End reasons of successful episodes; empty if unknown.
         view: Numbers for viewers, empty if unknown. `distance_m` and `tilt_deg` place the follow
             camera; `world_m`, `world_x_m` and `world_y_m` are the size and the center of the world;
@@ -105,6 +113,8 @@ class LogMetadata:
             empty.
         about: Description of the source dataset if the log was converted from another tool's
             format; JSON types only.
+        times: `NO_TIMES` if the data has no times, such as arrays; otherwise empty. The times of
+            such data start at 0, but data with times may start at 0 too.
     """
 
     observation_space: spaces.Space[Any]
@@ -122,6 +132,8 @@ class LogMetadata:
     versions: Mapping[str, str] = field(default_factory=dict)
     behavior_prob: str = ""
     about: Mapping[str, Any] = field(default_factory=dict)
+    times: str = ""
+    action_commands: ActionCommands | None = None
 
     @cached_property
     def leaves(self) -> tuple[Leaf, ...]:
@@ -157,6 +169,7 @@ class LogMetadata:
 
     def to_strings(self) -> dict[str, str]:
         """Return the map that is written to the file."""
+        commands = self.action_commands
         fields = [
             {
                 "path": leaf.path,
@@ -182,6 +195,8 @@ class LogMetadata:
             "versions": json.dumps(dict(self.versions)),
             **({"behavior_prob": self.behavior_prob} if self.behavior_prob else {}),
             **({"about": json.dumps(dict(self.about))} if self.about else {}),
+            **({"times": self.times} if self.times else {}),
+            **({"action_commands": json.dumps(commands.to_json())} if commands else {}),
         }
 
     @classmethod
@@ -218,6 +233,8 @@ class LogMetadata:
                 versions=_object(strings, "versions"),
                 behavior_prob=strings.get("behavior_prob", ""),
                 about=_object(strings, "about"),
+                times=strings.get("times", ""),
+                action_commands=_commands(strings, action_space),
             )
         except (KeyError, ValueError, TypeError, MemoryError) as error:
             raise LogError(
@@ -228,8 +245,9 @@ class LogMetadata:
     def common(cls, parts: Sequence[LogMetadata]) -> LogMetadata:
         """Return metadata that describes several logs; fields that differ have the default value.
 
-        The spaces of all logs must be equal. `behavior_prob` is `ESTIMATED` if any of the logs has
-        this value.
+        The spaces of all logs must be equal. `behavior_prob` is `ESTIMATED`, and `times` is
+        `NO_TIMES`, if any of the logs has this value. The commands of the actions are those of the
+        first log that has them, if those of the others have the same fields.
         """
         first, *others = parts
         blank = cls(first.observation_space, first.action_space)
@@ -238,8 +256,17 @@ class LogMetadata:
             for field_ in fields(cls)
             if any(getattr(other, field_.name) != getattr(first, field_.name) for other in others)
         }
-        estimated = any(part.behavior_prob for part in parts)
-        return replace(first, **{**differing, "behavior_prob": ESTIMATED if estimated else ""})
+        commands = [part.action_commands for part in parts if part.action_commands is not None]
+        same = len({one.fields for one in commands}) == 1
+        estimated, no_times = (
+            any(getattr(part, name) for part in parts) for name in ("behavior_prob", "times")
+        )
+        differing |= {
+            "behavior_prob": ESTIMATED if estimated else "",
+            "times": NO_TIMES if no_times else "",
+            "action_commands": commands[0] if same else None,
+        }
+        return replace(first, **differing)
 
     @classmethod
     def of_env(
@@ -319,6 +346,19 @@ def _object(strings: Mapping[str, str], name: str) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise ValueError(f"{name} is not a JSON object")
     return found
+
+
+def _commands(strings: Mapping[str, str], space: spaces.Space[Any]) -> ActionCommands | None:
+    """Return the commands of the actions; None if there are none.
+
+    Raises:
+        ValueError: They do not fit the action space.
+    """
+    if "action_commands" not in strings:
+        return None
+    if not isinstance(space, spaces.Discrete):
+        raise ValueError("action_commands are for a Discrete action space")
+    return ActionCommands.from_json(parse_json(strings["action_commands"]), int(space.n))
 
 
 def _numbers(values: Any) -> dict[str, float]:

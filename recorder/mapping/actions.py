@@ -24,6 +24,8 @@ class Actions(NamedTuple):
         missing: (N,) bool: whether there is no command.
         far: (N,) bool: whether the command is far from every named command, or outside the Box.
         meanings: Names of the discrete actions; empty if they have none.
+        commands: (N, K) elements of the command: float64, 0 where missing, or texts of a `field`.
+        fields: Path or expression of each element of the command.
     """
 
     space: spaces.Space[Any]
@@ -31,6 +33,8 @@ class Actions(NamedTuple):
     missing: NDArray[np.bool_]
     far: NDArray[np.bool_]
     meanings: tuple[str, ...]
+    commands: NDArray[Any]
+    fields: tuple[str, ...]
 
 
 class CommandPart(NamedTuple):
@@ -41,12 +45,14 @@ class CommandPart(NamedTuple):
         values: (N,) or (N, K) numbers, or (N,) texts of a discrete field.
         missing: (N,) bool: whether there is no value.
         names: Names of the K elements; empty if they have none.
+        path: Path of the field, or the expression.
     """
 
     name: str
     values: NDArray[Any]
     missing: NDArray[np.bool_]
     names: tuple[str, ...] = ()
+    path: str = ""
 
     @property
     def elements(self) -> tuple[str, ...]:
@@ -54,6 +60,14 @@ class CommandPart(NamedTuple):
         if self.values.ndim == 1:
             return (self.name,)
         return self.names or tuple(f"{self.name}[{k}]" for k in range(self.values.shape[1]))
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Paths of the elements, or of the single value."""
+        if self.values.ndim == 1:
+            return (self.path,)
+        names = self.names or tuple(map(str, range(self.values.shape[1])))
+        return tuple(f"{self.path}[{name}]" for name in names)
 
 
 def actions_of(action: Action, commands: Sequence[CommandPart]) -> Actions:
@@ -68,11 +82,12 @@ def actions_of(action: Action, commands: Sequence[CommandPart]) -> Actions:
             the mapping does not have an entry for each element.
     """
     missing = np.logical_or.reduce([each.missing for each in commands])
-    none = np.zeros(len(missing), bool)
+    none, fields = np.zeros(len(missing), bool), tuple(f for part in commands for f in part.fields)
     if action.field is not None:
         values, meanings = _discrete(action, commands[0].values, missing)
         count = max(len(meanings), int(values.max(initial=0)) + 1)
-        return Actions(spaces.Discrete(count), values, missing, none, meanings)
+        one = commands[0].values[:, np.newaxis]
+        return Actions(spaces.Discrete(count), values, missing, none, meanings, one, fields)
     numbers = np.column_stack([each.values for each in commands]).astype(np.float64)
     action.check_count(numbers.shape[1])
     missing = missing | ~np.isfinite(numbers).all(axis=1)
@@ -84,16 +99,19 @@ def actions_of(action: Action, commands: Sequence[CommandPart]) -> Actions:
         )
         far = ((numbers < low) | (numbers > high)).any(axis=1) & ~missing
         kept = np.clip(numbers, low, high).astype(np.float32)
-        return Actions(spaces.Box(low.copy(), high.copy()), kept, missing, far, ())
+        space = spaces.Box(low.copy(), high.copy())
+        return Actions(space, kept, missing, far, (), numbers, fields)
     if action.actions:
         values, distance = _nearest(numbers, np.array(list(action.actions.values()), np.float64))
         far = (distance > action.far) & ~missing
-        space = spaces.Discrete(len(action.actions))
-        return Actions(space, values, missing, far, tuple(action.actions))
+        space: spaces.Space[Any] = spaces.Discrete(len(action.actions))
+        names = tuple(action.actions)
+        return Actions(space, values, missing, far, names, numbers, fields)
     values, meanings = _binned(
         action, numbers, [each for part in commands for each in part.elements]
     )
-    return Actions(spaces.Discrete(len(meanings)), values, missing, none, meanings)
+    space = spaces.Discrete(len(meanings))
+    return Actions(space, values, missing, none, meanings, numbers, fields)
 
 
 def _discrete(

@@ -19,6 +19,7 @@ from mcaprl.recorder.format.spaces import leaves_of
 from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.paths import as_numbers
 from mcaprl.recorder.mapping.plan import Plan
+from mcaprl.recorder.mapping.representatives import action_commands
 from mcaprl.recorder.mapping.segments import Segment
 from mcaprl.recorder.mapping.steps import NS_PER_S, Steps
 
@@ -64,19 +65,26 @@ def assembled(
     observed = _observations(plan, runs, np.concatenate(frames), lengths, images)
     if observed is None:
         return None
+    actions = np.concatenate([run.actions.values for run in runs])[steps]
+    space, meanings = _common_space([run.actions.space for run in runs]), runs[0].actions.meanings
+    with plan.place.named("action", "representatives"):
+        logged = np.concatenate([run.actions.commands for run in runs])[steps]
+        fields = runs[0].actions.fields
+        commands = action_commands(plan.mapping.action, fields, space, meanings, actions, logged)
     metadata = LogMetadata(
         observation_space=observed.space,
-        action_space=_common_space([run.actions.space for run in runs]),
+        action_space=space,
         env_id=plan.mapping.meta.env_id,
         observation_names=observed.names,
-        action_meanings=runs[0].actions.meanings,
+        action_meanings=meanings,
+        action_commands=commands,
         step_duration_ns=_step_ns(plan, times),
         policy=plan.mapping.meta.policy,
     )
     transitions = Transitions(
         frames=tuple(observed.frames[leaf.path] for leaf in leaves_of(observed.space)),
         log_time_ns=np.concatenate(times),
-        actions=np.concatenate([run.actions.values for run in runs])[steps],
+        actions=actions,
         rewards=np.concatenate([run.rewards for run in runs])[steps],
         terminated=_at_ends(lengths, [each.terminated for each in summaries]),
         truncated=_at_ends(lengths, [each.truncated for each in summaries]),
@@ -200,15 +208,29 @@ def _put_vector(
         if quantity.image is None:
             values = np.concatenate([run.quantities[name].values for run in runs])[rows]
             with plan.place.named("observation", name):
-                numbers = as_numbers(values, name).astype(np.float32).reshape(len(rows), -1)
+                numbers = _as_float32(as_numbers(values, name), name).reshape(len(rows), -1)
             vectors.append(numbers)
-            names += _names(name, quantity, numbers.shape[1])
+            names += element_names(name, quantity, numbers.shape[1])
             limits += [_limits(quantity)] * numbers.shape[1]
     if vectors:
         arrays[_STATE] = np.concatenate(vectors, axis=1)
         low, high = np.array(limits, np.float32).T
         parts[_STATE] = spaces.Box(low, high)
     return names
+
+
+def _as_float32(values: NDArray[np.float64], name: str) -> NDArray[np.float32]:
+    """Round values to float32.
+
+    Raises:
+        UsageError: A finite value becomes infinite.
+    """
+    with np.errstate(over="ignore"):
+        found = values.astype(np.float32)
+    lost = values[np.isinf(found) & np.isfinite(values)]
+    if len(lost):
+        raise UsageError(f"{name} has the value {lost[0]:g}, too large for float32: use `scale`")
+    return found
 
 
 def _limits(quantity: Quantity) -> tuple[float, float]:
@@ -219,9 +241,10 @@ def _limits(quantity: Quantity) -> tuple[float, float]:
     return min(*quantity.clip, *missing), max(*quantity.clip, *missing)
 
 
-def _names(name: str, quantity: Quantity, count: int) -> list[str]:
+def element_names(name: str, quantity: Quantity, count: int) -> list[str]:
+    """Return the names of the `count` elements of a quantity in the vector of observations."""
     if quantity.transform is not None:
-        return [f"{name}_{part}" for part in ("x", "y", "yaw")]
+        return [f"{name}_{part}" for part in quantity.parts]
     if isinstance(quantity.names, list) and quantity.names:
         return [f"{name}_{element}" for element in quantity.names]
     return [name] if count == 1 else [f"{name}_{k}" for k in range(count)]

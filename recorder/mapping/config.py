@@ -34,6 +34,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 LARGEST = 3.4028234663852886e38
 """Largest number of float32, in which observations and actions are stored."""
 Stored = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
+CommandValue = int | Finite | str
+PosePart = Literal["x", "y", "z", "roll", "pitch", "yaw", "qx", "qy", "qz", "qw"]
 _Count = Annotated[int, Field(ge=1, le=2**16)]
 _MAX_RATE_HZ, _MAX_STACK = 1e9, 1024
 
@@ -121,9 +123,23 @@ class Quantity(_Part):
         default=None, description="Topic of Image or CompressedImage messages."
     )
     transform: str | None = Field(
-        default=None, description="Frame whose pose is looked up in `/tf`."
+        default=None,
+        description="Frame whose pose is looked up in the transforms. A leading `/` of a frame is"
+        " ignored.",
     )
     in_: str = Field(default="map", alias="in", description="Frame in which the pose is given.")
+    parts: Annotated[list[PosePart], Field(min_length=1)] = Field(
+        default=["x", "y", "yaw"],
+        description="Parts of the pose, in this order: `x`, `y`, `z` in meters; `roll`, `pitch`,"
+        " `yaw` in radians, about the fixed axes x, y, z in this order (REP 103), with a yaw of 0"
+        " if the pitch is 90 degrees up or down; `qx`, `qy`, `qz`, `qw`, the unit quaternion with"
+        " qw >= 0.",
+    )
+    tf: str | None = Field(
+        default=None,
+        description="Topic of the transforms, such as `/robot1/tf`; `/robot1/tf_static` is used,"
+        " too. Default: `/tf`, or else the only topic of transforms in the bag.",
+    )
     as_: Literal["yaw", "count", "depth", "intensity"] | None = Field(
         default=None,
         alias="as",
@@ -182,6 +198,13 @@ class Quantity(_Part):
                 raise ValueError(f"{name} is for images only")
         if self.as_ is not None and (self.as_ in ("depth", "intensity")) != (given == ["image"]):
             raise ValueError(f"as: {self.as_} is not for {given[0]}")
+        for name in ("parts", "tf"):
+            # A saved mapping has the default values of all keys.
+            default = type(self).model_fields[name].default
+            if getattr(self, name) != default and given != ["transform"]:
+                raise ValueError(f"{name} is for transforms only")
+        if len(set(self.parts)) < len(self.parts):
+            raise ValueError("parts has a part twice")
         if given == ["image"] and self.align == "linear":
             raise ValueError("images cannot be interpolated: use last or nearest")
         if self.range is not None and self.as_ != "intensity":
@@ -285,6 +308,16 @@ class Action(_Part):
     box: Limits | None = Field(
         default=None, description="Limits of a Box action; commands are clipped to them."
     )
+    representatives: (
+        dict[str, CommandValue | list[CommandValue]] | list[CommandValue | list[CommandValue]]
+    ) = Field(
+        default={},
+        description="Command of each discrete action, by the name of the action, or as"
+        " a list in the order of the actions; several fields have a list of values. Default: the"
+        " named command, the value of the `field`, or with `edges` the median of the logged"
+        " commands of the action, field by field. For an action that was never logged, it is the"
+        " median of each field's bin, or else the middle of the bin, or the edge of an open bin.",
+    )
     far: Positive = Field(
         default=0.25,
         description="Distance to the nearest named command above which a command is counted as far."
@@ -316,6 +349,8 @@ class Action(_Part):
         if self.selected is not None and given != ["fields"]:
             raise ValueError("a list of names is for `fields`")
         _check_names(self.selected, self.names_from)
+        if self.representatives and self.box is not None:
+            raise ValueError("representatives are for discrete actions, not for box")
         least = len(self.fields or self.expressions)
         for name, length in self._lengths():
             # The elements of a field are counted when the bag is known.

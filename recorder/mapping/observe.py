@@ -26,11 +26,13 @@ from mcaprl.recorder.mapping.paths import (
     topic_of,
     unknown_field,
 )
+from mcaprl.recorder.mapping.rotations import yaw_of
 from mcaprl.recorder.mapping.runs import Messages
 from mcaprl.recorder.mapping.streams import TopicStream
-from mcaprl.recorder.mapping.transforms import TF, TF_STATIC, Transforms, yaw_of
+from mcaprl.recorder.mapping.transforms import Transforms, transform_topic
 
 _QUATERNION = ("x", "y", "z", "w")
+_ANGLES = ("roll", "pitch", "yaw")
 
 
 class Values(NamedTuple):
@@ -77,7 +79,7 @@ def source_of(bag: Bag, quantity: Quantity) -> Source:
     if quantity.image is not None:
         return Source(topic_of(bag, quantity.image), (), None)
     if quantity.transform is not None:
-        return Source(topic_of(bag, TF if TF in bag.topics else TF_STATIC), (), None)
+        return Source(transform_topic(bag, quantity.tf), (), None)
     assert quantity.field is not None, "the mapping was validated"
     if quantity.as_ == "count":
         return Source(topic_of(bag, quantity.field), (), None)
@@ -107,8 +109,14 @@ def pose_of(
 ) -> Values:
     """Return the pose of a frame at the times of steps; see `values_of`."""
     assert quantity.transform is not None, "the quantity is a transform"
-    found, age_s = transforms.planar(
-        quantity.transform, quantity.in_, steps_ns, quantity.align, quantity.tolerance_s, gap_s
+    found, age_s = transforms.pose(
+        quantity.transform,
+        quantity.in_,
+        steps_ns,
+        quantity.align,
+        quantity.tolerance_s,
+        quantity.parts,
+        gap_s,
     )
     return _shaped(quantity, found, np.isnan(age_s), age_s)
 
@@ -307,7 +315,9 @@ def _shaped(
     """Scale, wrap and clip values, and replace missing values."""
     found = found * quantity.scale + quantity.offset
     if quantity.wrap_angle or (quantity.as_ == "yaw" and quantity.align == "linear"):
-        found = (found + math.pi) % (2 * math.pi) - math.pi
+        wrapped = (found + math.pi) % (2 * math.pi) - math.pi
+        is_angle = quantity.transform is None or np.isin(quantity.parts, _ANGLES)
+        found = np.where(is_angle, wrapped, found)
     if quantity.clip is not None:
         found = np.clip(found, *quantity.clip)
     # Observations are float32, in which larger numbers are infinite.

@@ -66,6 +66,7 @@ class Plan:
         reward: Function that computes the rewards.
         streams: Messages of the used topics by the name of the stream, without those of transforms.
         clock: Name of the stream with a message for each step; None for a fixed rate.
+        frames: Coordinate frames of the transforms, by topic.
         constants: Constants of the message types, by name; names with several values are omitted.
     """
 
@@ -139,6 +140,11 @@ class Plan:
         self.streams: dict[str, TopicStream] = {}
         self.clock: str | None = None
         self._open_streams()
+        self.frames: dict[str, set[str]] = {}
+        for _, quantity, source, *_ in self.quantities.values():
+            if quantity.transform is not None:
+                frames = self.frames.setdefault(source.topic, set())
+                frames |= {quantity.transform, quantity.in_}
         self.constants = self._constants()
 
     def _wanted(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from collections.abc import Mapping as MappingOf
 from contextlib import closing
@@ -19,9 +20,10 @@ from mcaprl.recorder.bags.bag import Bag, open_bag
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.mapping.actions import Actions
-from mcaprl.recorder.mapping.assemble import assembled
+from mcaprl.recorder.mapping.assemble import assembled, element_names
 from mcaprl.recorder.mapping.config import Mapping, Place, load_mapping
 from mcaprl.recorder.mapping.plan import Plan
+from mcaprl.recorder.mapping.precision import Rounding, rounding_of
 from mcaprl.recorder.mapping.runs import Runs
 from mcaprl.recorder.mapping.segments import Segment
 from mcaprl.recorder.mapping.steps import StepReader, Steps
@@ -108,7 +110,10 @@ def _read(plan: Plan, images: Storage) -> MappedBag | None:
     if dataset is None:
         return None
     problems = [problem for each in plan.images.values() for problem in each.problems()]
-    return MappedBag(dataset, replace(report, images=problems))
+    report = replace(report, images=problems)
+    if (commands := dataset.action_commands) is not None:
+        report = replace(report, commands=commands.by_name(dataset.action_names))
+    return MappedBag(dataset, report)
 
 
 def _longest(kept: list[list[Segment]], recordings: list[int]) -> list[list[Segment]]:
@@ -157,6 +162,7 @@ def _report(
         missing_actions=_share(np.concatenate([each.missing for each in actions])),
         far_actions=_share(np.concatenate([each.far for each in actions])[rows]),
         action_counts=_action_counts(actions, rows),
+        rounded=_rounded(plan, runs),
     )
 
 
@@ -197,6 +203,25 @@ def _left_out(plan: Plan, runs: Runs) -> list[Problem]:
         for name in runs.mixed
     ]
     return found
+
+
+def _rounded(plan: Plan, runs: list[Steps]) -> dict[str, Rounding]:
+    """Return the digits that observed quantities, and a Box action, lose as float32."""
+    found = {}
+    for name, quantity in plan.mapping.observation.items():
+        parts = [run.quantities[name] for run in runs]
+        values = [each.values[~each.missing] for each in parts]
+        if quantity.image is None and all(each.dtype.kind == "f" for each in values):
+            names = element_names(name, quantity, math.prod(values[0].shape[1:]))
+            topic = plan.quantities[name].source.topic
+            found[name] = rounding_of(values, names, topic, quantity.offset)
+    if plan.mapping.action.box is not None:
+        commands = [run.actions.commands[~run.actions.missing] for run in runs]
+        topic = plan.commands[0].source.topic if plan.commands else "action"
+        rounding = rounding_of(commands, runs[0].actions.fields, topic)
+        # An action has no key `offset`.
+        found["action"] = rounding and rounding._replace(offset=None)
+    return {name: each for name, each in found.items() if each is not None}
 
 
 def _counts(names: Iterable[str]) -> dict[str, int]:

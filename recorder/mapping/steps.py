@@ -72,17 +72,18 @@ class StepReader:
             UsageError: The clock of a topic was reset while that of another topic went on.
         """
         self._plan, self._mapping = plan, plan.mapping
-        self._transforms: Transforms | None = None
         self._streams: dict[str, Recorded] = {**plan.streams}
+        self._transforms: dict[str, Transforms] = {
+            topic: Transforms(plan.bag, self._transform_time(topic), topic=topic, frames=frames)
+            for topic, frames in plan.frames.items()
+        }
         # Names of the streams of each transform.
         self._frames: dict[str, list[str]] = {}
-        for name, (keys, quantity, *_) in plan.quantities.items():
+        for name, (keys, quantity, source, *_) in plan.quantities.items():
             if quantity.transform is not None:
+                transforms = self._transforms[source.topic]
                 with plan.place.named(*keys):
-                    self._transforms = self._transforms or Transforms(
-                        plan.bag, self._transform_time()
-                    )
-                    found = self._transforms.streams(quantity.transform, quantity.in_)
+                    found = transforms.streams(quantity.transform, quantity.in_)
                     self._streams |= found
                     self._frames[name] = list(found)
         self.runs: Runs = runs_of(
@@ -143,19 +144,22 @@ class StepReader:
         episodes = segments(marks, self._mapping.episodes.max_steps)
         return Steps(times_ns, quantities, actions, probs, rewards, episodes, reasons)
 
-    def _transform_time(self) -> TimeSource:
-        """Return the time of the transforms.
+    def _transform_time(self, topic: str) -> TimeSource:
+        """Return the time of the transforms of a topic.
 
         Raises:
             UsageError: The mapping gives different times, or a field.
         """
-        quantities = self._mapping.quantities.values()
-        times = {q.time or self._mapping.time for q in quantities if q.transform is not None}
+        times = {
+            wanted.quantity.time or self._mapping.time
+            for wanted in self._plan.quantities.values()
+            if wanted.quantity.transform is not None and wanted.source.topic == topic
+        }
         time = times.pop()
         if times or isinstance(time, Stamp):
             raise UsageError(
-                "all transforms need the same time: log_time, publish_time or header (the stamp of"
-                " each transform)"
+                f"{self._plan.place.of('observation')}: all transforms of {topic} need the same"
+                " time: log_time, publish_time or header (the stamp of each transform)"
             )
         return time
 
@@ -198,8 +202,8 @@ class StepReader:
         quantity, gap_s = wanted.quantity, self._mapping.episodes.gap_s
         with self._plan.place.named(*wanted.keys):
             if quantity.transform is not None:
-                assert self._transforms is not None, "they are read if a quantity uses them"
-                return pose_of(quantity, self._transforms.within(run), ticks.times_ns, gap_s)
+                transforms = self._transforms[wanted.source.topic].within(run)
+                return pose_of(quantity, transforms, ticks.times_ns, gap_s)
             stream, messages = self._plan.streams[wanted.stream], run.streams[wanted.stream]
             ends_ns = ticks.ends_ns if wanted.is_during else None
             return values_of(
@@ -244,7 +248,9 @@ class StepReader:
         for place, expression in enumerate(plan.expressions):
             with plan.place.named("action", "expressions", place):
                 values = expression.evaluate(columns, following).astype(np.float64)
-            commands.append(CommandPart(expression.text, values, np.isnan(values)))
+            commands.append(
+                CommandPart(expression.text, values, np.isnan(values), path=expression.text)
+            )
         with plan.place.named("action"):
             return actions_of(action, commands)
 
@@ -280,4 +286,4 @@ def _command(wanted: Wanted, found: Values) -> CommandPart:
     assert path is not None, "commands are fields"
     whole = path._replace(elements=None) if isinstance(path.elements, slice) else path
     word = str(whole).rpartition(".")[2]
-    return CommandPart(word, found.values, found.missing, tuple(names or ()))
+    return CommandPart(word, found.values, found.missing, tuple(names or ()), str(path))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -10,8 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.problem import Problem
+from mcaprl.recorder.format.action_commands import Command
+from mcaprl.recorder.mapping.precision import Rounding
 from mcaprl.texts import counted
 
+_LISTED = 20
 _MUCH = 0.1
 """Share of missing or dropped steps above which a problem is reported."""
 
@@ -83,6 +87,20 @@ def _dropped(lengths: list[int]) -> str:
     return f"{len(lengths)}, at most {counted(max(lengths), 'step')}" if lengths else "none"
 
 
+def _listed(commands: dict[str, Command | None]) -> str:
+    """Return the first commands with the names of their actions."""
+    texts = [
+        f"{name}: {'unknown' if command is None else ', '.join(map(_short, command))}"
+        for name, command in itertools.islice(commands.items(), _LISTED)
+    ]
+    more = len(commands) - len(texts)
+    return "; ".join([*texts, *([f"and {more} more"] if more else [])])
+
+
+def _short(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
 @dataclass(frozen=True)
 class MappingReport:
     """Result of reading a bag with a mapping.
@@ -104,6 +122,8 @@ class MappingReport:
             beyond the limits of the Box.
         action_counts: Number of transitions of each discrete action, by name or number.
         images: Problems of the images: messages that were left out, and guesses of their meaning.
+        rounded: Digits that observed quantities and the action lose as float32, by name.
+        commands: Command of each discrete action, by name or number of the action.
     """
 
     clock_steps: int
@@ -119,6 +139,8 @@ class MappingReport:
     far_actions: float
     action_counts: dict[str, int]
     images: list[Problem] = field(default_factory=list)
+    rounded: dict[str, Rounding] = field(default_factory=dict)
+    commands: dict[str, Command | None] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return the report as JSON types; ages that are not finite become None."""
@@ -126,7 +148,12 @@ class MappingReport:
         for each in found["fields"].values():
             for name in ("median_age_s", "max_age_s"):
                 each[name] = each[name] if np.isfinite(each[name]) else None
-        return {**found, "left_out": [each.to_json() for each in self.left_out]}
+        found["rounded"] = {name: each._asdict() for name, each in self.rounded.items()}
+        return {
+            **found,
+            "left_out": [each.to_json() for each in self.left_out],
+            "images": [each.to_json() for each in self.images],
+        }
 
     def problems(self) -> list[Problem]:
         """Return problems that reduce the quality or the number of the transitions."""
@@ -139,6 +166,9 @@ class MappingReport:
             )
             for name, each in self.fields.items()
             if each.missing > _MUCH
+        ]
+        found += [
+            Problem(str(each), each.topic, next=each.advice()) for each in self.rounded.values()
         ]
         if self.missing_actions > _MUCH:
             what = f"{self.missing_actions:.0%} of the steps have no action"
@@ -168,6 +198,8 @@ class MappingReport:
         if self.action_counts:
             actions = ", ".join(f"{count} {name}" for name, count in self.action_counts.items())
             rows.append(("actions", actions))
+        if self.commands:
+            rows.append(("commands", _listed(self.commands)))
         return [*rows, ("far commands", f"{self.far_actions:.1%}")]
 
     def why_empty(self) -> str:

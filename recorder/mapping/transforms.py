@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from array import array
+from collections.abc import Iterable, Sequence
 from copy import copy
 from typing import NamedTuple
 
@@ -14,22 +15,21 @@ from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
 from mcaprl.recorder.mapping.align import NONE, NS_PER_S, last, nearest, time_order
 from mcaprl.recorder.mapping.config import TimeSource
+from mcaprl.recorder.mapping.paths import topic_of
+from mcaprl.recorder.mapping.rotations import (
+    Floats,
+    between,
+    euler_of,
+    product,
+    rotated,
+    unit,
+    upper,
+)
 from mcaprl.recorder.mapping.runs import Recorded, Run
+from mcaprl.recorder.mapping.transform_messages import STATIC, are_transforms, transforms_of
 
-Floats = NDArray[np.float64]
-
-TF, TF_STATIC = "/tf", "/tf_static"
-
-
-class _Pose(NamedTuple):
-    """Pose of a frame in its parent: position, and quaternion x y z w."""
-
-    parent: str
-    time_ns: int
-    place: list[int]
-    position: list[float]
-    quaternion: list[float]
-    is_static: bool
+TF = "/tf"
+PLANAR = ("x", "y", "yaw")
 
 
 class _Edge(NamedTuple):
@@ -38,7 +38,6 @@ class _Edge(NamedTuple):
     The (M, 2) places are those of the messages; see `Bag.places`.
     """
 
-    parent: str
     times_ns: NDArray[np.int64]
     places: NDArray[np.int64]
     positions: Floats
@@ -55,36 +54,119 @@ class _Edge(NamedTuple):
         )
 
 
+class _Poses:
+    """Poses of a frame in the order of reading, as compact arrays."""
+
+    def __init__(self) -> None:
+        self.is_static = True
+        self._integers, self._numbers = array("q"), array("d")
+
+    def add(self, time_ns: int, place: Sequence[int], pose: Sequence[float]) -> None:
+        """Add a pose: position, and quaternion x y z w."""
+        self._integers.extend((time_ns, *place))
+        self._numbers.extend(pose)
+
+    def edge(self) -> _Edge:
+        """Return the poses in the order of recording; a pose with an invalid number is NaN."""
+        integers = np.array(self._integers, np.int64).reshape(-1, 3)
+        numbers = np.array(self._numbers, np.float64).reshape(-1, 7)
+        order = np.lexsort((integers[:, 2], integers[:, 1]))
+        integers, numbers = integers[order], numbers[order]
+        positions, quaternions = numbers[:, :3], unit(numbers[:, 3:])
+        is_bad = ~np.isfinite(np.hstack([positions, quaternions])).all(axis=1)
+        positions[is_bad], quaternions[is_bad] = np.nan, np.nan
+        return _Edge(integers[:, 0], integers[:, 1:], positions, quaternions, self.is_static)
+
+
 class Transforms:
     """Tree of the coordinate frames of a bag."""
 
-    def __init__(self, bag: Bag, time: TimeSource = "log_time") -> None:
-        """Read all transforms.
+    def __init__(
+        self,
+        bag: Bag,
+        time: TimeSource = "log_time",
+        *,
+        topic: str = TF,
+        frames: Iterable[str] | None = None,
+    ) -> None:
+        """Read the transforms.
 
         Args:
-            bag: Bag with `/tf`, `/tf_static` or both.
+            bag: Bag with the topic, its static sibling or both.
             time: Time of a transform; `header` is the stamp of each transform.
+            topic: Topic of the transforms, such as `/tf`; its static sibling is `/tf_static`.
+            frames: Frames whose poses are used. Poses of frames that are neither these nor their
+                ancestors are not stored. None for all frames.
         """
-        found: dict[str, list[_Pose]] = {}
-        for topic in (TF, TF_STATIC):
-            if topic in bag.topics and bag.topics[topic].count:
-                for child, pose in _poses(bag, topic, time):
-                    found.setdefault(child, []).append(pose)
-        self._recorded = {child: _edge(child, poses) for child, poses in found.items()}
+        self.topic = topic.removesuffix(STATIC)
+        self._parents: dict[str, list[str]] = {}
+        targets = None if frames is None else {_plain(frame) for frame in frames}
+        found = None
+        while found is None:
+            found = self._read(bag, time, targets)
+        self._recorded = {child: poses.edge() for child, poses in found.items()}
         self._edges = {
             child: edge.at(time_order(edge.times_ns)) for child, edge in self._recorded.items()
         }
+
+    def _read(
+        self, bag: Bag, time: TimeSource, targets: set[str] | None
+    ) -> dict[str, _Poses] | None:
+        """Read the poses of the targets and their ancestors, and add to the parents of all frames.
+
+        Returns:
+            Poses by frame; None if poses of a frame were left out that turned out to be an
+            ancestor. The next call then reads them.
+        """
+        found: dict[str, _Poses] = {}
+        left_out: set[str] = set()
+        used = None if targets is None else self._ancestors(targets)
+        # Static transforms are read first, because they reveal many ancestors early.
+        for topic in (self.topic + STATIC, self.topic):
+            if topic not in bag.topics or not bag.topics[topic].count:
+                continue
+            for each in transforms_of(bag, topic, time):
+                parents = self._parents.setdefault(each.child, [])
+                if each.parent not in parents:
+                    parents.append(each.parent)
+                    if used is not None and each.child in used:
+                        used |= self._ancestors({each.parent})
+                        if used & left_out:
+                            return None
+                if used is not None and each.child not in used:
+                    left_out.add(each.child)
+                    continue
+                poses = found.setdefault(each.child, _Poses())
+                poses.is_static &= topic.endswith(STATIC)
+                poses.add(each.time_ns, each.place, each.pose())
+        return found
+
+    def _ancestors(self, frames: set[str]) -> set[str]:
+        """Return frames and all their known ancestors."""
+        found, new = set(frames), set(frames)
+        while new:
+            new = {parent for child in new for parent in self._parents.get(child, ())} - found
+            found |= new
+        return found
 
     def streams(self, frame: str, fixed: str) -> dict[str, Recorded]:
         """Return the moving transforms between two frames, in the order of recording, by name.
 
         Raises:
-            UsageError: No transforms connect the frames.
+            UsageError: No transforms connect the frames, or a frame between them has several
+                parents, or no valid pose.
         """
+        path = [child for part in self._path(frame, fixed) for child in part]
+        for child in path:
+            if np.isnan(self._recorded[child].positions).all():
+                raise UsageError(
+                    f"{self.topic} gives frame '{child}' no valid pose in"
+                    f" '{self._parents[child][0]}': each one has a quaternion of length 0, or a"
+                    " number that is not finite"
+                )
         return {
-            _name(child): self._recorded[child]
-            for part in self._path(frame, fixed)
-            for child in part
+            self._name(child): self._recorded[child]
+            for child in path
             if not self._recorded[child].is_static
         }
 
@@ -93,23 +175,24 @@ class Transforms:
         found = copy(self)
         found._edges = {}
         for child, edge in self._recorded.items():
-            if _name(child) in run.streams:
-                found._edges[child] = edge.at(run.streams[_name(child)].rows)
+            if self._name(child) in run.streams:
+                found._edges[child] = edge.at(run.streams[self._name(child)].rows)
             else:
                 first, stop = np.searchsorted(edge.places[:, 0], run.files)
                 found._edges[child] = edge.at(np.arange(first, stop)[-1:])
         return found
 
-    def planar(
+    def pose(
         self,
         frame: str,
         fixed: str,
         steps_ns: NDArray[np.int64],
         align: str,
         tolerance_s: float | None,
+        parts: Sequence[str] = PLANAR,
         gap_s: float = math.inf,
     ) -> tuple[Floats, Floats]:
-        """Return the planar pose of a frame in another frame at the times of steps.
+        """Return the pose of a frame in another frame at the times of steps.
 
         The pose is composed of the transforms between the two frames. Static transforms are valid
         at all times.
@@ -120,15 +203,18 @@ class Transforms:
             steps_ns: (N,) times of the steps.
             align: Selection of each transform: `last`, `nearest` or `linear` (interpolated).
             tolerance_s: Maximum age of a transform in seconds; older transforms count as missing.
+            parts: K parts of the pose: `x y z roll pitch yaw qx qy qz qw`; see `Quantity.parts`.
             gap_s: Longest gap, in seconds, across which a transform is interpolated or taken from a
                 later message.
 
         Returns:
-            (N, 3) x, y and yaw, NaN where missing; and (N,) age in seconds of the transform that is
-            farthest in time, negative if that transform is later than the step.
+            (N, K) parts in meters, radians and numbers, NaN where missing; and (N,) age in seconds
+            of the transform that is farthest in time, negative if that transform is later than the
+            step.
 
         Raises:
-            UsageError: No transforms connect the frames.
+            UsageError: No transforms connect the frames, or a frame between them has several
+                parents.
         """
         count = len(steps_ns)
         age_s = np.zeros(count)
@@ -137,86 +223,87 @@ class Transforms:
             position, turn = np.zeros((count, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
             for name in part:
                 at, rotation, age = _at(self._edges[name], steps_ns, align, tolerance_s, gap_s)
-                position, turn = at + _rotated(rotation, position), _product(rotation, turn)
+                position, turn = at + rotated(rotation, position), product(rotation, turn)
                 is_older = np.isnan(age) | (np.abs(age) > np.abs(age_s))
                 age_s = np.where(is_older, age, age_s)
             poses.append((position, turn))
         (at, turn), (origin, back) = poses
         inverse = back * [-1.0, -1.0, -1.0, 1.0]
-        position, rotation = _rotated(inverse, at - origin), _product(inverse, turn)
-        return np.column_stack([position[:, :2], yaw_of(rotation)]), age_s
+        position, rotation = rotated(inverse, at - origin), product(inverse, turn)
+        columns = np.hstack([position, euler_of(rotation), upper(rotation)])
+        names = ("x", "y", "z", "roll", "pitch", "yaw", "qx", "qy", "qz", "qw")
+        return columns[:, [names.index(part) for part in parts]], age_s
 
     def _path(self, frame: str, fixed: str) -> tuple[list[str], list[str]]:
         """Return the frames from each of two frames up to their common ancestor, without it."""
+        frame, fixed = _plain(frame), _plain(fixed)
         above, below = self._chain(frame), self._chain(fixed)
         common = next((each for each in above if each in below), None)
-        if common is None:
-            known = sorted({*self._edges, *(edge.parent for edge in self._edges.values())})
-            raise UsageError(
-                f"/tf has no path from frame '{frame}' to '{fixed}'; frames:"
-                f" {', '.join(known[:12])}"
-            )
-        return above[: above.index(common)], below[: below.index(common)]
+        if common is not None:
+            path = above[: above.index(common)], below[: below.index(common)]
+            circle = next((each for part in path for each in part if self._is_circular(each)), None)
+            if circle is None:
+                return path
+            raise UsageError(f"{self.topic} has a cycle at frame '{circle}'")
+        known = sorted({*self._parents, *(each for one in self._parents.values() for each in one)})
+        for end in (above[-1], below[-1]):
+            parents = sorted(self._parents.get(end, []))
+            if len(parents) > 1 and {frame, fixed} <= set(known):
+                raise UsageError(
+                    f"{self.topic} gives frame '{end}' several parents: {', '.join(parents)}"
+                )
+            if len(parents) == 1:
+                raise UsageError(f"{self.topic} has a cycle at frame '{end}'")
+        raise UsageError(
+            f"{self.topic} has no path from frame '{frame}' to '{fixed}'; frames:"
+            f" {', '.join(known[:12])}"
+        )
 
     def _chain(self, frame: str) -> list[str]:
-        """Return a frame and its ancestors."""
+        """Return a frame and its ancestors, up to a frame with several parents or to a cycle."""
         chain = [frame]
-        while chain[-1] in self._edges:
-            parent = self._edges[chain[-1]].parent
-            if parent in chain:
-                raise UsageError(f"/tf has a cycle at frame '{parent}'")
-            chain.append(parent)
+        while len(parents := self._parents.get(chain[-1], [])) == 1 and parents[0] not in chain:
+            chain.append(parents[0])
         return chain
 
+    def _is_circular(self, frame: str) -> bool:
+        """Return whether a frame is its own ancestor."""
+        chain = self._chain(frame)
+        return self._parents.get(chain[-1], []) == [frame]
 
-def yaw_of(quaternions: Floats) -> Floats:
-    """Return the yaw in radians of quaternions (N, 4) x y z w; NaN for a quaternion of zeros."""
-    x, y, z, w = quaternions.T
-    with np.errstate(invalid="ignore"):
-        is_none = ~(np.square(quaternions).sum(axis=1) > 0)
-    return np.where(is_none, np.nan, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-
-
-def _name(child: str) -> str:
-    return f"frame '{child}' in {TF}"
+    def _name(self, child: str) -> str:
+        return f"frame '{child}' in {self.topic}"
 
 
-def _poses(bag: Bag, topic: str, time: TimeSource) -> Iterator[tuple[str, _Pose]]:
-    """Yield each frame and its pose, in the order of recording."""
-    fields = ["transforms", *(["publish_time"] if time == "publish_time" else [])]
-    stream = bag.read(topic, fields)
-    places = bag.places(topic)[stream.rows]
-    times_ns = stream.columns.get("publish_time", stream.log_time_ns)
-    is_static = topic == TF_STATIC
-    for time_ns, place, transforms in zip(
-        times_ns.tolist(), places.tolist(), stream.columns["transforms"], strict=True
-    ):
-        for each in transforms:
-            stamp, pose = each.header.stamp, each.transform
-            own_ns = stamp.sec * 10**9 + stamp.nanosec if time == "header" else time_ns
-            at, turn = pose.translation, pose.rotation
-            parent, child = (
-                name.removeprefix("/") for name in (each.header.frame_id, each.child_frame_id)
-            )
-            position, quaternion = [at.x, at.y, at.z], [turn.x, turn.y, turn.z, turn.w]
-            yield child, _Pose(parent, own_ns, place, position, quaternion, is_static)
+def transform_topic(bag: Bag, wanted: str | None) -> str:
+    """Return the topic of transforms that a quantity uses: the moving one, if the bag has both.
+
+    Args:
+        bag: Bag to read.
+        wanted: Topic in the mapping; None for `/tf`, or else the only topic of transforms.
+
+    Raises:
+        UsageError: There is no such topic, it has other messages, or the choice is not clear.
+    """
+    found = {info.name: info.count for info in bag.topics.values() if are_transforms(info)}
+    known = sorted({name.removesuffix(STATIC) for name, count in found.items() if count})
+    listed = f"topics of transforms: {', '.join(known[:8]) or 'none'}"
+    base = TF if wanted is None else wanted.removesuffix(STATIC)
+    if wanted is None and known and TF not in known:
+        if len(known) > 1:
+            raise UsageError(f"several topics have transforms: choose one with `tf`; {listed}")
+        base = known[0]
+    topic = base if base in bag.topics else base + STATIC
+    if topic not in bag.topics:
+        raise UsageError(f"no topic {base}; {listed}")
+    if topic not in found:
+        raise UsageError(f"{topic} ({bag.topics[topic].type_name}) has no transforms; {listed}")
+    return topic_of(bag, topic)
 
 
-def _edge(child: str, poses: list[_Pose]) -> _Edge:
-    parents = sorted({pose.parent for pose in poses})
-    if len(parents) > 1:
-        raise UsageError(f"/tf gives frame '{child}' several parents: {', '.join(parents)}")
-    poses = sorted(poses, key=lambda pose: pose.place)
-    turns = np.array([pose.quaternion for pose in poses], np.float64)
-    sizes = np.linalg.norm(turns, axis=1, keepdims=True)
-    return _Edge(
-        parent=parents[0],
-        times_ns=np.array([pose.time_ns for pose in poses], np.int64),
-        places=np.array([pose.place for pose in poses], np.int64),
-        positions=np.array([pose.position for pose in poses], np.float64),
-        quaternions=np.divide(turns, sizes, out=np.full_like(turns, np.nan), where=sizes > 0),
-        is_static=all(pose.is_static for pose in poses),
-    )
+def _plain(frame: str) -> str:
+    """Return the name of a frame as in the bag, where a leading `/` is ignored as well."""
+    return frame.removeprefix("/")
 
 
 def _at(
@@ -253,32 +340,7 @@ def _at(
         # As for fields, the age is that of the nearer one of the two poses.
         age_s = np.where(is_between & (wait_s < age_s), -wait_s, age_s)
         positions = positions + share * (edge.positions[after] - positions)
-        turns = _interpolated(turns, edge.quaternions[after], share)
+        turns = between(turns, edge.quaternions[after], share)
     positions, turns = positions.copy(), turns.copy()
     positions[is_none], turns[is_none] = np.nan, np.nan
     return positions, turns, np.where(is_none, np.nan, age_s)
-
-
-def _interpolated(first: Floats, second: Floats, share: Floats) -> Floats:
-    """Interpolate unit quaternions along the shorter arc (slerp)."""
-    cosine = (first * second).sum(axis=1, keepdims=True)
-    second, cosine = np.where(cosine < 0, -second, second), np.abs(cosine).clip(max=1.0)
-    angle = np.arccos(cosine)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        weights = [np.sin((1 - share) * angle), np.sin(share * angle)] / np.sin(angle)
-    close = np.broadcast_to(angle < 1e-6, weights[0].shape)
-    low, high = np.where(close, 1 - share, weights[0]), np.where(close, share, weights[1])
-    return low * first + high * second
-
-
-def _rotated(quaternions: Floats, vectors: Floats) -> Floats:
-    axis, w = quaternions[:, :3], quaternions[:, 3:]
-    across = 2 * np.cross(axis, vectors)
-    return vectors + w * across + np.cross(axis, across)
-
-
-def _product(first: Floats, second: Floats) -> Floats:
-    axis, w = first[:, :3], first[:, 3:]
-    other, v = second[:, :3], second[:, 3:]
-    vector = w * other + v * axis + np.cross(axis, other)
-    return np.hstack([vector, w * v - (axis * other).sum(axis=1, keepdims=True)])

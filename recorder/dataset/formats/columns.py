@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from mcaprl.recorder.dataset.arrays import exactly, with_fresh_times
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.transitions import Transitions, joined_infos
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
-from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
 
 
@@ -51,7 +51,8 @@ def dataset_of(episodes: Sequence[EpisodeArrays], metadata: LogMetadata, where: 
     """Return a dataset of these episodes.
 
     If the times of the episodes increase strictly from row to row, they become the log_times.
-    Otherwise, the log_times start at 0 and increase by the step duration in the metadata.
+    Otherwise, the data has no times: the log_times start at 0 and increase by the step duration in
+    the metadata.
 
     Args:
         episodes: Episodes in order; episodes without a transition are left out.
@@ -87,9 +88,9 @@ def dataset_of(episodes: Sequence[EpisodeArrays], metadata: LogMetadata, where: 
         )
     except SpaceError as error:
         raise SpaceError(f"{where}: {error}") from error
-    times = columns.log_time_ns
-    if not len(times) or (np.diff(times) <= 0).any():
+    if (np.diff(columns.log_time_ns) <= 0).any():
         columns = with_fresh_times(columns, 0, metadata.step_duration_ns)
+        metadata = replace(metadata, times=NO_TIMES)
     return Dataset(columns, metadata)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,9 @@ from hypothesis import strategies as st
 
 import mcaprl
 from mcaprl.errors import LogError, SpaceError, UsageError
+from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.dataset.formats.registry import target_format, write_format
+from mcaprl.recorder.format.metadata import LogMetadata
 from tests.support.recordings import MIXED_SPACE, record
 
 
@@ -260,3 +264,58 @@ def test_arrays_of_a_registered_environment_have_its_spaces() -> None:
     other = mcaprl.Dataset.from_arrays(**arrays, env_id="Pendulum-v1")
     assert other.observation_space == spaces.Box(-np.inf, np.inf, (4,), np.float64)
     assert other.action_space == spaces.Discrete(1)
+
+
+def with_times(times: list[list[int]]) -> mcaprl.Dataset:
+    """Return a dataset with one episode for each list of times."""
+    episodes = [
+        EpisodeArrays(
+            observations=np.zeros((len(each), 1), np.float32),
+            actions=np.zeros(len(each) - 1, np.int64),
+            rewards=np.zeros(len(each) - 1),
+            terminated=True,
+            truncated=False,
+            times_ns=np.array(each),
+        )
+        for each in times
+    ]
+    space = spaces.Box(-1, 1, (1,), np.float32)
+    return dataset_of(episodes, LogMetadata(space, spaces.Discrete(2)), "test")
+
+
+def test_times_from_0_are_kept(tmp_path: Path) -> None:
+    times = [[0, 1, 5], [3_900_000_000, 3_900_000_007]]
+    data = with_times(times)
+    for name in ("first.mcap", "second.mcap"):
+        data.save(tmp_path / name)
+        found = mcaprl.open(tmp_path / name)
+        assert [each.log_time_ns.tolist() for each in found.episodes] == times
+        assert [each.summary.start_time_ns for each in found.episodes] == [0, 3_900_000_000]
+    assert (tmp_path / "first.mcap").read_bytes() == (tmp_path / "second.mcap").read_bytes()
+    # A copy of the log keeps the times, too.
+    found.save(tmp_path / "third.mcap")
+    assert mcaprl.open(tmp_path / "third.mcap").episodes[1].log_time_ns.tolist() == times[1]
+    with pytest.raises(LogError, match="the first time is -1 ns; a log cannot have times before"):
+        with_times([[-1, 0]]).save(tmp_path / "fourth.mcap")
+
+
+@pytest.mark.parametrize("suffix", ["", ".npz", ".hdf5", "parquet", "minari-v0"])
+def test_arrays_have_the_times_of_their_log(tmp_path: Path, suffix: str) -> None:
+    data = small()
+    if suffix:
+        for package in ("h5py", "pyarrow"):
+            pytest.importorskip(package, reason="needs the extras interop and tables")
+        form = {"parquet": "parquet", "minari-v0": "minari"}.get(suffix)
+        write_format(data, tmp_path / f"data{suffix}", target_format(tmp_path / f"a{suffix}", form))
+        data = mcaprl.open(tmp_path / f"data{suffix}")
+    log = tmp_path / "log.mcap"
+    for part in (data, data.filter(lambda episode: episode.index > 0)):
+        before_ns = time.time_ns()
+        part.save(log, overwrite=True)
+        saved = mcaprl.open(log)
+        assert before_ns <= saved.episodes[0].log_time_ns[0] <= time.time_ns()
+        assert "times" not in saved.metadata
+    # A log and arrays together have no common clock.
+    both = mcaprl.Dataset.concatenate([saved, small()])
+    both.save(log, overwrite=True)
+    assert mcaprl.open(log).episodes[0].log_time_ns[0] > before_ns

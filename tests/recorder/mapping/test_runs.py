@@ -437,3 +437,29 @@ def test_arrays_of_bytes_are_numbers(tmp_path: Path) -> None:
         ],
     )
     assert read(path).dataset.observations[:3].tolist() == [[49, 48], [49, 49], [49, 50]]
+
+
+def test_a_converted_log_has_the_times_of_the_bag(tmp_path: Path) -> None:
+    # Two runs of a simulation, whose clock starts at 0; 4.9 s are between the first steps.
+    bag = write_channels(
+        tmp_path / "bag.mcap",
+        [
+            numbers("/odom", [*seconds(0, 11, 0), *seconds(4.9, 11, 100)]),
+            integers("/cmd", [*commands(0, 11, 0), *commands(4.9, 11, 1)]),
+        ],
+        start_ns=0,
+    )
+    mapping = {
+        "clock": {"rate_hz": 10},
+        "observation": {"x": {"field": "/odom.data", "tolerance_s": 0.05}},
+        "action": {"field": "/cmd.data"},
+    }
+    opened = mcaprl.open(bag, mapping=mapping)
+    logs = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
+    for log in logs:
+        mcaprl.convert(bag, log, mapping=mapping)
+        times = [episode.log_time_ns.tolist() for episode in mcaprl.open(log).episodes]
+        assert times == [episode.log_time_ns.tolist() for episode in opened.episodes]
+        assert times[0][0] == 0
+        assert times[1][0] == 4_900_000_000
+    assert logs[0].read_bytes() == logs[1].read_bytes()
