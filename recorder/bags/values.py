@@ -310,6 +310,8 @@ def _float(value: Any) -> float:
 def names_of(message: Any, path: str) -> list[str] | None:
     """Return the names of the elements of a field in a message; None if they have none.
 
+    An element that omits the field has the name ''.
+
     The names of the elements of an array are the strings of a parallel array, `name` or
     `joint_names` for example, in the message that contains the array or one that contains this
     message. If the elements are messages, they may contain their names themselves. The names of
@@ -350,7 +352,7 @@ def _names(value: Any, steps: Sequence[Step], parents: list[Any]) -> list[str] |
             continue
         return _combined(
             [
-                (name, _names(each, after, []))
+                ("" if _walked(each, after) is ABSENT else name, _names(each, after, []))
                 for each, name in zip(value[step], names[step], strict=True)
             ]
         )

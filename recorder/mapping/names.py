@@ -209,6 +209,10 @@ def check_order(path: FieldPath, column: NDArray[Any], texts: NDArray[Any]) -> N
             found = element_of(listed, path.elements)
             listed = [] if isinstance(found, Lack) else _flat_texts(found) or []
         if listed:
+            # An element that omits the field has no name here.
+            known = next(iter(orders), ())
+            if len(known) == len(listed):
+                listed = [name or old for name, old in zip(listed, known, strict=True)]
             orders.setdefault(tuple(listed), row)
     if len(orders) > 1:
         (one, first), (other, second) = list(orders.items())[:2]

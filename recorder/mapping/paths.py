@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
 from mcaprl.recorder.bags.values import (
+    ABSENT,
     Lack,
     Step,
     as_array,
@@ -193,8 +194,9 @@ def check_lacks(path: FieldPath, values: Sequence[Any], *, optional: bool) -> No
     longest = max(lacks, key=lambda lack: lack.length)
     if optional and longest.length == 0:
         return
-    if longest.length < 0:
-        raise UsageError(f"{path} has no value in any message: {longest.reason}")
+    if longest.length < 0 or ABSENT in lacks:
+        reason = ABSENT.reason if ABSENT in lacks else longest.reason
+        raise UsageError(f"{path} has no value in any message: {reason}")
     raise UsageError(
         f"{path}: the longest array has {longest.length} elements; index 0 is the first"
     )
