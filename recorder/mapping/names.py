@@ -11,16 +11,8 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import TopicInfo
-from mcaprl.recorder.bags.values import (
-    NAMES,
-    PARALLEL,
-    Lack,
-    as_array,
-    element_of,
-    path_text,
-    steps_of,
-    texts_of,
-)
+from mcaprl.recorder.bags.path_steps import NAMES, path_text, steps_of
+from mcaprl.recorder.bags.values import PARALLEL, Lack, as_array, element_of, texts_of
 from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.paths import FieldPath, Floats, path_in, rows_of
 

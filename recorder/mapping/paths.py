@@ -13,17 +13,8 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
-from mcaprl.recorder.bags.values import (
-    ABSENT,
-    Lack,
-    Step,
-    as_array,
-    element_of,
-    is_mapped,
-    path_text,
-    steps_of,
-    without_lacks,
-)
+from mcaprl.recorder.bags.path_steps import Step, is_mapped, path_text, steps_of
+from mcaprl.recorder.bags.values import ABSENT, Lack, as_array, element_of, without_lacks
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +24,7 @@ class FieldPath(NamedTuple):
 
     Attributes:
         topic: Name of the topic.
-        field: Path of the field in the message, see `bags.values`; empty for the message as a
+        field: Path of the field in the message, see `bags.path_steps`; empty for the message as a
             whole.
         elements: Index or slice of the field's array; None for the whole field.
     """
