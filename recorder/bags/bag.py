@@ -17,18 +17,10 @@ from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.recorder.bags.decoders import MessageDecoder, decoder_of, merged
 from mcaprl.recorder.bags.files import find_bags, open_recordings
 from mcaprl.recorder.bags.mcap_file import McapFile
+from mcaprl.recorder.bags.path_steps import NAMES, general_path, kind_at, steps_of
 from mcaprl.recorder.bags.rosbag_file import RosbagFile
 from mcaprl.recorder.bags.source import Definition, TopicSource
-from mcaprl.recorder.bags.values import (
-    ABSENT,
-    NAMES,
-    NUMBERS,
-    column_of,
-    general_path,
-    kind_at,
-    steps_of,
-    value_at,
-)
+from mcaprl.recorder.bags.values import ABSENT, NUMBERS, column_of, value_at
 
 _PUBLISH_TIME = "publish_time"
 
@@ -152,7 +144,7 @@ class Bag(Protocol):
 
         Args:
             topic: Name of the topic.
-            fields: Paths of fields, see `values`; `publish_time` is the time of publication in
+            fields: Paths of fields, see `path_steps`; `publish_time` is the time of publication in
                 nanoseconds.
             rows: Indices into `times` of the messages to read, in output order; default: all.
 

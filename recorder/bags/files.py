@@ -18,21 +18,29 @@ from mcaprl.recorder.bags.rosbag_file import RosbagFile
 _METADATA = "metadata.yaml"
 _KINDS = (".mcap", ".db3", ".bag")
 _COMPRESSED = ".zstd"
+_COPY = ".images"
+"""Suffix of the uncompressed copy of a bag's images; see `mapping.image_copy`."""
 
 
 def find_bags(data: str | Path | Sequence[str | Path]) -> list[Path]:
     """Resolve files, folders and globs to existing paths.
 
+    Copies of images, which are beside their bags, are left out.
+
     Raises:
-        LogError: There is no such path.
+        LogError: There is no such path, or there are only copies of images.
     """
-    if not isinstance(data, str | Path):
-        return [path for part in data for path in find_bags(part)]
-    path = Path(data)
-    found = [path] if path.exists() else sorted(map(Path, glob.glob(str(data))))
-    if not found:
-        raise LogError(f"{data}: no such file, folder or match")
-    return found
+    found: list[Path] = []
+    for part in [data] if isinstance(data, str | Path) else data:
+        path = Path(part)
+        matches = [path] if path.exists() else sorted(map(Path, glob.glob(str(part))))
+        if not matches:
+            raise LogError(f"{part}: no such file, folder or match")
+        found += matches
+    bags = [path for path in found if path.suffix != _COPY]
+    if found and not bags:
+        raise LogError(f"{found[0]} is a copy of images: give the bag beside it")
+    return bags
 
 
 def open_recordings(paths: Sequence[Path], opened: ExitStack) -> list[list[McapFile | RosbagFile]]:

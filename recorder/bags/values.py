@@ -1,12 +1,4 @@
-"""Values of fields in decoded messages, and their conversion to columns.
-
-The path of a field is a sequence of steps: `twist.linear.x`, `points[0].positions`. A step is the
-name of a field or the key of a map (`values[left]`, in quotes if it contains other characters:
-`values["a.b"]`), an index of an array (`[3]`, `[-1]`), or a slice (`[0:12]`, `[::10]`, `[:]` or
-`[]`). The steps after `slice.name` apply to each selected element: `motors[0:12].q` is the vector
-of the `q` of twelve motors. An index directly after a slice selects one of the selected elements.
-`PATH[@]` is the list of the names of the elements of `PATH`; see `names_of`.
-"""
+"""Values of fields in decoded messages, and their conversion to columns."""
 
 from __future__ import annotations
 
@@ -15,19 +7,13 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import UsageError
+from mcaprl.recorder.bags.path_steps import NAMES, Step, is_mapped, steps_of
 
-Step = str | int | slice
-"""Name of a field or key of a map, index, or slice."""
-
-NAMES = "[@]"
-"""Suffix of the path of the names of a field's elements."""
 NUMBERS = (
     "int",
     "uint",
@@ -47,12 +33,7 @@ _NS_PER_S = 10**9
 # Names of the parts of a time in ROS 2, protobuf, Foxglove's JSON, and JSON of ROS 1.
 _TIMES = (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec"), ("secs", "nsecs"))
 _INT64 = np.iinfo(np.int64)
-_MAX_STEPS = 64
-# A name, or brackets with a quoted key or anything else.
-_STEP = re.compile(r"""\.?([^.\[\]]+)|\[(?:"([^"]*)"|'([^']*)'|([^\[\]]*))\]""")
-_SLICE = re.compile(r"(-?\d{0,18}):(-?\d{0,18})(?::(-?\d{0,18}))?")
-_INDEX = re.compile(r"-?\d+")
-_INDEX_DIGITS = 18
+_WHOLE, _MAX_DIGITS = re.compile(r"-?\d{1,19}"), 20
 PARALLEL = ("name", "names", "joint_names", "joint_name", "interface_names")
 """Arrays of names beside an array of values, or in a message that contains it."""
 _OWN = ("name", "joint_name", "interface_name", "child_frame_id", "key")
@@ -76,94 +57,6 @@ class Lack:
 
 ABSENT = Lack("the message has no such key")
 """Marker of a key that a message omits: the message is not an update of the field."""
-
-
-@lru_cache(maxsize=1024)
-def steps_of(path: str) -> tuple[Step, ...]:
-    """Parse the path of a field.
-
-    Raises:
-        UsageError: The path has a wrong character, index or slice.
-    """
-    steps: list[Step] = []
-    place = 0
-    while place < len(path):
-        match = _STEP.match(path, place)
-        # A dot is between a step and a name, and nowhere else.
-        if match is None or (match[1] is not None and (path[place] == ".") != bool(steps)):
-            raise UsageError(f"'{path[:200]}' is not a path of a field, see '{path[place:][:20]}'")
-        steps.append(_step(match))
-        place = match.end()
-    if len(steps) > _MAX_STEPS:
-        raise UsageError(f"'{path[:40]}...' has {len(steps)} steps; at most {_MAX_STEPS}")
-    return tuple(steps)
-
-
-def _step(match: re.Match[str]) -> Step:
-    name, quoted, other, text = match.groups()
-    for key in (name, quoted, other):
-        if key is not None:
-            return str(key)
-    if _INDEX.fullmatch(text):
-        if len(text.lstrip("-")) > _INDEX_DIGITS:
-            raise UsageError(f"the index [{text[:20]}...] has {len(text)} digits")
-        return int(text)
-    if not text:
-        return slice(None)
-    found = _SLICE.fullmatch(text)
-    if found is None:
-        return str(text)
-    numbers = [int(part) if part else None for part in found.groups()]
-    if numbers[2] == 0:
-        raise UsageError(f"[{text}]: the step of a slice cannot be 0")
-    return slice(*numbers)
-
-
-def path_text(steps: Sequence[Step]) -> str:
-    """Return the steps as a path; the inverse of `steps_of`."""
-    found = ""
-    for step in steps:
-        if isinstance(step, slice):
-            parts = [step.start, step.stop, *([step.step] if step.step else [])]
-            found += f"[{':'.join('' if part is None else str(part) for part in parts)}]"
-        elif isinstance(step, int):
-            found += f"[{step}]"
-        elif not step or re.search(r"[.\[\]]", step):
-            quote = "'" if '"' in step else '"'
-            found += f"[{quote}{step}{quote}]"
-        else:
-            found += f"{'.' if found else ''}{step}"
-    return found
-
-
-def is_mapped(steps: Sequence[Step], number: int) -> bool:
-    """Return whether a step is a slice, and the steps after it apply to each element."""
-    after = steps[number + 1 : number + 2]
-    return isinstance(steps[number], slice) and bool(after) and isinstance(after[0], str)
-
-
-def general_path(path: str) -> str:
-    """Return a path as it is in `TopicInfo.fields`: `motors[].q` for `motors[3].q`."""
-    steps = list(steps_of(path.removesuffix(NAMES)))
-    while steps and not isinstance(steps[-1], str):
-        steps.pop()
-    found = ""
-    for step in steps:
-        found += f"{'.' if found else ''}{step}" if isinstance(step, str) else "[]"
-    return found
-
-
-def kind_at(fields: Mapping[str, str], path: str) -> str:
-    """Return the kind of the values of a path by `TopicInfo.fields`; empty if unknown.
-
-    The kind of a field in the elements of arrays has a `[]` for each of these arrays.
-    """
-    steps = steps_of(path)
-    are_several = any(is_mapped(steps, number) for number in range(len(steps)))
-    if path.endswith(NAMES) or are_several or not steps or not isinstance(steps[-1], str):
-        return ""
-    general = general_path(path)
-    return fields.get(general, "").removesuffix("[]" * general.count("[]"))
 
 
 def value_at(message: Any, path: str) -> Any:
@@ -212,13 +105,13 @@ def _member(value: Any, name: str) -> Any:
 
 def _entry(value: Mapping[Any, Any], key: str | int) -> Any:
     """Return the value of a key of a map, which may be a number or a text."""
-    for each in (key, *([int(key)] if isinstance(key, str) and _INDEX.fullmatch(key) else [])):
+    for each in (key, *([int(key)] if isinstance(key, str) and _WHOLE.fullmatch(key) else [])):
         try:
             # Reading a key that a protobuf map of messages lacks would add it.
             if each in value:
                 return value[each]
         # Keys of protobuf maps have one type.
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             continue
     return ABSENT
 
@@ -312,6 +205,8 @@ def _float(value: Any) -> float:
 def names_of(message: Any, path: str) -> list[str] | None:
     """Return the names of the elements of a field in a message; None if they have none.
 
+    An element that omits the field has the name ''.
+
     The names of the elements of an array are the strings of a parallel array, `name` or
     `joint_names` for example, in the message that contains the array or one that contains this
     message. If the elements are messages, they may contain their names themselves. The names of
@@ -352,7 +247,7 @@ def _names(value: Any, steps: Sequence[Step], parents: list[Any]) -> list[str] |
             continue
         return _combined(
             [
-                (name, _names(each, after, []))
+                ("" if _walked(each, after) is ABSENT else name, _names(each, after, []))
                 for each, name in zip(value[step], names[step], strict=True)
             ]
         )
@@ -447,7 +342,7 @@ def _sum_ns(second: Any, rest: Any) -> Any:
 
 def _whole(value: Any, factor: int) -> int:
     """Return the product of a number, or the digits of one as in the JSON form of protobuf."""
-    if isinstance(value, str) and len(value) > _INDEX_DIGITS + 2:
+    if isinstance(value, str) and len(value) > _MAX_DIGITS:
         raise ValueError("too many digits")
     if isinstance(value, float):
         seconds = math.floor(value)

@@ -41,7 +41,7 @@ def decoded_file(
     pillow = import_extra("PIL.Image", extra)
     try:
         with warnings.catch_warnings():
-            # Pillow warns about sizes above a limit of its own, and about damaged EXIF data.
+            # Pillow warns about sizes above its limit, and about damaged EXIF data.
             warnings.simplefilter("ignore")
             image = pillow.open(BytesIO(data), formats=list(formats))
             width, height = image.size

@@ -20,6 +20,7 @@ from mcaprl.problem import Problem
 from mcaprl.recorder.bags.bag import Bag, Failure, TopicInfo
 from mcaprl.recorder.dataset.image_cache import Storage, is_mapped
 from mcaprl.recorder.dataset.mapped import Frames, as_pixels
+from mcaprl.recorder.format.spaces import MAX_ELEMENTS
 from mcaprl.recorder.mapping.compressed import compressed_pixels, is_video
 from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.image_copy import copied_images
@@ -113,6 +114,12 @@ class ImageReader:
         if first is None:
             raise LogError(f"{self.topic}: {self._why_none(wanted)}")
         image = first[1]
+        elements = image.size * (rows.shape[1] if rows.ndim > 1 else 1)
+        if elements > MAX_ELEMENTS:
+            raise UsageError(
+                f"{self.topic}: an observation of {elements} elements is too large; at most"
+                f" {MAX_ELEMENTS} can be used: set `resize` or `crop`, or a smaller `stack`"
+            )
         if not is_mapped(storage, rows.size * image.nbytes):
             found: Frames | None = self._in_memory(wanted, places.reshape(rows.shape), image)
         elif (mapped := copied_images(self, wanted, image)) is not None:

@@ -11,16 +11,8 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import TopicInfo
-from mcaprl.recorder.bags.values import (
-    NAMES,
-    PARALLEL,
-    Lack,
-    as_array,
-    element_of,
-    path_text,
-    steps_of,
-    texts_of,
-)
+from mcaprl.recorder.bags.path_steps import NAMES, path_text, steps_of
+from mcaprl.recorder.bags.values import PARALLEL, Lack, as_array, element_of, texts_of
 from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.paths import FieldPath, Floats, path_in, rows_of
 
@@ -209,6 +201,10 @@ def check_order(path: FieldPath, column: NDArray[Any], texts: NDArray[Any]) -> N
             found = element_of(listed, path.elements)
             listed = [] if isinstance(found, Lack) else _flat_texts(found) or []
         if listed:
+            # An element that omits the field has no name here.
+            known = next(iter(orders), ())
+            if len(known) == len(listed):
+                listed = [name or old for name, old in zip(listed, known, strict=True)]
             orders.setdefault(tuple(listed), row)
     if len(orders) > 1:
         (one, first), (other, second) = list(orders.items())[:2]

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
-from mcaprl.recorder.bags.values import path_text, without_lacks
+from mcaprl.recorder.bags.path_steps import path_text
+from mcaprl.recorder.bags.values import without_lacks
 from mcaprl.recorder.mapping.align import NONE, Matches, during, interpolated, last, nearest
 from mcaprl.recorder.mapping.config import LARGEST, Quantity
 from mcaprl.recorder.mapping.names import Named, by_names, check_order, names_field

@@ -13,16 +13,8 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
-from mcaprl.recorder.bags.values import (
-    Lack,
-    Step,
-    as_array,
-    element_of,
-    is_mapped,
-    path_text,
-    steps_of,
-    without_lacks,
-)
+from mcaprl.recorder.bags.path_steps import Step, is_mapped, path_text, steps_of
+from mcaprl.recorder.bags.values import ABSENT, Lack, as_array, element_of, without_lacks
 
 Floats = NDArray[np.float64]
 
@@ -32,7 +24,7 @@ class FieldPath(NamedTuple):
 
     Attributes:
         topic: Name of the topic.
-        field: Path of the field in the message, see `bags.values`; empty for the message as a
+        field: Path of the field in the message, see `bags.path_steps`; empty for the message as a
             whole.
         elements: Index or slice of the field's array; None for the whole field.
     """
@@ -193,8 +185,9 @@ def check_lacks(path: FieldPath, values: Sequence[Any], *, optional: bool) -> No
     longest = max(lacks, key=lambda lack: lack.length)
     if optional and longest.length == 0:
         return
-    if longest.length < 0:
-        raise UsageError(f"{path} has no value in any message: {longest.reason}")
+    if longest.length < 0 or ABSENT in lacks:
+        reason = ABSENT.reason if ABSENT in lacks else longest.reason
+        raise UsageError(f"{path} has no value in any message: {reason}")
     raise UsageError(
         f"{path}: the longest array has {longest.length} elements; index 0 is the first"
     )

@@ -228,8 +228,8 @@ def _planar(sizes: _Sizes, name: str) -> Image:
         )
         return _rgb_of_yuv(luma, u, v)
     pairs = sizes.plane(first, height // 2, step, width).reshape(height // 2, width // 2, 2)
-    u, v = (1, 0) if name == "nv21" else (0, 1)
-    return _rgb_of_yuv(luma, pairs[..., u], pairs[..., v])
+    first_u = 1 if name == "nv21" else 0
+    return _rgb_of_yuv(luma, pairs[..., first_u], pairs[..., 1 - first_u])
 
 
 # OpenCV's constants: the factors of BT.601 for limited range, times 2^20.

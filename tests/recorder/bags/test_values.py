@@ -15,15 +15,8 @@ from hypothesis import strategies as st
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import open_bag
-from mcaprl.recorder.bags.values import (
-    ABSENT,
-    Lack,
-    column_of,
-    kind_at,
-    path_text,
-    steps_of,
-    value_at,
-)
+from mcaprl.recorder.bags.path_steps import kind_at, path_text, steps_of
+from mcaprl.recorder.bags.values import ABSENT, Lack, column_of, value_at
 from tests.support.nested_bags import write_json
 
 TIME = {"sec": "integer", "nsec": "integer"}
@@ -136,6 +129,7 @@ def test_values_by_hand() -> None:
         ("a.z", ABSENT),
         ("a.z.b[3]", ABSENT),
         ("['x.y']", 4),
+        (f"a['{'9' * 5000}']", ABSENT),
     ):
         assert value_at(message, path) == expected, path
     for path, length in (("a.b[3]", 3), ("c[-4].d", 3), ("a[0]", -1), ("a.b[0][0]", -1)):

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from mcaprl.errors import LogError
+from mcaprl.errors import LogError, SpaceError
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.image_files import FORMATS, decoded_file
 from mcaprl.recorder.mapping.compressed import compressed_pixels
@@ -185,6 +185,31 @@ def test_image_columns_of_lerobot_open_the_same_formats(ghostscript: Path) -> No
     with pytest.raises(LogError, match=r"it declares 8 x 8 pixels; at most 63 can be read"):
         image_of("front", file_of("PNG"), max_pixels=63)
     assert not list(ghostscript.iterdir())
+
+
+def test_images_of_lerobot_are_limited_by_their_declared_shape(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    arrow = pytest.importorskip("pyarrow", reason="needs PyArrow")
+    from mcaprl.recorder.dataset.formats.lerobot import features
+
+    def column(*files: bytes) -> Any:
+        found = arrow.array([{"bytes": file} for file in files])
+        return arrow.chunked_array([found])
+
+    front = features.Feature("front", "image", (3, 8, 8))
+    assert front.decode(column(file_of("PNG"))).shape == (1, 8, 8, 3)
+    with pytest.raises(LogError, match=r"it declares 13000 x 13000 pixels; at most 192 can be"):
+        front.decode(column(png_of(13000, 13000)))
+    with pytest.raises(SpaceError, match="a space of 169000000 elements is too large"):
+        features.Feature("front", "image", (13000, 13000, 1)).decode(column(b""))
+
+    def fail(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(np, "stack", fail)
+    with pytest.raises(LogError, match="2 images of front do not fit into memory"):
+        front.decode(column(file_of("PNG"), file_of("PNG")))
 
 
 def png_of(width: int, height: int) -> bytes:

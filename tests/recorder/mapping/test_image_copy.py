@@ -21,7 +21,7 @@ from mcaprl.recorder.dataset import image_cache
 from mcaprl.recorder.dataset.mapped import MappedImages
 from mcaprl.recorder.mapping import image_copy
 from mcaprl.recorder.mapping.images import ImageReader
-from tests.support.bags import Channel, integers, write_channels
+from tests.support.bags import Channel, integers, write_channels, write_rosbag1, write_rosbag2
 from tests.support.recordings import assert_same_bits
 
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -167,6 +167,45 @@ def test_an_open_dataset_keeps_its_images_when_the_copy_is_replaced(tmp_path: Pa
     other = mcaprl.open(bag, mapping=mapping(crop=[1, 0, 8, 8]), images="mapped")
     assert_same_bits(mapped.observations[:], memory.observations)
     assert_same_bits(other.observations[:], memory.observations[:, :8, 1:9])
+
+
+def test_the_copy_is_not_taken_for_a_bag(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag.mcap", [file_of(each) for each in noise(20, 9, 9)])
+    memory = mcaprl.open(bag, mapping=mapping(), images="memory")
+    mcaprl.open(bag, mapping=mapping(), images="mapped")
+    every = sorted(tmp_path.iterdir())
+    assert len(every) == 2
+    for data in (str(tmp_path / "*"), every):
+        found = mcaprl.open(data, mapping=mapping())
+        assert found.sources == (bag,)
+        assert found.fingerprint == memory.fingerprint
+    with pytest.raises(LogError, match="is a copy of images: give the bag beside it"):
+        mcaprl.open(every[1], mapping=mapping())
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "ros1", "FILE", "MESSAGE"])
+def test_images_of_all_formats_are_mapped(tmp_path: Path, storage: str) -> None:
+    if storage == "ros1":
+        bag = write_rosbag1(tmp_path / "drive.bag")
+    elif storage in ("FILE", "MESSAGE"):
+        bag = write_rosbag2(tmp_path / "drive", compression=storage)
+    else:
+        bag = write_rosbag2(tmp_path / "drive", storage)
+    tree = {
+        "clock": {"rate_hz": 10},
+        "observation": {"depth": {"image": "/camera/depth"}},
+        "action": {"fields": ["/cmd_vel.angular.z"], "edges": [[0]]},
+        "stack": 2,
+    }
+    memory = mcaprl.open(bag, mapping=tree, images="memory")
+    for _ in range(2):
+        mapped = mcaprl.open(bag, mapping=tree, images="mapped")
+        assert_same_bits(mapped.observations[:], memory.observations)
+    assert memory.observations[2, 0, 0].tolist() == [
+        float(np.float32(1.001)),
+        float(np.float32(1.002)),
+    ]
+    assert len(list(tmp_path.rglob("*.depth.images"))) == 1
 
 
 def test_automatic_storage_depends_on_the_free_memory(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import struct
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from gymnasium import spaces
 from PIL import Image
 
+import mcaprl
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.bag import Failure
 from mcaprl.recorder.mapping.config import Quantity, parse_mapping
@@ -38,7 +40,7 @@ def raw_bag(arrays: list[np.ndarray[Any, Any]], encoding: str, padding: int = 0)
     return MemoryBag({"/camera": (range(count), columns)}, KINDS)
 
 
-def reader_of(bag: MemoryBag, *, strict: bool = False, **options: Any) -> ImageReader:
+def reader_of(bag: MemoryBag, *, strict: Any = False, **options: Any) -> ImageReader:
     quantity = Quantity.model_validate({"image": "/camera", **options})
     return ImageReader(bag, "/camera", quantity, strict=strict)
 
@@ -88,7 +90,7 @@ def test_depth_keeps_its_unit() -> None:
     millimeters = np.array([[0, 1500], [3000, 65535]], np.uint16)
     found = read(raw_bag([millimeters], "16UC1"), [0])
     assert found.dtype == np.float32
-    # REP 118: 16 bits are millimeters. The quotient is exact to the last bit.
+    # REP 118: 16 bits are millimeters. The result of the division is exact to the last bit.
     assert found[0, ..., 0].tolist() == [[0.0, 1.5], [3.0, float(np.float32(65.535))]]
     meters = np.array([[np.nan, np.inf], [2.5, 0.5]], np.float32)
     np.testing.assert_allclose(
@@ -144,9 +146,9 @@ def test_damaged_and_unknown_images_are_clear_errors() -> None:
 
 def test_spaces_of_images() -> None:
     reader = ImageReader(raw_bag([COLORS], "rgb8"), "/camera", Quantity(image="/camera"))
-    assert reader.space(reader.read(np.zeros(1, np.int64))) == spaces.Box(
-        0, 255, (4, 6, 3), np.uint8
-    )
+    images = reader.read(np.zeros(1, np.int64))
+    assert images is not None
+    assert reader.space(images) == spaces.Box(0, 255, (4, 6, 3), np.uint8)
 
 
 GRAY = np.arange(64, dtype=np.uint8).reshape(8, 8)
@@ -190,7 +192,8 @@ def test_sixteen_bits_are_depth_or_intensity() -> None:
         "images 'mono16' are read as depth, but may have other values (/camera); set `as: depth`,"
         " or `as: intensity` for infrared and thermal images"
     )
-    for options in ({"as": "depth"}, {"range_m": (0, 10)}, {"as": "intensity"}):
+    certain: list[dict[str, Any]] = [{"as": "depth"}, {"range_m": (0, 10)}, {"as": "intensity"}]
+    for options in certain:
         reader = reader_of(bag, **options)
         reader.read(np.array([0]))
         assert not reader.problems()
@@ -389,6 +392,13 @@ def test_strict_reading_raises_at_the_first_damaged_image() -> None:
         read_open_bag(bag, parse_mapping({**tree, "strict": True}))
 
 
+def test_observations_of_too_many_elements_are_refused_at_the_first_image() -> None:
+    bag = compressed_bag("png", file_of(np.zeros((3000, 3000, 3), np.uint8), "PNG"), b"never read")
+    reader = reader_of(bag, strict=True)
+    with pytest.raises(UsageError, match="an observation of 54000000 elements is too large"):
+        reader.read(np.array([[0, 0], [0, 1]]))
+
+
 def test_stacks_are_joined_oldest_first() -> None:
     images = [np.full((2, 2), k, np.uint8) for k in range(5)]
     found = reader_of(raw_bag(images, "mono8")).read(np.array([[0, 0], [0, 3], [3, 4]]))
@@ -399,3 +409,47 @@ def test_stacks_are_joined_oldest_first() -> None:
     found = reader_of(raw_bag(colors, "rgb8")).read(np.array([[1, 0]]))
     assert found is not None
     np.testing.assert_array_equal(found[0], np.concatenate([COLORS + 1, COLORS], axis=-1))
+
+
+@pytest.fixture(scope="module")
+def foxglove_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write raw and compressed images as protobuf, and raw images as JSON without a schema."""
+    foxglove = pytest.importorskip("foxglove", reason="needs foxglove-sdk")
+    from foxglove.channels import CompressedImageChannel, RawImageChannel
+    from foxglove.messages import CompressedImage, RawImage
+
+    path = tmp_path_factory.mktemp("foxglove") / "robot.mcap"
+    context = foxglove.Context()
+    raw = RawImageChannel("/raw", context=context)
+    compressed = CompressedImageChannel("/compressed", context=context)
+    plain = foxglove.Channel("/json", message_encoding="json", context=context)
+    schema = {"type": "object", "properties": {"mode": {"type": "integer"}}}
+    modes = foxglove.Channel("/mode", schema=schema, context=context)
+    with foxglove.open_mcap(path, context=context):
+        for k in range(12):
+            pixels = np.full((8, 10, 3), 10 * k, np.uint8)
+            data = pixels.tobytes()
+            sizes: dict[str, Any] = {"height": 8, "width": 10, "encoding": "rgb8", "step": 30}
+            raw.log(RawImage(**sizes, data=data), log_time=k * 10**8)
+            file = file_of(pixels, "PNG")
+            compressed.log(CompressedImage(data=file, format="png"), log_time=k * 10**8)
+            text = base64.b64encode(data).decode()
+            plain.log({**sizes, "data": text}, log_time=k * 10**8)
+            modes.log({"mode": k % 2}, log_time=k * 10**8)
+    return path
+
+
+def test_images_of_foxglove(foxglove_log: Path) -> None:
+    for topic in ("/raw", "/compressed", "/json"):
+        tree = {
+            "clock": {"rate_hz": 10},
+            "observation": {"camera": {"image": topic}},
+            "action": {"field": "/mode.mode"},
+        }
+        found = mcaprl.open(foxglove_log, mapping=tree)
+        assert found.observation_space == spaces.Box(0, 255, (8, 10, 3), np.uint8)
+        assert found.observations[:, 3, 4, 1].tolist() == [10 * k for k in range(11)]
+    text = mcaprl.suggest_mapping(foxglove_log)
+    assert "# camera: {image: /raw, resize: [84, 84]}  # foxglove.RawImage, 12" in text
+    assert "# camera: {image: /compressed, resize: [84, 84]}" in text
+    assert "height" not in text

@@ -185,6 +185,20 @@ def test_names_by_convention(message: Any, path: str, expected: list[str] | None
     assert names_of(message, path) == expected
 
 
+def test_an_element_that_omits_its_value_keeps_the_last_one(tmp_path: Path) -> None:
+    messages: list[dict[str, Any]] = [
+        {"items": [{"name": "a", "v": 1}, {"name": "b", "v": 2}], "command": 0},
+        {"items": [{"name": "b", "v": None}, {"name": "a"}], "command": 0},
+        {"items": [], "command": 0},
+        {"command": 0},
+        {"items": [{"name": "b", "v": 3}], "command": 0},
+    ]
+    path = write_json(tmp_path / "items.mcap", messages)
+    by_name = {"field": "/low.items[:].v", "names": ["b", "a"], "missing": -1}
+    data = read_bag(path, mapping(by_name)).dataset
+    assert data.frames.tolist() == [[2, 1], [-1, 1], [-1, 1], [-1, 1], [3, 1]]
+
+
 def test_an_element_of_nan_is_missing() -> None:
     columns = {
         "name": [["a", "b"], ["b"], ["a", "b"]],

@@ -219,6 +219,11 @@ def test_fields_that_no_message_has_are_refused_if_there_is_a_schema(tmp_path: P
     path = write_json(tmp_path / "typo.mcap", [{"command": 0, "more": 1}] * 3, SCHEMA)
     with pytest.raises(UsageError, match=r"has no field 'commandd'; nearest: command"):
         read_bag(path, mapping({"field": "/low.commandd"}))
+    path_of_typo = write_json(
+        tmp_path / "a.mcap", [{"a": [{"x": 1}] * k, "command": 0} for k in range(3)]
+    )
+    with pytest.raises(UsageError, match=r"/low.a\[0\].y has no value in any message: the mess"):
+        read_bag(path_of_typo, mapping({"field": "/low.a[0].y"}))
     # The schema does not list this field, but the messages have it.
     assert (
         read_bag(path, mapping({"field": "/low.more"})).dataset.frames.ravel().tolist() == [1] * 3

@@ -75,7 +75,7 @@ def test_yuv_equals_that_of_ffmpeg(encoding: str) -> None:
     frame = av.VideoFrame.from_ndarray(colors, format="rgb24").reformat(
         format=names.get(encoding, encoding)
     )
-    planes = []
+    planes: list[Any] = []
     for plane in frame.planes:
         rows = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
         used = plane.width * (2 if len(frame.planes) < 3 and (planes or encoding[0] in "yu") else 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from contextlib import closing
 from pathlib import Path
 
@@ -64,3 +65,29 @@ def test_a_log_needs_no_mapping(tmp_path: Path) -> None:
     mcaprl.record("lane", tmp_path / "lane.mcap", episodes=1)
     with pytest.raises(LogError, match=r"lane.mcap is a log already, with the topic /rl/step"):
         mcaprl.suggest_mapping(tmp_path / "lane.mcap")
+
+
+def test_types_of_ros_1_in_mcap_are_known_without_msg_in_their_names(tmp_path: Path) -> None:
+    image = "uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\n"
+    image += "uint8[] data"
+    scan = bytes(4) + struct.pack("<I20f", 20, *range(20))
+    joints = struct.pack("<I2dI", 2, 0.5, 1.5, 0)
+    pixels = struct.pack("<II", 1, 2) + struct.pack("<I5s", 5, b"mono8")
+    with (tmp_path / "ros1.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros1")
+        for name, kind, text, data in (
+            ("/camera", "sensor_msgs/Image", image, pixels + struct.pack("<BII", 0, 2, 2) + b"12"),
+            ("/scan", "sensor_msgs/LaserScan", "float32 angle_min\nfloat32[] ranges", scan),
+            ("/joints", "sensor_msgs/JointState", "float64[] position\nfloat64[] velocity", joints),
+        ):
+            schema = writer.register_schema(kind, "ros1msg", text.encode())
+            channel = writer.register_channel(name, "ros1", schema)
+            for k in range(10):
+                writer.add_message(channel, k * 10**8, data, k * 10**8)
+        writer.finish()
+    text = suggestion(tmp_path / "ros1.mcap")
+    assert "# camera: {image: /camera, resize: [84, 84]}  # sensor_msgs/Image, 10 messages" in text
+    assert '"/scan.ranges[::10]"' in text
+    assert "{field: /joints.position}" in text
+    assert "height" not in text

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, import_extra
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.image_files import decoded_file
-from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf
+from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, check_elements
 
 STATE, IMAGE, IMAGES = "observation.state", "observation.image", "observation.images."
 ACTION, REWARD, DONE, TRUNCATED = "action", "next.reward", "next.done", "next.truncated"
@@ -115,14 +115,22 @@ class Feature:
         """Return the values (T, *shape) of an Arrow column.
 
         Raises:
-            LogError: A value is missing, has another shape, or is a damaged image.
+            LogError: A value is missing, has another shape, or is a damaged image; or the images
+                do not fit into memory.
+            SpaceError: The declared shape has too many elements.
         """
         if self.dtype == "image":
             files = [file for chunk in column.chunks for file in chunk.field("bytes").to_pylist()]
             # The declared shape limits the memory, in whichever order it has its dimensions.
             most = min(math.prod(self.shape), MAX_IMAGE_PIXELS)
-            images = [image_of(self.name, file, max_pixels=most) for file in files]
-            return _stack(self.name, images)
+            check_elements(math.prod(self.shape))
+            try:
+                images = [image_of(self.name, file, max_pixels=most) for file in files]
+                return _stack(self.name, images)
+            except MemoryError as error:
+                raise LogError(
+                    f"{len(files)} images of {self.name} do not fit into memory"
+                ) from error
         parts = [_numbers(self.name, chunk) for chunk in column.chunks if len(chunk)]
         flat = np.concatenate(parts) if parts else np.zeros(0, self.dtype)
         if flat.size != len(column) * math.prod(self.shape):
