@@ -71,7 +71,9 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
 }
 """Examples of each command, shown at the end of its help."""
 
-_BAGS: Final[dict[str, tuple[str, ...]]] = {"Bags of other robots": ("mapping", "trust_code")}
+_BAGS: Final[dict[str, tuple[str, ...]]] = {
+    "Bags of other robots": ("mapping", "definitions", "trust_code")
+}
 _RAY: Final[dict[str, tuple[str, ...]]] = {"Ray cluster": ("ray", "workers", "address")}
 OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "record": {
@@ -123,7 +125,7 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     },
     "convert": {
         "Formats": ("source_format", "to", "lossy"),
-        "Bags of other robots": ("mapping", "trust_code", "suggest"),
+        "Bags of other robots": ("mapping", "definitions", "trust_code", "suggest"),
         "Output": ("dry_run", "overwrite", "upload", "as_json"),
     },
 }

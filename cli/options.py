@@ -35,12 +35,19 @@ def mapping_options(command: F) -> F:
         is_flag=True,
         help="Trust the mapping: import the Python function that it names.",
     )
+    definitions = click.option(
+        "--definitions",
+        multiple=True,
+        type=click.Path(path_type=Path),
+        metavar="DIR",
+        help="Folder or file with definitions of ROS types that the bag lacks; may be repeated.",
+    )
     return click.option(
         "--mapping",
         type=click.Path(path_type=Path),
         metavar="FILE",
         help="Mapping that describes a bag; see docs/bags.md.",
-    )(code(command))
+    )(definitions(code(command)))
 
 
 def sim_options(command: F) -> F:

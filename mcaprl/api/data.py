@@ -23,6 +23,8 @@ Data = Dataset | Paths
 """A dataset, or paths of logs."""
 MappingFile = str | Path | Mapping[str, Any]
 """Path of a mapping file, or its keys and values."""
+Definitions = Sequence[str | Path]
+"""Files and folders with definitions of ROS types."""
 
 
 def open_data(
@@ -30,6 +32,7 @@ def open_data(
     *,
     mapping: MappingFile | None = None,
     trust_code: bool = False,
+    definitions: Definitions = (),
     format: str | None = None,
     columns: Sequence[str] | None = None,
     episodes: Episodes | None = None,
@@ -51,6 +54,8 @@ def open_data(
         mapping: Mapping that says which topics and fields of a bag are observations, actions,
             rewards and episode ends; see docs/bags.md. None for logs of this package.
         trust_code: Whether the mapping may name a Python function, which is imported.
+        definitions: Files and folders with definitions of ROS types that a bag lacks; see
+            docs/bags.md.
         format: Name of the other tool's format; default: detected from the path.
         columns: Keys to read from a Dict observation space, for example `joints/q` for a nested
             key. The dataset's observation space contains only these keys. An empty sequence reads
@@ -95,7 +100,7 @@ def open_data(
             raise UsageError(f"only logs may have several paths: pass one {other.name} dataset")
         return read_format(one, other)
     assert mapping is not None
-    return mapped(data, mapping, trust_code=trust_code).dataset
+    return mapped(data, mapping, trust_code=trust_code, definitions=definitions).dataset
 
 
 def _only(data: Paths) -> str | Path | None:
@@ -117,12 +122,18 @@ def _other_format(data: Paths, name: str | None) -> Format | None:
     return None if one is None else other_format(one)
 
 
-def mapped(data: Paths, mapping: MappingFile, *, trust_code: bool = False) -> MappedBag:
+def mapped(
+    data: Paths,
+    mapping: MappingFile,
+    *,
+    trust_code: bool = False,
+    definitions: Definitions = (),
+) -> MappedBag:
     """Read a bag by a mapping; raise the same errors as `open_data`."""
     import_extra("pydantic", "bags")
     from mcaprl.recorder.mapping.read import read_bag
 
-    return read_bag(data, mapping, trust_code=trust_code)
+    return read_bag(data, mapping, trust_code=trust_code, definitions=definitions)
 
 
 def mapping_tree(mapping: MappingFile) -> dict[str, Any]:
@@ -137,12 +148,15 @@ def opened(
     *,
     mapping: MappingFile | None = None,
     trust_code: bool = False,
+    definitions: Definitions = (),
     threads: int = 1,
 ) -> Dataset:
     """Return a dataset unchanged, or read it from paths with `open_data`."""
     if isinstance(data, Dataset):
         return data
-    return open_data(data, mapping=mapping, trust_code=trust_code, threads=threads)
+    return open_data(
+        data, mapping=mapping, trust_code=trust_code, definitions=definitions, threads=threads
+    )
 
 
 def named(data: Data) -> str:

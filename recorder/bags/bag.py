@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -20,6 +20,7 @@ from mcaprl.recorder.bags.decoders import (
     merged,
     value_at,
 )
+from mcaprl.recorder.bags.definition_files import DefinitionFiles
 from mcaprl.recorder.bags.files import find_bags, open_files
 from mcaprl.recorder.bags.mcap_file import McapFile
 from mcaprl.recorder.bags.rosbag_file import RosbagFile
@@ -53,9 +54,12 @@ class TopicInfo:
         first_ns: log_time of the first message; 0 if there are no messages.
         last_ns: log_time of the last message; 0 if there are no messages.
         fields: Kind of each leaf field by its dotted path, such as `float64`, `float32[36]`,
-            `uint8[]`, `string` or `time`; empty if unknown.
+            `uint8[]`, `string` or `time`; empty if unknown. A leaf field in an array of messages
+            has a path such as `motors[].q`, and a kind that ends with `[]` for each such array.
         constants: Constants of the type, by name.
         problem: Reason why the messages cannot be read; empty if they can be read.
+        is_open: Whether messages can have other fields than `fields`, as JSON can.
+        unreadable: Reason by dotted path for each field of the type that cannot be read.
     """
 
     name: str
@@ -67,6 +71,8 @@ class TopicInfo:
     fields: dict[str, str]
     constants: dict[str, int]
     problem: str = ""
+    is_open: bool = False
+    unreadable: Mapping[str, str] = field(default_factory=dict)
 
 
 class Bag(Protocol):
@@ -114,10 +120,15 @@ class Bag(Protocol):
 class _Topic:
     """One topic of a bag, joined from all files and channels in the order of recording."""
 
-    def __init__(self, name: str, sources: Sequence[tuple[int, TopicSource]]) -> None:
-        """Store the sources, each with the index of its file."""
+    def __init__(
+        self,
+        name: str,
+        sources: Sequence[tuple[int, TopicSource]],
+        others: DefinitionFiles | None = None,
+    ) -> None:
+        """Store the sources, each with the index of its file, and the user's definitions."""
         self.name = name
-        self._given = sources
+        self._given, self._others = sources, others
 
     @cached_property
     def _used(self) -> list[tuple[int, TopicSource]]:
@@ -166,6 +177,7 @@ class _Topic:
                 each.schema_encoding,
                 each.schema,
                 distribution=each.distribution,
+                others=self._others,
             )
             for each in found
         }
@@ -174,8 +186,10 @@ class _Topic:
     def info(self) -> TopicInfo:
         found, problem = self._used[0][1].definition, ""
         fields, constants = dict[str, str](), dict[str, int]()
+        decoders = list[MessageDecoder]()
         try:
-            fields, constants = merged(list(self._decoders.values()))
+            decoders = list(self._decoders.values())
+            fields, constants = merged(decoders)
         except (LogError, UsageError) as error:
             problem = str(error)
         times_ns = self.times_ns
@@ -189,6 +203,8 @@ class _Topic:
             fields=fields,
             constants=constants,
             problem=problem,
+            is_open=any(each.is_open for each in decoders),
+            unreadable={path: why for each in decoders for path, why in each.unreadable.items()},
         )
 
     def read(self, fields: Sequence[str], rows: NDArray[np.int64] | None) -> Stream:
@@ -216,11 +232,11 @@ class _Topic:
             for row, raw in zip(mine.tolist(), source.raw(chosen[mine, 3]), strict=True):
                 try:
                     message = decoder.decode(raw.data)
+                    for name, column in values.items():
+                        is_time = name == _PUBLISH_TIME
+                        column[row] = raw.publish_ns if is_time else value_at(message, name)
                 except LogError as error:
                     raise LogError(f"{self.name}: {error}") from error
-                for name, column in values.items():
-                    is_time = name == _PUBLISH_TIME
-                    column[row] = raw.publish_ns if is_time else value_at(message, name)
         return values
 
 
@@ -243,7 +259,12 @@ class _Infos(Mapping[str, TopicInfo]):
 class _FileBag:
     """Bag that consists of one or more open files."""
 
-    def __init__(self, files: Sequence[McapFile | RosbagFile], opened: ExitStack) -> None:
+    def __init__(
+        self,
+        files: Sequence[McapFile | RosbagFile],
+        opened: ExitStack,
+        definitions: DefinitionFiles | None,
+    ) -> None:
         self._opened = opened
         if len(files) > 1:
             # The files of a split bag cover successive time ranges.
@@ -254,6 +275,7 @@ class _FileBag:
             name: _Topic(
                 name,
                 [(k, each) for k, file in enumerate(files) for each in file.topics.get(name, [])],
+                definitions,
             )
             for name in sorted(names)
         }
@@ -271,10 +293,12 @@ class _FileBag:
         found = self._topic(topic)
         if found.info.problem:
             raise LogError(f"{topic} cannot be read: {found.info.problem}")
-        known = found.info.fields
-        for field in fields:
-            if known and field not in known and field != _PUBLISH_TIME:
-                raise UnknownNameError(f"field of {topic}", field, known)
+        known = found.info.fields if not found.info.is_open else {}
+        for name in fields:
+            if name in found.info.unreadable:
+                raise LogError(f"{topic}: {found.info.unreadable[name]}")
+            if known and name not in known and name != _PUBLISH_TIME:
+                raise UnknownNameError(f"field of {topic}", name, known)
         return found.read(fields, rows)
 
     def close(self) -> None:
@@ -286,7 +310,9 @@ class _FileBag:
         return self._topics[name]
 
 
-def open_bag(data: str | Path | Sequence[str | Path]) -> Bag:
+def open_bag(
+    data: str | Path | Sequence[str | Path], *, definitions: Sequence[str | Path] = ()
+) -> Bag:
     """Open a bag: MCAP files, rosbag2 folders and databases, and ROS 1 bags.
 
     Files that rosbag2 compressed as a whole are decompressed to a temporary folder. If a topic
@@ -295,10 +321,14 @@ def open_bag(data: str | Path | Sequence[str | Path]) -> Bag:
     Args:
         data: A file, a folder, a glob, or a sequence of these. Files are read in the order of
             their first messages.
+        definitions: Files and folders with definitions of ROS types that the bag lacks; see
+            `DefinitionFiles`.
 
     Raises:
         LogError: A file is missing, damaged, or not a bag.
+        UsageError: There is no such file or folder of definitions, or it has none.
     """
+    others = DefinitionFiles(definitions) if definitions else None
     with ExitStack() as opened:
         files = [file for path in find_bags(data) for file in open_files(path, opened)]
-        return _FileBag(files, opened.pop_all())
+        return _FileBag(files, opened.pop_all(), others)

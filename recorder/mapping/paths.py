@@ -87,12 +87,14 @@ def field_path(bag: Bag, text: str) -> FieldPath:
     topics = [topic for topic in bag.topics if name == topic or name.startswith(f"{topic}.")]
     topic = topic_of(bag, max(topics, key=len) if topics else name.split(".")[0])
     field = name[len(topic) + 1 :]
-    known = bag.topics[topic].fields
+    info = bag.topics[topic]
+    if field in info.unreadable:
+        raise UsageError(f"{topic}: {info.unreadable[field]}")
+    known = {} if info.is_open else info.fields
     if known and field not in known and not any(each.startswith(f"{field}.") for each in known):
         near = difflib.get_close_matches(field, known, n=3, cutoff=0.4) or list(known)[:8]
         raise UsageError(
-            f"{topic} ({bag.topics[topic].type_name}) has no field '{field}'; nearest:"
-            f" {', '.join(near)}"
+            f"{topic} ({info.type_name}) has no field '{field}'; nearest: {', '.join(near)}"
         )
     return FieldPath(topic, field, elements)
 

@@ -41,6 +41,7 @@ def read_bag(
     mapping: Mapping | str | Path | MappingOf[str, Any],
     *,
     trust_code: bool = False,
+    definitions: Sequence[str | Path] = (),
 ) -> MappedBag:
     """Read a bag as a dataset.
 
@@ -48,6 +49,8 @@ def read_bag(
         data: MCAP file, rosbag2 folder, ROS 1 bag, or several; see `bags.bag.open_bag`.
         mapping: Mapping, path of a mapping file, or its keys and values.
         trust_code: Whether `reward` may name a function of a Python module, which is imported.
+        definitions: Files and folders with definitions of ROS types that the bag lacks, in addition
+            to those of the mapping.
 
     Raises:
         UsageError: The mapping does not fit the bag; the message names file, line and key.
@@ -57,7 +60,7 @@ def read_bag(
     place = Place()
     if not isinstance(mapping, Mapping):
         mapping, place = load_mapping(mapping)
-    with closing(open_bag(data)) as bag:
+    with closing(open_bag(data, definitions=[*mapping.definitions, *definitions])) as bag:
         return read_open_bag(bag, mapping, place, trust_code=trust_code)
 
 
