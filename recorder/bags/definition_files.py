@@ -44,9 +44,8 @@ class DefinitionFiles:
             count = 0
             for file in _definitions_in(path):
                 count += 1
-                for package in _packages_of(file):
-                    for name in _names_of(file, package):
-                        self._files.setdefault(name, []).append(file)
+                for name in _names_of(file, _package_of(file)):
+                    self._files.setdefault(name, []).append(file)
             if not count:
                 raise UsageError(f"{path} has no {', '.join(_KINDS)} files")
 
@@ -97,10 +96,7 @@ class DefinitionFiles:
         """
         if file not in self._parsed:
             try:
-                types = {}
-                for package in _packages_of(file):
-                    types |= _parsed(file, package)
-                self._parsed[file] = types
+                self._parsed[file] = _parsed(file, _package_of(file))
             except LogError as error:
                 self._parsed[file] = LogError(f"{file}: {error}")
         found = self._parsed[file]
@@ -127,17 +123,15 @@ def _definitions_in(path: Path) -> Iterator[Path]:
         yield from (Path(folder, name) for name in sorted(names) if name.endswith(_KINDS))
 
 
-def _packages_of(file: Path) -> list[str]:
-    """Return the name of a file's package, and that of its folder if it is another."""
+def _package_of(file: Path) -> str:
+    """Return the name of a file's package."""
     folder = next((each.parent for each in file.parents if each.name in _FOLDERS), file.parent)
-    names = [folder.name]
     try:
         with (folder / "package.xml").open(encoding="utf-8", errors="replace") as text:
             match = _PACKAGE_NAME.search(text.read(2**16))
-        names = list(dict.fromkeys([match[1], *names])) if match else names
     except OSError:
-        pass
-    return names
+        match = None
+    return match[1] if match else folder.name
 
 
 def _names_of(file: Path, package: str) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Any, Final
 from urllib.parse import unquote
 
 from mcaprl.errors import LogError
-from mcaprl.limits import MAX_TYPE_DEPTH, MAX_TYPE_FIELDS
+from mcaprl.limits import MAX_DEFINITION_BYTES, MAX_TYPE_DEPTH, MAX_TYPE_FIELDS
 
 _KINDS: Final = {"number": "float64", "integer": "int64", "boolean": "bool", "string": "string"}
 _OBJECT: Final = "object"
@@ -36,6 +36,10 @@ class JsonDecoder:
         self.fields, self.constants = dict[str, str](), dict[str, int]()
         self.unreadable: dict[str, str] = {}
         self._visited = 0
+        if len(schema) > MAX_DEFINITION_BYTES:
+            raise LogError(
+                f"the JSON schema has {len(schema)} bytes; at most {MAX_DEFINITION_BYTES} are read"
+            )
         try:
             found = json.loads(schema) if schema.strip() else {}
         except (ValueError, RecursionError) as error:
@@ -64,9 +68,11 @@ class JsonDecoder:
         Schemas that are nested in themselves are skipped.
         """
         self._visit()
-        found, used = self._resolved(schema)
+        used = set[int]()
+        parts = list(self._parts(schema, used))
         if len(parents) >= MAX_TYPE_DEPTH or not used.isdisjoint(parents):
             return
+        found = _joined(parts)
         parents, inner = (*parents, *used), found.get("properties")
         if isinstance(inner, dict) and {"sec", "nsec"} == set(inner) and path:
             self.fields[path] = f"time{brackets}"
@@ -87,26 +93,8 @@ class JsonDecoder:
         if self._visited > MAX_TYPE_FIELDS:
             raise LogError(f"the JSON schema has more than {MAX_TYPE_FIELDS} fields")
 
-    def _resolved(self, schema: Any) -> tuple[_Schema, set[int]]:
-        """Return a schema with its references, and the identities of all schemas that it joins."""
-        found: _Schema = {}
-        used = set[int]()
-        for each in self._parts(schema, used):
-            for key, value in each.items():
-                if key == "properties" and isinstance(value, dict):
-                    known = found.get(key)
-                    found[key] = {**value, **(known if isinstance(known, dict) else {})}
-                else:
-                    found.setdefault(key, value)
-        kinds = found.get("type")
-        if isinstance(kinds, list):
-            others = {kind for kind in kinds if isinstance(kind, str) and kind != "null"}
-            found["type"] = "number" if others == {"number", "integer"} else ""
-            found["type"] = others.pop() if len(others) == 1 else found["type"]
-        return found, used
-
     def _parts(self, schema: Any, used: set[int]) -> Iterator[_Schema]:
-        """Yield a schema and all schemas that apply to the same value."""
+        """Yield a schema and all that apply to the same value, and add their ids to `used`."""
         needed = [schema]
         while needed:
             each = needed.pop()
@@ -140,6 +128,25 @@ class JsonDecoder:
             else:
                 return []
         return [found]
+
+
+def _joined(parts: list[_Schema]) -> _Schema:
+    """Return the schema with the keys of all parts, of which earlier ones come first."""
+    found: _Schema = {}
+    properties: _Schema = {}
+    for part in parts:
+        for key, value in part.items():
+            found.setdefault(key, value)
+        inner = part.get("properties")
+        for name, value in inner.items() if isinstance(inner, dict) else ():
+            found["properties"] = properties
+            properties.setdefault(name, value)
+    kinds = found.get("type")
+    if isinstance(kinds, list):
+        others = {kind for kind in kinds if isinstance(kind, str) and kind != "null"}
+        found["type"] = "number" if others == {"number", "integer"} else ""
+        found["type"] = others.pop() if len(others) == 1 else found["type"]
+    return found
 
 
 def _is_null(schema: Any) -> bool:

@@ -40,7 +40,7 @@ def chain(count: int, fields: int = 1) -> str:
         (chain(40, fields=2), "has more than 10000 fields"),
         (text_of(A="p/E[1000000000] x", E="uint8 b"), "arrays of 1000000000 messages or strings"),
         ("string[1000000000] x", "fixed arrays of 1000000000 messages or strings"),
-        ("float64 x\n" * 60_000, "600000 characters; at most|more than 10000 fields"),
+        ("float64 x\n" * 60_000, "has more than 10000 fields and constants"),
         ("#" * 2**20 + "\nfloat64 x", "1048586 characters; at most 1048576"),
     ],
 )
@@ -50,7 +50,7 @@ def test_types_that_are_too_large_cost_only_their_topic(
     plain = Channel("/plain", "p/msg/X", "float64 x", [(0, struct.pack("<d", 1.5))])
     channels = [Channel("/large", "p/msg/A", text, [(0, b"\0" * 16)]), plain]
     with closing(open_bag(write_channels(tmp_path / "a.mcap", channels))) as bag:
-        assert reason.split("|")[-1] in bag.topics["/large"].problem
+        assert reason in bag.topics["/large"].problem
         assert bag.read("/plain", ["x"]).columns["x"].tolist() == [1.5]
 
 
