@@ -135,7 +135,8 @@ class ProtobufDecoder:
                     self.fields[path] = _KINDS.get(inner.fields[0].type, "int32") + repeated
                 if len(parents) >= MAX_TYPE_DEPTH:
                     raise LogError(
-                        f"type {self._name}: messages are nested in more than {MAX_TYPE_DEPTH} levels"
+                        f"type {self._name}: messages are nested in more than"
+                        f" {MAX_TYPE_DEPTH} levels"
                     )
                 if inner.full_name not in parents:
                     self._collect(inner, f"{path}.", repeated, (*parents, inner.full_name))
@@ -278,7 +279,7 @@ class _Entry:
         self.key, self.value = key, value
 
 
-_BOXES: Final = {
+_BOXES: Final[dict[type, Callable[[Any], Any]]] = {
     kind: type(f"_{kind.__name__}", (kind,), {"value": property(kind)})
     for kind in (int, float, str, bytes)
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import keyword
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from functools import cached_property, lru_cache
 from operator import attrgetter
 from typing import Any, NamedTuple, Protocol
@@ -34,7 +34,7 @@ _UNREADABLE = ("wstring", "wchar", "float128", "fixed")
 _ARRAYS = (Nodetype.ARRAY, Nodetype.SEQUENCE)
 
 
-class TypeSource(Protocol):
+class TypeSource(Hashable, Protocol):
     """Definitions of types that a file lacks."""
 
     def types_of(self, name: str) -> Any | None:
@@ -295,7 +295,8 @@ class _Sizes:
                 f"{parents[0]}: messages are nested in more than {MAX_TYPE_DEPTH} levels"
             )
         if name not in self._known:
-            parts = [self._field(name, *field, (*parents, name)) for field in self._types[name][1]]
+            path = (*parents, name)
+            parts = [self._field(field, each, path) for field, each in self._types[name][1]]
             leaves, depths, messages, least_bytes = zip(*parts, strict=True) if parts else ((),) * 4
             found = _Size(
                 max(sum(leaves), 1), 1 + max(depths, default=0), 1 + sum(messages), sum(least_bytes)
@@ -322,7 +323,7 @@ class _Sizes:
                 f" {MAX_FIXED_MESSAGES} are read"
             )
 
-    def _field(self, owner: str, field: str, description: Any, parents: tuple[str, ...]) -> _Size:
+    def _field(self, field: str, description: Any, parents: tuple[str, ...]) -> _Size:
         kind, what = description
         element_kind, element = _element(description)
         if element_kind == Nodetype.BASE:
@@ -339,7 +340,9 @@ class _Sizes:
             )
         if kind == Nodetype.SEQUENCE:
             if size.messages > MAX_MESSAGES_PER_BYTE * max(size.least_bytes, 1):
-                raise LogError(f"{owner}: {field} is a sequence of messages with too few bytes")
+                raise LogError(
+                    f"{parents[-1]}: {field} is a sequence of messages with too few bytes"
+                )
             return size._replace(messages=0, least_bytes=4)
         return size
 

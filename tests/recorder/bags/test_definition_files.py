@@ -142,7 +142,9 @@ def test_services_actions_and_idl(tmp_path: Path) -> None:
         return found and [each for each, _ in found[1]]
 
     assert fields("acme_msgs/srv/msg/Go_Request") == ["to"]
-    assert files.types_of("acme_msgs/srv/msg/Go_Request")[1][0][1][1] == "acme_msgs/msg/Point"
+    request = files.types_of("acme_msgs/srv/msg/Go_Request")
+    assert request is not None
+    assert request[1][0][1][1] == "acme_msgs/msg/Point"
     assert fields("acme_msgs/srv/msg/Go_Event") == ["info", "request", "response"]
     assert fields("acme_msgs/action/Drive_FeedbackMessage") == ["goal_id", "feedback"]
     assert fields("acme_msgs/action/Drive_Result") == ["end"]

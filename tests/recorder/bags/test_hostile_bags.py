@@ -70,7 +70,8 @@ def test_values_of_metadata_are_texts(tmp_path: Path) -> None:
     path = tmp_path / "metadata.yaml"
     path.write_text(
         f"{ROOT}:\n  version: 2024-13-45\n  files: [{{path: a}}]\n  relative_file_paths:\n"
-        "    - a.mcap\n    - !!int abc\n  ros_distro: humble\n  compression_mode: ''\nother: {a: 1}\n"
+        "    - a.mcap\n    - !!int abc\n  ros_distro: humble\n  compression_mode: ''\n"
+        "other: {a: 1}\n"
     )
     assert read_metadata(path) == {
         "relative_file_paths": ["a.mcap", "abc"],
@@ -300,11 +301,14 @@ def test_damaged_messages_are_decoded_or_refused() -> None:
 
 
 SCHEMAS = {
-    ("cdr", "ros2msg"): b"float64 x\np/B[2] b\nstring<=5 s \"a\"\n" + b"=" * 80 + b"\nMSG: p/B\nint8 X=3\n",
-    ("cdr", "ros2idl"): b"#ifndef A\nmodule p { module msg { struct A { sequence<double, 3> x; }; }; };\n#endif",
+    ("cdr", "ros2msg"): b"float64 x\np/B[2] b\nstring<=5 s \"a\"\n"
+    + b"=" * 80 + b"\nMSG: p/B\nint8 X=3\n",
+    ("cdr", "ros2idl"): b"#ifndef A\nmodule p { module msg { struct A {"
+    b" sequence<double, 3> x; }; }; };\n#endif",
     ("ros1", "ros1msg"): b"Header header\ntime t\nfloat64[] x",
     ("protobuf", "protobuf"): schema_of(STATE),
-    ("json", "jsonschema"): b'{"properties": {"x": {"$ref": "#/$defs/A"}}, "$defs": {"A": {"type": "number"}}}',
+    ("json", "jsonschema"): b'{"properties": {"x": {"$ref": "#/$defs/A"}},'
+    b' "$defs": {"A": {"type": "number"}}}',
 }  # fmt: skip
 
 

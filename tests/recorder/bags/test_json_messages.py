@@ -63,7 +63,8 @@ def test_schemas_of_pydantic() -> None:
         ({"allOf": [{"properties": {"x": NUMBER}}, {"properties": {"y": NUMBER}}]}, "x y"),
         ({"properties": {"x": {"type": ["null", "number"]}}}, "x"),
         ({"properties": {"x": {"oneOf": [NUMBER, {"type": "null"}]}}}, "x"),
-        ({"$id": "urn:a", "properties": {"x": {"$ref": "urn:a#/$defs/N"}}, "$defs": {"N": NUMBER}}, "x"),
+        ({"$id": "urn:a", "$defs": {"N": NUMBER}, "properties": {"x": {"$ref": "urn:a#/$defs/N"}}},
+         "x"),
     ],
 )  # fmt: skip
 def test_references_and_alternatives(schema: Any, fields: str) -> None:
