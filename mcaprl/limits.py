@@ -12,8 +12,8 @@ MAX_TYPE_FIELDS: Final = 10_000
 """Leaf fields of a message type with all nested types: nested types can multiply them."""
 MAX_TYPE_DEPTH: Final = 64
 """Levels of nested messages in a type: types are read by recursion."""
-MAX_FIXED_MESSAGES: Final = 10_000
-"""Messages and strings in all fixed arrays of a type: rosbags generates code for each of them."""
+MAX_FIXED_MESSAGES: Final = 1_000
+"""Messages and strings in all fixed arrays of a type: compiling the code for each takes 1 ms."""
 MAX_MESSAGES_PER_BYTE: Final = 16
 """Nested messages for each byte of a message, beyond 64: empty messages take memory, but no bytes
 of the file."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import graphlib
 import importlib
 from collections.abc import Callable
+from functools import partial
 from operator import attrgetter
 from typing import Any, Final
 
@@ -85,7 +86,7 @@ class ProtobufDecoder:
         # protobuf raises errors of many types for a wrong schema.
         except Exception as error:
             raise LogError(f"the schema of {type_name} cannot be used: {error}") from error
-        self._type = _Type(descriptor, {})
+        self._readers = _Readers(descriptor, {})
         self.fields, self.unreadable = dict[str, str](), dict[str, str]()
         self._values, self._visited = dict[str, set[int]](), 0
         self._collect(descriptor, "", "", ())
@@ -100,7 +101,7 @@ class ProtobufDecoder:
             LogError: The bytes do not fit the type.
         """
         try:
-            return _Message(self._class.FromString(data), self._type)
+            return _Message(self._readers, self._class.FromString(data))
         # protobuf's own error is DecodeError; other errors come from invalid strings.
         except Exception as error:
             raise LogError(f"cannot decode {len(data)} bytes as {self._name}: {error}") from error
@@ -199,52 +200,46 @@ def _is_wrapper(descriptor: Any) -> bool:
     return bool(descriptor.file.name == "google/protobuf/wrappers.proto")
 
 
-class _Type:
-    """Functions that read the fields of a type's messages, built when they are first used."""
+class _Readers(dict[str, Callable[[Any], Any]]):
+    """Functions that read the fields of a type's messages by name, built when they are needed.
 
-    def __init__(self, descriptor: Any, types: dict[str, _Type]) -> None:
+    A function returns None if the field is not set.
+    """
+
+    def __init__(self, descriptor: Any, types: dict[str, _Readers]) -> None:
         """Store the descriptor and the types that are known so far by name, which are shared."""
         self._fields = dict(descriptor.fields_by_name)
         self._types = types
         self._is_time = descriptor.full_name in _TIMES
-        self._readers: dict[str, Callable[[Any], Any]] = {}
         types[descriptor.full_name] = self
 
-    def reader(self, name: str) -> Callable[[Any], Any]:
-        """Return the function that reads a field, which is None if the field is not set.
-
-        Raises:
-            AttributeError: The type has no such field.
-        """
-        found = self._readers.get(name)
-        if found is None:
-            if name not in self._fields:
-                raise AttributeError(name)
-            found = self._readers[name] = self._new_reader(self._fields[name])
+    def __missing__(self, name: str) -> Callable[[Any], Any]:
+        if name not in self._fields:
+            raise AttributeError(name)
+        self[name] = found = self._reader(self._fields[name])
         return found
 
-    def _new_reader(self, field: Any) -> Callable[[Any], Any]:
-        name, inner = field.name, field.message_type
+    def _reader(self, field: Any) -> Callable[[Any], Any]:
+        name, inner, value = field.name, field.message_type, attrgetter(field.name)
         if self._is_time and name == "seconds":
             return _seconds
-        value = attrgetter(name)
-        if inner is None:
-            if not field.has_presence:
-                return value
-            return lambda message: value(message) if message.HasField(name) else None
-        if field.is_repeated and inner.GetOptions().map_entry:
+        if field.is_repeated and inner is not None and inner.GetOptions().map_entry:
             return self._entries(value, inner.fields_by_name["value"])
-        wrapped = self._wrapped(inner)
-        if field.is_repeated:
+        wrapped = None if inner is None else self._wrapped(inner)
+        if field.is_repeated and wrapped is not None:
             return lambda message: [wrapped(each) for each in value(message)]
+        if not field.has_presence:
+            return value
+        if wrapped is None:
+            return lambda message: value(message) if message.HasField(name) else None
         return lambda message: wrapped(value(message)) if message.HasField(name) else None
 
     def _wrapped(self, descriptor: Any) -> Callable[[Any], Any]:
         """Return the function that wraps a nested message."""
         if _is_wrapper(descriptor):
             return lambda message: _boxed(message.value)
-        found = self._types.get(descriptor.full_name) or _Type(descriptor, self._types)
-        return lambda message: _Message(message, found)
+        found = self._types.get(descriptor.full_name)
+        return partial(_Message, _Readers(descriptor, self._types) if found is None else found)
 
     def _entries(self, value: Callable[[Any], Any], field: Any) -> Callable[[Any], Any]:
         """Return the function that reads a map; its order in the message has no meaning."""
@@ -261,13 +256,13 @@ class _Type:
 class _Message:
     """Message whose fields are attributes; a field that is not set is None."""
 
-    __slots__ = ("_message", "_type")
+    __slots__ = ("_message", "_readers")
 
-    def __init__(self, message: Any, type: _Type) -> None:
-        self._message, self._type = message, type
+    def __init__(self, readers: _Readers, message: Any) -> None:
+        self._readers, self._message = readers, message
 
     def __getattr__(self, name: str) -> Any:
-        return self._type.reader(name)(self._message)
+        return self._readers[name](self._message)
 
 
 class _Entry:

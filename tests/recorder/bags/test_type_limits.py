@@ -55,7 +55,7 @@ def test_types_that_are_too_large_cost_only_their_topic(
 
 
 def test_ros1_messages_without_bytes_are_counted() -> None:
-    texts = {"A": "p/B[900] b", "B": "p/C[900] c", "C": "p/E[900] e", "E": ""}
+    texts = {"A": "p/B[300] b", "B": "p/C[300] c", "C": "p/E[300] e", "E": ""}
     with pytest.raises(LogError, match="nested messages in 0 bytes"):
         RosDecoder("p/A", text_of(**texts), encoding="ros1msg")
     with pytest.raises(LogError, match="b is a sequence of messages with too few bytes"):
