@@ -10,7 +10,6 @@ from __future__ import annotations
 import graphlib
 import importlib
 from collections.abc import Callable
-from functools import partial
 from operator import attrgetter
 from typing import Any, Final
 
@@ -86,7 +85,7 @@ class ProtobufDecoder:
         # protobuf raises errors of many types for a wrong schema.
         except Exception as error:
             raise LogError(f"the schema of {type_name} cannot be used: {error}") from error
-        self._readers = _Readers(descriptor, {})
+        self._wrapped = _Classes().of(descriptor)
         self.fields, self.unreadable = dict[str, str](), dict[str, str]()
         self._values, self._visited = dict[str, set[int]](), 0
         self._collect(descriptor, "", "", ())
@@ -101,7 +100,7 @@ class ProtobufDecoder:
             LogError: The bytes do not fit the type.
         """
         try:
-            return _Message(self._readers, self._class.FromString(data))
+            return self._wrapped(self._class.FromString(data))
         # protobuf's own error is DecodeError; other errors come from invalid strings.
         except Exception as error:
             raise LogError(f"cannot decode {len(data)} bytes as {self._name}: {error}") from error
@@ -200,69 +199,77 @@ def _is_wrapper(descriptor: Any) -> bool:
     return bool(descriptor.file.name == "google/protobuf/wrappers.proto")
 
 
-class _Readers(dict[str, Callable[[Any], Any]]):
-    """Functions that read the fields of a type's messages by name, built when they are needed.
-
-    A function returns None if the field is not set.
-    """
-
-    def __init__(self, descriptor: Any, types: dict[str, _Readers]) -> None:
-        """Store the descriptor and the types that are known so far by name, which are shared."""
-        self._fields = dict(descriptor.fields_by_name)
-        self._types = types
-        self._is_time = descriptor.full_name in _TIMES
-        types[descriptor.full_name] = self
-
-    def __missing__(self, name: str) -> Callable[[Any], Any]:
-        if name not in self._fields:
-            raise AttributeError(name)
-        self[name] = found = self._reader(self._fields[name])
-        return found
-
-    def _reader(self, field: Any) -> Callable[[Any], Any]:
-        name, inner, value = field.name, field.message_type, attrgetter(field.name)
-        if self._is_time and name == "seconds":
-            return _seconds
-        if field.is_repeated and inner is not None and inner.GetOptions().map_entry:
-            return self._entries(value, inner.fields_by_name["value"])
-        wrapped = None if inner is None else self._wrapped(inner)
-        if field.is_repeated and wrapped is not None:
-            return lambda message: [wrapped(each) for each in value(message)]
-        if not field.has_presence:
-            return value
-        if wrapped is None:
-            return lambda message: value(message) if message.HasField(name) else None
-        return lambda message: wrapped(value(message)) if message.HasField(name) else None
-
-    def _wrapped(self, descriptor: Any) -> Callable[[Any], Any]:
-        """Return the function that wraps a nested message."""
-        if _is_wrapper(descriptor):
-            return lambda message: _boxed(message.value)
-        found = self._types.get(descriptor.full_name)
-        return partial(_Message, _Readers(descriptor, self._types) if found is None else found)
-
-    def _entries(self, value: Callable[[Any], Any], field: Any) -> Callable[[Any], Any]:
-        """Return the function that reads a map; its order in the message has no meaning."""
-        inner = field.message_type
-        wrapped = (lambda each: each) if inner is None else self._wrapped(inner)
-
-        def entries(message: Any) -> list[Any]:
-            found = value(message)
-            return [_Entry(key, wrapped(found[key])) for key in sorted(found)]
-
-        return entries
-
-
 class _Message:
     """Message whose fields are attributes; a field that is not set is None."""
 
-    __slots__ = ("_message", "_readers")
+    __slots__ = ("_of_protobuf",)
 
-    def __init__(self, readers: _Readers, message: Any) -> None:
-        self._readers, self._message = readers, message
+    def __init__(self, message: Any) -> None:
+        self._of_protobuf = message
 
-    def __getattr__(self, name: str) -> Any:
-        return self._readers[name](self._message)
+
+class _Classes(dict[str, type[_Message]]):
+    """Subclass of `_Message` for each type, with a property for each field."""
+
+    def of(self, descriptor: Any) -> type[_Message]:
+        """Return the class of a type; its nested types get their classes when they are used."""
+        found = self.get(descriptor.full_name)
+        if found is None:
+            fields = {field.name: field for field in descriptor.fields}
+            is_time = descriptor.full_name in _TIMES
+            readers = {
+                name: _seconds if is_time and name == "seconds" else self._reader(field)
+                for name, field in fields.items()
+                if not name.startswith("__")
+            }
+            members = {"__slots__": (), **{name: property(each) for name, each in readers.items()}}
+            found = self[descriptor.full_name] = type("_Message", (_Message,), members)
+        return found
+
+    def _reader(self, field: Any) -> Callable[[Any], Any]:
+        name, inner = field.name, field.message_type
+        value = attrgetter(f"_of_protobuf.{name}")
+        if inner is None:
+            if not field.has_presence:
+                return value
+            return lambda message: (
+                value(message) if message._of_protobuf.HasField(name) else None
+            )
+        if field.is_repeated and inner.GetOptions().map_entry:
+            return self._entries(value, inner.fields_by_name["value"].message_type)
+        if field.is_repeated:
+            return lambda message: list(map(self._wrapper(inner), value(message)))
+        return self._nested(name, inner)
+
+    def _nested(self, name: str, descriptor: Any) -> Callable[[Any], Any]:
+        """Return the function that reads a message, with a class that is built when it is used."""
+        wrapper: Callable[[Any], Any] | None = None
+
+        def nested(message: Any) -> Any:
+            nonlocal wrapper
+            if not message._of_protobuf.HasField(name):
+                return None
+            if wrapper is None:
+                wrapper = self._wrapper(descriptor)
+            return wrapper(getattr(message._of_protobuf, name))
+
+        return nested
+
+    def _wrapper(self, descriptor: Any) -> Callable[[Any], Any]:
+        """Return the function that wraps a message of a type."""
+        if _is_wrapper(descriptor):
+            return lambda message: _boxed(message.value)
+        return self.of(descriptor)
+
+    def _entries(self, value: Callable[[Any], Any], descriptor: Any) -> Callable[[Any], Any]:
+        """Return the function that reads a map; its order in the message has no meaning."""
+
+        def entries(message: Any) -> list[Any]:
+            found = value(message)
+            wrapped = (lambda each: each) if descriptor is None else self._wrapper(descriptor)
+            return [_Entry(key, wrapped(found[key])) for key in sorted(found)]
+
+        return entries
 
 
 class _Entry:
@@ -291,6 +298,7 @@ def _seconds(message: Any) -> int:
     Raises:
         LogError: The time in nanoseconds has more than 64 bits.
     """
-    if abs(message.seconds) > _MAX_SECONDS:
-        raise LogError(f"a time of {message.seconds} s is not within the years 1678 to 2262")
-    return int(message.seconds)
+    found: int = message._of_protobuf.seconds
+    if abs(found) > _MAX_SECONDS:
+        raise LogError(f"a time of {found} s is not within the years 1678 to 2262")
+    return found
