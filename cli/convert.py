@@ -30,6 +30,7 @@ def convert(
     paths: tuple[str, ...],
     mapping: Path | None,
     trust_code: bool,
+    definitions: tuple[Path, ...],
     source_format: str | None,
     to: str | None,
     lossy: bool,
@@ -48,7 +49,7 @@ def convert(
     """
     if suggest:
         with working("reading the topics"):
-            text = mcaprl.suggest_mapping(paths)
+            text = mcaprl.suggest_mapping(paths, definitions=definitions)
         click.echo(text, nl=False)
         return
     if not dry_run and len(paths) < 2:
@@ -63,6 +64,7 @@ def convert(
             to=to,
             lossy=lossy,
             trust_code=trust_code,
+            definitions=definitions,
             overwrite=overwrite,
             upload=upload,
         )

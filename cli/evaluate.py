@@ -30,7 +30,16 @@ if TYPE_CHECKING:
     from mcaprl.api.estimate import LogEstimates
     from mcaprl.api.evaluate import Evaluation
 
-_OF_DATA = ("gamma", "epsilon", "updates", "estimate_behavior", "threads", "mapping", "trust_code")
+_OF_DATA = (
+    "gamma",
+    "epsilon",
+    "updates",
+    "estimate_behavior",
+    "threads",
+    "mapping",
+    "trust_code",
+    "definitions",
+)
 
 
 @click.command(cls=Command)

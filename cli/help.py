@@ -72,7 +72,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
 """Examples of each command, shown at the end of its help."""
 
 _BAGS: Final[dict[str, tuple[str, ...]]] = {
-    "Bags of other robots": ("mapping", "strict_mapping", "trust_code")
+    "Bags of other robots": ("mapping", "definitions", "strict_mapping", "trust_code")
 }
 _RAY: Final[dict[str, tuple[str, ...]]] = {"Ray cluster": ("ray", "workers", "address")}
 OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
@@ -110,7 +110,7 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         **_BAGS,
         **_RAY,
     },
-    "info": {"Bags of other robots": ("mapping", "trust_code")},
+    "info": {"Bags of other robots": ("mapping", "definitions", "trust_code")},
     "check": _BAGS,
     "annotate": {
         "Values": ("policy", "gamma"),
@@ -125,7 +125,13 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     },
     "convert": {
         "Formats": ("source_format", "to", "lossy"),
-        "Bags of other robots": ("mapping", "strict_mapping", "trust_code", "suggest"),
+        "Bags of other robots": (
+            "mapping",
+            "definitions",
+            "strict_mapping",
+            "trust_code",
+            "suggest",
+        ),
         "Output": ("dry_run", "overwrite", "upload", "as_json"),
     },
 }

@@ -51,13 +51,20 @@ def mapping_options(command: F, *, has_strict: bool = True) -> F:
         is_flag=True,
         help="Trust the mapping: import the Python function that it names.",
     )
+    definitions = click.option(
+        "--definitions",
+        multiple=True,
+        type=click.Path(path_type=Path),
+        metavar="DIR",
+        help="Folder or file with definitions of ROS types that the bag lacks; may be repeated.",
+    )
     mapping = click.option(
         "--mapping",
         type=click.Path(path_type=Path),
         metavar="FILE",
         help="Mapping that describes a bag; see docs/bags.md.",
     )
-    found = code(cast(F, with_mapping))
+    found = definitions(code(cast(F, with_mapping)))
     return mapping(strict(found) if has_strict else found)
 
 

@@ -1,4 +1,8 @@
-"""Limits on what a foreign file may ask for, each with its reason."""
+"""Limits on what a foreign file can make a program read, allocate or compute.
+
+Each limit is far above what real files need. A file that exceeds a limit is refused with an error
+that names it.
+"""
 
 from __future__ import annotations
 
@@ -6,3 +10,26 @@ from typing import Final
 
 MAX_IMAGE_PIXELS: Final = 64_000_000
 """Pixels of one image: more than any camera of a robot has; a few kB of PNG can declare 10^9."""
+MAX_TYPE_FIELDS: Final = 10_000
+"""Leaf fields of a message type with all nested types: nested types can multiply them."""
+MAX_TYPE_DEPTH: Final = 64
+"""Levels of nested messages in a type: types are read by recursion."""
+MAX_FIXED_MESSAGES: Final = 1_000
+"""Messages and strings in all fixed arrays of a type: compiling the code for each takes 1 ms."""
+MAX_MESSAGES_PER_BYTE: Final = 16
+"""Nested messages for each byte of a message, beyond 64: empty messages take memory, but no bytes
+of the file."""
+MAX_DEFINITION_BYTES: Final = 2**20
+"""Size of the definition of a message type as text: parsing takes seconds per MiB."""
+MAX_DEFINITION_FILES: Final = 100_000
+"""Files and folders that are searched for definitions of message types."""
+MAX_METADATA_BYTES: Final = 2**21
+"""Size of a bag's `metadata.yaml`: parsing YAML takes seconds per 100 kB."""
+MAX_METADATA_DEPTH: Final = 20
+"""Levels of nested values in a bag's `metadata.yaml`."""
+MAX_CHUNK_BYTES: Final = 2**28
+"""Decompressed size of a chunk or message: 32 KB of zstd data can become 1 GiB in memory."""
+MAX_UNPACKED_BYTES: Final = 2**30
+"""Decompressed size of a file that is decompressed to disk, whatever its compressed size."""
+MAX_UNPACKED_RATIO: Final = 200
+"""Ratio of the decompressed to the compressed size of a larger file."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mcaprl.api.data import MappingFile, open_data
+from mcaprl.api.data import Definitions, MappingFile, open_data
 from mcaprl.api.environments import sim_of
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
 from mcaprl.api.ranges import check_fraction
@@ -53,6 +53,7 @@ def annotate(
     overwrite: bool = False,
     mapping: MappingFile | None = None,
     trust_code: bool = False,
+    definitions: Definitions = (),
     progress: ProgressBar = no_progress,
 ) -> Annotation:
     """Copy a log, and add values of policies or the scene of the sim to each step.
@@ -72,6 +73,8 @@ def annotate(
         overwrite: Whether an existing file is replaced.
         mapping: Mapping that describes a bag; see `open`.
         trust_code: Whether the mapping may name a Python function.
+        definitions: Files and folders with definitions of ROS types that a bag lacks; see
+            docs/bags.md.
         progress: Function that opens a progress bar.
 
     Raises:
@@ -90,7 +93,7 @@ def annotate(
     if mapping is not None:
         if scene:
             raise UsageError("the scene of a bag cannot be added: there is no sim to step")
-        dataset = open_data(path, mapping=mapping, trust_code=trust_code)
+        dataset = open_data(path, mapping=mapping, trust_code=trust_code, definitions=definitions)
         check_target(Path(out), overwrite=overwrite)
         with tempfile.TemporaryDirectory(prefix="mcaprl-") as folder:
             log = Path(folder) / "converted.mcap"

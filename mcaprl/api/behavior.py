@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mcaprl.api.data import Data, MappingFile, opened
+from mcaprl.api.data import Data, Definitions, MappingFile, opened
 from mcaprl.api.ranges import check_least
 from mcaprl.api.train import torch_threads
 from mcaprl.progress import ProgressBar, no_progress
@@ -22,6 +22,7 @@ def estimate_behavior(
     threads: int = 1,
     mapping: MappingFile | None = None,
     trust_code: bool = False,
+    definitions: Definitions = (),
     progress: ProgressBar = no_progress,
 ) -> BehaviorEstimate:
     """Estimate the probability of each logged action under the policy that took it.
@@ -40,6 +41,8 @@ def estimate_behavior(
         threads: Number of threads of PyTorch and of the reader.
         mapping: Mapping that describes a bag; see `open`.
         trust_code: Whether the mapping may name a Python function.
+        definitions: Files and folders with definitions of ROS types that a bag lacks; see
+            docs/bags.md.
         progress: Function that opens a progress bar.
 
     Returns:
@@ -54,7 +57,9 @@ def estimate_behavior(
 
     check_least(1, updates=updates, threads=threads)
     check_least(2, folds=folds)
-    dataset = opened(data, mapping=mapping, trust_code=trust_code, threads=threads)
+    dataset = opened(
+        data, mapping=mapping, trust_code=trust_code, definitions=definitions, threads=threads
+    )
     text = f"estimating behavior_prob in {folds} folds"
     with torch_threads(threads), progress(text, folds * updates) as advance:
         return behavior.estimate_behavior(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mcaprl.api.data import MappingFile, Paths, mapped, open_data
+from mcaprl.api.data import Definitions, MappingFile, Paths, mapped, open_data
 from mcaprl.errors import UsageError
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -69,6 +69,7 @@ def convert(
     to: str | None = None,
     lossy: bool = False,
     trust_code: bool = False,
+    definitions: Definitions = (),
     overwrite: bool = False,
     upload: str | None = None,
 ) -> Conversion:
@@ -84,6 +85,8 @@ def convert(
             format with the suffix of `out`.
         lossy: Whether data that the format cannot store may be dropped or converted.
         trust_code: Whether the mapping may name a Python function, which is imported.
+        definitions: Files and folders with definitions of ROS types that a bag lacks; see
+            docs/bags.md.
         overwrite: Whether an existing file or folder is replaced.
         upload: URL to which the written file is copied when it is complete.
 
@@ -103,7 +106,7 @@ def convert(
         check_upload(upload, overwrite=overwrite)
         if out is None or (form is not None and not form.suffix):
             raise UsageError("upload copies one file: choose a file, not a folder, as the output")
-    dataset, report = _read(source, mapping, source_format, trust_code)
+    dataset, report = _read(source, mapping, source_format, trust_code, definitions)
     lost: list[str] = []
     if out is not None and form is not None:
         lost = write_format(dataset, out, form, lossy=lossy, overwrite=overwrite)
@@ -115,22 +118,29 @@ def convert(
 
 
 def _read(
-    source: Paths, mapping: MappingFile | None, source_format: str | None, trust_code: bool
+    source: Paths,
+    mapping: MappingFile | None,
+    source_format: str | None,
+    trust_code: bool,
+    definitions: Definitions,
 ) -> tuple[Dataset, MappingReport | None]:
     if mapping is None:
         return open_data(source, format=source_format), None
-    found = mapped(source, mapping, trust_code=trust_code)
+    found = mapped(source, mapping, trust_code=trust_code, definitions=definitions)
     return found.dataset, found.report
 
 
-def suggest_mapping(bag: Paths) -> str:
+def suggest_mapping(bag: Paths, *, definitions: Definitions = ()) -> str:
     """Return a commented draft of a mapping file, based on the topics and rates of a bag.
 
     Args:
         bag: MCAP files, rosbag2 folders and databases, or ROS 1 bags.
+        definitions: Files and folders with definitions of ROS types that the bag lacks; see
+            docs/bags.md.
 
     Raises:
         LogError: The bag cannot be read.
+        UsageError: There is no such file or folder of definitions.
         MissingExtraError: The packages of the `bags` extra are not installed.
     """
     from contextlib import closing
@@ -138,7 +148,7 @@ def suggest_mapping(bag: Paths) -> str:
     from mcaprl.recorder.bags.bag import open_bag
     from mcaprl.recorder.mapping.suggest import suggested
 
-    with closing(open_bag(bag)) as found:
+    with closing(open_bag(bag, definitions=definitions)) as found:
         return suggested(found)
 
 

@@ -33,6 +33,8 @@ class ChangedMapping(NamedTuple):
 
 MappingFile = str | Path | Mapping[str, Any] | ChangedMapping
 """Path of a mapping file, or its keys and values."""
+Definitions = Sequence[str | Path]
+"""Files and folders with definitions of ROS types."""
 
 
 def open_data(
@@ -40,6 +42,7 @@ def open_data(
     *,
     mapping: MappingFile | None = None,
     trust_code: bool = False,
+    definitions: Definitions = (),
     format: str | None = None,
     columns: Sequence[str] | None = None,
     episodes: Episodes | None = None,
@@ -61,6 +64,8 @@ def open_data(
         mapping: Mapping that says which topics and fields of a bag are observations, actions,
             rewards and episode ends; see docs/bags.md. None for logs of this package.
         trust_code: Whether the mapping may name a Python function, which is imported.
+        definitions: Files and folders with definitions of ROS types that a bag lacks; see
+            docs/bags.md.
         format: Name of the other tool's format; default: detected from the path.
         columns: Keys to read from a Dict observation space, for example `joints/q` for a nested
             key. The dataset's observation space contains only these keys. An empty sequence reads
@@ -109,7 +114,7 @@ def open_data(
             raise UsageError(f"only logs may have several paths: pass one {other.name} dataset")
         return read_format(one, other)
     assert mapping is not None
-    found = mapped(data, mapping, trust_code=trust_code, images=images)
+    found = mapped(data, mapping, trust_code=trust_code, definitions=definitions, images=images)
     for problem in (*found.report.left_out, *found.report.images):
         warnings.warn(str(problem), stacklevel=2)
     return found.dataset
@@ -140,13 +145,21 @@ def mapped(
     *,
     trust_code: bool = False,
     images: Storage = "auto",
+    definitions: Definitions = (),
 ) -> MappedBag:
     """Read a bag by a mapping; raise the same errors as `open_data`."""
     import_extra("pydantic", "bags")
     from mcaprl.recorder.mapping.read import read_bag
 
     source, changes = mapping if isinstance(mapping, ChangedMapping) else (mapping, {})
-    return read_bag(data, source, changes=changes, trust_code=trust_code, images=images)
+    return read_bag(
+        data,
+        source,
+        changes=changes,
+        trust_code=trust_code,
+        images=images,
+        definitions=definitions,
+    )
 
 
 def mapping_tree(mapping: MappingFile) -> dict[str, Any]:
@@ -178,12 +191,15 @@ def opened(
     *,
     mapping: MappingFile | None = None,
     trust_code: bool = False,
+    definitions: Definitions = (),
     threads: int = 1,
 ) -> Dataset:
     """Return a dataset unchanged, or read it from paths with `open_data`."""
     if isinstance(data, Dataset):
         return data
-    return open_data(data, mapping=mapping, trust_code=trust_code, threads=threads)
+    return open_data(
+        data, mapping=mapping, trust_code=trust_code, definitions=definitions, threads=threads
+    )
 
 
 def named(data: Data) -> str:

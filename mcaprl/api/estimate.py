@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from mcaprl.api.behavior import estimate_behavior as estimate_of_behavior
-from mcaprl.api.data import Data, MappingFile, named, opened
+from mcaprl.api.data import Data, Definitions, MappingFile, named, opened
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
 from mcaprl.api.ranges import check_fraction, check_least
 from mcaprl.api.train import torch_threads
@@ -78,6 +78,7 @@ def estimate(
     threads: int = 1,
     mapping: MappingFile | None = None,
     trust_code: bool = False,
+    definitions: Definitions = (),
     progress: ProgressBar = no_progress,
 ) -> LogEstimates:
     """Estimate the discounted returns of policies from logs, with each estimator.
@@ -96,6 +97,8 @@ def estimate(
         threads: Number of threads of PyTorch and of the reader.
         mapping: Mapping that describes a bag; see `open`.
         trust_code: Whether the mapping may name a Python function.
+        definitions: Files and folders with definitions of ROS types that a bag lacks; see
+            docs/bags.md.
         progress: Function that opens a progress bar.
 
     Raises:
@@ -110,7 +113,9 @@ def estimate(
     check_fraction(gamma=gamma, epsilon=epsilon)
     check_least(1, updates=updates, threads=threads)
     check_least(0, seed=seed)
-    dataset = opened(data, mapping=mapping, trust_code=trust_code, threads=threads)
+    dataset = opened(
+        data, mapping=mapping, trust_code=trust_code, definitions=definitions, threads=threads
+    )
     found = _policies(as_names(policies), dataset)
     behavior = None
     if estimate_behavior:

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mcaprl.api.data import MappingFile, Paths, mapped, open_data
+from mcaprl.api.data import Definitions, MappingFile, Paths, mapped, open_data
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import LogError, ReportError, UsageError, import_extra
 from mcaprl.files import check_log_name, size_of, write_json
@@ -121,6 +121,7 @@ def info(
     threads: int = 1,
     mapping: MappingFile | None = None,
     trust_code: bool = False,
+    definitions: Definitions = (),
 ) -> LogInfo:
     """Return facts about logs, and their problems.
 
@@ -130,6 +131,8 @@ def info(
         threads: Number of threads that decompress chunks.
         mapping: Mapping that describes a bag; see `open`.
         trust_code: Whether the mapping may name a Python function.
+        definitions: Files and folders with definitions of ROS types that a bag lacks; see
+            docs/bags.md.
 
     Raises:
         LogError: A log cannot be read.
@@ -145,7 +148,7 @@ def info(
             dataset, noted = open_data(data, threads=threads), []
             paths: Sequence[Path] = dataset.sources
         else:
-            dataset, result = mapped(data, mapping, trust_code=trust_code)
+            dataset, result = mapped(data, mapping, trust_code=trust_code, definitions=definitions)
             paths, noted = dataset.sources, result.problems()
     warned = [str(warning.message) for warning in caught]
     are_logs = mapping is None and all(path.suffix == ".mcap" for path in paths)
@@ -231,6 +234,7 @@ def check(
     threads: int = 1,
     mapping: MappingFile | None = None,
     trust_code: bool = False,
+    definitions: Definitions = (),
 ) -> CheckResult:
     """Read logs completely; validate structure, CRCs, indexes, episodes and metadata.
 
@@ -244,6 +248,8 @@ def check(
         threads: Number of threads that decompress chunks.
         mapping: Mapping that describes a bag; see `open`.
         trust_code: Whether the mapping may name a Python function.
+        definitions: Files and folders with definitions of ROS types that a bag lacks; see
+            docs/bags.md.
 
     Raises:
         UsageError: `data` is empty, `threads` is below 1, or the mapping does not fit the bag.
@@ -253,7 +259,7 @@ def check(
 
     check_least(1, threads=threads)
     if mapping is not None:
-        found_bag, report = mapped(data, mapping, trust_code=trust_code)
+        found_bag, report = mapped(data, mapping, trust_code=trust_code, definitions=definitions)
         return CheckResult(found_bag.sources, (), tuple(report.problems()))
     names: Sequence[str | Path] = [data] if isinstance(data, str | Path) else data
     if not names:

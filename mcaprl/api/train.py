@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mcaprl.api.cluster import ClusterOptions
-from mcaprl.api.data import MAPPING_NAME, Data, MappingFile, mapping_tree, open_data
+from mcaprl.api.data import MAPPING_NAME, Data, Definitions, MappingFile, mapping_tree, open_data
 from mcaprl.api.environments import all_options
 from mcaprl.api.policies import TrainedPolicy, as_names, is_policy, load_policies
 from mcaprl.api.ranges import check_least, check_port, check_positive
@@ -44,6 +44,7 @@ def train(
     other_data: bool = False,
     mapping: MappingFile | None = None,
     trust_code: bool = False,
+    definitions: Definitions = (),
     budget_minutes: float | None = None,
     report: str | Path | None = None,
     ray: bool = False,
@@ -78,6 +79,8 @@ def train(
         mapping: Mapping that describes a bag; see `open`. The mapping is copied to `out`. With a
             mapping, paths cannot have weights such as `:2`.
         trust_code: Whether the mapping may name a Python function.
+        definitions: Files and folders with definitions of ROS types that a bag lacks; see
+            docs/bags.md.
         budget_minutes: Wall time of `auto`, minutes; None for no bound.
         report: Output folder of the HTML page on the choice of `auto`.
         ray: Whether Ray workers train, each on some of the episodes. The result is that of one
@@ -163,7 +166,9 @@ def train(
         if mapping is not None and not isinstance(data, Dataset):
             if follow:
                 raise UsageError("follow is for logs; a bag with a mapping cannot be followed")
-            dataset = open_data(as_names(data), mapping=mapping, trust_code=trust_code)
+            dataset = open_data(
+                as_names(data), mapping=mapping, trust_code=trust_code, definitions=definitions
+            )
         elif isinstance(data, Dataset):
             if follow:
                 raise UsageError("follow needs the paths of logs, not a dataset")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.recorder.bags.decoders import MessageDecoder, decoder_of, merged
+from mcaprl.recorder.bags.definition_files import DefinitionFiles
 from mcaprl.recorder.bags.files import find_bags, open_recordings
 from mcaprl.recorder.bags.mcap_file import McapFile
 from mcaprl.recorder.bags.path_steps import NAMES, general_path, kind_at, steps_of
@@ -66,9 +67,12 @@ class TopicInfo:
         first_ns: log_time of the first message; 0 if there are no messages.
         last_ns: log_time of the last message; 0 if there are no messages.
         fields: Kind of each leaf field by its dotted path, such as `float64`, `float32[36]`,
-            `uint8[]`, `string` or `time`; empty if unknown.
+            `uint8[]`, `string` or `time`; empty if unknown. A leaf field in an array of messages
+            has a path such as `motors[].q`, and a kind that ends with `[]` for each such array.
         constants: Constants of the type, by name.
         problem: Reason why the messages cannot be read; empty if they can be read.
+        is_open: Whether messages can have other fields than `fields`, as JSON can.
+        unreadable: Reason by dotted path for each field of the type that cannot be read.
     """
 
     name: str
@@ -80,13 +84,15 @@ class TopicInfo:
     fields: dict[str, str]
     constants: dict[str, int]
     problem: str = ""
+    is_open: bool = False
+    unreadable: Mapping[str, str] = field(default_factory=dict)
 
     def may_have(self, path: str) -> bool:
         """Return whether messages may have a field.
 
-        Messages in JSON may have other fields than their schema lists.
+        Messages in JSON, for example, may have other fields than their schema lists.
         """
-        return not self.fields or self.encoding == "json" or self.lists(path)
+        return not self.fields or self.is_open or self.lists(path)
 
     def lists(self, path: str) -> bool:
         """Return whether the type has a field, as far as it is known."""
@@ -161,10 +167,15 @@ class Bag(Protocol):
 class _Topic:
     """One topic of a bag, joined from all files and channels in the order of recording."""
 
-    def __init__(self, name: str, sources: Sequence[tuple[int, TopicSource]]) -> None:
-        """Store the sources, each with the index of its file."""
+    def __init__(
+        self,
+        name: str,
+        sources: Sequence[tuple[int, TopicSource]],
+        others: DefinitionFiles | None = None,
+    ) -> None:
+        """Store the sources, each with the index of its file, and the user's definitions."""
         self.name = name
-        self._given = sources
+        self._given, self._others = sources, others
 
     @cached_property
     def _used(self) -> list[tuple[int, TopicSource]]:
@@ -213,6 +224,7 @@ class _Topic:
                 each.schema_encoding,
                 each.schema,
                 distribution=each.distribution,
+                others=self._others,
             )
             for each in found
         }
@@ -221,8 +233,10 @@ class _Topic:
     def info(self) -> TopicInfo:
         found, problem = self._used[0][1].definition, ""
         fields, constants = dict[str, str](), dict[str, int]()
+        decoders = list[MessageDecoder]()
         try:
-            fields, constants = merged(list(self._decoders.values()))
+            decoders = list(self._decoders.values())
+            fields, constants = merged(decoders)
         except (LogError, UsageError) as error:
             problem = str(error)
         times_ns = self.times_ns
@@ -236,6 +250,8 @@ class _Topic:
             fields=fields,
             constants=constants,
             problem=problem,
+            is_open=any(each.is_open for each in decoders),
+            unreadable={path: why for each in decoders for path, why in each.unreadable.items()},
         )
 
     def read(
@@ -278,13 +294,12 @@ class _Topic:
             for row, raw in zip(mine.tolist(), source.raw(chosen[mine, 3]), strict=True):
                 try:
                     message = decoder.decode(raw.data)
+                    for name, column in values.items():
+                        is_time = name == _PUBLISH_TIME
+                        column[row] = raw.publish_ns if is_time else value_at(message, name)
                 except LogError as error:
                     number = int(rows[row])
                     failures.append(Failure(number, int(self.times_ns[number]), str(error)))
-                    continue
-                for name, column in values.items():
-                    is_time = name == _PUBLISH_TIME
-                    column[row] = raw.publish_ns if is_time else value_at(message, name)
         return values, sorted(failures)
 
 
@@ -311,6 +326,7 @@ class _FileBag:
         self,
         recordings: Sequence[Sequence[McapFile | RosbagFile]],
         opened: ExitStack,
+        definitions: DefinitionFiles | None,
         *,
         strict: bool,
     ) -> None:
@@ -326,6 +342,7 @@ class _FileBag:
             name: _Topic(
                 name,
                 [(k, each) for k, file in enumerate(files) for each in file.topics.get(name, [])],
+                definitions,
             )
             for name in sorted(names)
         }
@@ -343,9 +360,11 @@ class _FileBag:
         found = self._topic(topic)
         if found.info.problem:
             raise LogError(f"{topic} cannot be read: {found.info.problem}")
-        for field in fields:
-            if field != _PUBLISH_TIME and not found.info.may_have(field):
-                raise UnknownNameError(f"field of {topic}", field, found.info.fields)
+        for name in fields:
+            if name in found.info.unreadable:
+                raise LogError(f"{topic}: {found.info.unreadable[name]}")
+            if name != _PUBLISH_TIME and not found.info.may_have(name):
+                raise UnknownNameError(f"field of {topic}", name, found.info.fields)
         return found.read(fields, rows, strict=self._strict)
 
     def close(self) -> None:
@@ -361,7 +380,12 @@ def _first_ns(file: McapFile | RosbagFile) -> int:
     return file.first_ns
 
 
-def open_bag(data: str | Path | Sequence[str | Path], *, strict: bool = False) -> Bag:
+def open_bag(
+    data: str | Path | Sequence[str | Path],
+    *,
+    definitions: Sequence[str | Path] = (),
+    strict: bool = False,
+) -> Bag:
     """Open a bag: MCAP files, rosbag2 folders and databases, and ROS 1 bags.
 
     Files that rosbag2 compressed as a whole are decompressed to a temporary folder. If a topic
@@ -370,12 +394,16 @@ def open_bag(data: str | Path | Sequence[str | Path], *, strict: bool = False) -
     Args:
         data: A file, a folder, a glob, or a sequence of these. Recordings are read in the order of
             their first messages.
+        definitions: Files and folders with definitions of ROS types that the bag lacks; see
+            `DefinitionFiles`.
         strict: Whether a message that cannot be decoded is an error; by default, it is left out
             and reported in `Stream.failures`.
 
     Raises:
         LogError: A file is missing, damaged, or not a bag.
+        UsageError: There is no such file or folder of definitions, or it has none.
     """
+    others = DefinitionFiles(definitions) if definitions else None
     with ExitStack() as opened:
         recordings = open_recordings(find_bags(data), opened)
-        return _FileBag(recordings, opened.pop_all(), strict=strict)
+        return _FileBag(recordings, opened.pop_all(), others, strict=strict)

@@ -1,18 +1,19 @@
-"""Decoders of messages to objects."""
+"""Decoders of messages to objects, and conversion of their fields to columns."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, Protocol
 
-from mcaprl.errors import LogError, import_extra
+from mcaprl.errors import LogError
+from mcaprl.recorder.bags.json_messages import JsonDecoder
+from mcaprl.recorder.bags.protobuf import ProtobufDecoder
 from mcaprl.recorder.bags.ros import RosDecoder
 from mcaprl.recorder.bags.values import NUMBERS, are_bytes
 from mcaprl.recorder.bags.values import column_of as column_of
 from mcaprl.recorder.bags.values import value_at as value_at
-
-_JSON_KINDS = {"number": "float64", "integer": "int64", "boolean": "bool", "string": "string"}
+from mcaprl.recorder.format.reading import TypeSource
 
 
 class MessageDecoder(Protocol):
@@ -21,10 +22,14 @@ class MessageDecoder(Protocol):
     Attributes:
         fields: Kind of each leaf field by its dotted path; empty if unknown.
         constants: Constants of the type by name.
+        unreadable: Reason by dotted path for each field that cannot be read.
+        is_open: Whether messages can have other fields than these.
     """
 
     fields: dict[str, str]
     constants: dict[str, int]
+    unreadable: dict[str, str]
+    is_open: bool
 
     def decode(self, data: bytes) -> Any:
         """Decode a message to an object or a dict.
@@ -41,6 +46,7 @@ def decoder_of(
     schema: bytes,
     *,
     distribution: str = "",
+    others: TypeSource | None = None,
 ) -> MessageDecoder:
     """Return the decoder of a type.
 
@@ -50,24 +56,51 @@ def decoder_of(
         schema_encoding: Encoding of the schema; empty without a schema.
         schema: Definition of the type.
         distribution: ROS distribution that the bag names.
+        others: Definitions of ROS types that the bag lacks.
 
     Raises:
         LogError: The encoding is not supported, or the definition cannot be used.
     """
-    match encoding, schema_encoding:
-        case ("cdr", "ros2msg" | "ros2idl" | "") | ("ros1", "ros1msg" | ""):
-            kind = schema_encoding or ("ros1msg" if encoding == "ros1" else "ros2msg")
-            text = schema.decode(errors="replace")
-            return RosDecoder(type_name, text, encoding=kind, distribution=distribution)
-        case "protobuf", "protobuf":
-            return ProtobufDecoder(type_name, schema)
-        case "json", _:
-            return JsonDecoder(schema if schema_encoding == "jsonschema" else b"")
-        case _:
-            raise LogError(
-                f"messages of encoding '{encoding}' with a schema of encoding '{schema_encoding}'"
-                " are not supported; supported: cdr, ros1, protobuf, json"
-            )
+    found = _outcome(encoding, type_name, schema_encoding, schema, distribution, others)
+    if isinstance(found, LogError):
+        raise LogError(str(found))
+    return found
+
+
+@lru_cache(maxsize=256)
+def _outcome(
+    encoding: str,
+    type_name: str,
+    schema_encoding: str,
+    schema: bytes,
+    distribution: str,
+    others: TypeSource | None,
+) -> MessageDecoder | LogError:
+    """Return the decoder, or the reason why there is none: many topics may have the same type."""
+    try:
+        match encoding, schema_encoding:
+            # rosbag2 writes the encoding `unknown` if it did not find the definition.
+            case ("cdr", "ros2msg" | "ros2idl" | "" | "unknown") | ("ros1", "ros1msg" | ""):
+                is_known = schema_encoding not in ("", "unknown")
+                default = "ros1msg" if encoding == "ros1" else "ros2msg"
+                return RosDecoder(
+                    type_name,
+                    schema.decode(errors="replace") if is_known or encoding == "ros1" else "",
+                    encoding=schema_encoding if is_known else default,
+                    distribution=distribution,
+                    others=others,
+                )
+            case "protobuf", "protobuf":
+                return ProtobufDecoder(type_name, schema)
+            case "json", _:
+                return JsonDecoder(schema if schema_encoding == "jsonschema" else b"")
+            case _:
+                return LogError(
+                    f"messages of encoding '{encoding}' with a schema of encoding"
+                    f" '{schema_encoding}' are not supported; supported: cdr, ros1, protobuf, json"
+                )
+    except LogError as error:
+        return error
 
 
 def merged(decoders: Sequence[MessageDecoder]) -> tuple[dict[str, str], dict[str, int]]:
@@ -82,7 +115,8 @@ def merged(decoders: Sequence[MessageDecoder]) -> tuple[dict[str, str], dict[str
     for decoder in decoders:
         for path, kind in decoder.fields.items():
             known = fields.setdefault(path, kind)
-            if _shape(known) != _shape(kind):
+            # Of the elements of an array of messages, the messages decide.
+            if "[" not in path and _shape(known) != _shape(kind):
                 raise LogError(
                     f"the type has several definitions: {path} is {known} in one and {kind} in"
                     " another: read the files one by one"
@@ -99,102 +133,3 @@ def _shape(kind: str) -> tuple[str, bool]:
     element, bracket, _ = kind.partition("[")
     is_number = element.rstrip("0123456789") in NUMBERS and not are_bytes(kind)
     return "number" if is_number else element, bool(bracket)
-
-
-class ProtobufDecoder:
-    """Decoder of a protobuf type, from a serialized FileDescriptorSet."""
-
-    def __init__(self, type_name: str, schema: bytes) -> None:
-        """Build the message class.
-
-        Raises:
-            LogError: The schema is not a FileDescriptorSet with the type.
-            MissingExtraError: protobuf is not installed.
-        """
-        pools = import_extra("google.protobuf.descriptor_pool", "bags")
-        descriptors = import_extra("google.protobuf.descriptor_pb2", "bags")
-        factory = import_extra("google.protobuf.message_factory", "bags")
-        try:
-            files = descriptors.FileDescriptorSet.FromString(schema)
-            pool = pools.DescriptorPool()
-            for file in files.file:
-                pool.Add(file)
-            self._descriptor = pool.FindMessageTypeByName(type_name)
-            self._class = factory.GetMessageClass(self._descriptor)
-        # protobuf raises errors of many types for a wrong schema.
-        except Exception as error:
-            raise LogError(f"the schema of {type_name} cannot be used: {error}") from error
-        self.fields, self.constants = dict[str, str](), dict[str, int]()
-        self._collect(self._descriptor, "", ())
-
-    def decode(self, data: bytes) -> Any:
-        """Decode a message."""
-        try:
-            return self._class.FromString(data)
-        except Exception as error:
-            raise LogError(
-                f"cannot decode {len(data)} bytes as {self._descriptor.name}: {error}"
-            ) from error
-
-    def _collect(self, descriptor: Any, prefix: str, parents: tuple[str, ...]) -> None:
-        """Collect the leaf fields and enum constants; skip types that are nested in themselves."""
-        for field in descriptor.fields:
-            path = f"{prefix}{field.name}"
-            inner = field.message_type
-            repeated = "[]" if field.is_repeated else ""
-            if field.enum_type is not None:
-                self.constants |= {each.name: each.number for each in field.enum_type.values}
-            if inner is None:
-                self.fields[path] = _protobuf_kind(field) + repeated
-            elif inner.full_name in ("google.protobuf.Timestamp", "google.protobuf.Duration"):
-                self.fields[path] = f"time{repeated}"
-            elif repeated:
-                self.fields[path] = f"{inner.full_name}[]"
-            elif inner.full_name not in parents:
-                self._collect(inner, f"{path}.", (*parents, inner.full_name))
-
-
-def _protobuf_kind(field: Any) -> str:
-    names = {1: "float64", 2: "float32", 8: "bool", 9: "string", 12: "bytes", 14: "enum"}
-    names |= {3: "int64", 16: "int64", 18: "int64", 4: "uint64", 6: "uint64"}
-    return names.get(field.type, "uint32" if field.type in (7, 13) else "int32")
-
-
-class JsonDecoder:
-    """Decoder of JSON objects, with or without a JSON schema."""
-
-    def __init__(self, schema: bytes) -> None:
-        """Collect the fields of the JSON schema; without a schema, the fields are unknown."""
-        self.fields, self.constants = dict[str, str](), dict[str, int]()
-        try:
-            found = json.loads(schema) if schema.strip() else {}
-        except ValueError as error:
-            raise LogError(f"the JSON schema cannot be read: {error}") from error
-        if isinstance(found, dict):
-            self._collect(found, "")
-
-    def decode(self, data: bytes) -> Any:
-        """Decode a message."""
-        try:
-            return json.loads(data)
-        except ValueError as error:
-            raise LogError(f"{len(data)} bytes are not JSON: {error}") from error
-
-    def _collect(self, schema: dict[str, Any], prefix: str) -> None:
-        properties = schema.get("properties")
-        for name, each in properties.items() if isinstance(properties, dict) else ():
-            if not isinstance(each, dict):
-                continue
-            path, kind = f"{prefix}{name}", each.get("type")
-            inner = each.get("properties")
-            if isinstance(inner, dict) and {"sec", "nsec"} == set(inner):
-                self.fields[path] = "time"
-            elif isinstance(inner, dict):
-                self._collect(each, f"{path}.")
-            elif kind == "array":
-                item = each.get("items")
-                item_kind = item.get("type") if isinstance(item, dict) else None
-                self.fields[path] = f"{_JSON_KINDS.get(str(item_kind), 'object')}[]"
-            else:
-                is_bytes = each.get("contentEncoding") == "base64"
-                self.fields[path] = "bytes" if is_bytes else _JSON_KINDS.get(str(kind), "object")

@@ -9,9 +9,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import zstandard
-
-from mcaprl.errors import LogError, import_extra
+from mcaprl.errors import LogError
+from mcaprl.recorder.bags.bag_metadata import read_metadata
+from mcaprl.recorder.bags.compressed import CompressedTopic, decompress_file
 from mcaprl.recorder.bags.mcap_file import McapFile
 from mcaprl.recorder.bags.rosbag_file import RosbagFile
 
@@ -72,22 +72,15 @@ def _opened(path: Path, opened: ExitStack) -> Iterator[tuple[Path, McapFile | Ro
         yield (folder if is_part else path).resolve(), _open(path, "", opened)
         return
     metadata = _metadata(path)
-    if str(metadata.get("compression_mode") or "").lower() == "message":
-        # Each message of this bag is compressed separately. `RosbagFile` decompresses the messages
-        # only if it opens the folder instead of a file.
-        whole = RosbagFile(path)
-        opened.callback(whole.close)
-        yield path.resolve(), whole
-        return
-    distribution = str(metadata.get("ros_distro") or "")
+    are_compressed = metadata.get("compression_mode", "").lower() == "message"
+    distribution = metadata.get("ros_distro", "")
     listed = [_existing(part) for part in _listed(path, metadata)]
     others = _unlisted(path, listed)
     if not listed and not others:
         raise LogError(f"{path} has no {', '.join(_KINDS)} files")
-    for part in listed:
-        yield path.resolve(), _open(part, distribution, opened)
-    for part in others:
-        yield part.resolve(), _open(part, distribution, opened)
+    for part in (*listed, *others):
+        file = _open(part, distribution, opened, are_compressed=are_compressed)
+        yield (path if part in listed else part).resolve(), file
 
 
 def _listed(folder: Path, metadata: dict[str, Any]) -> list[Path]:
@@ -131,36 +124,37 @@ def _plain_name(path: Path) -> str:
 
 
 def _metadata(folder: Path, *, is_optional: bool = False) -> dict[str, Any]:
-    """Return the metadata of a rosbag2 folder; empty if there is none.
+    """Return what is used of the metadata of a rosbag2 folder; empty if there is none.
 
     Raises:
-        LogError: The file is damaged, and not optional.
+        LogError: The file is damaged, too large, or has a value of another type, and is not
+            optional.
     """
     path = folder / _METADATA
-    if not path.exists():
-        return {}
-    yaml = import_extra("ruamel.yaml", "bags")
     try:
-        found = yaml.YAML(typ="safe").load(path.read_text(encoding="utf-8"))
-        return dict(found["rosbag2_bagfile_information"])
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+        return read_metadata(path) if path.exists() else {}
+    except LogError:
         if is_optional:
             return {}
-        raise LogError(f"{path} is not the metadata of a rosbag2 bag: {error}") from error
+        raise
 
 
-def _open(path: Path, distribution: str, opened: ExitStack) -> McapFile | RosbagFile:
+def _open(
+    path: Path, distribution: str, opened: ExitStack, *, are_compressed: bool = False
+) -> McapFile | RosbagFile:
+    """Open a file; `are_compressed` tells whether its messages are compressed one by one."""
+    if not path.is_file():
+        raise LogError(f"{path} is not a regular file")
     plain = path
     if path.name.endswith(_COMPRESSED):
         folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="mcaprl-"))
         plain = Path(folder) / _plain_name(path)
-        try:
-            with path.open("rb") as packed, plain.open("wb") as file:
-                zstandard.ZstdDecompressor().copy_stream(packed, file)
-        except (OSError, zstandard.ZstdError) as error:
-            raise LogError(f"{path} cannot be decompressed: {error}") from error
+        decompress_file(path, plain)
     kind = RosbagFile if plain.suffix in (".db3", ".bag") else McapFile
     found = kind(plain, distribution=distribution)
     opened.callback(found.close)
     found.path = path
+    if are_compressed:
+        for sources in found.topics.values():
+            sources[:] = [CompressedTopic(source) for source in sources]
     return found

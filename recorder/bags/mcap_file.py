@@ -19,6 +19,8 @@ from mcaprl.recorder.format.reading import (
     McapReader,
     MessageRange,
     Topic,
+    definitions_of,
+    full_name,
 )
 
 _BYTES = ("uint8", "byte", "octet")
@@ -109,7 +111,7 @@ class _McapTopic:
     def columns(
         self, fields: Sequence[str], rows: NDArray[np.int64] | None
     ) -> dict[str, NDArray[Any]] | None:
-        if self._channel.message_encoding != "cdr":
+        if not self._is_defined:
             return None
         topic = self._columnar
         if topic is None or not all(_is_column(topic.kinds.get(field, "")) for field in fields):
@@ -119,6 +121,18 @@ class _McapTopic:
         # Arrays of different lengths cannot form a column; they are decoded one by one.
         except LogError:
             return None
+
+    @cached_property
+    def _is_defined(self) -> bool:
+        """Whether the file defines the type: the columnar reader knows no other definitions."""
+        found = self.definition
+        if found.encoding != "cdr" or found.schema_encoding not in ("ros2msg", "ros2idl"):
+            return False
+        text = found.schema.decode(errors="replace")
+        try:
+            return definitions_of(full_name(found.type_name), text, found.schema_encoding).is_own
+        except LogError:
+            return False
 
     @cached_property
     def _columnar(self) -> Topic | None:

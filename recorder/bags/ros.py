@@ -1,14 +1,20 @@
 """Decoder of ROS messages.
 
-The definitions of the types come from the bag. If the bag has none, they come from a ROS
-distribution.
+The definitions of the types come from the bag, or else from the user's definition files, or else
+from a ROS distribution.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from mcaprl.recorder.format.reading import ROS1, definitions_of, full_name, leaf_kinds
+from mcaprl.recorder.format.reading import (
+    ROS1,
+    TypeSource,
+    definitions_of,
+    full_name,
+    leaf_kinds,
+)
 
 
 class RosDecoder:
@@ -17,10 +23,20 @@ class RosDecoder:
     Attributes:
         fields: Kind of each leaf field by its dotted path; see `bag.TopicInfo`.
         constants: Constants of the type by name.
+        unreadable: Reason by dotted path for each field that cannot be read.
+        is_open: Whether messages can have other fields than these.
     """
 
+    is_open = False
+
     def __init__(
-        self, type_name: str, text: str, *, encoding: str = "ros2msg", distribution: str = ""
+        self,
+        type_name: str,
+        text: str,
+        *,
+        encoding: str = "ros2msg",
+        distribution: str = "",
+        others: TypeSource | None = None,
     ) -> None:
         """Parse the definition.
 
@@ -29,15 +45,18 @@ class RosDecoder:
             text: Definition with its nested types; empty if the bag has none.
             encoding: `ros2msg`, `ros2idl` or `ros1msg`.
             distribution: ROS distribution that the bag names, such as `humble`.
+            others: Definitions of types that the bag lacks.
 
         Raises:
-            LogError: The definition does not parse, or a type is not defined.
+            LogError: The definition does not parse, a type is not defined, contains itself, or is
+                too large.
         """
         self._is_ros1 = encoding == ROS1
         self._name = full_name(type_name)
-        self._definitions = definitions_of(self._name, text, encoding, distribution)
+        self._definitions = definitions_of(self._name, text, encoding, distribution, others)
         self.constants = self._definitions.constants
-        self.fields = leaf_kinds(self._definitions.types, self._name)
+        self.unreadable = self._definitions.unreadable
+        self.fields = leaf_kinds(self._definitions.types, self._name, inner=True)
 
     def decode(self, data: bytes) -> Any:
         """Decode a message to an object with an attribute for each field.

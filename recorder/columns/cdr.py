@@ -25,7 +25,13 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 
 from mcaprl.errors import CorruptLogError, LogError
-from mcaprl.recorder.columns.definitions import TIME_TYPES, definitions_of, full_name, leaf_kinds
+from mcaprl.recorder.columns.definition_text import full_name
+from mcaprl.recorder.columns.definitions import (
+    TIME_TYPES,
+    clear_definitions,
+    definitions_of,
+    leaf_kinds,
+)
 
 # The encapsulation header of little-endian plain CDR, bytes 00 01 00 00, as a uint32.
 ENCAPSULATION = 0x0100
@@ -147,6 +153,11 @@ class MessageType:
         """Kind of each leaf field by its dotted path; see `definitions.leaf_kinds`."""
         return leaf_kinds(self._definitions.types, self.name)
 
+    @property
+    def unreadable(self) -> dict[str, str]:
+        """Reason by dotted path for each field that cannot be read."""
+        return self._definitions.unreadable
+
     @cached_property
     def leaf_dtypes(self) -> dict[str, np.dtype[Any]]:
         """Dtype of each leaf field by its dotted path.
@@ -193,7 +204,9 @@ class MessageType:
                 self._pass(walk, description, name, wanted)
         except (struct.error, _NoLayout):
             return None
-        if not walk.position <= len(example) <= walk.position + MAX_PADDING_BYTES:
+        # The length of fields that cannot be read is unknown.
+        most = len(example) if self._definitions.unreadable else walk.position + MAX_PADDING_BYTES
+        if not walk.position <= len(example) <= most:
             return None
         return walk.layout()
 
@@ -332,7 +345,7 @@ _parsed = lru_cache(maxsize=64)(MessageType)
 def clear_types() -> None:
     """Clear the cache of parsed types, so that a benchmark includes the time of parsing."""
     _parsed.cache_clear()
-    definitions_of.cache_clear()
+    clear_definitions()
 
 
 def _dtype_of(description: Any) -> np.dtype[Any]:

@@ -13,12 +13,9 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
 from mcaprl.errors import CorruptLogError
+from mcaprl.limits import MAX_CHUNK_BYTES
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.message_rows import RECORD_HEADER_BYTES
-
-# Maximum size of a decompressed chunk. It limits the memory of a reader, because 32 KB of zstd data
-# can decompress to 1 GiB. Ordinary writers write smaller chunks.
-MAX_CHUNK_BYTES = 256 * 2**20
 
 _CHUNK_START = struct.Struct("<BQQQQII")
 _ZSTD = zstandard.ZstdCompressionParameters.from_level

@@ -1,16 +1,26 @@
-"""Definitions of ROS types, from a file or, if the file lacks them, from a ROS distribution."""
+"""Definitions of ROS types: from the file, from definition files, or from a ROS distribution."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import keyword
+from collections.abc import Hashable, Mapping
 from functools import cached_property, lru_cache
-from typing import Any
+from operator import attrgetter
+from typing import Any, NamedTuple, Protocol
 
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from mcaprl.errors import LogError
+from mcaprl.limits import (
+    MAX_DEFINITION_BYTES,
+    MAX_FIXED_MESSAGES,
+    MAX_MESSAGES_PER_BYTE,
+    MAX_TYPE_DEPTH,
+    MAX_TYPE_FIELDS,
+)
+from mcaprl.recorder.columns.definition_text import parsed_types
 
 TIME_TYPES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 ROS1 = "ros1msg"
@@ -18,17 +28,21 @@ ROS1 = "ros1msg"
 # default, events contain neither requests nor responses, and can be read without these definitions.
 _EVENT, _PARTS = "_Event", ("_Request", "_Response")
 _UNKNOWN: Any = ([], [("unknown", (Nodetype.BASE, ("uint8", 0)))])
-_IDL_LINE = "=" * 80 + "\n"
+# A ROS 2 message without fields has one byte.
+_EMPTY: Any = ([], [("structure_needs_at_least_one_member", (Nodetype.BASE, ("uint8", 0)))])
+_UNREADABLE = ("wstring", "wchar", "float128", "fixed")
+_ARRAYS = (Nodetype.ARRAY, Nodetype.SEQUENCE)
 
 
-def full_name(name: str) -> str:
-    """Return the name of a type in the form that rosbags uses.
+class TypeSource(Hashable, Protocol):
+    """Definitions of types that a file lacks."""
 
-    >>> full_name("geometry_msgs/Twist"), full_name("std_srvs/srv/Trigger_Event")
-    ('geometry_msgs/msg/Twist', 'std_srvs/srv/msg/Trigger_Event')
-    """
-    folder, slash, last = name.rpartition("/")
-    return name if not slash or folder.endswith("/msg") else f"{folder}/msg/{last}"
+    def types_of(self, name: str) -> Any | None:
+        """Return constants and fields of the type with this full name; None if it is unknown.
+
+        Raises:
+            LogError: The definition cannot be read.
+        """
 
 
 class Definitions:
@@ -36,13 +50,23 @@ class Definitions:
 
     Attributes:
         name: Full name of the type.
-        types: Constants and fields of each type by its full name, as rosbags describes them.
+        types: Constants and fields of each type by its full name, as rosbags describes them,
+            without the fields that cannot be read.
+        unreadable: Reason by dotted path for each field that cannot be read: a wide string, and
+            all fields after it.
+        is_own: Whether the file defines all types.
     """
 
-    def __init__(self, name: str, types: dict[str, Any]) -> None:
-        """Store the parsed definitions; see `definitions_of`."""
-        self.name = name
-        self.types = types
+    def __init__(self, name: str, types: dict[str, Any], *, is_own: bool = True) -> None:
+        """Check the parsed definitions; see `definitions_of`.
+
+        Raises:
+            LogError: A type contains itself, or is too large.
+        """
+        self.name, self.is_own = name, is_own
+        _Sizes(types).of(name, ())
+        self.unreadable: dict[str, str] = {}
+        self.types = _readable(types, name, self.unreadable)
 
     @property
     def fields(self) -> dict[str, Any]:
@@ -60,6 +84,11 @@ class Definitions:
         store = get_typestore(Stores.EMPTY)
         new = {key: found for key, found in self.types.items() if key not in store.fielddefs}
         store.register(new)
+        for key, (_, fields) in new.items():
+            for field in fields:
+                # rosbags appends _ to a field name such as `from`, which is a word of Python.
+                if keyword.iskeyword(field[0]):
+                    setattr(store.types[key], field[0], property(attrgetter(f"{field[0]}_")))
         return store
 
     def decode(self, data: bytes, *, is_ros1: bool = False) -> Any:
@@ -69,49 +98,102 @@ class Definitions:
             LogError: The bytes do not fit the type, or no code can be generated for it.
         """
         try:
+            if self.unreadable:
+                return self._beginning(data, is_ros1=is_ros1)
             decoded = self._store.deserialize_ros1 if is_ros1 else self._store.deserialize_cdr
             return decoded(data, self.name)
         # rosbags raises errors of many types; each means that the bytes do not fit the type.
         except Exception as error:
-            raise LogError(f"cannot decode {len(data)} bytes as {self.name}: {error}") from error
+            why = str(error) or type(error).__name__
+            raise LogError(f"cannot decode {len(data)} bytes as {self.name}: {why}") from error
+
+    def _beginning(self, data: bytes, *, is_ros1: bool) -> Any:
+        """Decode the fields before the first that cannot be read."""
+        found: Any = self._store.get_msgdef(self.name)
+        if is_ros1:
+            return found.deserialize_ros1(data, 0, found.cls, self._store)[0]
+        if data[:2] not in (b"\0\0", b"\0\1"):
+            raise ValueError("the encapsulation is not that of plain CDR")
+        decode = found.deserialize_cdr_le if data[1] else found.deserialize_cdr_be
+        return decode(data[4:], 0, found.cls, self._store)[0]
 
 
-@lru_cache(maxsize=256)
 def definitions_of(
-    name: str, text: str, encoding: str = "ros2msg", distribution: str = ""
+    name: str,
+    text: str,
+    encoding: str = "ros2msg",
+    distribution: str = "",
+    others: TypeSource | None = None,
 ) -> Definitions:
     """Return a type and all types that are nested in it.
 
-    If both the file and the distribution define a type, the file's definition is used.
+    The definition of each type is that of the file, or else that of `others`, or else that of the
+    distribution.
 
     Args:
         name: Full name of the type.
         text: Definition with its nested types; empty if the file has none.
         encoding: `ros2msg`, `ros2idl` or `ros1msg`.
         distribution: ROS distribution of the file, such as `humble`; empty if unknown.
+        others: Definitions of types that the file lacks.
 
     Raises:
-        LogError: The definition does not parse, or a type is not defined.
+        LogError: The definition does not parse, a type is not defined, contains itself, or is too
+            large.
     """
-    own = _parsed(name, text, encoding) if text.strip() else {}
+    if len(text) > MAX_DEFINITION_BYTES:
+        raise LogError(
+            f"the definition of {name} has {len(text)} characters; at most"
+            f" {MAX_DEFINITION_BYTES} are read"
+        )
+    found = _outcome(name, text, encoding, distribution, others)
+    if isinstance(found, LogError):
+        raise LogError(str(found))
+    return found
+
+
+@lru_cache(maxsize=256)
+def _outcome(
+    name: str, text: str, encoding: str, distribution: str, others: TypeSource | None
+) -> Definitions | LogError:
+    """Return the definitions, or the reason why there are none: many topics may have the same."""
+    try:
+        return _collected(name, text, encoding, distribution, others)
+    except LogError as error:
+        return error
+
+
+clear_definitions = _outcome.cache_clear
+
+
+def _collected(
+    name: str, text: str, encoding: str, distribution: str, others: TypeSource | None
+) -> Definitions:
+    own = parsed_types(name, text, encoding) if text.strip() else {}
     needed, types = [name], dict[str, Any]()
     while needed:
         each = needed.pop()
         if each not in types:
-            found = own.get(each) or _known(distribution, encoding == ROS1).fielddefs.get(each)
+            found = own.get(each) or (others.types_of(each) if others is not None else None)
+            found = found or _known(distribution, encoding == ROS1).fielddefs.get(each)
             if name.endswith(_EVENT) and each.endswith(_PARTS) and not (found and found[1]):
                 found = _UNKNOWN
             if found is None:
                 what = "its definition" if each == name else f"the definition of nested type {each}"
-                raise LogError(f"{name}: {what} is missing, and the ROS distribution lacks it")
+                where = "the ROS distribution lacks it"
+                if others is not None:
+                    where = f"{others} and the ROS distribution lack it"
+                raise LogError(f"{name}: {what} is missing, and {where}")
+            if not found[1] and encoding != ROS1:
+                found = (found[0], _EMPTY[1])
             types[each] = found
-            for field, description in found[1]:
-                _refuse_wide(name, field, description)
-                needed += _nested(description)
-    return Definitions(name, types)
+            needed += [nested for _, field in found[1] for nested in _nested(field)]
+    return Definitions(name, types, is_own=types.keys() <= own.keys())
 
 
-def leaf_kinds(types: Mapping[str, Any], name: str, prefix: str = "") -> dict[str, str]:
+def leaf_kinds(
+    types: Mapping[str, Any], name: str, prefix: str = "", *, inner: bool = False
+) -> dict[str, str]:
     """Return the kind of each leaf field of a type by its dotted path.
 
     Kinds of numbers, strings and arrays are, for example, `float64`, `string`, `float32[36]` and
@@ -122,18 +204,30 @@ def leaf_kinds(types: Mapping[str, Any], name: str, prefix: str = "") -> dict[st
         types: Definitions of the type and all nested ones; see `Definitions.types`.
         name: Full name of the type.
         prefix: Path of the field that has this type, with a final dot; empty at the top level.
+        inner: Whether to add the leaf fields in arrays of messages: the path is, for example,
+            `points[].x`, and `[]` is added to the kind for each such array, as in `float64[]`.
     """
-    found = {}
+    found = dict[str, str]()
     for field, description in types[name][1]:
-        kind, what = description
-        path = f"{prefix}{field}"
-        if kind != Nodetype.NAME:
-            found[path] = _kind(description)
-        elif what in TIME_TYPES:
-            found |= {path: "time", f"{path}.sec": "int32", f"{path}.nanosec": "uint32"}
-        else:
-            found |= leaf_kinds(types, str(what), f"{path}.")
+        found |= _field_kinds(types, description, f"{prefix}{field}", inner=inner)
     return found
+
+
+def _field_kinds(
+    types: Mapping[str, Any], description: Any, path: str, *, inner: bool
+) -> dict[str, str]:
+    kind, what = description
+    if kind in _ARRAYS:
+        found = {path: _kind(description)}
+        if inner and what[0][0] == Nodetype.NAME:
+            parts = _field_kinds(types, what[0], f"{path}[]", inner=True)
+            found |= {each: f"{part}[]" for each, part in parts.items() if each != f"{path}[]"}
+        return found
+    if kind == Nodetype.BASE:
+        return {path: _kind(description)}
+    if what in TIME_TYPES:
+        return {path: "time", f"{path}.sec": "int32", f"{path}.nanosec": "uint32"}
+    return leaf_kinds(types, str(what), f"{path}.", inner=inner)
 
 
 def _kind(description: Any) -> str:
@@ -153,35 +247,167 @@ def _known(distribution: str, is_ros1: bool) -> Typestore:
     return get_typestore(stores.get(f"ros2_{distribution}", latest))
 
 
-def _parsed(name: str, text: str, encoding: str) -> dict[str, Any]:
-    try:
-        if encoding != "ros2idl":
-            return dict(get_types_from_msg(text, name))
-        if not text.startswith(f"{_IDL_LINE}IDL: "):
-            return dict(get_types_from_idl(text))
-        # The text contains several definitions, each preceded by a line with the type name.
-        parts = [part.split("\n", 1)[1] for part in text.split(_IDL_LINE) if part.strip()]
-        return {key: found for part in parts for key, found in get_types_from_idl(part).items()}
-    # rosbags raises errors of many types when a definition does not parse.
-    except Exception as error:
-        raise LogError(f"the definition of {name} does not parse: {error}") from error
-
-
-def _refuse_wide(name: str, field: str, description: Any) -> None:
+def _element(description: Any) -> tuple[Any, Any]:
+    """Return kind and type of a field, or of the elements of an array."""
     kind, what = description
-    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        kind, what = what[0]
-    # `get_types_from_msg` parses `wstring` as the name of a message type.
-    word = what[0] if kind == Nodetype.BASE else str(what).rpartition("/")[2]
-    if word == "wstring":
-        raise LogError(
-            f"{name}: field {field} is a wide string, whose encoding depends on the DDS of the"
-            " robot: record a string instead"
-        )
+    return what[0] if kind in _ARRAYS else (kind, what)
 
 
 def _nested(description: Any) -> list[str]:
-    kind, what = description
-    if kind == Nodetype.NAME:
-        return [str(what)]
-    return _nested(what[0]) if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else []
+    kind, what = _element(description)
+    return [str(what)] if kind == Nodetype.NAME else []
+
+
+class _Size(NamedTuple):
+    """Size of a type.
+
+    Attributes:
+        leaves: Number of leaf fields, with those in arrays of messages.
+        depth: Number of levels of nested messages.
+        messages: Number of nested messages in the smallest message of the type.
+        least_bytes: Number of bytes of the smallest message of the type, without padding.
+    """
+
+    leaves: int
+    depth: int
+    messages: int
+    least_bytes: int
+
+
+class _Sizes:
+    """Sizes of types, each computed once: their leaf fields can be exponential in their number."""
+
+    def __init__(self, types: Mapping[str, Any]) -> None:
+        self._types = types
+        self._known: dict[str, _Size] = {}
+        self._fixed = 0
+
+    def of(self, name: str, parents: tuple[str, ...]) -> _Size:
+        """Return the size of a type that is nested in the types `parents`.
+
+        Raises:
+            LogError: The type contains itself, or is too large.
+        """
+        if name in parents:
+            raise LogError(f"type {name} contains itself")
+        if len(parents) >= MAX_TYPE_DEPTH:
+            raise LogError(
+                f"{parents[0]}: messages are nested in more than {MAX_TYPE_DEPTH} levels"
+            )
+        if name not in self._known:
+            path = (*parents, name)
+            parts = [self._field(field, each, path) for field, each in self._types[name][1]]
+            leaves, depths, messages, least_bytes = zip(*parts, strict=True) if parts else ((),) * 4
+            found = _Size(
+                max(sum(leaves), 1), 1 + max(depths, default=0), 1 + sum(messages), sum(least_bytes)
+            )
+            self._check(name, found)
+            self._known[name] = found
+        if len(parents) + self._known[name].depth > MAX_TYPE_DEPTH:
+            raise LogError(
+                f"{parents[0]}: messages are nested in more than {MAX_TYPE_DEPTH} levels"
+            )
+        return self._known[name]
+
+    def _check(self, name: str, size: _Size) -> None:
+        if size.leaves > MAX_TYPE_FIELDS:
+            raise LogError(f"type {name} has more than {MAX_TYPE_FIELDS} fields in nested messages")
+        if size.messages > MAX_TYPE_DEPTH + MAX_MESSAGES_PER_BYTE * size.least_bytes:
+            raise LogError(
+                f"type {name} has {size.messages} nested messages in {size.least_bytes} bytes: at"
+                f" most {MAX_MESSAGES_PER_BYTE} for each byte are read"
+            )
+        if self._fixed > MAX_FIXED_MESSAGES:
+            raise LogError(
+                f"type {name} has fixed arrays of {self._fixed} messages or strings; at most"
+                f" {MAX_FIXED_MESSAGES} are read"
+            )
+
+    def _field(self, field: str, description: Any, parents: tuple[str, ...]) -> _Size:
+        kind, what = description
+        element_kind, element = _element(description)
+        if element_kind == Nodetype.BASE:
+            size = _Size(1, 0, 0, _BYTES.get(element[0], 1))
+        else:
+            size = self.of(str(element), parents)
+            size = size._replace(leaves=size.leaves + (3 if element in TIME_TYPES else 1))
+        if kind == Nodetype.ARRAY:
+            count = what[1]
+            is_unrolled = element_kind == Nodetype.NAME or element[0] in ("string", *_UNREADABLE)
+            self._fixed += count if is_unrolled else 0
+            return size._replace(
+                messages=count * size.messages, least_bytes=count * size.least_bytes
+            )
+        if kind == Nodetype.SEQUENCE:
+            if size.messages > MAX_MESSAGES_PER_BYTE * max(size.least_bytes, 1):
+                raise LogError(
+                    f"{parents[-1]}: {field} is a sequence of messages with too few bytes"
+                )
+            return size._replace(messages=0, least_bytes=4)
+        return size
+
+
+_BYTES = {"string": 4, "wstring": 4} | {
+    f"{kind}{bits}": bits // 8 for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64, 128)
+}
+
+
+def _readable(types: dict[str, Any], name: str, unreadable: dict[str, str]) -> dict[str, Any]:
+    """Return the types without the fields that cannot be read, which are added to `unreadable`.
+
+    The encoding of a wide string depends on the DDS of the robot, so that the positions of all
+    fields after it are unknown.
+
+    Raises:
+        LogError: The first field cannot be read.
+    """
+    found = dict(types)
+    is_wide: dict[str, bool] = {}
+
+    def has_wide(description: Any) -> bool:
+        kind, what = _element(description)
+        if kind == Nodetype.BASE:
+            return what[0] in _UNREADABLE
+        if what not in is_wide:
+            is_wide[what] = any(has_wide(field) for _, field in types[what][1])
+        return is_wide[what]
+
+    def cut(owner: str, prefix: str, reason: str) -> str:
+        """Remove all fields of a type from the first that cannot be read; return the reason."""
+        kept = []
+        for field, description in types[owner][1]:
+            path, was_readable = f"{prefix}{field}", not reason
+            if was_readable and not has_wide(description):
+                kept.append((field, description))
+                continue
+            kind, what = description
+            if was_readable and kind == Nodetype.NAME:
+                reason = cut(str(what), f"{path}.", "")
+                kept += [(field, description)] if found[what][1] else []
+                continue
+            if was_readable:
+                reason = (
+                    f"{name}: field {path} contains a {_wide_word(types, description)}, whose"
+                    " encoding depends on the DDS of the robot: it and all fields after it cannot"
+                    " be read; record a string or a number instead"
+                )
+            unreadable.update(
+                dict.fromkeys(_field_kinds(types, description, path, inner=True), reason)
+            )
+        found[owner] = (types[owner][0], kept)
+        return reason
+
+    if has_wide((Nodetype.NAME, name)):
+        reason = cut(name, "", "")
+        if not found[name][1]:
+            raise LogError(reason)
+    return found
+
+
+def _wide_word(types: Mapping[str, Any], description: Any) -> str:
+    """Return the first type in a field that cannot be read."""
+    kind, what = _element(description)
+    if kind == Nodetype.BASE:
+        return str(what[0]) if what[0] in _UNREADABLE else ""
+    words = (_wide_word(types, field) for _, field in types[what][1])
+    return next((word for word in words if word), "")

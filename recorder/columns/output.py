@@ -14,8 +14,9 @@ from mcap.records import ChunkIndex, DataEnd, McapRecord
 
 from mcaprl.errors import LogError
 from mcaprl.files import is_at
+from mcaprl.limits import MAX_CHUNK_BYTES
 from mcaprl.recorder.columns.checksum import crc32
-from mcaprl.recorder.columns.chunks import MAX_CHUNK_BYTES, ChunkHeader
+from mcaprl.recorder.columns.chunks import ChunkHeader
 from mcaprl.recorder.columns.file_lock import release
 from mcaprl.recorder.columns.message_rows import message_index_head
 from mcaprl.recorder.columns.signals import HoldSignals

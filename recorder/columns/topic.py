@@ -151,7 +151,8 @@ class Topic:
 
         Raises:
             CorruptLogError: A chunk is damaged, or a message does not fit its type.
-            LogError: The shape or type of a field is not the same in all messages.
+            LogError: The shape or type of a field is not the same in all messages, or a field
+                cannot be read; see `Definitions.unreadable`.
             UnknownNameError: The type has no such field, or the field is a message.
         """
         self._check(wanted)
@@ -197,6 +198,8 @@ class Topic:
         types = [decoder.type for decoder in self._decoders]
         for one in types:
             for name in wanted:
+                if name in one.unreadable:
+                    raise LogError(f"{self._reader.path}: {self.name}: {one.unreadable[name]}")
                 if name not in one.kinds:
                     raise UnknownNameError(f"field of {self.name}", name, one.kinds)
                 if one is not types[0] and one.leaf_dtypes[name] != types[0].leaf_dtypes[name]:

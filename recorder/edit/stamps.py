@@ -87,7 +87,10 @@ class Delay:
         if name == EPISODE_TYPE:
             return self._move_episode
         text = schema.data.decode(errors="replace")
-        types = definitions_of(name, text, schema.encoding).types
+        found = definitions_of(name, text, schema.encoding)
+        types = found.types
+        for reason in found.unreadable.values():
+            raise LogError(f"{self._reader.path}: {channel.topic}: {reason}")
         if _TIME not in types:
             return None
         return lambda payload: self._move(payload, name, types)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from mcaprl.recorder.columns.cdr import ROS_TO_NUMPY
 from mcaprl.recorder.columns.chunks import Scratch, chunk_header
 from mcaprl.recorder.columns.decoder import Columns, Decoder
-from mcaprl.recorder.columns.definitions import ROS1, definitions_of, full_name, leaf_kinds
+from mcaprl.recorder.columns.definition_text import full_name, parsed_types
+from mcaprl.recorder.columns.definitions import ROS1, TypeSource, definitions_of, leaf_kinds
 from mcaprl.recorder.columns.file_check import check_chunk, check_file, check_statistics, place
 from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, MessageRange
 from mcaprl.recorder.columns.reader import McapReader
@@ -24,6 +25,7 @@ __all__ = [
     "MessageRange",
     "Scratch",
     "Topic",
+    "TypeSource",
     "check_chunk",
     "check_file",
     "check_statistics",
@@ -31,5 +33,6 @@ __all__ = [
     "definitions_of",
     "full_name",
     "leaf_kinds",
+    "parsed_types",
     "place",
 ]

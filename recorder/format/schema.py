@@ -35,8 +35,8 @@ import numpy as np
 from gymnasium import spaces
 
 from mcaprl.errors import SpaceError
+from mcaprl.limits import MAX_CHUNK_BYTES
 from mcaprl.recorder.columns.cdr import ENCAPSULATION, ENCAPSULATION_BYTES, ROS_TO_NUMPY
-from mcaprl.recorder.columns.chunks import MAX_CHUNK_BYTES
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
 
 LEARNER_TYPE = "mcaprl_msgs/msg/Learner"

@@ -475,6 +475,12 @@ class Mapping(_Part):
         description="Whether a message that cannot be decoded is an error; without it, the message"
         " is left out and reported.",
     )
+    definitions: list[str] = Field(
+        default=[],
+        description="Folders or files with definitions (`.msg`, `.srv`, `.action`, `.idl`) of ROS"
+        " types that the bag lacks, as in a rosbag2 database of a distribution before Iron. Paths"
+        " are relative to the mapping file.",
+    )
 
     @model_validator(mode="after")
     def _names_are_words(self) -> Mapping:
@@ -573,7 +579,13 @@ def load_mapping(source: str | Path | MappingOf[str, Any]) -> tuple[Mapping, Pla
     place = Place(str(path), tree)
     if not isinstance(tree, dict):
         raise UsageError(f"{path}: a mapping has keys and values, such as `clock: {{rate_hz: 10}}`")
-    return parse_mapping(tree, place), place
+    found = parse_mapping(tree, place)
+    folder = Path(path).parent.absolute()
+    paths = [str(folder / each) for each in found.definitions]
+    for number, each in enumerate(paths):
+        if not Path(each).exists():
+            raise UsageError(f"{place.of('definitions', number)}: {each} does not exist")
+    return found.model_copy(update={"definitions": paths}), place
 
 
 def parse_mapping(tree: MappingOf[str, Any], place: Place | None = None) -> Mapping:

@@ -144,6 +144,8 @@ def field_path(bag: Bag, text: str) -> FieldPath:
         raise UsageError(f"{text}: an index or slice is missing between the brackets")
     path = path_in(topic, rest.removeprefix("."))
     info = bag.topics[topic]
+    if path.field in info.unreadable:
+        raise UsageError(f"{topic}: {info.unreadable[path.field]}")
     is_parent = any(each.startswith(f"{path.field}.") for each in info.fields)
     if not info.may_have(path.field) and not is_parent:
         raise unknown_field(bag, path)

@@ -50,6 +50,7 @@ def read_bag(
     changes: MappingOf[str, Any] | None = None,
     trust_code: bool = False,
     images: Storage = "auto",
+    definitions: Sequence[str | Path] = (),
 ) -> MappedBag:
     """Read a bag as a dataset.
 
@@ -59,6 +60,8 @@ def read_bag(
         changes: Values that replace those of the mapping's keys.
         trust_code: Whether `reward` may name a function of a Python module, which is imported.
         images: Storage of images: `memory`, `mapped`, or `auto`; see `mcaprl.open`.
+        definitions: Files and folders with definitions of ROS types that the bag lacks, in addition
+            to those of the mapping.
 
     Raises:
         UsageError: The mapping does not fit the bag; the message names file, line and key.
@@ -69,7 +72,8 @@ def read_bag(
     if not isinstance(mapping, Mapping):
         mapping, place = load_mapping(mapping)
     mapping = mapping.model_copy(update=dict(changes or {}))
-    with closing(open_bag(data, strict=mapping.strict)) as bag:
+    others = [*mapping.definitions, *definitions]
+    with closing(open_bag(data, definitions=others, strict=mapping.strict)) as bag:
         return read_open_bag(bag, mapping, place, trust_code=trust_code, images=images)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from contextlib import closing
 from pathlib import Path
@@ -199,3 +200,89 @@ def test_service_events_are_read_without_their_request(parts: str, tmp_path: Pat
         assert len(found["request"][0]) == 0
         assert bag.topics["/set/_service_event"].constants == {}
         assert bag.read("/v", ["x"]).columns["x"].tolist() == [1.0]
+
+
+def with_parts(text: str, part: str) -> str:
+    """Return a definition with the definition of a nested type, as rosbag2 writes it."""
+    return f"{text}\n{'=' * 80}\n{part}\n"
+
+
+@pytest.mark.parametrize("end", ["\r\n", "\r"])
+def test_other_ends_of_lines(end: str) -> None:
+    text = with_parts("float64 x\n# A comment\n\np/B b\nuint8 A=3", "MSG: p/B\nint32 y\n")
+    decoder = RosDecoder("p/A", text.replace("\n", end))
+    assert (decoder.fields, decoder.constants) == ({"x": "float64", "b.y": "int32"}, {"A": 3})
+    idl = RosDecoder("demo_msgs/msg/Level", IDL.replace("\n", end), encoding="ros2idl")
+    assert idl.fields["ratio"] == "float64"
+
+
+def test_idl_with_preprocessor_lines_and_several_modules() -> None:
+    text = f"""\
+{"=" * 80}
+IDL: car_msgs/msg/Car
+// generated from rosidl_adapter/resource/msg.idl.em
+#include "geometry_msgs/msg/Point.idl"
+#ifndef CAR_IDL
+#define CAR_IDL
+  #pragma once  // and a comment
+module car_msgs {{ module msg {{
+  /* # not a directive
+   * @verbatim (language="comment", text="x") */
+  @verbatim (language="comment", text="a " "# b")
+  struct Car {{
+    @unit (value="m")
+    geometry_msgs::msg::Point at;
+    wheels::msg::Wheel wheel;
+    #ifdef OLD
+    double old;
+    #else
+    double speed;
+    #endif
+  }};
+}}; }};
+#endif // CAR_IDL
+{"=" * 80}
+IDL: geometry_msgs/msg/Point
+module geometry_msgs {{ module msg {{ struct Point {{ double x; double y; }}; }}; }};
+module wheels {{ module msg {{ struct Wheel {{ float turns; }}; }}; }};
+"""
+    expected = {"at.x": "float64", "at.y": "float64", "wheel.turns": "float32", "speed": "float64"}
+    assert RosDecoder("car_msgs/msg/Car", text, encoding="ros2idl").fields == expected
+    for line, reason in (
+        ("#if VERSION > 2", "#if VERSION > 2 cannot be evaluated"),
+        ("#endif", "#endif has no #if"),
+        ("const long A = ((1));", "expressions in parentheses are not supported"),
+        ("const long A = 1 << 10000000000;", "shifts by more than 99 bits"),
+    ):
+        broken = text.replace("module car_msgs", f"{line}\nmodule car_msgs")
+        with pytest.raises(
+            LogError, match=f"car_msgs/msg/Car does not parse: .*{re.escape(reason)}"
+        ):
+            RosDecoder("car_msgs/msg/Car", broken, encoding="ros2idl")
+
+
+def test_idl_wide_strings_and_names_of_services() -> None:
+    text = """\
+module p { module srv { struct Go_Request { double x; wstring<5> w; double y; }; }; };
+"""
+    decoder = RosDecoder("p/srv/Go_Request", text, encoding="ros2idl")
+    assert decoder.fields == {"x": "float64"}
+    assert set(decoder.unreadable) == {"w", "y"}
+    wide = 'float64 x\nwstring<=7 w\nwstring GREETING="hi"\nwstring d "hello"\nfloat64 y'
+    decoder = RosDecoder("p/A", wide)
+    assert (decoder.fields, set(decoder.unreadable)) == ({"x": "float64"}, {"w", "d", "y"})
+
+
+def test_the_encoding_unknown_means_that_there_is_no_definition(tmp_path: Path) -> None:
+    kind = "geometry_msgs/msg/Vector3"
+    data = bytes(STORE2.serialize_cdr(vector(STORE2), kind))
+    path = write_mcap(
+        tmp_path / "unknown.mcap",
+        [
+            ("/known", kind, "unknown", "", "cdr", data),
+            ("/own", "acme_msgs/msg/Robot", "unknown", "", "cdr", data),
+        ],
+    )
+    with closing(open_bag(path)) as bag:
+        assert bag.read("/known", ["y"]).columns["y"].tolist() == [2.0]
+        assert "acme_msgs/msg/Robot: its definition is missing" in bag.topics["/own"].problem

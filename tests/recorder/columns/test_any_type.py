@@ -175,18 +175,26 @@ def test_times_are_leaves_and_lists_are_objects(tmp_path: Path) -> None:
     assert columns["d.sec"].tolist() == [-1, 0, 2]
 
 
-@pytest.mark.parametrize("kind", ["wstring", "wstring[]", "wstring[2]"])
-def test_wide_strings_cost_only_their_topic(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["wstring", "wstring[]", "wstring[2]", "wstring<=9"])
+def test_wide_strings_cost_only_the_fields_after_them(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "wide.mcap"
+    texts = {"wide": f"uint8 a\n{kind} b\nuint8 c\n", "plain": "uint8 a\n", "first": f"{kind} b\n"}
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="ros2")
-        for topic, text in (("/wide", f"uint8 a\n{kind} b\n"), ("/plain", "uint8 a\n")):
-            schema = writer.register_schema(f"demo_msgs/msg{topic}", "ros2msg", text.encode())
-            channel = writer.register_channel(topic, "cdr", schema)
-            writer.add_message(channel, 0, b"\0\1\0\0\7", 0)
+        for topic, text in texts.items():
+            schema = writer.register_schema(f"demo_msgs/msg/{topic}", "ros2msg", text.encode())
+            channel = writer.register_channel(f"/{topic}", "cdr", schema)
+            rest = b"" if topic == "plain" else b"\0\0\0\2\0\0\0a\0b\0\1"
+            writer.add_message(channel, 0, b"\0\1\0\0\7" + rest, 0)
         writer.finish()
     reader = McapReader(path)
-    with pytest.raises(LogError, match=r"/wide: .* field b is a wide string"):
-        Topic(reader, "/wide")
+    wide = Topic(reader, "/wide")
+    assert wide.kinds == {"a": "uint8"}
+    assert wide.read(["a"])["a"].tolist() == [7]
+    for name in ("b", "c"):
+        with pytest.raises(LogError, match=r"/wide: .*field b contains a wstring, whose encoding"):
+            wide.read([name])
+    with pytest.raises(LogError, match=r"/first: .*field b contains a wstring"):
+        Topic(reader, "/first")
     assert Topic(reader, "/plain").read(["a"])["a"].tolist() == [7]
