@@ -28,6 +28,14 @@ from mcaprl.recorder.bags.source import Definition, TopicSource
 _PUBLISH_TIME = "publish_time"
 
 
+class Failure(NamedTuple):
+    """A message that cannot be decoded: its index in `Bag.times`, its log_time, and why."""
+
+    row: int
+    log_time_ns: int
+    reason: str
+
+
 class Stream(NamedTuple):
     """Messages of a topic as columns.
 
@@ -74,9 +82,11 @@ class Bag(Protocol):
 
     Attributes:
         paths: Files of the bag.
+        cut: Files that were cut off, or are still being written.
     """
 
     paths: tuple[Path, ...]
+    cut: tuple[Path, ...]
 
     @property
     def topics(self) -> Mapping[str, TopicInfo]:
@@ -105,6 +115,13 @@ class Bag(Protocol):
         Raises:
             LogError: A message cannot be read.
             UnknownNameError: There is no such topic or field.
+        """
+
+    def failures(self, topic: str) -> Iterator[Failure]:
+        """Decode all messages of a topic one by one, and yield those that cannot be decoded.
+
+        Raises:
+            LogError: The file is damaged, or no message of the topic can be decoded.
         """
 
     def close(self) -> None:
@@ -223,6 +240,17 @@ class _Topic:
                     column[row] = raw.publish_ns if is_time else value_at(message, name)
         return values
 
+    def failures(self) -> Iterator[Failure]:
+        for k, (_, source) in enumerate(self._used):
+            decoder = self._decoders[source.definition]
+            rows = np.flatnonzero(self._order[:, 2] == k)
+            places = self._order[rows, 3]
+            for row, raw in zip(rows.tolist(), source.raw(places), strict=True):
+                try:
+                    decoder.decode(raw.data)
+                except LogError as error:
+                    yield Failure(row, int(self.times_ns[row]), str(error))
+
 
 class _Infos(Mapping[str, TopicInfo]):
     """Mapping from topic name to `TopicInfo`; the type of a topic is parsed at the first access."""
@@ -249,6 +277,7 @@ class _FileBag:
             # The files of a split bag cover successive time ranges.
             files = sorted(files, key=lambda file: file.first_ns)
         self.paths = tuple(file.path for file in files)
+        self.cut = tuple(file.path for file in files if not file.complete)
         names = dict.fromkeys(name for file in files for name in file.topics)
         self._topics = {
             name: _Topic(
@@ -268,17 +297,24 @@ class _FileBag:
     def read(
         self, topic: str, fields: Sequence[str], rows: NDArray[np.int64] | None = None
     ) -> Stream:
-        found = self._topic(topic)
-        if found.info.problem:
-            raise LogError(f"{topic} cannot be read: {found.info.problem}")
+        found = self._readable(topic)
         known = found.info.fields
         for field in fields:
             if known and field not in known and field != _PUBLISH_TIME:
                 raise UnknownNameError(f"field of {topic}", field, known)
         return found.read(fields, rows)
 
+    def failures(self, topic: str) -> Iterator[Failure]:
+        return self._readable(topic).failures()
+
     def close(self) -> None:
         self._opened.close()
+
+    def _readable(self, name: str) -> _Topic:
+        found = self._topic(name)
+        if found.info.problem:
+            raise LogError(f"{name} cannot be read: {found.info.problem}")
+        return found
 
     def _topic(self, name: str) -> _Topic:
         if name not in self._topics:

@@ -45,7 +45,7 @@ def find_bags(data: str | Path | Sequence[str | Path]) -> list[Path]:
     if not isinstance(data, str | Path):
         every = [path for part in data for path in find_bags(part)]
         # A bag that is listed under several paths is read once.
-        return list({path.resolve(): path for path in every}.values())
+        return list({os.path.realpath(path): path for path in every}.values())
     path = Path(data)
     found = [path] if path.exists() else sorted(map(Path, glob.glob(str(data))))
     if not found:
@@ -65,14 +65,14 @@ def find_bags(data: str | Path | Sequence[str | Path]) -> list[Path]:
 
 def _bags_in(folder: Path) -> list[Path]:
     """Return a folder if it is a bag, and all bags in its folders unless it has `metadata.yaml`."""
-    seen, left = set[Path](), _MAX_ENTRIES
+    seen, left = set[str](), _MAX_ENTRIES
 
     def walk(place: Path, depth: int) -> list[Path]:
         nonlocal left
         # Links may form a loop.
-        if place.resolve() in seen:
+        if os.path.realpath(place) in seen:
             return []
-        seen.add(place.resolve())
+        seen.add(os.path.realpath(place))
         entries = _entries(place)
         left -= len(entries)
         if left < 0:

@@ -26,7 +26,10 @@ class RosbagFile:
     Attributes:
         path: Path of the file or folder.
         topics: Sources of each topic by its name, one source for each connection.
+        complete: True: a bag that was cut off cannot be opened.
     """
+
+    complete = True
 
     def __init__(self, path: Path, *, distribution: str = "") -> None:
         """Open a bag.

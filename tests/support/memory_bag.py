@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.recorder.bags.bag import Stream, TopicInfo
+from mcaprl.recorder.bags.bag import Failure, Stream, TopicInfo
 
 SECOND_NS = 10**9
 
@@ -18,6 +18,7 @@ class MemoryBag:
     """Bag whose topics are given as times in seconds and columns."""
 
     paths: tuple[Path, ...] = (Path("memory.bag"),)
+    cut: tuple[Path, ...] = ()
 
     def __init__(
         self,
@@ -54,6 +55,9 @@ class MemoryBag:
         chosen = slice(None) if rows is None else rows
         columns = {name: self._columns[topic][name][chosen] for name in fields}
         return Stream(self._times[topic][chosen], columns)
+
+    def failures(self, topic: str) -> Iterator[Failure]:
+        return iter(())
 
     def close(self) -> None:
         """Do nothing."""
