@@ -10,7 +10,7 @@ import mcaprl
 from mcaprl.cli.help import Command
 from mcaprl.cli.options import PATH, json_option, mapping_options
 from mcaprl.cli.progress import working
-from mcaprl.cli.show import echo, print_facts, print_json, print_problems
+from mcaprl.cli.show import echo, print_facts, print_json, print_problems, print_wide
 from mcaprl.errors import UsageError
 from mcaprl.texts import counted
 
@@ -70,10 +70,10 @@ def convert(
         print_json(found.to_json())
         return
     if found.report is not None:
-        print_facts(", ".join(sources), found.report.rows())
+        print_facts(", ".join(sources), found.report.rows(), width=100)
+        print_wide("recordings: missing share, median age, largest age", *found.run_table())
     if dry_run:
-        for number, step in enumerate(found.first()):
-            echo(f"{number}: {step}")
+        print_wide("first transitions", *found.first_table(), last=3)
     if found.report is not None:
         print_problems(found.report.problems())
     for sentence in found.lost:

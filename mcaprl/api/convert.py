@@ -53,6 +53,54 @@ class Conversion:
             for k in range(count)
         ]
 
+    def first_table(self) -> tuple[list[str], list[list[str]]]:
+        """Return the columns and rows of a table of the first five transitions.
+
+        A vector has a column for each element. Numbers have four significant digits.
+        """
+        data, count = self.dataset, min(_SHOWN, len(self.dataset))
+        batch = data.batch(np.arange(count))
+        parts = batch.observations
+        parts = _flat(parts) if isinstance(parts, dict) else {"": parts}
+        names = list(data.observation_names or (self.report.elements if self.report else ()))
+        table: dict[str, list[str]] = {"step": [str(k) for k in range(count)]}
+        for key, values in parts.items():
+            if values.ndim > 2:
+                table[key or "image"] = [_image_text(row) for row in values]
+                continue
+            flat = values.reshape(count, -1)
+            width = flat.shape[1]
+            labels = names if len(names) == width else _labels(key or "state", width)
+            table |= {label: [f"{x:.4g}" for x in flat[:, k]] for k, label in enumerate(labels)}
+        table["action"] = [self._action_text(action) for action in batch.actions]
+        table["reward"] = [f"{reward:.4g}" for reward in batch.rewards]
+        ends = zip(batch.terminated, batch.truncated, strict=True)
+        table["end"] = ["terminated" if t else "truncated" if u else "" for t, u in ends]
+        return list(table), [list(row) for row in zip(*table.values(), strict=True)]
+
+    def _action_text(self, action: Any) -> str:
+        if np.ndim(action):
+            return ", ".join(f"{x:.4g}" for x in np.ravel(action))
+        return self.dataset.action_names.get(int(action), str(action))
+
+    def run_table(self) -> tuple[list[str], list[list[str]]]:
+        """Return the columns and rows of a table of the recordings; no rows if there is only one.
+
+        The cell of a quantity has the share of the steps without a value, and the median and the
+        largest age in seconds.
+        """
+        runs = [] if self.report is None else self.report.runs
+        if len(runs) < 2:
+            return [], []
+        names = list(runs[0].fields)
+        columns = ["recording", "clock steps", "steps", "episodes", *names]
+        rows = [
+            [str(k), str(run.clock_steps), str(run.steps), str(run.episodes)]
+            + [run.fields[name].short for name in names]
+            for k, run in enumerate(runs)
+        ]
+        return columns, rows
+
     def to_json(self) -> dict[str, Any]:
         """Return what `convert --json` prints."""
         out = None if self.out is None else str(self.out)
@@ -140,6 +188,24 @@ def suggest_mapping(bag: Paths) -> str:
 
     with closing(open_bag(bag)) as found:
         return suggested(found)
+
+
+def _flat(parts: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the arrays of a Dict observation by their path."""
+    found: dict[str, Any] = {}
+    for name, part in parts.items():
+        path = f"{prefix}{name}"
+        found |= _flat(part, f"{path}/") if isinstance(part, dict) else {path: part}
+    return found
+
+
+def _labels(name: str, count: int) -> list[str]:
+    return [name] if count == 1 else [f"{name}_{k}" for k in range(count)]
+
+
+def _image_text(image: Any) -> str:
+    shape = "x".join(map(str, image.shape))
+    return f"{image.dtype} {shape}, mean {image.mean():.4g}"
 
 
 def _plain(observation: Any, k: int) -> Any:

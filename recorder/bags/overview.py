@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -78,6 +79,32 @@ class Recording:
     messages: int
     first_ns: int
     last_ns: int
+
+
+def instants_of(times_ns: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Return instants at which the topics of a bag are compared: times of their messages.
+
+    Each topic has the same number of them at most, so that a fast topic does not outweigh others.
+    Pauses of all topics have none.
+    """
+    parts = [np.sort(each) for each in times_ns if len(each)]
+    chosen = [
+        each[np.linspace(0, len(each) - 1, min(len(each), 1000)).astype(int)] for each in parts
+    ]
+    return np.concatenate([np.empty(0, np.int64), *chosen])
+
+
+def is_fresh(
+    times_ns: NDArray[np.int64], instants_ns: NDArray[np.int64], gap_s: float
+) -> NDArray[np.bool_]:
+    """Return (N,) whether the last message before each instant is at most `gap_s` old."""
+    if not len(times_ns):
+        return np.zeros(len(instants_ns), bool)
+    times_ns = np.sort(times_ns)
+    rows = np.searchsorted(times_ns, instants_ns, side="right") - 1
+    ages_s = (instants_ns - times_ns[np.maximum(rows, 0)]) / NS_PER_S
+    found: NDArray[np.bool_] = (rows >= 0) & (ages_s <= gap_s)
+    return found
 
 
 def recordings_of(bag: Bag) -> NDArray[np.int64]:

@@ -190,6 +190,16 @@ def _put_vector(
     return names
 
 
+def vector_names(plan: Plan, runs: list[Steps]) -> list[str]:
+    """Return the names of the elements of the observed vector."""
+    names = []
+    for name, quantity in plan.mapping.observation.items():
+        if quantity.image is None:
+            shapes = [run.quantities[name].values.shape[1:] for run in runs]
+            names += _names(name, quantity, max((shape[0] for shape in shapes if shape), default=1))
+    return names
+
+
 def _limits(quantity: Quantity) -> tuple[float, float]:
     """Return the lowest and highest value of a quantity, including the number for missing ones."""
     if quantity.clip is None:

@@ -14,14 +14,16 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
 from mcaprl.recorder.bags.bag import Bag, open_bag
+from mcaprl.recorder.bags.overview import is_fresh
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.mapping.actions import Actions
-from mcaprl.recorder.mapping.assemble import assembled
+from mcaprl.recorder.mapping.assemble import assembled, vector_names
+from mcaprl.recorder.mapping.blame import Blame
 from mcaprl.recorder.mapping.config import Mapping, Place, load_mapping
 from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.segments import Segment
 from mcaprl.recorder.mapping.steps import StepReader, Steps
-from mcaprl.recorder.mapping.summary import FieldReport, MappingReport
+from mcaprl.recorder.mapping.summary import FieldReport, MappingReport, RunReport
 
 
 class MappedBag(NamedTuple):
@@ -80,12 +82,8 @@ def read_open_bag(
 
 
 def _report(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> MappingReport:
-    fields = {}
-    for name, wanted in plan.quantities.items():
-        values = [run.quantities[name] for run in runs]
-        missing = np.concatenate([each.missing for each in values])
-        ages_s = np.concatenate([each.age_s for each in values])
-        fields[name] = FieldReport.of(wanted.source.topic, missing, ages_s)
+    blame = Blame(plan, runs)
+    fields = _fields(plan, runs, blame)
     offsets = np.cumsum([0, *(len(run.times_ns) for run in runs)]).tolist()
     taken = [
         offset + np.arange(each.first, each.last)
@@ -106,7 +104,60 @@ def _report(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> Mapping
         missing_actions=_share(np.concatenate([each.missing for each in actions])),
         far_actions=_share(np.concatenate([each.far for each in actions])[rows]),
         action_counts=_action_counts(actions, rows),
+        runs=[_run(plan, *each) for each in zip(runs, kept, strict=True)],
+        elements=vector_names(plan, runs),
+        causes=[] if any(kept) else _causes(plan, runs, blame),
     )
+
+
+def _fields(plan: Plan, runs: list[Steps], blame: Blame | None = None) -> dict[str, FieldReport]:
+    """Return statistics of each quantity at the steps that are within a stretch of data."""
+    gap_s, found = plan.mapping.episodes.gap_s, dict[str, FieldReport]()
+    is_data = np.concatenate([_is_data(plan, run, gap_s) for run in runs])
+    for name, wanted in plan.quantities.items():
+        values = [run.quantities[name] for run in runs]
+        missing = np.concatenate([each.missing for each in values])[is_data]
+        ages_s = np.concatenate([each.age_s for each in values])[is_data]
+        prevents = 0.0 if blame is None else blame.alone.get(name, 0.0)
+        found[name] = FieldReport.of(wanted.source.topic, missing, ages_s, prevents)
+    return found
+
+
+def _is_data(plan: Plan, run: Steps, gap_s: float) -> NDArray[np.bool_]:
+    """Return (N,) whether any observed value or command is recent; between two drives, none is."""
+    ages_s = np.array([np.abs(run.quantities[name].age_s) for name in plan.mapping.observation])
+    with np.errstate(invalid="ignore"):
+        found: NDArray[np.bool_] = (ages_s <= gap_s).any(axis=0)
+    for command in plan.commands:
+        found |= is_fresh(plan.bag.times(command.source.topic), run.times_ns, gap_s)
+    return found if found.any() else np.ones(len(found), bool)
+
+
+def _run(plan: Plan, run: Steps, kept: list[Segment]) -> RunReport:
+    return RunReport(
+        first_ns=int(run.times_ns[0]) if len(run.times_ns) else 0,
+        clock_steps=len(run.times_ns),
+        steps=sum(each.length for each in kept),
+        episodes=len(kept),
+        fields=_fields(plan, [run]),
+    )
+
+
+def _causes(plan: Plan, runs: list[Steps], blame: Blame) -> list[str]:
+    """Return why there are no episodes."""
+    episodes = plan.mapping.episodes
+    named = [
+        name
+        for name in ("begin", "end", "terminated", "truncated")
+        if getattr(episodes, name) is not None
+    ]
+    if blame.usable_steps < episodes.min_steps or not named or any(run.episodes for run in runs):
+        return blame.causes()
+    begins = "`begin` never becomes true" if "begin" in named else ""
+    ends = " or ".join(f"`{name}`" for name in named if name != "begin")
+    ends = f"{ends} is always true" if ends else ""
+    reasons = ", or ".join(each for each in (begins, ends) if each)
+    return [f"{blame.usable_steps} steps have all values, but no episode begins: {reasons}"]
 
 
 def _counts(names: Iterable[str]) -> dict[str, int]:
