@@ -22,6 +22,12 @@ from mcaprl.texts import counted
 @click.option("--to", metavar="FORMAT", help="Format of DST if not clear from its name.")
 @click.option("--lossy", is_flag=True, help="Convert or omit data that the format cannot store.")
 @click.option("--suggest", is_flag=True, help="Print a draft of a mapping for SRC; takes no DST.")
+@click.option(
+    "--bins",
+    type=click.IntRange(2),
+    metavar="N",
+    help="With --suggest: N bins of each continuous command, each with as many commands.",
+)
 @click.option("--dry-run", is_flag=True, help="Read SRC and write nothing; takes no DST.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 @click.option("--upload", metavar="URL", help="Copy the finished file to a URL.")
@@ -34,6 +40,7 @@ def convert(
     to: str | None,
     lossy: bool,
     suggest: bool,
+    bins: int | None,
     dry_run: bool,
     overwrite: bool,
     upload: str | None,
@@ -46,9 +53,11 @@ def convert(
     `mcaprl convert --suggest BAG > robot.yaml`. DST is a log if it ends with .mcap. Otherwise, DST
     is a dataset in the format that --to names: lerobot, minari, parquet, npz, d3rlpy or hdf5.
     """
+    if bins is not None and not suggest:
+        raise UsageError("--bins is for --suggest: set `edges` of the mapping instead")
     if suggest:
         with working("reading the topics"):
-            text = mcaprl.suggest_mapping(paths)
+            text = mcaprl.suggest_mapping(paths, bins=bins)
         click.echo(text, nl=False)
         return
     if not dry_run and len(paths) < 2:

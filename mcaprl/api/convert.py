@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mcaprl.api.data import MappingFile, Paths, mapped, open_data
-from mcaprl.errors import UsageError
+from mcaprl.api.ranges import check_least
+from mcaprl.errors import UsageError, import_extra
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.registry import target_format, write_format
@@ -171,23 +172,32 @@ def _read(
     return found.dataset, found.report
 
 
-def suggest_mapping(bag: Paths) -> str:
-    """Return a commented draft of a mapping file, based on the topics and rates of a bag.
+def suggest_mapping(bag: Paths, *, bins: int | None = None) -> str:
+    """Return a commented draft of a mapping file, based on the topics and messages of a bag.
+
+    The draft is tried: quantities that prevent all episodes become comments. A warning, which is
+    also a comment of the draft, says if there is no command, or still no episode.
 
     Args:
-        bag: MCAP files, rosbag2 folders and databases, or ROS 1 bags.
+        bag: MCAP files, rosbag2 folders and databases, ROS 1 bags, or folders of these.
+        bins: Number of bins of each element of a continuous command, with similar numbers of
+            commands in each bin; default: a Box action with limits from the commands.
 
     Raises:
-        LogError: The bag cannot be read.
+        LogError: The bag cannot be read, or has no topic that can be observed.
+        UsageError: `bins` is below 2.
         MissingExtraError: The packages of the `bags` extra are not installed.
     """
+    import_extra("pydantic", "bags")
     from contextlib import closing
 
     from mcaprl.recorder.bags.bag import open_bag
     from mcaprl.recorder.mapping.suggest import suggested
 
+    if bins is not None:
+        check_least(2, bins=bins)
     with closing(open_bag(bag)) as found:
-        return suggested(found)
+        return suggested(found, bins)
 
 
 def _flat(parts: dict[str, Any], prefix: str = "") -> dict[str, Any]:

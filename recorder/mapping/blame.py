@@ -14,7 +14,7 @@ from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.steps import Steps
 from mcaprl.texts import counted
 
-_LISTED = 8
+_LISTED, _MAX_CAUSES = 8, 3
 _SIMILAR = 0.5
 """Share of the largest effect above which other quantities are named, too."""
 ACTION = "the action"
@@ -74,18 +74,19 @@ class Blame:
         ]
         return np.concatenate([np.empty(0, bool), *found])
 
-    def causes(self) -> list[str]:
-        """Return in one line each why the worst quantities prevent episodes, and what to do."""
+    def causes(self) -> dict[str, str]:
+        """Return why the worst quantities prevent episodes, in one line for each name."""
         if not any(map(len, self._times.values())):
-            return ["the topics have no messages"]
+            return {"": "the topics have no messages"}
         for reason_of in (self._without_times, self._apart):
             # The topic with the fewest messages is named first.
             names = sorted(self._topics, key=lambda name: len(self._times[self._topics[name]]))
             found = {name: reason_of(name, self._times[self._topics[name]]) for name in names}
             if any(found.values()):
-                certain = [f"{self._label(name)} {text}" for name, text in found.items() if text]
-                return certain[: 1 if reason_of == self._apart else 3]
-        return [self._with_steps(name) for name in self._worst()]
+                most = 1 if reason_of == self._apart else _MAX_CAUSES
+                certain = [name for name, text in found.items() if text][:most]
+                return {name: f"{self._label(name)} {found[name]}" for name in certain}
+        return {name: self._with_steps(name) for name in self._worst()}
 
     @property
     def usable_steps(self) -> int:
@@ -104,7 +105,7 @@ class Blame:
             effect = {name: max(self._share(name)) for name in self._topics}
         most = max(effect.values())
         found = [name for name, share in effect.items() if share and share >= _SIMILAR * most]
-        return sorted(found, key=lambda name: -effect[name])[:3]
+        return sorted(found, key=lambda name: -effect[name])[:_MAX_CAUSES]
 
     def _share(self, name: str) -> tuple[float, float]:
         """Return the shares of the instants and of the steps that a quantity prevents."""

@@ -152,7 +152,7 @@ def _causes(plan: Plan, runs: list[Steps], blame: Blame) -> list[str]:
         if getattr(episodes, name) is not None
     ]
     if blame.usable_steps < episodes.min_steps or not named or any(run.episodes for run in runs):
-        return blame.causes()
+        return list(blame.causes().values())
     begins = "`begin` never becomes true" if "begin" in named else ""
     ends = " or ".join(f"`{name}`" for name in named if name != "begin")
     ends = f"{ends} is always true" if ends else ""
