@@ -21,7 +21,7 @@ _SIZES = (8, 16, 32, 64)
 NUMBERS = {"float32", "float64", "bool", *(f"{u}int{bits}" for u in ("", "u") for bits in _SIZES)}
 _MAX_ELEMENTS, _ELEMENTS = 64, 36
 """Number of elements up to which an array is observed as a whole, and to which it is thinned."""
-_MAX_JOINTS = 64
+_MAX_JOINTS, _MAX_INNER = 64, 8
 _ARE_FRESH, _ARE_FINITE = 0.9, 0.95
 """Share of the time with a recent message, and share of numbers, of a likely quantity."""
 
@@ -164,12 +164,33 @@ def candidates(bag: Bag, topic: TopicOverview, share: float) -> list[Candidate]:
             penalty, why = _penalty(name, columns[name], share, is_known=bool(likely))
             is_scalar = columns[name].ndim == 1
             found.append(Candidate(topic, name, spec, is_scalar, penalty, why))
+    found += _inner(bag, topic, share)
     yaw = _YAWS.get(kind)
     if yaw is not None and f"{yaw}.w" in info.fields:
         penalty, why = (0, "") if share >= _ARE_FRESH else _rare(share)
         spec = {"field": f"{info.name}.{yaw}", "as": "yaw"}
         found.append(Candidate(topic, f"{yaw}.yaw", spec, True, penalty, why))
     return sorted(found, key=lambda each: each.penalty)
+
+
+def _inner(bag: Bag, topic: TopicOverview, share: float) -> list[Candidate]:
+    """Return numbers in arrays of messages as vectors, such as `motors[:].q`."""
+    info, found = topic.info, list[Candidate]()
+    names = [
+        name
+        for name, kind in info.fields.items()
+        if "[]." in name and kind.count("[") == 1 and kind.partition("[")[0] in NUMBERS
+    ]
+    for name in names[:_MAX_INNER]:
+        path = name.replace("[]", "[:]")
+        try:
+            columns = sampled(bag, info, [path])
+        except (LogError, UsageError):
+            continue
+        if (spec := _spec(info, path, columns)) is not None and columns[path].ndim == 2:
+            penalty, why = _penalty(name, columns[path], share, is_known=False)
+            found.append(Candidate(topic, path, spec, False, penalty, why))
+    return found
 
 
 def _unknown_fields(info: TopicInfo) -> list[str]:
@@ -256,19 +277,27 @@ def _loses_digits(numbers: NDArray[np.float64]) -> bool:
 
 def _penalty(name: str, column: NDArray[Any], share: float, *, is_known: bool) -> tuple[int, str]:
     """Return how unlikely a quantity is, and why."""
-    words = {word.lower() for word in _WORDS.findall(name.rpartition(".")[2])}
-    if not is_known and words & _COUNTING:
+    if not is_known and is_counting(name, column):
         return 4, "a time, counter or id"
-    if column.dtype.kind in "iu" and column.ndim == 1 and len(column) > 2:
-        steps = np.diff(column.astype(np.int64))
-        if (steps > 0).all() or np.abs(column.astype(np.float64)).max() > 2**31:
-            return 4, "a time, counter or id"
     if share < _ARE_FRESH:
         return _rare(share)
     numbers = column.astype(np.float64)
     return (
         (1, "constant") if (np.nan_to_num(numbers) == np.nan_to_num(numbers[:1])).all() else (0, "")
     )
+
+
+def is_counting(name: str, column: NDArray[Any]) -> bool:
+    """Return whether a field is a time, a counter or an id, by its name and values."""
+    words = {word.lower() for word in _WORDS.findall(name.rpartition(".")[2])}
+    if words & _COUNTING:
+        return True
+    if column.dtype.kind not in "iu" or column.ndim > 1 or len(column) < 3:
+        return False
+    # A counter of messages may have the same value twice in messages of equal times.
+    steps = np.diff(column.astype(np.float64))
+    is_rising = bool((steps >= 0).all()) and (steps > 0).mean() > 0.5
+    return is_rising or bool(np.abs(column.astype(np.float64)).max() > 2**31)
 
 
 def _rare(share: float) -> tuple[int, str]:

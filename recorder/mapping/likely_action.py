@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.bag import Bag, TopicInfo
 from mcaprl.recorder.bags.overview import TopicOverview
-from mcaprl.recorder.mapping.likely import NUMBERS, is_never_observed, kind_of, number_fields
+from mcaprl.recorder.mapping.likely import (
+    NUMBERS,
+    is_counting,
+    is_never_observed,
+    kind_of,
+    number_fields,
+)
 
 # If the name of a topic or type contains one of these words, the topic is likely to have commands,
 # unless its name also contains one of the words of `_ANSWERS`.
@@ -81,12 +87,19 @@ def _commands(bag: Bag, topic: TopicOverview) -> Command | None:
         for name, kind in info.fields.items()
         if kind.endswith("]") and kind.partition("[")[0] in NUMBERS and "[" not in name
     ]
-    columns = bag.read(info.name, [*numbers, *arrays]).columns
-    found = {name: columns[name].astype(np.float64) for name in numbers}
-    for name in arrays:
-        if columns[name].dtype.kind in "biuf" and columns[name].ndim == 2:
-            elements = columns[name].astype(np.float64).T
-            found |= {f"{name}[{k}]": each for k, each in enumerate(elements[:_MAX_FIELDS])}
+    columns = dict(bag.read(info.name, [*numbers, *arrays]).columns)
+    found = {
+        name: columns[name].astype(np.float64)
+        for name in numbers
+        if not is_counting(name, columns[name])
+    }
+    inner = _inner(bag, info)
+    for name, column in [*((name, columns[name]) for name in arrays), *inner.items()]:
+        if column.dtype.kind in "biuf" and column.ndim == 2:
+            # `motors[:].q` becomes `motors[3].q`, and `positions` becomes `positions[3]`.
+            path = name.replace("[:]", "[{}]") if "[:]" in name else f"{name}[{{}}]"
+            elements = column.astype(np.float64).T[:_MAX_FIELDS]
+            found |= {path.format(k): each for k, each in enumerate(elements)}
     chosen = _chosen(found)
     if chosen:
         values = np.column_stack([found[name] for name in chosen])
@@ -94,13 +107,23 @@ def _commands(bag: Bag, topic: TopicOverview) -> Command | None:
     return _texts(bag, topic)
 
 
+def _inner(bag: Bag, info: TopicInfo) -> dict[str, NDArray[Any]]:
+    """Return numbers in arrays of messages by path; of a trajectory, those of its first point."""
+    found: dict[str, NDArray[Any]] = {}
+    for name, kind in info.fields.items():
+        if "[]." not in name or kind.partition("[")[0] not in NUMBERS:
+            continue
+        path = name.replace("[]", "[:]" if kind.count("[") == 1 else "[0]")
+        try:
+            found |= bag.read(info.name, [path]).columns
+        except (LogError, UsageError):
+            continue
+    return found
+
+
 def _chosen(columns: dict[str, NDArray[np.float64]]) -> list[str]:
-    """Return the elements of a command: those that vary, except times, counters and NaN."""
-    usable = [
-        name
-        for name, values in columns.items()
-        if np.isfinite(values).mean() > 0.5 and not re.search(r"time|stamp|seq|(^|[._])id$", name)
-    ]
+    """Return the elements of a command: those that vary and are not NaN."""
+    usable = [name for name, values in columns.items() if np.isfinite(values).mean() > 0.5]
     varying = [name for name in usable if np.nanmax(columns[name]) > np.nanmin(columns[name])]
     # The speed and the turn of a vehicle are a pair, even if one of them is constant.
     pair = [name for name in usable if re.fullmatch(r"(.*\.)?(linear\.x|angular\.z)", name)]
@@ -166,19 +189,19 @@ def _discrete(paths: tuple[str, ...], distinct: NDArray[np.float64]) -> dict[str
 def box_limits(values: NDArray[np.float64]) -> tuple[float, float]:
     """Return limits that contain all values, rounded outward to three digits of the range."""
     low, high = float(values.min()), float(values.max())
+    below = float(np.nextafter(np.float32(low), np.float32(-np.inf)))
+    above = float(np.nextafter(np.float32(high), np.float32(np.inf)))
     if low == high:
-        return math.floor(low) - 1.0, math.ceil(high) + 1.0
+        return min(math.floor(low) - 1.0, below), max(math.ceil(high) + 1.0, above)
     unit = 10.0 ** (math.floor(math.log10(high - low)) - _DIGITS + 1)
     least, most = math.floor(low / unit), math.ceil(high / unit)
     # The limits are stored as float32, which must not cut the lowest and the highest value.
     lows, highs = (
         [_times(n, unit) for n in each] for each in ((least, least - 1), (most, most + 1))
     )
-    lows.append(float(np.nextafter(np.float32(low), np.float32(-np.inf))))
-    highs.append(float(np.nextafter(np.float32(high), np.float32(np.inf))))
     return (
-        next(each for each in lows if np.float32(each) <= low),
-        next(each for each in highs if np.float32(each) >= high),
+        next(each for each in [*lows, below] if float(np.float32(each)) <= low),
+        next(each for each in [*highs, above] if float(np.float32(each)) >= high),
     )
 
 

@@ -40,7 +40,7 @@ from mcaprl.recorder.mapping.steps import StepReader
 from mcaprl.texts import printable
 
 _MAX_RATE_HZ, _MIN_RATE_HZ, _GAP_S = 20.0, 1.0, 2.0
-_MAX_OBSERVED, _MAX_PER_TOPIC = 12, 4
+_MAX_OBSERVED, _MAX_PER_TOPIC = 12, 5
 _LISTED, _MAX_OTHERS = 5, 100
 # YAML reads these paths and words as text without quotes.
 _PLAIN = re.compile(r"/[\w/.-]+|(?!(?i:true|false|null|yes|no|on|off|y|n)$)[a-z_]+", re.ASCII)
