@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,11 @@ from mcaprl.recorder.bags.files import find_bags, open_files
 from mcaprl.recorder.bags.mcap_file import McapFile
 from mcaprl.recorder.bags.rosbag_file import RosbagFile
 from mcaprl.recorder.bags.source import Definition, TopicSource
+from mcaprl.texts import counted, printable
 
 _PUBLISH_TIME = "publish_time"
+_SHOWN = 8
+"""Number of topics and files that the text of a bag shows."""
 
 
 class Failure(NamedTuple):
@@ -75,6 +78,12 @@ class TopicInfo:
     fields: dict[str, str]
     constants: dict[str, int]
     problem: str = ""
+
+    def __str__(self) -> str:
+        """Return name, type, number of messages, and the problem if there is one."""
+        problem = f", cannot be read: {self.problem}" if self.problem else ""
+        kind = self.type_name or self.encoding
+        return f"{self.name}: {kind}, {counted(self.count, 'message')}{problem}"
 
 
 class Bag(Protocol):
@@ -268,10 +277,19 @@ class _Infos(Mapping[str, TopicInfo]):
         return len(self._topics)
 
 
-class _FileBag:
-    """Bag that consists of one or more open files."""
+class OpenBag:
+    """Bag whose files are open, as `open_bag` returns it; a context manager that closes them.
+
+    Attributes:
+        paths: Files of the bag.
+        cut: Files that were cut off, or are still being written.
+        topics: Description of each topic by name: `type_name`, `encoding`, `count`, `first_ns`,
+            `last_ns`, `fields` (kind of each leaf field by its dotted path), `constants`, and
+            `problem`, which is not empty if the topic cannot be read.
+    """
 
     def __init__(self, files: Sequence[McapFile | RosbagFile], opened: ExitStack) -> None:
+        """Join the topics of open files; `opened` closes them."""
         self._opened = opened
         if len(files) > 1:
             # The files of a split bag cover successive time ranges.
@@ -288,15 +306,67 @@ class _FileBag:
         }
         self.topics: Mapping[str, TopicInfo] = _Infos(self._topics)
 
+    def __enter__(self) -> Self:
+        """Return the bag."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the files."""
+        self.close()
+
+    def __repr__(self) -> str:
+        """Return the files, and the first topics with their types."""
+        names = list(self._topics)[:_SHOWN]
+        topics = [f"  {self.topics[name]}" for name in names]
+        more = [f"  and {len(self._topics) - _SHOWN} more"] if len(self._topics) > _SHOWN else []
+        where = ", ".join(map(str, self.paths[:_SHOWN]))
+        return printable("\n".join([f"Bag {where}: {len(self._topics)} topics", *topics, *more]))
+
     def times(self, topic: str) -> NDArray[np.int64]:
+        """Return the (N,) log_times of a topic in nanoseconds, in the order of recording.
+
+        Raises:
+            UnknownNameError: There is no such topic.
+        """
         return self._topic(topic).times_ns
 
     def places(self, topic: str) -> NDArray[np.int64]:
+        """Return the (N, 2) places of a topic's messages: index of the file, position in the file.
+
+        Raises:
+            UnknownNameError: There is no such topic.
+        """
         return self._topic(topic).places
 
     def read(
-        self, topic: str, fields: Sequence[str], rows: NDArray[np.int64] | None = None
+        self,
+        topic: str,
+        fields: Sequence[str] | None = None,
+        rows: NDArray[np.int64] | None = None,
     ) -> Stream:
+        """Read fields of a topic as columns.
+
+        Args:
+            topic: Name of the topic.
+            fields: Dotted paths of fields; `publish_time` is the time of publication in
+                nanoseconds. Default: all leaf fields.
+            rows: Indexes into `times` of the messages to read, in output order, so that a topic
+                that is larger than the memory is read in parts; default: all.
+
+        Returns:
+            Named tuple of `log_time_ns` (N,) and `columns`: the column of each field by its path,
+            which has (N,) numbers, (N, K) numbers if all values are arrays of K numbers, otherwise
+            (N,) objects such as strings, bytes and lists.
+
+        Raises:
+            LogError: The topic or a message cannot be read.
+            UnknownNameError: There is no such topic or field.
+            UsageError: No fields are given, and the topic has no schema that lists them.
+        """
+        if fields is None:
+            fields = self._leaf_fields(topic)
+        if rows is not None:
+            rows = np.asarray(rows, np.int64)
         found = self._readable(topic)
         known = found.info.fields
         for field in fields:
@@ -304,10 +374,25 @@ class _FileBag:
                 raise UnknownNameError(f"field of {topic}", field, known)
         return found.read(fields, rows)
 
+    def _leaf_fields(self, topic: str) -> list[str]:
+        fields = self._readable(topic).info.fields
+        if not fields:
+            raise UsageError(
+                f"the fields of {topic} are unknown, because it has no schema: name them"
+            )
+        # The fields of the messages in an array are within the field of the array.
+        return [name for name in fields if "[" not in name]
+
     def failures(self, topic: str) -> Iterator[Failure]:
+        """Decode all messages of a topic one by one, and yield those that cannot be decoded.
+
+        Raises:
+            LogError: The file is damaged, or no message of the topic can be decoded.
+        """
         return self._readable(topic).failures()
 
     def close(self) -> None:
+        """Close the files."""
         self._opened.close()
 
     def _readable(self, name: str) -> _Topic:
@@ -322,19 +407,25 @@ class _FileBag:
         return self._topics[name]
 
 
-def open_bag(data: str | Path | Sequence[str | Path]) -> Bag:
+OpenBag.__module__ = "mcaprl"
+
+
+def open_bag(data: str | Path | Sequence[str | Path]) -> OpenBag:
     """Open a bag: MCAP files, rosbag2 folders and databases, and ROS 1 bags.
 
     Files that rosbag2 compressed as a whole are decompressed to a temporary folder. If a topic
     cannot be read, its `problem` is not empty; all other topics can still be read.
 
     Args:
-        data: A file, a folder, a glob, or a sequence of these. Files are read in the order of
-            their first messages.
+        data: A file, a folder, a glob, or a sequence of these. A folder is a bag, or contains
+            bags, also in its folders. Files are read in the order of their first messages.
+
+    Returns:
+        The open bag; `with mcaprl.open_bag(data) as bag` closes its files.
 
     Raises:
         LogError: A file is missing, damaged, or not a bag.
     """
     with ExitStack() as opened:
         files = [file for path in find_bags(data) for file in open_files(path, opened)]
-        return _FileBag(files, opened.pop_all())
+        return OpenBag(files, opened.pop_all())
