@@ -33,7 +33,8 @@ class TopicOverview:
     def _intervals_ns(self) -> NDArray[np.int64]:
         """Times between successive messages of a recording, without steps back."""
         intervals_ns = np.diff(self.times_ns)[np.diff(self.recordings) == 0]
-        return intervals_ns[intervals_ns > 0]
+        found: NDArray[np.int64] = intervals_ns[intervals_ns > 0]
+        return found
 
     @property
     def rate_hz(self) -> float:

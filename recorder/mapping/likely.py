@@ -25,10 +25,14 @@ _MAX_JOINTS, _MAX_INNER = 64, 8
 _ARE_FRESH, _ARE_FINITE = 0.9, 0.95
 """Share of the time with a recent message, and share of numbers, of a likely quantity."""
 
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-IMAGES += ("foxglove.RawImage", "foxglove.CompressedImage")
-_NEVER_TOPICS = ("rosout", "rosout_agg", "parameter_events", "tf", "tf_static", "diagnostics")
-_NEVER_TOPICS += ("diagnostics_agg", "clock", "camera_info", "bond", "statistics", "events")
+IMAGES = {
+    *("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
+    *("foxglove.RawImage", "foxglove.CompressedImage"),
+}
+_NEVER_TOPICS = {
+    *("rosout", "rosout_agg", "parameter_events", "tf", "tf_static", "diagnostics"),
+    *("diagnostics_agg", "clock", "camera_info", "bond", "statistics", "events"),
+}
 _NEVER_TYPES = re.compile(
     r"rosgraph_msgs/msg/.*|rcl_interfaces/msg/.*|tf2?_msgs/msg/.*|diagnostic_msgs/msg/.*"
     r"|sensor_msgs/msg/(CameraInfo|PointCloud2?)|nav_msgs/msg/(OccupancyGrid|Path|MapMetaData)"

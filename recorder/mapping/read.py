@@ -127,10 +127,10 @@ def _is_data(plan: Plan, run: Steps, gap_s: float) -> NDArray[np.bool_]:
     """Return (N,) whether any observed value or command is recent; between two drives, none is."""
     ages_s = np.array([np.abs(run.quantities[name].age_s) for name in plan.mapping.observation])
     with np.errstate(invalid="ignore"):
-        found: NDArray[np.bool_] = (ages_s <= gap_s).any(axis=0)
+        found: NDArray[np.bool_] = np.asarray((ages_s <= gap_s).any(axis=0))
     for command in plan.commands:
         found |= is_fresh(plan.bag.times(command.source.topic), run.times_ns, gap_s)
-    return found if found.any() else np.ones(len(found), bool)
+    return found if bool(found.any()) else np.ones(len(found), bool)
 
 
 def _run(plan: Plan, run: Steps, kept: list[Segment]) -> RunReport:

@@ -308,6 +308,7 @@ def holds(bag: Path, folder: Path, **options: Any) -> tuple[Mapping | None, Any]
         return mapping, None
     assert found.dataset.episode_lengths.sum() > 0
     assert not [each for each in warned if "the suggested mapping" in each]
+    assert found.report is not None
     assert found.report.far_actions == 0.0
     return mapping, found
 
@@ -384,7 +385,7 @@ def test_joints_are_selected_by_name_if_mappings_can(tmp_path: Path) -> None:
 
 
 def test_actions_by_kind_of_command(tmp_path: Path) -> None:
-    cases = {
+    cases: dict[str, dict[str, Any]] = {
         "only an integer command": {"field": "/mode_command.data"},
         "negative command": {"actions": {"-1": [-1], "0": [0], "1": [1]}},
         "text command": {"names": {"go": 0, "on": 1, "stop: #1": 2}},
