@@ -39,8 +39,12 @@ class Blame:
             if quantity.missing is None or quantity.image is not None
         ]
         self._topics = {name: plan.quantities[name].source.topic for name in required}
-        self._topics[ACTION] = plan.commands[0].source.topic
-        self._times = {topic: np.sort(self._times_of(topic)) for topic in {*self._topics.values()}}
+        # Of several topics of commands, the one with the fewest messages; none for expressions.
+        commands = [command.source.topic for command in plan.commands]
+        self._topics[ACTION] = min(commands, key=lambda each: len(plan.bag.times(each)), default="")
+        self._times = {
+            topic: np.sort(self._times_of(topic)) for topic in {*self._topics.values()} if topic
+        }
         self._stale = self._prevented_instants()
         self._missing = {name: self._missing_values(name) for name in self._topics}
         self.alone = {
@@ -57,15 +61,18 @@ class Blame:
         moving = {
             name: topic
             for name, topic in self._topics.items()
-            if name == ACTION or self._plan.quantities[name].quantity.transform is None
+            if topic and (name == ACTION or self._is_field(name))
         }
         instants_ns = instants_of(list(self._times.values()))
-        limits = dict.fromkeys(moving, self._plan.mapping.episodes.gap_s)
+        limits = dict.fromkeys(self._topics, self._plan.mapping.episodes.gap_s)
         limits[ACTION] = self._plan.mapping.action.tolerance_s or math.inf
         return {
             name: ~is_fresh(self._times[topic], instants_ns, limits[name])
             for name, topic in moving.items()
         }
+
+    def _is_field(self, name: str) -> bool:
+        return self._plan.quantities[name].quantity.transform is None
 
     def _missing_values(self, name: str) -> NDArray[np.bool_]:
         found = [
@@ -80,7 +87,8 @@ class Blame:
             return {"": "the topics have no messages"}
         for reason_of in (self._without_times, self._apart):
             # The topic with the fewest messages is named first.
-            names = sorted(self._topics, key=lambda name: len(self._times[self._topics[name]]))
+            known = [name for name, topic in self._topics.items() if topic]
+            names = sorted(known, key=lambda name: len(self._times[self._topics[name]]))
             found = {name: reason_of(name, self._times[self._topics[name]]) for name in names}
             if any(found.values()):
                 most = 1 if reason_of == self._apart else _MAX_CAUSES
@@ -95,7 +103,9 @@ class Blame:
 
     def _label(self, name: str) -> str:
         topic = self._topics[name]
-        return f"{topic} of the action" if name == ACTION else f"{name} ({topic})"
+        if name == ACTION:
+            return f"{topic} of the action" if topic else ACTION
+        return f"{name} ({topic})"
 
     def _worst(self) -> list[str]:
         """Return the names of the quantities with the largest effects."""
@@ -148,7 +158,8 @@ class Blame:
                 f" {self._pause(name)}: set `missing`, raise `gap_s`, or remove it"
             )
         if name == ACTION:
-            return f"{label} has no value at {missing:.0%} of the steps: {self._pause(name)}"
+            pause = f": {self._pause(name)}" if self._topics[name] else ""
+            return f"{label} has no value at {missing:.0%} of the steps{pause}"
         if elements := _not_finite([run.quantities[name] for run in self._runs]):
             return (
                 f"{label} is not finite at {missing:.0%} of the steps ({elements}): set `clip` to"

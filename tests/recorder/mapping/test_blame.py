@@ -149,3 +149,10 @@ def test_each_run_has_a_report() -> None:
     assert [run.steps for run in report.runs] == [19, 19]
     assert [run.fields["speed"].missing for run in report.runs] == [0.0, 0.5]
     assert report.elements == ["speed"]
+
+
+def test_the_topic_of_the_action_without_messages_is_named() -> None:
+    bag = drive(**{"/turn": ([], {"x": []})})
+    action = {"fields": ["/mode.data", "/turn.x"], "box": {"low": [0, 0], "high": [1, 1]}}
+    text = why_not(bag, action=action)
+    assert text == "no step has an action: /turn of the action has no messages"
