@@ -178,10 +178,9 @@ class _Draft:
         )
         try:
             reader = ImageReader(self._bag, topic.info.name, mapping.observation["camera"])
-            reader.read(np.array([0]))
+            return reader.read(np.array([0])) is not None
         except (LogError, UsageError):
             return False
-        return True
 
     def _why_nothing(self) -> str:
         """Return why no topic can be observed, in one line."""
