@@ -57,11 +57,8 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
         Problems in file order; for a bag, a note follows them.
     """
     path = as_path(path)
-    if (
-        not isinstance(path, RemotePath)
-        and path.suffix != ".mcap"
-        and (path.is_dir() or is_bag_file(path))
-    ):
+    is_other = path.is_dir() or (is_bag_file(path) and path.suffix != ".mcap")
+    if is_other and not isinstance(path, RemotePath):
         return check_messages(path)
     try:
         reader = McapReader(path)

@@ -321,7 +321,10 @@ def test_each_suggestion_finds_an_episode_or_says_why_not(
     _, found = holds(bag, tmp_path)
     impossible = {"only one message each", "camera and lidar without command"}
     impossible |= {"command after everything"}
-    if "names" not in Quantity.model_fields:
+    with mcaprl.open_bag(bag) as opened:
+        fields = [each for info in opened.topics.values() for each in info.fields]
+    if not any(each.startswith("points[].") for each in fields):
+        # The trajectories are arrays of messages, whose fields the bag does not list.
         impossible |= {"arm"}
     assert (found is None) == (name in impossible)
 
@@ -379,7 +382,7 @@ def test_joints_are_selected_by_name_if_mappings_can(tmp_path: Path) -> None:
     found = observed("joints that change their order", tmp_path).observation
     # By position, the elements would change their meaning.
     if "names" in Quantity.model_fields:
-        assert found["joints_position"].model_dump()["names"] == ["hip", "knee"]
+        assert sorted(found["joints_position"].model_dump()["names"]) == ["hip", "knee"]
     else:
         assert not any(name.startswith("joints") for name in found)
 
