@@ -10,7 +10,7 @@ import mcaprl
 from mcaprl.cli.help import Command
 from mcaprl.cli.options import PATH, json_option, mapping_options
 from mcaprl.cli.progress import working
-from mcaprl.cli.show import echo, print_facts, print_json, print_problems
+from mcaprl.cli.show import echo, print_facts, print_json, print_problems, print_wide
 from mcaprl.errors import UsageError
 from mcaprl.texts import counted
 
@@ -22,6 +22,12 @@ from mcaprl.texts import counted
 @click.option("--to", metavar="FORMAT", help="Format of DST if not clear from its name.")
 @click.option("--lossy", is_flag=True, help="Convert or omit data that the format cannot store.")
 @click.option("--suggest", is_flag=True, help="Print a draft of a mapping for SRC; takes no DST.")
+@click.option(
+    "--bins",
+    type=click.IntRange(2),
+    metavar="N",
+    help="With --suggest: N bins of each continuous command, each with as many commands.",
+)
 @click.option("--dry-run", is_flag=True, help="Read SRC and write nothing; takes no DST.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 @click.option("--upload", metavar="URL", help="Copy the finished file to a URL.")
@@ -35,6 +41,7 @@ def convert(
     to: str | None,
     lossy: bool,
     suggest: bool,
+    bins: int | None,
     dry_run: bool,
     overwrite: bool,
     upload: str | None,
@@ -47,9 +54,11 @@ def convert(
     `mcaprl convert --suggest BAG > robot.yaml`. DST is a log if it ends with .mcap. Otherwise, DST
     is a dataset in the format that --to names: lerobot, minari, parquet, npz, d3rlpy or hdf5.
     """
+    if bins is not None and not suggest:
+        raise UsageError("--bins is for --suggest: set `edges` of the mapping instead")
     if suggest:
         with working("reading the topics"):
-            text = mcaprl.suggest_mapping(paths, definitions=definitions)
+            text = mcaprl.suggest_mapping(paths, bins=bins, definitions=definitions)
         click.echo(text, nl=False)
         return
     if not dry_run and len(paths) < 2:
@@ -72,10 +81,10 @@ def convert(
         print_json(found.to_json())
         return
     if found.report is not None:
-        print_facts(", ".join(sources), found.report.rows())
+        print_facts(", ".join(sources), found.report.rows(), width=100)
+        print_wide("recordings: missing share, median age, largest age", *found.run_table())
     if dry_run:
-        for number, step in enumerate(found.first()):
-            echo(f"{number}: {step}")
+        print_wide("first transitions", *found.first_table(), last=3)
     if found.report is not None:
         print_problems(found.report.problems())
     for sentence in found.lost:

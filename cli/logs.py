@@ -9,12 +9,13 @@ from typing import Any
 import click
 
 import mcaprl
+from mcaprl.api.bags import RECORDING_COLUMNS, TOPIC_COLUMNS, BagInfo
 from mcaprl.cli.completion import Name, sims
 from mcaprl.cli.exit_codes import WITH_LOSSES
 from mcaprl.cli.help import Command
 from mcaprl.cli.options import PATH, integer_option, json_option, mapping_options, trust_option
 from mcaprl.cli.progress import hint, working
-from mcaprl.cli.show import echo, print_facts, print_json, print_problems
+from mcaprl.cli.show import echo, print_facts, print_json, print_problems, print_table
 from mcaprl.page import PAGE_NAME
 from mcaprl.texts import counted
 
@@ -31,11 +32,17 @@ from mcaprl.texts import counted
 def info(
     data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool, **request: Any
 ) -> int:
-    """Show the contents and problems of DATA: files, folders or globs of logs."""
+    """Show the contents and problems of DATA: files, folders or globs of logs.
+
+    For another robot's bag (MCAP, rosbag2, ROS 1), show its recordings and topics; with --mapping,
+    its episodes. Rates are those of the median interval between messages.
+    """
     with working("reading data"):
         found = mcaprl.info(data, report=report, **request)
     if as_json:
         print_json(found.to_json())
+    elif isinstance(found, BagInfo):
+        _print_bag(found)
     else:
         rows = [*found.rows(), ("problems", "\n".join(found.problems) or "none")]
         notes = [str(finding) for finding in found.findings if finding.severity == "note"]
@@ -48,6 +55,14 @@ def info(
     return int(strict and bool(found.problems))
 
 
+def _print_bag(found: BagInfo) -> None:
+    rows = [*found.rows(), ("problems", "\n".join(found.problems) or "none"), ("next", found.next)]
+    print_facts(found.title, rows)
+    if len(found.recordings) > 1:
+        print_table("", RECORDING_COLUMNS, found.recording_rows())
+    print_table("", TOPIC_COLUMNS, found.topic_rows())
+
+
 @click.command(cls=Command)
 @click.argument("files", nargs=-1, required=True, metavar="DATA...", type=PATH)
 @json_option
@@ -56,6 +71,7 @@ def info(
 def check(files: tuple[str, ...], as_json: bool, **request: Any) -> int:
     """Read DATA, files, folders or globs of logs, completely, and list all problems.
 
+    All messages of another robot's bag are decoded; with --mapping, its transitions are checked.
     Exits with 1 if there are problems.
     """
     with working("reading data"):
@@ -68,6 +84,7 @@ def check(files: tuple[str, ...], as_json: bool, **request: Any) -> int:
     print_problems(problem for problem in found.problems if problem not in found.missing)
     if found.ok:
         echo(f"{counted(len(found.files), 'file')} checked, no problems")
+    print_problems(found.notes[:1])
     return int(not found.ok)
 
 

@@ -12,7 +12,7 @@ import click
 
 from mcaprl.files import json_text
 from mcaprl.problem import Problem
-from mcaprl.texts import printable
+from mcaprl.texts import counted, printable, shortened
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from mcaprl.api.replay import LiveAddress
 
 _PIPE_WIDTH = 120
+_MAX_ROWS = 40
+"""Number of rows of a wide table that are printed."""
 
 
 def echo(text: object, *, err: bool = False) -> None:
@@ -74,6 +76,35 @@ def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     _print(console, table, title, rows)
 
 
+def print_wide(
+    title: str, columns: list[str], rows: list[list[str]], *, last: int = 0, width: int = 100
+) -> None:
+    """Print a table that may have many columns and rows; print nothing without rows.
+
+    The first column and the `last` ones are always shown. Of the others, as many are shown as fit
+    into `width` characters, or into the terminal; the names of the rest follow the table.
+    """
+    if not rows:
+        return
+    space = min(width, _console().width) - 1
+    cells = [max(map(len, map(printable, each))) + 3 for each in zip(columns, *rows, strict=True)]
+    kept = [0, *range(max(1, len(columns) - last), len(columns))]
+    middle, used = list[int](), sum(cells[k] for k in kept)
+    for k in range(1, len(columns) - last):
+        used += cells[k]
+        if used > space:
+            break
+        middle.append(k)
+    shown = sorted({*kept, *middle})
+    picked = [[row[k] for k in shown] for row in rows[:_MAX_ROWS]]
+    print_table(title, [columns[k] for k in shown], picked)
+    rest = [name for k, name in enumerate(columns) if k not in shown]
+    if rest:
+        echo(shortened(f"{counted(len(rest), 'more column')}: {', '.join(rest)}", width))
+    if len(rows) > _MAX_ROWS:
+        echo(f"{len(rows) - _MAX_ROWS} more rows")
+
+
 def _widths(columns: Iterable[Sequence[str]], available: int) -> Sequence[int | None]:
     """Return the width of each column of texts, such that no word is broken.
 
@@ -95,14 +126,16 @@ def _widths(columns: Iterable[Sequence[str]], available: int) -> Sequence[int | 
     return widths
 
 
-def print_facts(title: str, facts: list[tuple[str, str]]) -> None:
-    """Print names and values to stdout, one pair per line."""
+def print_facts(title: str, facts: list[tuple[str, str]], *, width: int = _PIPE_WIDTH) -> None:
+    """Print names and values to stdout, one pair per line, in at most `width` characters."""
     from rich.table import Table
 
     table = Table(show_header=False)
     table.add_column(style="dim")
     table.add_column(overflow="fold")
-    _print(_console(), table, title, facts)
+    console = _console()
+    console.width = min(console.width, width) if not _is_terminal(sys.stdout) else console.width
+    _print(console, table, title, facts)
 
 
 def _print(console: Console, table: Table, title: str, rows: Iterable[Iterable[str]]) -> None:

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from mcaprl.api.replay import render, replay, verify
     from mcaprl.api.sweep import sweep
     from mcaprl.api.train import train, train_online
+    from mcaprl.recorder.bags.bag import OpenBag, open_bag
     from mcaprl.recorder.dataset.dataset import Dataset
     from mcaprl.recorder.dataset.episode import Episode
     from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
@@ -49,6 +50,7 @@ __all__ = [
     "Dataset",
     "Episode",
     "McaprlError",
+    "OpenBag",
     "RecordMcap",
     "RecordVecMcap",
     "__version__",
@@ -67,6 +69,7 @@ __all__ = [
     "make_sim",
     "merge",
     "open",
+    "open_bag",
     "ray",
     "record",
     "recover",
@@ -102,6 +105,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.api.train": ["train", "train_online"],
         "mcaprl.ray": ["ray"],
         "mcaprl.torch": ["torch"],
+        "mcaprl.recorder.bags.bag": ["OpenBag", "open_bag"],
         "mcaprl.recorder.dataset.dataset": ["Dataset"],
         "mcaprl.recorder.dataset.episode": ["Episode"],
         "mcaprl.recorder.record.wrapper": ["RecordMcap"],

@@ -23,7 +23,13 @@ import difflib
 import importlib
 from collections.abc import Iterable
 from types import ModuleType
-from typing import ClassVar
+from typing import ClassVar, Final
+
+BAG_HINT: Final = (
+    "a robot's bag needs a mapping: convert it by `mcaprl convert BAG OUT.mcap --mapping FILE`;"
+    " `mcaprl convert --suggest BAG > FILE` drafts one"
+)
+"""What to do with the bag of a robot that is passed where a log is expected."""
 
 
 class McaprlError(Exception):

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mcaprl.api.data import Definitions, MappingFile, Paths, mapped, open_data
-from mcaprl.errors import UsageError
+from mcaprl.api.ranges import check_least
+from mcaprl.errors import UsageError, import_extra
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.registry import target_format, write_format
@@ -52,6 +53,54 @@ class Conversion:
             }
             for k in range(count)
         ]
+
+    def first_table(self) -> tuple[list[str], list[list[str]]]:
+        """Return the columns and rows of a table of the first five transitions.
+
+        A vector has a column for each element. Numbers have four significant digits.
+        """
+        data, count = self.dataset, min(_SHOWN, len(self.dataset))
+        batch = data.batch(np.arange(count))
+        parts = batch.observations
+        parts = _flat(parts) if isinstance(parts, dict) else {"": parts}
+        names = list(data.observation_names or (self.report.elements if self.report else ()))
+        table: dict[str, list[str]] = {"step": [str(k) for k in range(count)]}
+        for key, values in parts.items():
+            if values.ndim > 2:
+                table[key or "image"] = [_image_text(row) for row in values]
+                continue
+            flat = values.reshape(count, -1)
+            width = flat.shape[1]
+            labels = names if len(names) == width else _labels(key or "state", width)
+            table |= {label: [f"{x:.4g}" for x in flat[:, k]] for k, label in enumerate(labels)}
+        table["action"] = [self._action_text(action) for action in batch.actions]
+        table["reward"] = [f"{reward:.4g}" for reward in batch.rewards]
+        ends = zip(batch.terminated, batch.truncated, strict=True)
+        table["end"] = ["terminated" if t else "truncated" if u else "" for t, u in ends]
+        return list(table), [list(row) for row in zip(*table.values(), strict=True)]
+
+    def _action_text(self, action: Any) -> str:
+        if np.ndim(action):
+            return ", ".join(f"{x:.4g}" for x in np.ravel(action))
+        return self.dataset.action_names.get(int(action), str(action))
+
+    def run_table(self) -> tuple[list[str], list[list[str]]]:
+        """Return the columns and rows of a table of the recordings; no rows if there is only one.
+
+        The cell of a quantity has the share of the steps without a value, and the median and the
+        largest age in seconds.
+        """
+        runs = [] if self.report is None else self.report.runs
+        if len(runs) < 2:
+            return [], []
+        names = list(runs[0].fields)
+        columns = ["recording", "clock steps", "steps", "episodes", *names]
+        rows = [
+            [str(k), str(run.clock_steps), str(run.steps), str(run.episodes)]
+            + [run.fields[name].short for name in names]
+            for k, run in enumerate(runs)
+        ]
+        return columns, rows
 
     def to_json(self) -> dict[str, Any]:
         """Return what `convert --json` prints."""
@@ -130,26 +179,52 @@ def _read(
     return found.dataset, found.report
 
 
-def suggest_mapping(bag: Paths, *, definitions: Definitions = ()) -> str:
-    """Return a commented draft of a mapping file, based on the topics and rates of a bag.
+def suggest_mapping(bag: Paths, *, bins: int | None = None, definitions: Definitions = ()) -> str:
+    """Return a commented draft of a mapping file, based on the topics and messages of a bag.
+
+    The draft is tried: quantities that prevent all episodes become comments. A warning, which is
+    also a comment of the draft, says if there is no command, or still no episode.
 
     Args:
-        bag: MCAP files, rosbag2 folders and databases, or ROS 1 bags.
+        bag: MCAP files, rosbag2 folders and databases, ROS 1 bags, or folders of these.
+        bins: Number of bins of each element of a continuous command, with similar numbers of
+            commands in each bin; default: a Box action with limits from the commands.
         definitions: Files and folders with definitions of ROS types that the bag lacks; see
             docs/bags.md.
 
     Raises:
-        LogError: The bag cannot be read.
-        UsageError: There is no such file or folder of definitions.
+        LogError: The bag cannot be read, or has no topic that can be observed.
+        UsageError: `bins` is below 2, or there is no such file or folder of definitions.
         MissingExtraError: The packages of the `bags` extra are not installed.
     """
+    import_extra("pydantic", "bags")
     from contextlib import closing
 
     from mcaprl.recorder.bags.bag import open_bag
     from mcaprl.recorder.mapping.suggest import suggested
 
+    if bins is not None:
+        check_least(2, bins=bins)
     with closing(open_bag(bag, definitions=definitions)) as found:
-        return suggested(found)
+        return suggested(found, bins)
+
+
+def _flat(parts: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the arrays of a Dict observation by their path."""
+    found: dict[str, Any] = {}
+    for name, part in parts.items():
+        path = f"{prefix}{name}"
+        found |= _flat(part, f"{path}/") if isinstance(part, dict) else {path: part}
+    return found
+
+
+def _labels(name: str, count: int) -> list[str]:
+    return [name] if count == 1 else [f"{name}_{k}" for k in range(count)]
+
+
+def _image_text(image: Any) -> str:
+    shape = "x".join(map(str, image.shape))
+    return f"{image.dtype} {shape}, mean {image.mean():.4g}"
 
 
 def _plain(observation: Any, k: int) -> Any:

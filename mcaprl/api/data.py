@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mcaprl.errors import NotMcapError, UnknownNameError, UsageError, import_extra
+from mcaprl.errors import BAG_HINT, NotMcapError, UnknownNameError, UsageError, import_extra
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.image_cache import STORAGES, Storage
 from mcaprl.recorder.dataset.open import Episodes, open_logs
@@ -96,6 +96,8 @@ def open_data(
         except NotMcapError as error:
             from mcaprl.recorder.dataset.formats.registry import FORMATS
 
+            if BAG_HINT in str(error):
+                raise
             raise NotMcapError(
                 f"{error}, nor is it a dataset of one of the formats {', '.join(FORMATS)}"
             ) from error

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mcaprl.api.bags import BagInfo, bag_info, logs_or_bags
 from mcaprl.api.data import Definitions, MappingFile, Paths, mapped, open_data
 from mcaprl.api.ranges import check_least
-from mcaprl.errors import LogError, ReportError, UsageError, import_extra
+from mcaprl.errors import LogError, NoEpisodesError, ReportError, UsageError, import_extra
 from mcaprl.files import check_log_name, size_of, write_json
 from mcaprl.page import PAGE_NAME
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import Calibration, calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
-from mcaprl.recorder.dataset.open import find_logs
 from mcaprl.recorder.viewer.surprises import Surprise, moments_of
 from mcaprl.texts import size
 
@@ -91,7 +91,8 @@ class LogInfo:
             "findings": [asdict(finding) for finding in self.findings],
             "moments": [asdict(moment) for moment in self.moments],
         }
-        return {name: value for name, value in facts.items() if name != "sources"}
+        facts = {name: value for name, value in facts.items() if name != "sources"}
+        return {"kind": "log", **facts}
 
     def rows(self) -> list[tuple[str, str]]:
         """Return the name and the formatted value of each fact."""
@@ -122,11 +123,17 @@ def info(
     mapping: MappingFile | None = None,
     trust_code: bool = False,
     definitions: Definitions = (),
-) -> LogInfo:
-    """Return facts about logs, and their problems.
+) -> LogInfo | Any:
+    """Return facts about logs, and their problems; or about another robot's bag.
+
+    Without a mapping, the result for a bag is a `BagInfo`, which lists recordings and topics: type,
+    number of messages, rate, longest gap, first and last time, and whether they can be read. The
+    key `kind` of its `to_json` is `bag`; for logs and datasets, it is `log`. All times are in
+    nanoseconds, and all durations in seconds.
 
     Args:
-        data: File, folder, glob or URL of logs, or several of them; or a dataset of another tool.
+        data: File, folder, glob or URL of logs, or several of them; or a dataset of another tool;
+            or MCAP files, rosbag2 folders and databases, ROS 1 bags, and folders of these.
         report: Output folder of the HTML report, an image and JSON.
         threads: Number of threads that decompress chunks.
         mapping: Mapping that describes a bag; see `open`.
@@ -135,32 +142,50 @@ def info(
             docs/bags.md.
 
     Raises:
-        LogError: A log cannot be read.
+        LogError: A log or bag cannot be read.
+        UsageError: A report is requested for a bag without a mapping.
         MissingExtraError: The packages of the `report` extra are not installed.
         ReportError: The report cannot be written.
     """
     if report is not None:
         import_extra("matplotlib", "report")
         import_extra("jinja2", "report")
+    noted: list[Problem] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         if mapping is None:
-            dataset, noted = open_data(data, threads=threads), []
-            paths: Sequence[Path] = dataset.sources
+            contents = _dataset_or_bag(data, threads, definitions)
         else:
-            dataset, result = mapped(data, mapping, trust_code=trust_code, definitions=definitions)
-            paths, noted = dataset.sources, result.problems()
+            contents, result = mapped(data, mapping, trust_code=trust_code, definitions=definitions)
+            noted = result.problems()
     warned = [str(warning.message) for warning in caught]
+    if isinstance(contents, BagInfo):
+        if report is not None:
+            raise UsageError("a report of a bag needs a mapping: pass --mapping FILE")
+        return replace(contents, problems=[*warned, *contents.problems])
+    paths = contents.sources
     are_logs = mapping is None and all(path.suffix == ".mcap" for path in paths)
-    found = _describe(dataset, paths, [*warned, *map(str, noted)], are_logs=are_logs)
+    found = _describe(contents, paths, [*warned, *map(str, noted)], are_logs=are_logs)
     if report is not None:
         from mcaprl.recorder.viewer.report import dataset_figure, dataset_page
 
         folder = Path(report)
         write_json(folder / "dataset.json", found.to_json(), ReportError)
-        dataset_figure(folder / "dataset.png", dataset, found.title)
-        dataset_page(folder / PAGE_NAME, dataset, found.title, found.rows(), found.findings)
+        dataset_figure(folder / "dataset.png", contents, found.title)
+        dataset_page(folder / PAGE_NAME, contents, found.title, found.rows(), found.findings)
     return found
+
+
+def _dataset_or_bag(data: Paths, threads: int, definitions: Definitions) -> Dataset | BagInfo:
+    try:
+        return open_data(data, threads=threads)
+    except NoEpisodesError:
+        raise
+    except LogError:
+        found = bag_info(data, definitions)
+        if found is None:
+            raise
+        return found
 
 
 def _describe(
@@ -212,11 +237,13 @@ class CheckResult:
         files: Files that were read.
         missing: Problems with paths that contain no logs.
         problems: All problems, in the order of the paths.
+        notes: Files that are other robots' bags, whose messages were decoded.
     """
 
     files: tuple[Path, ...]
     missing: tuple[Problem, ...]
     problems: tuple[Problem, ...]
+    notes: tuple[Problem, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -238,13 +265,14 @@ def check(
 ) -> CheckResult:
     """Read logs completely; validate structure, CRCs, indexes, episodes and metadata.
 
-    With a mapping, the bag is read by the mapping. The function then also reports defects that
-    affect many steps: missing or outdated values, commands that are far from every named action,
-    and episodes that are too short.
+    Without a mapping, all messages of another robot's bag are decoded; topics and messages that
+    cannot be decoded are problems. With a mapping, the bag is read by the mapping. The function
+    then also reports defects that affect many steps: missing or outdated values, commands that are
+    far from every named action, and episodes that are too short.
 
     Args:
-        data: File, folder or glob of logs, or several of them. A path without logs is
-            reported as a problem.
+        data: File, folder or glob of logs or bags, or several of them. A path without logs and
+            bags is reported as a problem.
         threads: Number of threads that decompress chunks.
         mapping: Mapping that describes a bag; see `open`.
         trust_code: Whether the mapping may name a Python function.
@@ -269,7 +297,7 @@ def check(
     problems: list[Problem] = []
     for name in names:
         try:
-            found = find_logs(name)
+            found = logs_or_bags(name)
         except LogError as error:
             missing.append(
                 Problem(str(error), "searching for logs", next="check the path", file=str(name))
@@ -278,7 +306,9 @@ def check(
             continue
         files += found
         problems += [problem for path in found for problem in check_log(path, threads=threads)]
-    return CheckResult(tuple(files), tuple(missing), tuple(problems))
+    notes = tuple(one for one in problems if one.severity == "note")
+    problems = [one for one in problems if one.severity == "problem"]
+    return CheckResult(tuple(files), tuple(missing), tuple(problems), notes)
 
 
 def recover(

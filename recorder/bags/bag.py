@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,11 @@ from mcaprl.recorder.bags.path_steps import NAMES, general_path, kind_at, steps_
 from mcaprl.recorder.bags.rosbag_file import RosbagFile
 from mcaprl.recorder.bags.source import Definition, TopicSource
 from mcaprl.recorder.bags.values import ABSENT, NUMBERS, column_of, value_at
+from mcaprl.texts import counted, printable
 
 _PUBLISH_TIME = "publish_time"
+_SHOWN = 8
+"""Number of topics and files that the text of a bag shows."""
 
 
 class Failure(NamedTuple):
@@ -87,6 +90,12 @@ class TopicInfo:
     is_open: bool = False
     unreadable: Mapping[str, str] = field(default_factory=dict)
 
+    def __str__(self) -> str:
+        """Return name, type, number of messages, and the problem if there is one."""
+        problem = f", cannot be read: {self.problem}" if self.problem else ""
+        kind = self.type_name or self.encoding
+        return f"{self.name}: {kind}, {counted(self.count, 'message')}{problem}"
+
     def may_have(self, path: str) -> bool:
         """Return whether messages may have a field.
 
@@ -125,10 +134,12 @@ class Bag(Protocol):
     Attributes:
         paths: Files of the bag. The files of a recording follow each other.
         recordings: Index of the recording of each file, not descending.
+        cut: Files that were cut off, or are still being written.
     """
 
     paths: tuple[Path, ...]
     recordings: tuple[int, ...]
+    cut: tuple[Path, ...]
 
     @property
     def topics(self) -> Mapping[str, TopicInfo]:
@@ -158,6 +169,13 @@ class Bag(Protocol):
             LogError: The file is damaged, or no message of the topic can be decoded; if the bag is
                 strict: a message cannot be decoded.
             UnknownNameError: There is no such topic or field.
+        """
+
+    def failures(self, topic: str) -> Iterator[Failure]:
+        """Decode all messages of a topic one by one, and yield those that cannot be decoded.
+
+        Raises:
+            LogError: The file is damaged, or no message of the topic can be decoded.
         """
 
     def close(self) -> None:
@@ -302,6 +320,17 @@ class _Topic:
                     failures.append(Failure(number, int(self.times_ns[number]), str(error)))
         return values, sorted(failures)
 
+    def failures(self) -> Iterator[Failure]:
+        for k, (_, source) in enumerate(self._used):
+            decoder = self._decoders[source.definition]
+            rows = np.flatnonzero(self._order[:, 2] == k)
+            places = self._order[rows, 3]
+            for row, raw in zip(rows.tolist(), source.raw(places), strict=True):
+                try:
+                    decoder.decode(raw.data)
+                except LogError as error:
+                    yield Failure(row, int(self.times_ns[row]), str(error))
+
 
 class _Infos(Mapping[str, TopicInfo]):
     """Mapping from topic name to `TopicInfo`; the type of a topic is parsed at the first access."""
@@ -319,8 +348,17 @@ class _Infos(Mapping[str, TopicInfo]):
         return len(self._topics)
 
 
-class _FileBag:
-    """Bag that consists of one or more open recordings."""
+class OpenBag:
+    """Bag whose files are open, as `open_bag` returns it; a context manager that closes them.
+
+    Attributes:
+        paths: Files of the bag. The files of a recording follow each other.
+        recordings: Index of the recording of each file, not descending.
+        cut: Files that were cut off, or are still being written.
+        topics: Description of each topic by name: `type_name`, `encoding`, `count`, `first_ns`,
+            `last_ns`, `fields` (kind of each leaf field by its dotted path), `constants`, and
+            `problem`, which is not empty if the topic cannot be read.
+    """
 
     def __init__(
         self,
@@ -330,6 +368,7 @@ class _FileBag:
         *,
         strict: bool,
     ) -> None:
+        """Join the topics of open files; `opened` closes them."""
         self._opened, self._strict = opened, strict
         # The parts of a split bag cover successive time ranges.
         ordered = [sorted(files, key=_first_ns) for files in recordings]
@@ -337,6 +376,7 @@ class _FileBag:
         files = [file for each in ordered for file in each]
         self.paths = tuple(file.path for file in files)
         self.recordings = tuple(number for number, each in enumerate(ordered) for _ in each)
+        self.cut = tuple(file.path for file in files if not file.complete)
         names = dict.fromkeys(name for file in files for name in file.topics)
         self._topics = {
             name: _Topic(
@@ -348,18 +388,69 @@ class _FileBag:
         }
         self.topics: Mapping[str, TopicInfo] = _Infos(self._topics)
 
+    def __enter__(self) -> Self:
+        """Return the bag."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the files."""
+        self.close()
+
+    def __repr__(self) -> str:
+        """Return the files, and the first topics with their types."""
+        names = list(self._topics)[:_SHOWN]
+        topics = [f"  {self.topics[name]}" for name in names]
+        more = [f"  and {len(self._topics) - _SHOWN} more"] if len(self._topics) > _SHOWN else []
+        where = ", ".join(map(str, self.paths[:_SHOWN]))
+        return printable("\n".join([f"Bag {where}: {len(self._topics)} topics", *topics, *more]))
+
     def times(self, topic: str) -> NDArray[np.int64]:
+        """Return the (N,) log_times of a topic in nanoseconds, in the order of recording.
+
+        Raises:
+            UnknownNameError: There is no such topic.
+        """
         return self._topic(topic).times_ns
 
     def places(self, topic: str) -> NDArray[np.int64]:
+        """Return the (N, 2) places of a topic's messages: index of the file, position in the file.
+
+        Raises:
+            UnknownNameError: There is no such topic.
+        """
         return self._topic(topic).places
 
     def read(
-        self, topic: str, fields: Sequence[str], rows: NDArray[np.int64] | None = None
+        self,
+        topic: str,
+        fields: Sequence[str] | None = None,
+        rows: NDArray[np.int64] | None = None,
     ) -> Stream:
-        found = self._topic(topic)
-        if found.info.problem:
-            raise LogError(f"{topic} cannot be read: {found.info.problem}")
+        """Read fields of a topic as columns; messages that cannot be decoded are left out.
+
+        Args:
+            topic: Name of the topic.
+            fields: Paths of fields, such as `twist.linear.x` or `motors[0:12].q`; `publish_time`
+                is the time of publication in nanoseconds. Default: all leaf fields.
+            rows: Indexes into `times` of the messages to read, in output order, so that a topic
+                that is larger than the memory is read in parts; default: all.
+
+        Returns:
+            Named tuple of `log_time_ns` (N,) and `columns`: the column of each field by its path,
+            which has (N,) numbers, (N, K) numbers if all values are arrays of K numbers, otherwise
+            (N,) objects such as strings, bytes and lists. `rows` has the (N,) indexes of the
+            messages in `times`, and `failures` the messages that cannot be decoded.
+
+        Raises:
+            LogError: The topic or a file cannot be read, or no message can be decoded.
+            UnknownNameError: There is no such topic or field.
+            UsageError: No fields are given, and the topic has no schema that lists them.
+        """
+        if fields is None:
+            fields = self._leaf_fields(topic)
+        if rows is not None:
+            rows = np.asarray(rows, np.int64)
+        found = self._readable(topic)
         for name in fields:
             if name in found.info.unreadable:
                 raise LogError(f"{topic}: {found.info.unreadable[name]}")
@@ -367,13 +458,40 @@ class _FileBag:
                 raise UnknownNameError(f"field of {topic}", name, found.info.fields)
         return found.read(fields, rows, strict=self._strict)
 
+    def _leaf_fields(self, topic: str) -> list[str]:
+        fields = self._readable(topic).info.fields
+        if not fields:
+            raise UsageError(
+                f"the fields of {topic} are unknown, because it has no schema: name them"
+            )
+        # The fields of the messages in an array are within the field of the array.
+        return [name for name in fields if "[" not in name]
+
+    def failures(self, topic: str) -> Iterator[Failure]:
+        """Decode all messages of a topic one by one, and yield those that cannot be decoded.
+
+        Raises:
+            LogError: The file is damaged, or no message of the topic can be decoded.
+        """
+        return self._readable(topic).failures()
+
     def close(self) -> None:
+        """Close the files."""
         self._opened.close()
+
+    def _readable(self, name: str) -> _Topic:
+        found = self._topic(name)
+        if found.info.problem:
+            raise LogError(f"{name} cannot be read: {found.info.problem}")
+        return found
 
     def _topic(self, name: str) -> _Topic:
         if name not in self._topics:
             raise UnknownNameError("topic", name, self._topics)
         return self._topics[name]
+
+
+OpenBag.__module__ = "mcaprl"
 
 
 def _first_ns(file: McapFile | RosbagFile) -> int:
@@ -385,19 +503,22 @@ def open_bag(
     *,
     definitions: Sequence[str | Path] = (),
     strict: bool = False,
-) -> Bag:
+) -> OpenBag:
     """Open a bag: MCAP files, rosbag2 folders and databases, and ROS 1 bags.
 
     Files that rosbag2 compressed as a whole are decompressed to a temporary folder. If a topic
     cannot be read, its `problem` is not empty; all other topics can still be read.
 
     Args:
-        data: A file, a folder, a glob, or a sequence of these. Recordings are read in the order of
-            their first messages.
-        definitions: Files and folders with definitions of ROS types that the bag lacks; see
-            `DefinitionFiles`.
-        strict: Whether a message that cannot be decoded is an error; by default, it is left out
-            and reported in `Stream.failures`.
+        data: A file, a folder, a glob, or a sequence of these. A folder is a bag, or contains
+            bags, also in its folders. Recordings are read in the order of their first messages.
+        definitions: Files and folders with definitions of ROS types that the bag lacks: packages,
+            workspaces of packages, or files of types.
+        strict: Whether a message that cannot be decoded is an error; by default, it is left out,
+            and is one of the `failures` of what `read` returns.
+
+    Returns:
+        The open bag; `with mcaprl.open_bag(data) as bag` closes its files.
 
     Raises:
         LogError: A file is missing, damaged, or not a bag.
@@ -406,4 +527,4 @@ def open_bag(
     others = DefinitionFiles(definitions) if definitions else None
     with ExitStack() as opened:
         recordings = open_recordings(find_bags(data), opened)
-        return _FileBag(recordings, opened.pop_all(), others, strict=strict)
+        return OpenBag(recordings, opened.pop_all(), others, strict=strict)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import glob
+import os
 import tempfile
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -20,27 +22,99 @@ _KINDS = (".mcap", ".db3", ".bag")
 _COMPRESSED = ".zstd"
 _COPY = ".images"
 """Suffix of the uncompressed copy of a bag's images; see `mapping.image_copy`."""
+_SUFFIXES = (*_KINDS, *(f"{kind}{_COMPRESSED}" for kind in _KINDS))
+_MAX_DEPTH = 3
+"""Number of levels of folders below a given folder that are searched for bags."""
+_MAX_ENTRIES = 100_000
+"""Number of files and folders that are looked at in one search."""
+
+
+def is_bag_file(path: Path) -> bool:
+    """Return whether the name of a file is that of a bag of any format."""
+    return path.name.endswith(_SUFFIXES)
 
 
 def find_bags(data: str | Path | Sequence[str | Path]) -> list[Path]:
-    """Resolve files, folders and globs to existing paths.
+    """Resolve files, folders and globs to the existing paths of bags.
+
+    A folder is a bag if it has bag files or `metadata.yaml`. The bags in the folders of a folder
+    without `metadata.yaml` are found, too, up to three levels down and in the order of their names.
+    A warning names folders that have no bags.
 
     Copies of images, which are beside their bags, are left out.
 
     Raises:
-        LogError: There is no such path, or there are only copies of images.
+        LogError: There is no such path, or a folder has no bags.
     """
-    found: list[Path] = []
-    for part in [data] if isinstance(data, str | Path) else data:
-        path = Path(part)
-        matches = [path] if path.exists() else sorted(map(Path, glob.glob(str(part))))
-        if not matches:
-            raise LogError(f"{part}: no such file, folder or match")
-        found += matches
-    bags = [path for path in found if path.suffix != _COPY]
-    if found and not bags:
+    if not isinstance(data, str | Path):
+        every = [path for part in data for path in find_bags(part)]
+        # A bag that is listed under several paths is read once.
+        return list({os.path.realpath(path): path for path in every}.values())
+    path = Path(data)
+    found = [path] if path.exists() else sorted(map(Path, glob.glob(str(data))))
+    if not found:
+        raise LogError(f"{data}: no such file, folder or match")
+    found = [each for each in found if each.suffix != _COPY] or found
+    if found[0].suffix == _COPY:
         raise LogError(f"{found[0]} is a copy of images: give the bag beside it")
-    return bags
+    bags = {each: _bags_in(each) if each.is_dir() else [each] for each in found}
+    if len(found) > 1 and any(is_bag_file(each) or each.is_dir() for each in found):
+        # A glob such as `bags/*` also matches notes and images beside the bags.
+        bags |= {each: [] for each in found if not is_bag_file(each) and not each.is_dir()}
+    if not any(bags.values()):
+        raise LogError(
+            f"{found[0]} has no {', '.join(_KINDS)} files, nor do its folders: pass a bag file, a"
+            " rosbag2 folder, or a folder of these"
+        )
+    _note_ignored([each for each, inner in bags.items() if not inner])
+    return [each for inner in bags.values() for each in inner]
+
+
+def _bags_in(folder: Path) -> list[Path]:
+    """Return a folder if it is a bag, and all bags in its folders unless it has `metadata.yaml`."""
+    seen, left = set[str](), _MAX_ENTRIES
+
+    def walk(place: Path, depth: int) -> list[Path]:
+        nonlocal left
+        # Links may form a loop.
+        if os.path.realpath(place) in seen:
+            return []
+        seen.add(os.path.realpath(place))
+        entries = _entries(place)
+        left -= len(entries)
+        if left < 0:
+            raise LogError(
+                f"{folder} has more than {_MAX_ENTRIES} files and folders: pass the paths of the"
+                " bags in it"
+            )
+        is_whole = any(each.name == _METADATA for each in entries)
+        found = [place] if is_whole or any(map(is_bag_file, entries)) else []
+        if is_whole or depth == _MAX_DEPTH:
+            return found
+        inner = [each for each in entries if each.is_dir() and not each.name.startswith(".")]
+        bags = {each: walk(each, depth + 1) for each in inner}
+        found += [bag for each in bags.values() for bag in each]
+        if found:
+            _note_ignored([each for each, inside in bags.items() if not inside])
+        return found
+
+    return walk(folder, 0)
+
+
+def _entries(folder: Path) -> list[Path]:
+    """Return the files and folders of a folder by name; none if it may not be read."""
+    try:
+        return [folder / name for name in sorted(os.listdir(folder))]
+    except OSError as error:
+        warnings.warn(f"{folder} cannot be read: {error.strerror}", stacklevel=2)
+        return []
+
+
+def _note_ignored(paths: Sequence[Path]) -> None:
+    if paths:
+        more = f" and {len(paths) - 3} more" if len(paths) > 3 else ""
+        names = ", ".join(str(each) for each in paths[:3])
+        warnings.warn(f"ignored, because they are not bags: {names}{more}", stacklevel=2)
 
 
 def open_recordings(paths: Sequence[Path], opened: ExitStack) -> list[list[McapFile | RosbagFile]]:
@@ -93,10 +167,9 @@ def _unlisted(folder: Path, listed: Sequence[Path]) -> list[Path]:
 
     If the recorder was killed, `metadata.yaml` is missing or does not list all files.
     """
-    kinds = (*_KINDS, *(f"{kind}{_COMPRESSED}" for kind in _KINDS))
     # A compressed file and its original may both exist; only one of them is opened.
     known, found = {_plain_name(path) for path in listed}, []
-    for path in sorted(path for path in folder.iterdir() if path.name.endswith(kinds)):
+    for path in sorted(path for path in folder.iterdir() if is_bag_file(path)):
         if _plain_name(path) not in known:
             known.add(_plain_name(path))
             found.append(path)

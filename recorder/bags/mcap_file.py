@@ -32,6 +32,7 @@ class McapFile:
     Attributes:
         path: Path of the file.
         topics: Sources of each topic by its name, one source for each channel.
+        complete: Whether the file ends with a footer; if not, it was cut off or is being written.
     """
 
     def __init__(self, path: Path, *, distribution: str = "") -> None:
@@ -46,6 +47,7 @@ class McapFile:
         """
         self.path = path
         reader = McapReader(path)
+        self.complete = reader.complete
         self.topics: dict[str, list[TopicSource]] = {}
         for channel in reader.channels.values():
             sources = self.topics.setdefault(channel.topic, [])

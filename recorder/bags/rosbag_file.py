@@ -26,7 +26,10 @@ class RosbagFile:
         path: Path of the file.
         topics: Sources of each topic by its name, one source for each connection.
         first_ns: Lowest log_time of all messages; 2^63 - 1 if there are none.
+        complete: True: a bag that was cut off cannot be opened.
     """
+
+    complete = True
 
     def __init__(self, path: Path, *, distribution: str = "") -> None:
         """Open a bag.

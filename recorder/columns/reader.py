@@ -30,7 +30,7 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
-from mcaprl.errors import CorruptLogError, LogError, NotMcapError
+from mcaprl.errors import BAG_HINT, CorruptLogError, LogError, NotMcapError
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.chunk_indexes import (
     ChunkIndexes,
@@ -64,6 +64,12 @@ from mcaprl.remote import RemotePath, as_path
 
 # Number of bytes at the start and at the end of a remote file that are fetched when it is opened.
 _HEAD_BYTES, _TAIL_BYTES = 2**16, 2**18
+_OTHER_FILES = {
+    b"#ROSBAG V": f"is a ROS 1 bag; {BAG_HINT}",
+    b"SQLite format 3": f"is an SQLite database, as of rosbag2; {BAG_HINT}",
+    b"\x28\xb5\x2f\xfd": "is compressed with zstd",
+}
+"""Descriptions of files that are often given instead of MCAP files, by their first bytes."""
 _SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
 _CHANNEL_ID = struct.Struct("<H")
 _TOP_LEVEL = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
@@ -97,7 +103,11 @@ class McapReader:
         size = len(self._view)
         self.fetch([(0, _HEAD_BYTES), (size - _TAIL_BYTES, size)])
         if bytes(self._view[: len(MAGIC)]) != MAGIC:
-            raise NotMcapError(f"{self.path} is not an MCAP file: it has no magic bytes")
+            start = bytes(self._view[:16])
+            kinds = (kind for magic, kind in _OTHER_FILES.items() if start.startswith(magic))
+            raise NotMcapError(
+                f"{self.path} is not an MCAP file: it {next(kinds, 'has no magic bytes')}"
+            )
         self._named = _Named(self.path)
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}

@@ -12,7 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import CorruptLogError, LogError, NoEpisodesError, NoStepsError, SpaceError
+from mcaprl.errors import (
+    BAG_HINT,
+    CorruptLogError,
+    LogError,
+    NoEpisodesError,
+    NoStepsError,
+    SpaceError,
+)
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episodes import (
     COUNTERS,
@@ -286,8 +293,7 @@ def _steps_of(reader: McapReader) -> Topic:
         topics = ", ".join(sorted(channel.topic for channel in reader.channels.values())) or "none"
         raise NoStepsError(
             f"{reader.path} has no topic {STEP_TOPIC} and thus no transitions (topics: {topics});"
-            " a robot's bag needs a mapping: convert it by `mcaprl convert BAG OUT.mcap --mapping"
-            " FILE`"
+            f" {BAG_HINT}"
         )
     for schema in map(reader.schema_of, channels):
         if not is_intact(schema.name, schema.data):

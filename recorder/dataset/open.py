@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, NoEpisodesError, UsageError
+from mcaprl.errors import BAG_HINT, LogError, NoEpisodesError, UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
@@ -151,7 +151,9 @@ def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
     if path.is_dir():
         found = sorted(path.glob("*.mcap"))
         if not found:
-            raise LogError(f"{path} has no .mcap files")
+            has_bags = any(each.suffix in (".db3", ".bag") for each in path.iterdir())
+            hint = f"; {BAG_HINT}" if has_bags else ""
+            raise LogError(f"{path} has no .mcap files{hint}")
         return found
     if path.exists():
         return [path]

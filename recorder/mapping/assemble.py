@@ -233,6 +233,17 @@ def _as_float32(values: NDArray[np.float64], name: str) -> NDArray[np.float32]:
     return found
 
 
+def vector_names(plan: Plan, runs: list[Steps]) -> list[str]:
+    """Return the names of the elements of the observed vector."""
+    names = []
+    for name, quantity in plan.mapping.observation.items():
+        if quantity.image is None:
+            shapes = [run.quantities[name].values.shape[1:] for run in runs]
+            count = max((shape[0] for shape in shapes if shape), default=1)
+            names += element_names(name, quantity, count)
+    return names
+
+
 def _limits(quantity: Quantity) -> tuple[float, float]:
     """Return the lowest and highest value of a quantity, including the number for missing ones."""
     if quantity.clip is None:

@@ -20,14 +20,15 @@ from mcaprl.recorder.bags.bag import Bag, open_bag
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.mapping.actions import Actions
-from mcaprl.recorder.mapping.assemble import assembled, element_names
+from mcaprl.recorder.mapping.assemble import assembled, element_names, vector_names
+from mcaprl.recorder.mapping.blame import Blame
 from mcaprl.recorder.mapping.config import Mapping, Place, load_mapping
 from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.precision import Rounding, rounding_of
 from mcaprl.recorder.mapping.runs import Runs
 from mcaprl.recorder.mapping.segments import Segment
 from mcaprl.recorder.mapping.steps import StepReader, Steps
-from mcaprl.recorder.mapping.summary import FieldReport, MappingReport
+from mcaprl.recorder.mapping.summary import FieldReport, MappingReport, RunReport
 from mcaprl.texts import counted
 
 
@@ -136,14 +137,8 @@ def _longest(kept: list[list[Segment]], recordings: list[int]) -> list[list[Segm
 def _report(
     plan: Plan, found_runs: Runs, runs: list[Steps], kept: list[list[Segment]]
 ) -> MappingReport:
-    fields = {}
-    for name, wanted in plan.quantities.items():
-        values = [run.quantities[name] for run in runs]
-        missing = np.concatenate([each.missing for each in values])
-        ages_s = np.concatenate([each.age_s for each in values])
-        fields[name] = FieldReport.of(
-            wanted.source.topic, missing, ages_s, [each.values for each in values]
-        )
+    blame = Blame(plan, runs)
+    fields = _fields(plan, runs, blame)
     offsets = np.cumsum([0, *(len(run.times_ns) for run in runs)]).tolist()
     taken = [
         offset + np.arange(each.first, each.last)
@@ -166,8 +161,52 @@ def _report(
         missing_actions=_share(np.concatenate([each.missing for each in actions])),
         far_actions=_share(np.concatenate([each.far for each in actions])[rows]),
         action_counts=_action_counts(actions, rows),
+        runs=[_run(plan, *each) for each in zip(runs, kept, strict=True)],
+        elements=vector_names(plan, runs),
+        causes=[] if any(kept) else _causes(plan, runs, blame),
         rounded=_rounded(plan, runs),
     )
+
+
+def _fields(plan: Plan, runs: list[Steps], blame: Blame | None = None) -> dict[str, FieldReport]:
+    """Return statistics of each quantity at the steps."""
+    found = dict[str, FieldReport]()
+    for name, wanted in plan.quantities.items():
+        values = [run.quantities[name] for run in runs]
+        missing = np.concatenate([each.missing for each in values])
+        ages_s = np.concatenate([each.age_s for each in values])
+        prevents = 0.0 if blame is None else blame.alone.get(name, 0.0)
+        found[name] = FieldReport.of(
+            wanted.source.topic, missing, ages_s, [each.values for each in values], prevents
+        )
+    return found
+
+
+def _run(plan: Plan, run: Steps, kept: list[Segment]) -> RunReport:
+    return RunReport(
+        first_ns=int(run.times_ns[0]) if len(run.times_ns) else 0,
+        clock_steps=len(run.times_ns),
+        steps=sum(each.length for each in kept),
+        episodes=len(kept),
+        fields=_fields(plan, [run]),
+    )
+
+
+def _causes(plan: Plan, runs: list[Steps], blame: Blame) -> list[str]:
+    """Return why there are no episodes."""
+    episodes = plan.mapping.episodes
+    named = [
+        name
+        for name in ("begin", "end", "terminated", "truncated")
+        if getattr(episodes, name) is not None
+    ]
+    if blame.usable_steps < episodes.min_steps or not named or any(run.episodes for run in runs):
+        return list(blame.causes().values())
+    begins = "`begin` never becomes true" if "begin" in named else ""
+    ends = " or ".join(f"`{name}`" for name in named if name != "begin")
+    ends = f"{ends} is always true" if ends else ""
+    reasons = ", or ".join(each for each in (begins, ends) if each)
+    return [f"{blame.usable_steps} steps have all values, but no episode begins: {reasons}"]
 
 
 def _dropped(found: list[Segment], kept: list[list[Segment]]) -> list[int]:

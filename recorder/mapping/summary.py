@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
+from dataclasses import field as dataclass_field
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ class FieldReport:
         median_age_s: Median age of the value at its step, seconds; NaN if no step has a value.
         max_age_s: Largest age, seconds; NaN if no step has a value.
         elements: Indexes of the elements that are missing at steps at which others are not.
+        prevents: Share of the time that only this quantity prevents from being part of an episode,
+            because it is missing, or older than `gap_s`.
     """
 
     topic: str
@@ -37,6 +40,7 @@ class FieldReport:
     median_age_s: float
     max_age_s: float
     elements: tuple[int, ...] = ()
+    prevents: float = 0.0
 
     @classmethod
     def of(
@@ -45,6 +49,7 @@ class FieldReport:
         missing: NDArray[np.bool_],
         ages_s: NDArray[np.float64],
         values: Sequence[NDArray[Any]] = (),
+        prevents: float = 0.0,
     ) -> FieldReport:
         """Summarize flags `missing`, ages `ages_s` and `values` of N steps."""
         known = np.abs(ages_s[np.isfinite(ages_s)])
@@ -52,7 +57,15 @@ class FieldReport:
         if len(known):
             median, largest = float(np.median(known)), float(known.max())
         share = float(missing.mean()) if len(missing) else 1.0
-        return cls(topic, share, median, largest, _missing_elements(values))
+        return cls(topic, share, median, largest, _missing_elements(values), prevents)
+
+    @property
+    def short(self) -> str:
+        """Missing share, median and largest age in seconds, such as `0.0% 0.012 0.11`."""
+        ages = (
+            "" if np.isnan(self.median_age_s) else f" {self.median_age_s:.3f} {self.max_age_s:.3f}"
+        )
+        return f"{self.missing:.1%}{ages}"
 
     def __str__(self) -> str:
         """Return the statistics as text for a table."""
@@ -61,7 +74,8 @@ class FieldReport:
             if np.isnan(self.median_age_s)
             else (f", {self.median_age_s:.3f} s old (median), at most {self.max_age_s:.3f} s")
         )
-        return f"{self.topic}, missing {self.missing:.1%}{self.which}{age}"
+        prevents = f", alone prevents {self.prevents:.1%} of the time" if self.prevents else ""
+        return f"{self.topic}, missing {self.missing:.1%}{self.which}{age}{prevents}"
 
     @property
     def which(self) -> str:
@@ -102,6 +116,25 @@ def _short(value: float | str) -> str:
 
 
 @dataclass(frozen=True)
+class RunReport:
+    """Result for a recording, or for the part of it between two resets of the clock.
+
+    Attributes:
+        first_ns: Time of the first step; 0 if there are no steps.
+        clock_steps: Number of steps of the clock.
+        steps: Number of transitions.
+        episodes: Number of episodes.
+        fields: Statistics of each quantity, by name.
+    """
+
+    first_ns: int
+    clock_steps: int
+    steps: int
+    episodes: int
+    fields: dict[str, FieldReport]
+
+
+@dataclass(frozen=True)
 class MappingReport:
     """Result of reading a bag with a mapping.
 
@@ -124,6 +157,9 @@ class MappingReport:
         images: Problems of the images: messages that were left out, and guesses of their meaning.
         rounded: Digits that observed quantities and the action lose as float32, by name.
         commands: Command of each discrete action, by name or number of the action.
+        runs: Result for each recording; several for a recording whose clock was reset.
+        elements: Names of the elements of the observed vector.
+        causes: Reasons why there are no episodes, if there are none.
     """
 
     clock_steps: int
@@ -138,16 +174,20 @@ class MappingReport:
     missing_actions: float
     far_actions: float
     action_counts: dict[str, int]
-    images: list[Problem] = field(default_factory=list)
-    rounded: dict[str, Rounding] = field(default_factory=dict)
-    commands: dict[str, Command | None] = field(default_factory=dict)
+    images: list[Problem] = dataclass_field(default_factory=list)
+    rounded: dict[str, Rounding] = dataclass_field(default_factory=dict)
+    commands: dict[str, Command | None] = dataclass_field(default_factory=dict)
+    runs: list[RunReport] = dataclass_field(default_factory=list)
+    elements: list[str] = dataclass_field(default_factory=list)
+    causes: list[str] = dataclass_field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
         """Return the report as JSON types; ages that are not finite become None."""
         found = asdict(self)
-        for each in found["fields"].values():
-            for name in ("median_age_s", "max_age_s"):
-                each[name] = each[name] if np.isfinite(each[name]) else None
+        for part in (found, *found["runs"]):
+            for each in part["fields"].values():
+                for name in ("median_age_s", "max_age_s"):
+                    each[name] = each[name] if np.isfinite(each[name]) else None
         found["rounded"] = {name: each._asdict() for name, each in self.rounded.items()}
         return {
             **found,
@@ -169,6 +209,16 @@ class MappingReport:
         ]
         found += [
             Problem(str(each), each.topic, next=each.advice()) for each in self.rounded.values()
+        ]
+        found += [
+            Problem(
+                f"{name} alone prevents {field.prevents:.0%} of the time: it is missing, or older"
+                " than `gap_s`",
+                field.topic,
+                next="set `missing`, raise `gap_s`, or remove the quantity",
+            )
+            for name, field in self.fields.items()
+            if field.prevents > _MUCH >= field.missing
         ]
         if self.missing_actions > _MUCH:
             what = f"{self.missing_actions:.0%} of the steps have no action"
@@ -204,20 +254,11 @@ class MappingReport:
 
     def why_empty(self) -> str:
         """Return why there are no episodes, in one line."""
-        worst = max(self.fields, key=lambda name: self.fields[name].missing)
-        share = self.fields[worst].missing
-        if not self.clock_steps:
-            return "the topics have no messages"
-        if self.missing_actions == 1.0:
-            return "no step has an action"
-        if share == 1.0:
-            what = f"{worst} ({self.fields[worst].topic}) has no value at any step"
-            which = self.fields[worst].which
-            return f"{what}{which}: set `missing` or `clip`" if which else what
+        causes = "; ".join(self.causes)
         if self.dropped:
             longest = counted(max(self.dropped), "step")
-            return f"the longest of {counted(len(self.dropped), 'episode')} has {longest}"
-        return (
-            f"no episode begins; {worst} is missing at {share:.0%} of {self.clock_steps} steps"
-            f"{self.fields[worst].which}"
-        )
+            short = f"the longest of {counted(len(self.dropped), 'episode')} has {longest}"
+            return f"{short}; {causes}" if causes else short
+        if self.clock_steps and self.missing_actions == 1.0:
+            return f"no step has an action: {causes}"
+        return causes or "the topics have no messages"

@@ -3,6 +3,7 @@
     file      summary, CRCs of the data section and attachments        (file_check)
     chunks    CRCs, message indexes, chunk indexes of the summary      (file_check)
     log       metadata, schema, episodes, order of steps, images       (episode_check)
+    bag       all messages, if the file is another robot's bag         (bag_check)
 
 Each chunk is decompressed once.
 """
@@ -20,6 +21,7 @@ from mcap.records import ChunkIndex
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError, SpaceError
 from mcaprl.problem import Problem, Shortlist
+from mcaprl.recorder.bags.files import is_bag_file
 from mcaprl.recorder.format.metadata import METADATA_NAME
 from mcaprl.recorder.format.reading import (
     McapReader,
@@ -30,8 +32,9 @@ from mcaprl.recorder.format.reading import (
     place,
 )
 from mcaprl.recorder.format.topics import STEP_TOPIC
+from mcaprl.recorder.repair.bag_check import check_messages
 from mcaprl.recorder.repair.episode_check import EpisodeCheck
-from mcaprl.remote import as_path
+from mcaprl.remote import RemotePath, as_path
 
 # Number of chunks that a thread decompresses before it hands them over. Handing over each one takes
 # more time.
@@ -43,14 +46,20 @@ _Read = memoryview | CorruptLogError
 def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
     """Check the structure, CRCs, indexes, episodes and metadata of one log.
 
+    If the file is another robot's bag, its messages are decoded instead of the episodes.
+
     Args:
-        path: Path of the log.
+        path: Path of a log, or of a bag: an MCAP file, a ROS 1 bag, a rosbag2 database, or a
+            rosbag2 folder.
         threads: Number of threads that decompress chunks.
 
     Returns:
-        Problems in file order.
+        Problems in file order; for a bag, a note follows them.
     """
     path = as_path(path)
+    is_other = path.is_dir() or (is_bag_file(path) and path.suffix != ".mcap")
+    if is_other and not isinstance(path, RemotePath):
+        return check_messages(path)
     try:
         reader = McapReader(path)
     except LogError as error:
@@ -61,16 +70,22 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
         elif isinstance(error, CorruptLogError):
             action = _recover(path)
         return [Problem(what, "opening the file", next=action, file=str(path))]
-    found = Shortlist(check_file(reader))
-    action = _recover(path)
+    found, notes = Shortlist(check_file(reader)), list[Problem]()
+    is_log = bool(reader.channels_of(STEP_TOPIC)) or METADATA_NAME in reader.metadata
+    # Bags are read from local files only.
+    is_bag = not is_log and not isinstance(path, RemotePath)
     try:
         _check_contents(reader, found, threads=threads)
     except (LogError, SpaceError) as error:
-        if not found and METADATA_NAME not in reader.metadata:
-            action = "the MCAP file itself is valid, but it is not an mcaprl log"
-        found.append(Problem(_without_path(error, path), STEP_TOPIC))
+        if not is_bag:
+            found.append(Problem(_without_path(error, path), STEP_TOPIC))
+    if is_bag and not (found and reader.complete):
+        notes = check_messages(path)
     problems = [*found, *found.rest()]
-    return [replace(found, next=found.next or action, file=str(path)) for found in problems]
+    named = [
+        replace(found, next=found.next or _recover(path), file=str(path)) for found in problems
+    ]
+    return [*named, *notes]
 
 
 def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: int) -> None:

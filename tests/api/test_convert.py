@@ -14,7 +14,16 @@ import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import OutputExistsError, UsageError
 from mcaprl.recorder.mapping.config import load_mapping
-from tests.support.bags import STEPS, speed, turn, write_rosbag1, write_rosbag2
+from tests.support.bags import (
+    STEPS,
+    integers,
+    numbers,
+    speed,
+    turn,
+    write_channels,
+    write_rosbag1,
+    write_rosbag2,
+)
 
 MAPPING = """\
 clock: {rate_hz: 10}
@@ -85,7 +94,10 @@ def test_commands_read_a_bag_by_a_mapping(
     shown = capsys.readouterr().out
     assert "11 of 12 steps of the clock" in shown
     assert "6 left, 5 right" in shown
-    assert "'reward': 0.5" in shown
+    (first,) = [line for line in shown.splitlines() if line.startswith("│ 0 ")]
+    assert [cell.strip() for cell in first.split("│")[1:-1]] == [
+        *("0", "0", "0", "0", "-1", "0", "left", "0.5", "")
+    ]
     out = str(tmp_path / "out.mcap")
     assert run(["convert", str(bag), out, *mapping]) == 0
     assert f"{out}: 1 episode, 11 steps" in capsys.readouterr().out.replace("\n", "")
@@ -180,3 +192,43 @@ def test_unknown_formats_list_those_that_are_known(
     error = capsys.readouterr().err
     assert "text.csv is not an MCAP file" in error
     assert "nor is it a dataset of one of the formats lerobot, minari, parquet" in error
+
+
+def test_a_dry_run_of_wide_and_nested_observations_fits(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wide = MAPPING.replace("  yaw:", "  cov: {field: /odom.pose.covariance}\n  yaw:")
+    wide = wide.replace("action:\n", "  depth: {image: /camera/depth}\naction:\n", 1)
+    (tmp_path / "robot.yaml").write_text(wide)
+    mapping = ["--mapping", str(tmp_path / "robot.yaml")]
+    assert run(["convert", str(bag), *mapping, "--dry-run"]) == 0
+    shown = capsys.readouterr().out
+    assert max(map(len, shown.splitlines())) <= 100
+    (head,) = [line for line in shown.splitlines() if "┃ step" in line]
+    names = [cell.strip() for cell in head.split("┃")[1:-1]]
+    assert names[:4] == ["step", "depth", "speed", "cov_0"]
+    assert names[-3:] == ["action", "reward", "end"]
+    # The vector has 1 + 36 + 1 + 3 elements, of which `names` shows all but 5.
+    assert f"{41 - (len(names) - 5)} more columns: " in shown
+    assert "float32 4x6x1, mean 1" in shown
+
+
+def test_a_dry_run_has_a_row_for_each_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # The second file begins before the end of the first one.
+    for name, start in (("a.mcap", 0), ("b.mcap", 1)):
+        channels = [numbers("/x", [(start + k / 10, k) for k in range(30)])]
+        channels.append(integers("/cmd", [(start + k / 10, k % 2) for k in range(30)]))
+        write_channels(tmp_path / name, channels)
+    tree = {"clock": {"rate_hz": 10}, "observation": {"x": {"field": "/x.data"}}}
+    mapping = {**tree, "action": {"field": "/cmd.data"}}
+    (tmp_path / "m.yaml").write_text(json.dumps(mapping))
+    paths = [str(tmp_path / name) for name in ("a.mcap", "b.mcap")]
+    assert run(["convert", *paths, "--mapping", str(tmp_path / "m.yaml"), "--dry-run"]) == 0
+    shown = capsys.readouterr().out
+    rows = [line for line in shown.splitlines() if "0.0% 0.000 0.000" in line]
+    assert [[cell.strip() for cell in row.split("│")[1:4]] for row in rows] == [
+        ["0", "30", "29"],
+        ["1", "30", "29"],
+    ]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.recorder.bags.bag import Stream, TopicInfo
+from mcaprl.recorder.bags.bag import Failure, Stream, TopicInfo
 from mcaprl.recorder.bags.values import ABSENT, column_of, value_at
 
 SECOND_NS = 10**9
@@ -21,6 +21,7 @@ class MemoryBag:
 
     paths: tuple[Path, ...] = (Path("memory.bag"),)
     recordings: tuple[int, ...] = (0,)
+    cut: tuple[Path, ...] = ()
 
     def __init__(
         self,
@@ -87,6 +88,9 @@ class MemoryBag:
                 absent[name] = np.array([value is ABSENT for value in values], bool)[chosen]
             columns[name] = column[chosen]
         return Stream(self._times[topic][chosen], columns, chosen, (), absent)
+
+    def failures(self, topic: str) -> Iterator[Failure]:
+        return iter(())
 
     def close(self) -> None:
         """Do nothing."""

@@ -1,0 +1,358 @@
+"""Quantities of a bag that a policy is likely to observe, with the reasons against others."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, UsageError
+from mcaprl.recorder.bags.bag import Bag, TopicInfo
+from mcaprl.recorder.bags.overview import TopicOverview, instants_of, is_fresh
+from mcaprl.recorder.format.reading import full_name
+from mcaprl.recorder.mapping.config import Quantity
+
+_SAMPLES = 200
+_SIZES = (8, 16, 32, 64)
+NUMBERS = {"float32", "float64", "bool", *(f"{u}int{bits}" for u in ("", "u") for bits in _SIZES)}
+_MAX_ELEMENTS, _ELEMENTS = 64, 36
+"""Number of elements up to which an array is observed as a whole, and to which it is thinned."""
+_MAX_JOINTS, _MAX_INNER = 64, 8
+_ARE_FRESH, _ARE_FINITE = 0.9, 0.95
+"""Share of the time with a recent message, and share of numbers, of a likely quantity."""
+
+IMAGES = {
+    *("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
+    *("foxglove.RawImage", "foxglove.CompressedImage"),
+}
+_NEVER_TOPICS = {
+    *("rosout", "rosout_agg", "parameter_events", "tf", "tf_static", "diagnostics"),
+    *("diagnostics_agg", "clock", "camera_info", "bond", "statistics", "events"),
+}
+_NEVER_TYPES = re.compile(
+    r"rosgraph_msgs/msg/.*|rcl_interfaces/msg/.*|tf2?_msgs/msg/.*|diagnostic_msgs/msg/.*"
+    r"|sensor_msgs/msg/(CameraInfo|PointCloud2?)|nav_msgs/msg/(OccupancyGrid|Path|MapMetaData)"
+    r"|visualization_msgs/msg/.*|bond/msg/.*|foxglove[.](Log|CameraCalibration|PointCloud|Grid"
+    r"|SceneUpdate|FrameTransforms?|CompressedVideo|ImageAnnotations|GeoJSON)"
+)
+_LIKELY = {
+    "nav_msgs/msg/Odometry": (
+        "twist.twist.linear.x",
+        "twist.twist.angular.z",
+        "pose.pose.position.x",
+        "pose.pose.position.y",
+    ),
+    "geometry_msgs/msg/PoseStamped": ("pose.position.x", "pose.position.y"),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ("pose.pose.position.x", "pose.pose.position.y"),
+    "geometry_msgs/msg/Twist": ("linear.x", "angular.z"),
+    "geometry_msgs/msg/TwistStamped": ("twist.linear.x", "twist.angular.z"),
+    "sensor_msgs/msg/Imu": ("angular_velocity.z", "linear_acceleration.x"),
+    "sensor_msgs/msg/LaserScan": ("ranges",),
+    "foxglove.LaserScan": ("ranges",),
+    "foxglove.PoseInFrame": ("pose.position.x", "pose.position.y"),
+    "sensor_msgs/msg/JointState": ("position", "velocity"),
+    "sensor_msgs/msg/Range": ("range",),
+    "sensor_msgs/msg/BatteryState": ("percentage", "voltage"),
+    "std_msgs/msg/Float32MultiArray": ("data",),
+    "std_msgs/msg/Float64MultiArray": ("data",),
+}
+"""Fields of common types that a policy is likely to observe."""
+_YAWS = {
+    "nav_msgs/msg/Odometry": "pose.pose.orientation",
+    "geometry_msgs/msg/PoseStamped": "pose.orientation",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose.orientation",
+    "foxglove.PoseInFrame": "pose.orientation",
+}
+_COUNTING = {"seq", "sequence", "id", "ids", "idx", "index", "counter", "count", "num", "stamp"}
+_COUNTING |= {"stamps", "timestamp", "time", "sec", "nanosec", "nsec", "secs", "nsecs", "nanos"}
+_COUNTING |= {"seconds", "covariance", "crc", "checksum", "version", "reserved", "reserve", "tick"}
+_COUNTING |= {"ticks", "code", "bigendian", "offset", "stride"}
+_WORDS = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
+_BASES = ("base_link", "base_footprint", "base", "body", "pelvis", "trunk", "torso")
+_FIXED = ("odom", "map", "world", "earth")
+
+
+class Candidate(NamedTuple):
+    """A quantity that may be observed.
+
+    Attributes:
+        topic: Topic of the quantity.
+        label: Field or frame, from which the name is made.
+        spec: Keys and values of the quantity in the mapping.
+        is_scalar: Whether the value is one number.
+        penalty: 0 for a likely quantity, more for others.
+        why_not: Reason of the penalty; empty without one.
+    """
+
+    topic: TopicOverview
+    label: str
+    spec: dict[str, Any]
+    is_scalar: bool = False
+    penalty: int = 0
+    why_not: str = ""
+
+
+def kind_of(info: TopicInfo) -> str:
+    """Return the name of a type in one form: `pkg/msg/Type`, or `foxglove.Type`.
+
+    ROS 1 bags, and some writers of MCAP, have names such as `pkg/Type`.
+    """
+    name = full_name(info.type_name)
+    for start in ("foxglove_msgs/msg/", "foxglove_msgs."):
+        if name.startswith(start):
+            return f"foxglove.{name.removeprefix(start)}"
+    return name
+
+
+def is_never_observed(info: TopicInfo) -> bool:
+    """Return whether a topic has log lines, transforms, or data that is not a quantity."""
+    parts = info.name.strip("/").split("/")
+    is_named = parts[-1] in _NEVER_TOPICS or parts[-1].startswith("_service_event")
+    return is_named or _NEVER_TYPES.fullmatch(kind_of(info)) is not None
+
+
+def shares_of_time(topics: Sequence[TopicOverview], gap_s: float) -> dict[str, float]:
+    """Return the share of the time in which each topic has a message of the last `gap_s` seconds.
+
+    Only the time in which at least half of the topics have messages counts.
+    """
+    instants_ns = instants_of([topic.times_ns for topic in topics])
+    fresh = {topic.info.name: is_fresh(topic.times_ns, instants_ns, gap_s) for topic in topics}
+    count = np.sum(list(fresh.values()), axis=0)
+    is_data = count >= np.max(count, initial=0) / 2
+    return {name: float(each[is_data].mean()) for name, each in fresh.items() if is_data.any()}
+
+
+def number_fields(info: TopicInfo) -> list[str]:
+    """Return the names of the scalar number fields of a topic, except headers and stamps."""
+    return [
+        name
+        for name, kind in info.fields.items()
+        if kind in NUMBERS and not name.startswith(("header.", "stamp.", "timestamp"))
+    ]
+
+
+def sampled(bag: Bag, info: TopicInfo, fields: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Return fields of at most 200 messages of a topic, spread evenly.
+
+    Raises:
+        LogError: The messages cannot be read.
+    """
+    rows = np.unique(np.linspace(0, info.count - 1, min(info.count, _SAMPLES)).astype(np.int64))
+    return dict(bag.read(info.name, list(fields), rows).columns)
+
+
+def candidates(bag: Bag, topic: TopicOverview, share: float) -> list[Candidate]:
+    """Return the quantities of a topic that may be observed, the likely ones first.
+
+    Args:
+        bag: Bag to read samples from.
+        topic: Topic with messages at different times.
+        share: Share of the time with a recent message.
+    """
+    info, kind = topic.info, kind_of(topic.info)
+    likely = [name for name in _LIKELY.get(kind, ()) if name in info.fields]
+    names = likely or _unknown_fields(info)
+    extra = ("range_min", "range_max", "name")
+    try:
+        columns = sampled(bag, info, [*names, *(each for each in extra if each in info.fields)])
+    except (LogError, UsageError):
+        return []
+    found = []
+    for name in names:
+        if (spec := _spec(info, name, columns)) is not None:
+            penalty, why = _penalty(name, columns[name], share, is_known=bool(likely))
+            is_scalar = columns[name].ndim == 1
+            found.append(Candidate(topic, name, spec, is_scalar, penalty, why))
+    found += _inner(bag, topic, share)
+    yaw = _YAWS.get(kind)
+    if yaw is not None and f"{yaw}.w" in info.fields:
+        penalty, why = (0, "") if share >= _ARE_FRESH else _rare(share)
+        spec = {"field": f"{info.name}.{yaw}", "as": "yaw"}
+        found.append(Candidate(topic, f"{yaw}.yaw", spec, True, penalty, why))
+    return sorted(found, key=lambda each: each.penalty)
+
+
+def _inner(bag: Bag, topic: TopicOverview, share: float) -> list[Candidate]:
+    """Return numbers in arrays of messages as vectors, such as `motors[:].q`."""
+    info, found = topic.info, list[Candidate]()
+    names = [
+        name
+        for name, kind in info.fields.items()
+        if "[]." in name and kind.count("[") == 1 and kind.partition("[")[0] in NUMBERS
+    ]
+    for name in names[:_MAX_INNER]:
+        path = name.replace("[]", "[:]")
+        try:
+            columns = sampled(bag, info, [path])
+        except (LogError, UsageError):
+            continue
+        if (spec := _spec(info, path, columns)) is not None and columns[path].ndim == 2:
+            penalty, why = _penalty(name, columns[path], share, is_known=False)
+            found.append(Candidate(topic, path, spec, False, penalty, why))
+    return found
+
+
+def _unknown_fields(info: TopicInfo) -> list[str]:
+    """Return the fields of an own type that are numbers, or arrays of numbers."""
+    arrays = [
+        name
+        for name, kind in info.fields.items()
+        if kind.endswith("]")
+        and "[" not in name
+        and kind.partition("[")[0] in NUMBERS - {"uint8", "int8"}
+        and not name.startswith(("header.", "stamp.", "timestamp"))
+    ]
+    has_frame = {"height", "width"} <= {name.rpartition(".")[2] for name in info.fields}
+    names = [*number_fields(info), *arrays]
+    return [
+        name
+        for name in names
+        if not (has_frame and name.rpartition(".")[2] in ("height", "width", "step"))
+    ]
+
+
+def _spec(info: TopicInfo, name: str, columns: dict[str, NDArray[Any]]) -> dict[str, Any] | None:
+    """Return the keys and values of a quantity; None if it cannot be one."""
+    column, path = columns[name], f"{info.name}.{name}"
+    if column.dtype.kind not in "biuf" or column.ndim > 2 or not column.size:
+        return None
+    spec: dict[str, Any] = {"field": path}
+    if column.ndim == 2 and column.shape[1] > _MAX_ELEMENTS:
+        spec["field"] = f"{path}[::{math.ceil(column.shape[1] / _ELEMENTS)}]"
+    if name == "ranges":
+        spec |= _limits_of(columns)
+    is_joints = "name" in columns and name in ("position", "velocity", "effort")
+    if is_joints and not _add_joints(spec, columns["name"]):
+        return None
+    numbers = column.astype(np.float64)
+    finite = np.isfinite(numbers)
+    if "clip" not in spec and finite.mean() < _ARE_FINITE:
+        return None
+    if column.ndim == 1 and _loses_digits(numbers[finite]):
+        spec["offset"] = -float(round(float(np.median(numbers[finite])), 3))
+    return spec
+
+
+def _limits_of(columns: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    """Return `clip` of a scan, and `missing` if some beams have no number."""
+    limits = [columns[each] for each in ("range_min", "range_max") if each in columns]
+    column, found = columns["ranges"], dict[str, Any]()
+    is_number = np.isfinite(column.astype(np.float64))
+    if len(limits) == 2 and all(np.isfinite(each).all() for each in limits):
+        low, high = float(limits[0].min()), float(limits[1].max())
+    elif is_number.any():
+        low, high = 0.0, float(column[is_number].max())
+    else:
+        return found
+    if low < high:
+        found["clip"] = [_short(low), _short(high)]
+        if not is_number.all():
+            found["missing"] = _short(high)
+    return found
+
+
+def _short(number: float) -> float:
+    """Return a float32 number as the shortest number that float32 stores equally."""
+    return float(str(np.float32(number)))
+
+
+def _add_joints(spec: dict[str, Any], names: NDArray[Any]) -> bool:
+    """Select joints by name if mappings can; return False if their order changes otherwise."""
+    lists = [list(map(str, each)) for each in names]
+    every = list(dict.fromkeys(name for each in lists for name in each))
+    if not every or len(every) > _MAX_JOINTS:
+        return False
+    if "names" in Quantity.model_fields:
+        spec["names"] = every
+        return True
+    return all(each == lists[0] for each in lists)
+
+
+def _loses_digits(numbers: NDArray[np.float64]) -> bool:
+    """Return whether different numbers become equal as float32."""
+    distinct = np.unique(numbers)
+    return len(np.unique(distinct.astype(np.float32))) < len(distinct)
+
+
+def _penalty(name: str, column: NDArray[Any], share: float, *, is_known: bool) -> tuple[int, str]:
+    """Return how unlikely a quantity is, and why."""
+    if not is_known and is_counting(name, column):
+        return 4, "a time, counter or id"
+    if share < _ARE_FRESH:
+        return _rare(share)
+    numbers = column.astype(np.float64)
+    return (
+        (1, "constant") if (np.nan_to_num(numbers) == np.nan_to_num(numbers[:1])).all() else (0, "")
+    )
+
+
+def is_counting(name: str, column: NDArray[Any]) -> bool:
+    """Return whether a field is a time, a counter or an id, by its name and values."""
+    words = {word.lower() for word in _WORDS.findall(name.rpartition(".")[2])}
+    if words & _COUNTING:
+        return True
+    if column.dtype.kind not in "iu" or column.ndim > 1 or len(column) < 3:
+        return False
+    # A counter of messages may have the same value twice in messages of equal times.
+    steps = np.diff(column.astype(np.float64))
+    is_rising = bool((steps >= 0).all()) and (steps > 0).mean() > 0.5
+    return is_rising or bool(np.abs(column.astype(np.float64)).max() > 2**31)
+
+
+def _rare(share: float) -> tuple[int, str]:
+    return 2, f"has a recent message in {share:.0%} of the time only"
+
+
+def transforms(bag: Bag, topics: dict[str, TopicOverview]) -> Iterator[Candidate]:
+    """Yield the pose of the robot's base in a fixed frame, if `/tf` has it."""
+    if "/tf" not in topics or topics["/tf"].why_unusable:
+        return
+    moving, static = _parents(bag, topics, "/tf"), _parents(bag, topics, "/tf_static")
+    parents = {**static, **moving}
+    bases = [frame for base in _BASES for frame in parents if frame.rpartition("/")[2] == base]
+    for frame in dict.fromkeys([*bases, *moving]):
+        chain = _chain(frame, parents)
+        fixed = [each for name in _FIXED for each in chain if each.rpartition("/")[2] == name]
+        for parent in [*fixed, chain[-1]][: 1 if chain else 0]:
+            path = [frame, *chain[: chain.index(parent)]]
+            if any(each in moving for each in path):
+                spec = {"transform": frame, "in": parent}
+                yield Candidate(topics["/tf"], f"{frame}.in_{parent}", spec)
+                return
+
+
+def _parents(bag: Bag, topics: dict[str, TopicOverview], name: str) -> dict[str, str]:
+    """Return the parent of each frame in samples of a topic of transforms."""
+    if name not in topics or topics[name].info.problem or not topics[name].info.count:
+        return {}
+    found: dict[str, str] = {}
+    try:
+        column = sampled(bag, topics[name].info, ["transforms"])["transforms"]
+    except (LogError, UsageError):
+        return found
+    for transforms in column:
+        for each in transforms if isinstance(transforms, Sequence) else ():
+            child, header = _get(each, "child_frame_id"), _get(each, "header")
+            parent = _get(header, "frame_id")
+            if isinstance(child, str) and isinstance(parent, str):
+                found.setdefault(child.removeprefix("/"), parent.removeprefix("/"))
+    return found
+
+
+def _get(value: Any, name: str) -> Any:
+    return value.get(name) if isinstance(value, dict) else getattr(value, name, None)
+
+
+def _chain(frame: str, parents: dict[str, str]) -> list[str]:
+    """Return the ancestors of a frame, the nearest first."""
+    found: list[str] = []
+    while (parent := parents.get(found[-1] if found else frame)) is not None:
+        if parent in found or parent == frame:
+            return found
+        found.append(parent)
+    return found
