@@ -26,6 +26,7 @@ from mcaprl.recorder.mapping.config import Place, parse_mapping
 from mcaprl.recorder.mapping.images import ImageReader
 from mcaprl.recorder.mapping.likely import (
     IMAGES,
+    LIKELY,
     Candidate,
     candidates,
     is_never_observed,
@@ -148,7 +149,9 @@ class _Draft:
                 each._replace(penalty=each.penalty + extra if k < _MAX_PER_TOPIC else 9)
                 for k, each in enumerate(mine)
             ]
-        found += transforms(self._bag, self._topics)
+        # Topics of common types come first, because the number of quantities is limited.
+        found.sort(key=lambda each: kind_of(each.topic.info) not in LIKELY)
+        found[:0] = transforms(self._bag, self._topics)
         best = min((each.penalty for each in found), default=0)
         chosen = [each for each in found if each.penalty == best][:_MAX_OBSERVED]
         self.others = [each for each in found if each not in chosen]
