@@ -552,6 +552,18 @@ def test_unreadable_commands_are_named(tmp_path: Path) -> None:
     assert "# /cmd_vel cannot be read: own/msg/Twist" in text
 
 
+def test_what_prevents_episodes_is_left_out_without_a_command_too(tmp_path: Path) -> None:
+    robot = Robot([]).add("/odom", ODOM, 10, odometry)
+    robot.add("/x", FLOAT, 10, lambda t: {"data": math.sin(t)})
+    robot.add("/y", FLOAT, 10, lambda t: {"data": math.nan if t > 19.5 else math.sin(t)})
+    text, (warned,) = suggested(write_mcap(robot, tmp_path / "robot.mcap"))
+    assert "no topic looks like a command" in warned
+    assert "y_data: {field: /y.data}" in text
+    robot.topics[2] = robot.topics[2]._replace(name="/z", messages=robot.topics[2].messages[:2])
+    text, _ = suggested(write_mcap(robot, tmp_path / "robot.mcap"))
+    assert "z_data" not in text
+
+
 def test_all_times_equal(tmp_path: Path) -> None:
     same = [(0.0, {"data": 0.1 * k}) for k in range(10)]
     robot = Robot([]).add("/cmd", FLOAT, 10, lambda t: {"data": t})
