@@ -19,9 +19,11 @@ from mcaprl.recorder.mapping.config import Quantity
 _SAMPLES = 200
 _SIZES = (8, 16, 32, 64)
 NUMBERS = {"float32", "float64", "bool", *(f"{u}int{bits}" for u in ("", "u") for bits in _SIZES)}
+ELEMENTS = NUMBERS - {"uint8", "int8"}
+"""Kinds of numbers, and of the elements of arrays that are not raw data."""
 _MAX_ELEMENTS, _ELEMENTS = 64, 36
 """Number of elements up to which an array is observed as a whole, and to which it is thinned."""
-_MAX_JOINTS, _MAX_INNER = 64, 8
+_MAX_JOINTS, _MAX_INNER, _MAX_SAMPLED = 64, 8, 10_000
 _ARE_FRESH, _ARE_FINITE = 0.9, 0.95
 """Share of the time with a recent message, and share of numbers, of a likely quantity."""
 
@@ -39,7 +41,7 @@ _NEVER_TYPES = re.compile(
     r"|visualization_msgs/msg/.*|bond/msg/.*|foxglove[.](Log|CameraCalibration|PointCloud|Grid"
     r"|SceneUpdate|FrameTransforms?|CompressedVideo|ImageAnnotations|GeoJSON)"
 )
-_LIKELY = {
+LIKELY = {
     "nav_msgs/msg/Odometry": (
         "twist.twist.linear.x",
         "twist.twist.angular.z",
@@ -155,10 +157,10 @@ def candidates(bag: Bag, topic: TopicOverview, share: float) -> list[Candidate]:
         share: Share of the time with a recent message.
     """
     info, kind = topic.info, kind_of(topic.info)
-    likely = [name for name in _LIKELY.get(kind, ()) if name in info.fields]
-    names = likely or _unknown_fields(info)
+    likely = [name for name in LIKELY.get(kind, ()) if name in info.fields]
     extra = ("range_min", "range_max", "name")
     try:
+        names = _short_fields(bag, info, likely or _unknown_fields(info))
         columns = sampled(bag, info, [*names, *(each for each in extra if each in info.fields)])
     except (LogError, UsageError):
         return []
@@ -175,6 +177,14 @@ def candidates(bag: Bag, topic: TopicOverview, share: float) -> list[Candidate]:
         spec = {"field": f"{info.name}.{yaw}", "as": "yaw"}
         found.append(Candidate(topic, f"{yaw}.yaw", spec, True, penalty, why))
     return sorted(found, key=lambda each: each.penalty)
+
+
+def _short_fields(bag: Bag, info: TopicInfo, names: list[str]) -> list[str]:
+    """Return the fields that are not arrays of very many numbers, such as images of an own type."""
+    arrays = [name for name in names if info.fields[name].endswith("]")]
+    first = bag.read(info.name, arrays, np.array([0])).columns if arrays else {}
+    long = [name for name, column in first.items() if np.size(column[0]) > _MAX_SAMPLED]
+    return [name for name in names if name not in long]
 
 
 def _inner(bag: Bag, topic: TopicOverview, share: float) -> list[Candidate]:
@@ -204,7 +214,7 @@ def _unknown_fields(info: TopicInfo) -> list[str]:
         for name, kind in info.fields.items()
         if kind.endswith("]")
         and "[" not in name
-        and kind.partition("[")[0] in NUMBERS - {"uint8", "int8"}
+        and kind.partition("[")[0] in ELEMENTS
         and not name.startswith(("header.", "stamp.", "timestamp"))
     ]
     has_frame = {"height", "width"} <= {name.rpartition(".")[2] for name in info.fields}

@@ -14,6 +14,8 @@ from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.bag import Bag, TopicInfo
 from mcaprl.recorder.bags.overview import TopicOverview
 from mcaprl.recorder.mapping.likely import (
+    ELEMENTS,
+    IMAGES,
     NUMBERS,
     is_counting,
     is_never_observed,
@@ -60,7 +62,7 @@ def likelihood(info: TopicInfo) -> int:
     score += 2 * any(word in kind.lower() for word in _COMMANDS)
     score += _TYPES.fullmatch(kind) is not None
     score += any(word in name for word in ("cmd", "command", "setpoint"))
-    if is_never_observed(info) or not score:
+    if is_never_observed(info) or kind in IMAGES or not score:
         return 0
     return max(1, score - 5) if _ANSWERS.search(name) else score
 
@@ -85,7 +87,7 @@ def _commands(bag: Bag, topic: TopicOverview) -> Command | None:
     arrays = [
         name
         for name, kind in info.fields.items()
-        if kind.endswith("]") and kind.partition("[")[0] in NUMBERS and "[" not in name
+        if kind.endswith("]") and kind.partition("[")[0] in ELEMENTS and "[" not in name
     ]
     columns = dict(bag.read(info.name, [*numbers, *arrays]).columns)
     found = {

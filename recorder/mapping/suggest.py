@@ -26,6 +26,7 @@ from mcaprl.recorder.mapping.config import Place, parse_mapping
 from mcaprl.recorder.mapping.images import ImageReader
 from mcaprl.recorder.mapping.likely import (
     IMAGES,
+    LIKELY,
     Candidate,
     candidates,
     is_never_observed,
@@ -148,7 +149,9 @@ class _Draft:
                 each._replace(penalty=each.penalty + extra if k < _MAX_PER_TOPIC else 9)
                 for k, each in enumerate(mine)
             ]
-        found += transforms(self._bag, self._topics)
+        # Topics of common types come first, because the number of quantities is limited.
+        found.sort(key=lambda each: kind_of(each.topic.info) not in LIKELY)
+        found[:0] = transforms(self._bag, self._topics)
         best = min((each.penalty for each in found), default=0)
         chosen = [each for each in found if each.penalty == best][:_MAX_OBSERVED]
         self.others = [each for each in found if each not in chosen]
@@ -212,7 +215,7 @@ class _Draft:
     def _tree(self, action: dict[str, Any] | None = None) -> dict[str, Any]:
         command, nothing = self._command, np.empty((0, 0))
         if action is None:
-            action = _NOTHING if command is None else action_spec(command, None, nothing)
+            action = self._stand_in() if command is None else action_spec(command, None, nothing)
         return {
             "clock": {"rate_hz": self._rate_hz},
             "observation": {name: entry.spec for name, entry in self.observed.items()},
@@ -220,17 +223,23 @@ class _Draft:
             "episodes": {"gap_s": self._gap_s},
         }
 
+    def _stand_in(self) -> dict[str, Any]:
+        """Return an observed number as action, with which a bag without commands is tried."""
+        scalars = (each.spec for each in self.observed.values() if each.is_scalar)
+        paths = [spec["field"] for spec in scalars if "as" not in spec]
+        return {"fields": paths[:1], "box": {"low": [-1], "high": [1]}} if paths else _NOTHING
+
     def _try(self) -> str:
         """Leave out quantities that prevent all episodes; return why there is none in the end."""
         self.action = self._tree()["action"]
-        if self._command is None:
-            return self._why_no_command()
-        while True:
+        while self.action != _NOTHING:
             name, problem = self._tried()
             if not problem or name is None or len(self.observed) == 1:
-                return problem
+                return problem if self._command is not None else self._why_no_command()
             self.observed.pop(name)
             self.dropped.append(f"left out: {problem}")
+            self.action = self._tree()["action"]
+        return self._why_no_command()
 
     def _tried(self) -> tuple[str | None, str]:
         """Return the name of a quantity that prevents all episodes, and why; empty if none does."""

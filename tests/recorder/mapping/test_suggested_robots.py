@@ -356,6 +356,23 @@ def test_what_is_observed_and_what_is_not(tmp_path: Path) -> None:
         assert set(observed(name, folder).observation) == odom, name
 
 
+def test_common_types_come_first_and_raw_data_is_not_observed(tmp_path: Path) -> None:
+    robot = Robot([], {"my/msg/Grid": "float32[] cells\nfloat32 level\n"})
+    robot.add("/a_grid", "my/msg/Grid", 2, lambda t: {"cells": [t] * 20_000, "level": math.sin(t)})
+    for k in range(20):
+        robot.add(f"/b{k}", FLOAT, 5, lambda t: {"data": math.sin(t)})
+    robot.add("/odom", ODOM, 10, odometry).add("/cmd_vel", TWIST, 10, twist)
+    robot.add("/control/image", "sensor_msgs/msg/Image", 5, image)
+    mapping, _ = holds(write_mcap(robot, tmp_path / "robot.mcap"), tmp_path)
+    assert mapping is not None
+    names = list(mapping.observation)
+    assert names[:2] == ["odom_linear_x", "odom_angular_z"]
+    assert len(names) == 12
+    assert "a_grid_level" in names
+    assert "a_grid_cells" not in names
+    assert mapping.action.fields == ["/cmd_vel.linear.x", "/cmd_vel.angular.z"]
+
+
 def test_types_have_two_forms_of_their_name(tmp_path: Path) -> None:
     expected = observed("camera and lidar without command", tmp_path).observation
     for k, form in enumerate(("short names", "ros1 mcap", "bag")):
@@ -533,6 +550,18 @@ def test_unreadable_commands_are_named(tmp_path: Path) -> None:
     assert expected in warned
     assert expected in text
     assert "# /cmd_vel cannot be read: own/msg/Twist" in text
+
+
+def test_what_prevents_episodes_is_left_out_without_a_command_too(tmp_path: Path) -> None:
+    robot = Robot([]).add("/odom", ODOM, 10, odometry)
+    robot.add("/x", FLOAT, 10, lambda t: {"data": math.sin(t)})
+    robot.add("/y", FLOAT, 10, lambda t: {"data": math.nan if t > 19.5 else math.sin(t)})
+    text, (warned,) = suggested(write_mcap(robot, tmp_path / "robot.mcap"))
+    assert "no topic looks like a command" in warned
+    assert "y_data: {field: /y.data}" in text
+    robot.topics[2] = robot.topics[2]._replace(name="/z", messages=robot.topics[2].messages[:2])
+    text, _ = suggested(write_mcap(robot, tmp_path / "robot.mcap"))
+    assert "z_data" not in text
 
 
 def test_all_times_equal(tmp_path: Path) -> None:
