@@ -47,7 +47,8 @@ def find_bags(data: str | Path | Sequence[str | Path]) -> list[Path]:
         LogError: There is no such path, or a folder has no bags.
     """
     if not isinstance(data, str | Path):
-        every = [path for part in data for path in find_bags(part)]
+        parts = [part for part in data if Path(part).suffix != _COPY] or data
+        every = [path for part in parts for path in find_bags(part)]
         # A bag that is listed under several paths is read once.
         return list({os.path.realpath(path): path for path in every}.values())
     path = Path(data)

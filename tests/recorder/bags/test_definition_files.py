@@ -185,7 +185,8 @@ def test_definitions_of_a_mapping_and_of_a_command(
     with pytest.raises((UsageError, LogError), match="its definition is missing"):
         mcaprl.open(bag, mapping=mapping)
     assert len(mcaprl.open(bag, mapping=mapping, definitions=[workspace])) == 2
-    assert "/robot.motor.q" in mcaprl.suggest_mapping(bag, definitions=[workspace])
+    with pytest.warns(UserWarning, match="no topic looks like a command"):
+        assert "/robot.motor.q" in mcaprl.suggest_mapping(bag, definitions=[workspace])
     options = ["--mapping", str(mapping), "--definitions", str(workspace / "src")]
     for command in ("info", "check", ("convert", "--dry-run")):
         words = [command] if isinstance(command, str) else list(command)

@@ -449,7 +449,8 @@ def test_images_of_foxglove(foxglove_log: Path) -> None:
         found = mcaprl.open(foxglove_log, mapping=tree)
         assert found.observation_space == spaces.Box(0, 255, (8, 10, 3), np.uint8)
         assert found.observations[:, 3, 4, 1].tolist() == [10 * k for k in range(11)]
-    text = mcaprl.suggest_mapping(foxglove_log)
+    with pytest.warns(UserWarning, match="no topic looks like a command"):
+        text = mcaprl.suggest_mapping(foxglove_log)
     assert "# camera: {image: /raw, resize: [84, 84]}  # foxglove.RawImage, 12" in text
     assert "# camera: {image: /compressed, resize: [84, 84]}" in text
     assert "height" not in text

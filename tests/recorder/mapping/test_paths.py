@@ -249,7 +249,8 @@ def test_single_infinite_elements_are_replaced_or_clipped() -> None:
 def test_infinite_elements_are_named() -> None:
     rows = [[1.0, math.inf, 3.0, math.inf]] * 4
     with pytest.raises(
-        LogError, match=r"x \(/low\) has no value at any step \(elements 1, 3\): set"
+        LogError,
+        match=r"x \(/low\) is not finite at 100% of the steps \(elements 1, 3 of 4, for ex",
     ):
         scan(rows)
     report = scan([[1.0, math.inf if step else 2.0, 3.0] for step in (0, 0, 0, 1)]).report
