@@ -176,7 +176,8 @@ def _nanoseconds(value: Any) -> Any:
             if value.keys() == {second, rest}:
                 return int(value[second]) * _NS_PER_S + int(value[rest])
         elif hasattr(value, second) and hasattr(value, rest):
-            return int(getattr(value, second)) * _NS_PER_S + int(getattr(value, rest))
+            time_ns = int(getattr(value, second)) * _NS_PER_S + int(getattr(value, rest))
+            return time_ns if abs(time_ns) < 2**63 else None
     return value
 
 
