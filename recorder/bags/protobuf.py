@@ -261,8 +261,10 @@ class _Classes(dict[str, type[_Message]]):
 
         def entries(message: Any) -> list[Any]:
             found = value(message)
-            wrapped = (lambda each: each) if descriptor is None else self._wrapper(descriptor)
-            return [_Entry(key, wrapped(found[key])) for key in sorted(found)]
+            if descriptor is None:
+                return [_Entry(key, found[key]) for key in sorted(found)]
+            wrapper = self._wrapper(descriptor)
+            return [_Entry(key, wrapper(found[key])) for key in sorted(found)]
 
         return entries
 
