@@ -35,7 +35,6 @@ _KNOWN_FILES: Final = {
     )
 }
 """Modules with the definitions that come with protobuf."""
-_MAX_SECONDS: Final = 2**63 // 10**9 - 1
 _KINDS: Final = {
     1: "float64",
     2: "float32",
@@ -215,14 +214,12 @@ class _Classes(dict[str, type[_Message]]):
         """Return the class of a type; its nested types get their classes when they are used."""
         found = self.get(descriptor.full_name)
         if found is None:
-            fields = {field.name: field for field in descriptor.fields}
-            is_time = descriptor.full_name in _TIMES
-            readers = {
-                name: _seconds if is_time and name == "seconds" else self._reader(field)
-                for name, field in fields.items()
-                if not name.startswith("__")
+            properties = {
+                field.name: property(self._reader(field))
+                for field in descriptor.fields
+                if not field.name.startswith("__")
             }
-            members = {"__slots__": (), **{name: property(each) for name, each in readers.items()}}
+            members = {"__slots__": (), **properties}
             found = self[descriptor.full_name] = type("_Message", (_Message,), members)
         return found
 
@@ -264,8 +261,10 @@ class _Classes(dict[str, type[_Message]]):
 
         def entries(message: Any) -> list[Any]:
             found = value(message)
-            wrapped = (lambda each: each) if descriptor is None else self._wrapper(descriptor)
-            return [_Entry(key, wrapped(found[key])) for key in sorted(found)]
+            if descriptor is None:
+                return [_Entry(key, found[key]) for key in sorted(found)]
+            wrapper = self._wrapper(descriptor)
+            return [_Entry(key, wrapper(found[key])) for key in sorted(found)]
 
         return entries
 
@@ -288,15 +287,3 @@ _BOXES: Final[dict[type, Callable[[Any], Any]]] = {
 
 def _boxed(value: Any) -> Any:
     return _BOXES[int if isinstance(value, bool) else type(value)](value)
-
-
-def _seconds(message: Any) -> int:
-    """Return the seconds of a time.
-
-    Raises:
-        LogError: The time in nanoseconds has more than 64 bits.
-    """
-    found: int = message._of_protobuf.seconds
-    if abs(found) > _MAX_SECONDS:
-        raise LogError(f"a time of {found} s is not within the years 1678 to 2262")
-    return found

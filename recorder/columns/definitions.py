@@ -6,23 +6,23 @@ import keyword
 from collections.abc import Hashable, Mapping
 from functools import cached_property, lru_cache
 from operator import attrgetter
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from mcaprl.errors import LogError
-from mcaprl.limits import (
-    MAX_DEFINITION_BYTES,
-    MAX_FIXED_MESSAGES,
-    MAX_MESSAGES_PER_BYTE,
-    MAX_TYPE_DEPTH,
-    MAX_TYPE_FIELDS,
-)
+from mcaprl.limits import MAX_DEFINITION_BYTES
 from mcaprl.recorder.columns.definition_text import parsed_types
+from mcaprl.recorder.columns.type_sizes import (
+    ARRAYS,
+    TIME_TYPES,
+    UNREADABLE,
+    check_size,
+    element_of,
+)
 
-TIME_TYPES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 ROS1 = "ros1msg"
 # The definition of a service event may lack the definitions of the request and the response. By
 # default, events contain neither requests nor responses, and can be read without these definitions.
@@ -30,8 +30,6 @@ _EVENT, _PARTS = "_Event", ("_Request", "_Response")
 _UNKNOWN: Any = ([], [("unknown", (Nodetype.BASE, ("uint8", 0)))])
 # A ROS 2 message without fields has one byte.
 _EMPTY: Any = ([], [("structure_needs_at_least_one_member", (Nodetype.BASE, ("uint8", 0)))])
-_UNREADABLE = ("wstring", "wchar", "float128", "fixed")
-_ARRAYS = (Nodetype.ARRAY, Nodetype.SEQUENCE)
 
 
 class TypeSource(Hashable, Protocol):
@@ -64,7 +62,7 @@ class Definitions:
             LogError: A type contains itself, or is too large.
         """
         self.name, self.is_own = name, is_own
-        _Sizes(types).of(name, ())
+        check_size(types, name)
         self.unreadable: dict[str, str] = {}
         self.types = _readable(types, name, self.unreadable)
 
@@ -217,7 +215,7 @@ def _field_kinds(
     types: Mapping[str, Any], description: Any, path: str, *, inner: bool
 ) -> dict[str, str]:
     kind, what = description
-    if kind in _ARRAYS:
+    if kind in ARRAYS:
         found = {path: _kind(description)}
         if inner and what[0][0] == Nodetype.NAME:
             parts = _field_kinds(types, what[0], f"{path}[]", inner=True)
@@ -247,109 +245,9 @@ def _known(distribution: str, is_ros1: bool) -> Typestore:
     return get_typestore(stores.get(f"ros2_{distribution}", latest))
 
 
-def _element(description: Any) -> tuple[Any, Any]:
-    """Return kind and type of a field, or of the elements of an array."""
-    kind, what = description
-    return what[0] if kind in _ARRAYS else (kind, what)
-
-
 def _nested(description: Any) -> list[str]:
-    kind, what = _element(description)
+    kind, what = element_of(description)
     return [str(what)] if kind == Nodetype.NAME else []
-
-
-class _Size(NamedTuple):
-    """Size of a type.
-
-    Attributes:
-        leaves: Number of leaf fields, with those in arrays of messages.
-        depth: Number of levels of nested messages.
-        messages: Number of nested messages in the smallest message of the type.
-        least_bytes: Number of bytes of the smallest message of the type, without padding.
-    """
-
-    leaves: int
-    depth: int
-    messages: int
-    least_bytes: int
-
-
-class _Sizes:
-    """Sizes of types, each computed once: their leaf fields can be exponential in their number."""
-
-    def __init__(self, types: Mapping[str, Any]) -> None:
-        self._types = types
-        self._known: dict[str, _Size] = {}
-        self._fixed = 0
-
-    def of(self, name: str, parents: tuple[str, ...]) -> _Size:
-        """Return the size of a type that is nested in the types `parents`.
-
-        Raises:
-            LogError: The type contains itself, or is too large.
-        """
-        if name in parents:
-            raise LogError(f"type {name} contains itself")
-        if len(parents) >= MAX_TYPE_DEPTH:
-            raise LogError(
-                f"{parents[0]}: messages are nested in more than {MAX_TYPE_DEPTH} levels"
-            )
-        if name not in self._known:
-            path = (*parents, name)
-            parts = [self._field(field, each, path) for field, each in self._types[name][1]]
-            leaves, depths, messages, least_bytes = zip(*parts, strict=True) if parts else ((),) * 4
-            found = _Size(
-                max(sum(leaves), 1), 1 + max(depths, default=0), 1 + sum(messages), sum(least_bytes)
-            )
-            self._check(name, found)
-            self._known[name] = found
-        if len(parents) + self._known[name].depth > MAX_TYPE_DEPTH:
-            raise LogError(
-                f"{parents[0]}: messages are nested in more than {MAX_TYPE_DEPTH} levels"
-            )
-        return self._known[name]
-
-    def _check(self, name: str, size: _Size) -> None:
-        if size.leaves > MAX_TYPE_FIELDS:
-            raise LogError(f"type {name} has more than {MAX_TYPE_FIELDS} fields in nested messages")
-        if size.messages > MAX_TYPE_DEPTH + MAX_MESSAGES_PER_BYTE * size.least_bytes:
-            raise LogError(
-                f"type {name} has {size.messages} nested messages in {size.least_bytes} bytes: at"
-                f" most {MAX_MESSAGES_PER_BYTE} for each byte are read"
-            )
-        if self._fixed > MAX_FIXED_MESSAGES:
-            raise LogError(
-                f"type {name} has fixed arrays of {self._fixed} messages or strings; at most"
-                f" {MAX_FIXED_MESSAGES} are read"
-            )
-
-    def _field(self, field: str, description: Any, parents: tuple[str, ...]) -> _Size:
-        kind, what = description
-        element_kind, element = _element(description)
-        if element_kind == Nodetype.BASE:
-            size = _Size(1, 0, 0, _BYTES.get(element[0], 1))
-        else:
-            size = self.of(str(element), parents)
-            size = size._replace(leaves=size.leaves + (3 if element in TIME_TYPES else 1))
-        if kind == Nodetype.ARRAY:
-            count = what[1]
-            is_unrolled = element_kind == Nodetype.NAME or element[0] in ("string", *_UNREADABLE)
-            self._fixed += count if is_unrolled else 0
-            return size._replace(
-                messages=count * size.messages, least_bytes=count * size.least_bytes
-            )
-        if kind == Nodetype.SEQUENCE:
-            if size.messages > MAX_MESSAGES_PER_BYTE * max(size.least_bytes, 1):
-                raise LogError(
-                    f"{parents[-1]}: {field} is a sequence of messages with too few bytes"
-                )
-            return size._replace(messages=0, least_bytes=4)
-        return size
-
-
-_BYTES = {"string": 4, "wstring": 4} | {
-    f"{kind}{bits}": bits // 8 for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64, 128)
-}
 
 
 def _readable(types: dict[str, Any], name: str, unreadable: dict[str, str]) -> dict[str, Any]:
@@ -365,9 +263,9 @@ def _readable(types: dict[str, Any], name: str, unreadable: dict[str, str]) -> d
     is_wide: dict[str, bool] = {}
 
     def has_wide(description: Any) -> bool:
-        kind, what = _element(description)
+        kind, what = element_of(description)
         if kind == Nodetype.BASE:
-            return what[0] in _UNREADABLE
+            return what[0] in UNREADABLE
         if what not in is_wide:
             is_wide[what] = any(has_wide(field) for _, field in types[what][1])
         return is_wide[what]
@@ -406,8 +304,8 @@ def _readable(types: dict[str, Any], name: str, unreadable: dict[str, str]) -> d
 
 def _wide_word(types: Mapping[str, Any], description: Any) -> str:
     """Return the first type in a field that cannot be read."""
-    kind, what = _element(description)
+    kind, what = element_of(description)
     if kind == Nodetype.BASE:
-        return str(what[0]) if what[0] in _UNREADABLE else ""
+        return str(what[0]) if what[0] in UNREADABLE else ""
     words = (_wide_word(types, field) for _, field in types[what][1])
     return next((word for word in words if word), "")

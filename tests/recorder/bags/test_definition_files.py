@@ -17,7 +17,7 @@ from mcaprl.cli import cli
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.bag import open_bag
 from mcaprl.recorder.bags.definition_files import DefinitionFiles
-from tests.support.bags import START_NS
+from tests.support.bags import START_NS, Channel, write_channels
 
 Row = tuple[str, str, Sequence[bytes]]
 
@@ -165,6 +165,22 @@ def test_the_definitions_of_the_bag_are_used_first(tmp_path: Path) -> None:
     folder = package(tmp_path, "acme_msgs", Motor="float64 q")
     with closing(open_bag(bag, definitions=[folder])) as found:
         assert found.read("/m", ["own"]).columns["own"].tolist() == [1.5]
+
+
+@pytest.mark.parametrize("form", ["mcap", "db3"])
+def test_definitions_are_used_before_those_of_the_distribution(form: str, tmp_path: Path) -> None:
+    kind, data = "std_msgs/msg/Float32", struct.pack("<f", 1.5)
+    path = tmp_path / f"a.{form}"
+    if form == "mcap":
+        write_channels(path, [Channel("/x", kind, "", [(0, data)])])
+    else:
+        write_database(path, [("/x", kind, [data])])
+    folder = package(tmp_path, "std_msgs", Float32="uint8[4] bytes")
+    for definitions, field in (([], "data"), ([folder], "bytes")):
+        with closing(open_bag(path, definitions=definitions)) as found:
+            assert found.topics["/x"].fields.keys() == {field}
+            value = found.read("/x", [field]).columns[field][0]
+            assert bytes(value) == data if field == "bytes" else value == 1.5
 
 
 MAPPING = """\

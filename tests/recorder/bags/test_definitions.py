@@ -253,6 +253,10 @@ module wheels {{ module msg {{ struct Wheel {{ float turns; }}; }}; }};
         ("#endif", "#endif has no #if"),
         ("const long A = ((1));", "expressions in parentheses are not supported"),
         ("const long A = 1 << 10000000000;", "shifts by more than 99 bits"),
+        ("const long A = 9; const long B = A * A;", "products of constants"),
+        (f"const long A = 1{' + 1' * 20_000};", "more than 10000 fields and constants"),
+        (f"const long A = {'A::' * 20_000}A;", "more than 10000 fields and constants"),
+        ("@a ((1))", "expressions in parentheses are not supported"),
     ):
         broken = text.replace("module car_msgs", f"{line}\nmodule car_msgs")
         with pytest.raises(
