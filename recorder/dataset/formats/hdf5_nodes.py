@@ -1,7 +1,8 @@
 """Names and arrays in HDF5 files.
 
-The files may come from untrusted sources, so sizes are checked, and links to other files are not
-followed.
+The files may come from untrusted sources, so sizes are checked before anything is read, and links
+to other files are not followed. The sizes of all arrays count together, because several names may
+belong to one array.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, McaprlError, import_extra
+from mcaprl.limits import MAX_NESTED_GROUPS
+from mcaprl.recorder.dataset.formats.budget import Budget
+from mcaprl.texts import printable
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 EXTRA = "interop"
@@ -28,11 +33,29 @@ _MAX_RATIO = 2_000
 _SMALL_BYTES = 1 << 20
 _CHUNK_BYTES = 1 << 18
 _ELSEWHERE = "is stored in another file: copy it into this file"
+_GROUP_COST_BYTES = 16 << 10
+"""Bytes that each opened group counts, because groups may contain each other."""
+_DAMAGED = (
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    KeyError,
+    MemoryError,
+    OverflowError,
+    SystemError,
+)
+"""Errors that h5py raises for damaged structures."""
+_budget: ContextVar[Budget] = ContextVar("budget")
+"""Limit of the file that is open."""
 
 
 def is_hdf5(path: Path) -> bool:
     """Return whether a path is a file that starts with the HDF5 signature."""
     try:
+        # Opening a named pipe would wait for its writer.
+        if not path.is_file():
+            return False
         with path.open("rb") as file:
             return file.read(len(SIGNATURE)) == SIGNATURE
     except OSError:
@@ -48,14 +71,17 @@ def opened(path: Path) -> Iterator[Any]:
         MissingExtraError: h5py is not installed.
     """
     h5py = import_extra("h5py", EXTRA)
+    before = _budget.set(Budget.of_files(path, [path]))
     try:
         with h5py.File(path, "r") as file:
             yield file
     except McaprlError:
         raise
-    # h5py raises errors of many types for damaged structures.
-    except (OSError, RuntimeError, TypeError, ValueError) as error:
-        raise LogError(f"{path}: not a readable HDF5 file: {error}") from error
+    except _DAMAGED as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise LogError(f"{path}: not a readable HDF5 file: {printable(reason)}") from error
+    finally:
+        _budget.reset(before)
 
 
 @contextmanager
@@ -142,6 +168,7 @@ def group_in(parent: Any, name: str) -> Any:
     h5py, found = import_extra("h5py", EXTRA), _identifier(parent, name)
     if not isinstance(found, h5py.h5g.GroupID):
         raise LogError(f"{_place(parent, name)} is not a group")
+    _budget.get().take(_place(parent, name), (), _GROUP_COST_BYTES)
     return h5py.Group(found)
 
 
@@ -165,8 +192,11 @@ def array_in(parent: Any, name: str) -> NDArray[Any]:
         raise LogError(
             f"{_place(parent, name)} has shape {shape}, but only {stored} bytes are stored"
         )
+    if stored > parent.file.id.get_filesize():
+        raise LogError(f"{_place(parent, name)} is larger than the file, which is damaged")
     if dtype.kind == "V":
         raise LogError(f"{_place(parent, name)} has a compound type, expected numbers")
+    _budget.get().take(_place(parent, name), shape, dtype.itemsize)
     if dtype.kind == "O":
         return _objects(h5py.Dataset(found), _place(parent, name))
     values = np.empty(shape, dtype)
@@ -189,23 +219,45 @@ def array_at(parent: Any, path: Sequence[str | int]) -> NDArray[Any]:
     return array_in(parent, last)
 
 
-def tree_in(parent: Any, name: str) -> Any:
+def tree_in(parent: Any, name: str, depth: int = 0) -> Any:
     """Read an array, or the arrays of a group as nested dicts.
 
+    Args:
+        parent: Group.
+        name: Name of the member.
+        depth: Number of groups above the member.
+
     Raises:
-        LogError: There is no such member, or it is not stored in this file.
+        LogError: There is no such member, it is not stored in this file, or groups are nested too
+            deeply.
     """
     if not is_group(parent, name):
         return array_in(parent, name)
-    group = group_in(parent, name)
-    return {key: tree_in(group, key) for key in names_in(group)}
+    group = _nested_group(parent, name, depth)
+    return {key: tree_in(group, key, depth + 1) for key in names_in(group)}
+
+
+def has_rows(parent: Any, name: str, depth: int = 0) -> bool:
+    """Return whether a member is an array with dimensions, or a group with such an array."""
+    if is_group(parent, name):
+        group = _nested_group(parent, name, depth)
+        return any(has_rows(group, key, depth + 1) for key in names_in(group))
+    return bool(getattr(_identifier(parent, name), "shape", ()))
+
+
+def _nested_group(parent: Any, name: str, depth: int) -> Any:
+    """Return a group; refuse groups that contain themselves."""
+    if depth > MAX_NESTED_GROUPS:
+        raise LogError(f"{_place(parent, name)} is nested too deeply: it may contain itself")
+    return group_in(parent, name)
 
 
 def arrays_below(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield the dotted name and the values of each array in a group and its subgroups."""
     for name in names_in(group):
         if is_group(group, name):
-            yield from arrays_below(group_in(group, name), (*path, name))
+            inner = _nested_group(group, name, len(path))
+            yield from arrays_below(inner, (*path, name))
         else:
             yield ".".join((*path, name)), array_in(group, name)
 
@@ -274,9 +326,12 @@ def _objects(array: Any, place: str) -> NDArray[Any]:
     if import_extra("h5py", EXTRA).check_string_dtype(array.dtype) is None:
         return np.asarray(array[()])
     try:
-        return np.asarray(array.asstr()[()]).astype(np.str_)
+        texts = np.asarray(array.asstr()[()])
     except UnicodeDecodeError as error:
         raise LogError(f"{place} is not UTF-8 text") from error
+    longest = max((len(text) for text in texts.flat), default=0) if texts.ndim else 0
+    _budget.get().take(place, texts.shape, 4 * longest)
+    return texts.astype(np.str_)
 
 
 def _place(parent: Any, name: str) -> str:

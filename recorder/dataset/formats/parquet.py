@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError, import_extra
 from mcaprl.files import parse_json
-from mcaprl.recorder.dataset.arrays import exactly
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.infos import info_type, masked
 from mcaprl.recorder.dataset.tables import (
@@ -39,6 +38,7 @@ from mcaprl.recorder.dataset.tables import (
     transition_table,
 )
 from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.dataset.values import exactly
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.infos import Masked
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata

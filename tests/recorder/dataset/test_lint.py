@@ -31,7 +31,10 @@ def dataset(**changes: Any) -> Dataset:
         "observation_space": spaces.Box(0, 1, (2,), np.float32),
         "action_space": spaces.Discrete(3),
     }
-    return Dataset.from_arrays(**(columns | changes))
+    columns |= changes
+    # `from_arrays` refuses impossible probabilities, which logs of other writers may have.
+    probs = columns.pop("behavior_probs")
+    return Dataset.from_arrays(**columns).with_behavior_probs(probs)
 
 
 def changed(column: str, at: Any, value: float) -> dict[str, Any]:
