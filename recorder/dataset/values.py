@@ -115,6 +115,12 @@ def check_inside(
         raise SpaceError(f"{name}: {_row(values, wrong, first_row)}, which is outside of {space}")
 
 
+def is_beyond_float32(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return a mask of the finite numbers that are too large for float32."""
+    found: NDArray[np.bool_] = np.isfinite(values) & (np.abs(values) > np.finfo(np.float32).max)
+    return found
+
+
 def exactly(where: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Copy an array to another dtype without changing any value.
 

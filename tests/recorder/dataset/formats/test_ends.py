@@ -98,7 +98,7 @@ def test_every_name_of_an_end_is_read(tmp_path: Path, suffix: str, name: str) ->
         ("episode_ids", ["b", "b", "b", "a", "a", "c", "c"]),
     ],
 )
-def test_flags_numbers_and_names_are_told_apart(tmp_path: Path, name: str, values: Any) -> None:
+def test_flags_numbers_and_names_are_distinguished(tmp_path: Path, name: str, values: Any) -> None:
     arrays = {"terminals": TERMINALS, name: np.array(values)}
     assert _is_expected(_open(_write(tmp_path / "their.npz", arrays), NO_NEXT))
 
