@@ -16,3 +16,5 @@ MAX_NESTED_GROUPS: Final = 32
 """Depth of the groups in an HDF5 file, because a group may contain itself."""
 MAX_MEMBERS_SHOWN: Final = 20
 """Names of unread arrays in one warning, because a file may have any number of arrays."""
+MAX_READ_RATIO: Final = 50
+"""Bytes read of an HDF5 file for each of its bytes, because damaged structures can be circular."""

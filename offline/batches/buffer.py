@@ -23,11 +23,11 @@ from mcaprl.offline.batches.items import n_step_returns, returns_to_go
 from mcaprl.offline.batches.observations import FramesOnDisk, ObservationEncoder, Observations
 from mcaprl.offline.batches.packing import Packing
 from mcaprl.offline.batches.share import ALONE, Share
+from mcaprl.recorder.dataset.values import is_beyond_float32
 from mcaprl.recorder.format.spaces import check_actions
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.values import is_beyond_float32
 
 
 DEVICES = ("cpu", "cuda")

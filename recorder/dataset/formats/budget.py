@@ -17,6 +17,9 @@ class Budget:
     """Bytes that the arrays of a file or folder may take in memory.
 
     Files can declare arrays of any size, and compression can make large arrays of few bytes.
+
+    Attributes:
+        where: Name of the source, for errors.
     """
 
     def __init__(self, where: object, stored_bytes: int) -> None:
@@ -26,7 +29,7 @@ class Budget:
             where: Name of the source, for errors.
             stored_bytes: Size of the file, or of all files of the folder.
         """
-        self._where, self._stored = where, stored_bytes
+        self.where, self._stored = where, stored_bytes
         self._left = UNPACKED_ALLOWANCE_BYTES + MAX_UNPACKED_RATIO * stored_bytes
 
     @classmethod
@@ -52,7 +55,7 @@ class Budget:
         if self._left < 0:
             declared = shortened(str(tuple(shape)), _MAX_SHOWN)
             raise LogError(
-                f"{self._where}: {printable(name)} has shape {declared}, which is too large for the"
+                f"{self.where}: {printable(name)} has shape {declared}, which is too large for the"
                 f" {size(self._stored)} that are stored: unpack the data, or divide it into several"
                 " files"
             )

@@ -65,6 +65,7 @@ def dataset_of(
     where: object,
     *,
     is_foreign: bool = False,
+    has_rewards: bool = True,
 ) -> Dataset:
     """Return a dataset of these episodes.
 
@@ -78,6 +79,7 @@ def dataset_of(
         is_foreign: Whether another tool wrote the data. Then, all rewards and actions must be
             finite, and discrete values must be in their space. A log may contain other values,
             which `lint` reports, so they are accepted in data that this package wrote.
+        has_rewards: Whether the source has rewards; otherwise, they are NaN.
 
     Raises:
         LogError: There is no transition, or the step duration is not positive.
@@ -88,7 +90,10 @@ def dataset_of(
         raise LogError(f"{where} has no transitions")
     check_duration(metadata, sum(len(episode.rewards) + 1 for _, episode in kept), where)
     for index, episode in kept:
-        _check(episode, metadata, _place(where, index, episode), is_foreign=is_foreign)
+        place = _place(where, index, episode)
+        _check_times_and_probabilities(episode, place)
+        if is_foreign:
+            _check_values(episode, metadata, place, has_rewards=has_rewards)
     return _joined([episode for _, episode in kept], metadata, where)
 
 
@@ -122,20 +127,25 @@ def _place(where: object, index: int, episode: EpisodeArrays) -> str:
     return f"{where}" if episode.first_row is not None else f"{where}: episode {index}"
 
 
-def _check(episode: EpisodeArrays, metadata: LogMetadata, place: str, *, is_foreign: bool) -> None:
-    """Check the values of an episode; see `dataset_of`."""
+def _check_times_and_probabilities(episode: EpisodeArrays, place: str) -> None:
     first = episode.first_row or 0
     if episode.times_ns is not None:
         check_times(f"{place}: log_time_ns", episode.times_ns)
     if episode.behavior_probs is not None:
         probabilities_of(f"{place}: behavior_probs", episode.behavior_probs, first_row=first)
-    if not is_foreign:
-        return
+
+
+def _check_values(
+    episode: EpisodeArrays, metadata: LogMetadata, place: str, *, has_rewards: bool
+) -> None:
+    """Check the values of another tool; see `dataset_of`."""
+    first = episode.first_row or 0
     actions = numbers(f"{place}: actions", episode.actions)
     check_finite(f"{place}: actions", actions, first_row=first)
     check_inside(f"{place}: actions", actions, metadata.action_space, first_row=first)
     rewards = numbers(f"{place}: rewards", episode.rewards)
-    check_finite(f"{place}: rewards", rewards, first_row=first)
+    if has_rewards:
+        check_finite(f"{place}: rewards", rewards, first_row=first)
     for leaf in metadata.leaves:
         name = f"{place}: {leaf.name}"
         space = leaf.of(metadata.observation_space)

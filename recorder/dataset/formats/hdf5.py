@@ -213,7 +213,7 @@ def _own_infos(
         )
         if len(steps) != sum(lengths) or len(last) != len(finals):
             raise LogError(
-                f"{file.filename}: {INFOS}/{array} has {len(steps)} rows, which does not fit"
+                f"{nodes.source()}: {INFOS}/{array} has {len(steps)} rows, which does not fit"
                 " episode_lengths"
             )
         steps = steps.astype(np.result_type(steps, last))

@@ -8,7 +8,9 @@ belong to one array.
 from __future__ import annotations
 
 import math
+import os
 import re
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -21,12 +23,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, McaprlError, import_extra
-from mcaprl.limits import MAX_NESTED_GROUPS
+from mcaprl.limits import MAX_NESTED_GROUPS, MAX_READ_RATIO, UNPACKED_ALLOWANCE_BYTES
 from mcaprl.recorder.dataset.formats.budget import Budget
 from mcaprl.texts import printable
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 EXTRA = "interop"
+_HEAP = b"HEAP\0\0\0\0"
 # HDF5's filters reach a compression ratio of at most 1032. If the declared size of an array exceeds
 # its stored size by a larger factor, some of its values were never written.
 _MAX_RATIO = 2_000
@@ -73,7 +76,7 @@ def opened(path: Path) -> Iterator[Any]:
     h5py = import_extra("h5py", EXTRA)
     before = _budget.set(Budget.of_files(path, [path]))
     try:
-        with h5py.File(path, "r") as file:
+        with _Input(path) as source, h5py.File(source, "r") as file:
             yield file
     except McaprlError:
         raise
@@ -105,6 +108,64 @@ def created(path: Path, **options: Any) -> Iterator[Any]:
             # HDF5 continues after an error, and then raises others.
             if output.error is not None:
                 raise output.error
+
+
+class _Input(FileIO):
+    """File that refuses what HDF5's library does not check in damaged files.
+
+    The library allocates what a structure declares, and fills what is past the end of the file with
+    zeros; memory that is never written takes no space. It follows circular lists of free space
+    without end.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file.
+
+        Raises:
+            OSError: The file has addresses or lengths of another size than 8 bytes.
+        """
+        super().__init__(path, "rb")
+        self._size = path.stat().st_size
+        self._left = MAX_READ_RATIO * self._size + UNPACKED_ALLOWANCE_BYTES
+        start = self.read(16)
+        is_old = start[8:9] in (b"\0", b"\1")
+        if start.startswith(SIGNATURE) and start[13:15] != b"\x08\x08" and is_old:
+            raise OSError("its addresses do not have 8 bytes")
+        if start.startswith(SIGNATURE) and start[9:11] != b"\x08\x08" and not is_old:
+            raise OSError("its addresses do not have 8 bytes")
+
+    def readinto(self, buffer: Any) -> int:
+        """Read bytes, and return their number.
+
+        Raises:
+            OSError: The bytes are not in the file, too many are read, or a structure is circular.
+        """
+        count, place = memoryview(buffer).nbytes, self.tell()
+        self._left -= count
+        if count > self._size - place or self._left < 0:
+            raise OSError(f"{count} bytes at {place} are not in the file")
+        found = super().readinto(buffer)
+        if bytes(buffer[:8]) == _HEAP and count >= 32:
+            self._check_heap(*struct.unpack_from("<QQQ", buffer, 8))
+        return found
+
+    def _check_heap(self, size: int, free: int, data: int) -> None:
+        """Check that the list of free blocks in a local heap ends.
+
+        Args:
+            size: Size of the heap, bytes.
+            free: Offset of the first free block; 1 if there is none.
+            data: Address of the heap.
+
+        Raises:
+            OSError: The list has more blocks than fit into the heap.
+        """
+        # A free block has at least 16 bytes: the offset of the next one, and its size.
+        for _ in range(min(size, self._size) // 16 + 1):
+            if not 1 < free <= size - 16:
+                return
+            free = int.from_bytes(os.pread(self.fileno(), 8, data + free), "little")
+        raise OSError("a list of free blocks is circular")
 
 
 class _Output(FileIO):
@@ -142,6 +203,11 @@ def image_settings(shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, An
     return {"chunks": (rows, *shape[1:]), "compression": "lzf"}
 
 
+def source() -> object:
+    """Return the name of the file that is open, for errors."""
+    return _budget.get().where
+
+
 def has(group: Any, name: str) -> bool:
     """Return whether a group has a member with this name."""
     return bool(group.id.links.exists(name.encode()))
@@ -155,7 +221,7 @@ def names_in(group: Any) -> list[str]:
     """
     names = list(group)
     if not all(isinstance(name, str) for name in names):
-        raise LogError(f"{group.file.filename}: {group.name} has a name that is not UTF-8")
+        raise LogError(f"{source()}: {group.name} has a name that is not UTF-8")
     return names
 
 
@@ -275,7 +341,7 @@ def attributes_of(group: Any) -> dict[str, Any]:
         for key in groups:
             inner = inner.setdefault(key, {})
             if not isinstance(inner, dict):
-                raise LogError(f"{group.file.filename}: {group.name} has both {key} and {path}")
+                raise LogError(f"{source()}: {group.name} has both {key} and {path}")
         inner[name] = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
     return found
 
@@ -335,7 +401,7 @@ def _objects(array: Any, place: str) -> NDArray[Any]:
 
 
 def _place(parent: Any, name: str) -> str:
-    return f"{parent.file.filename}: {parent.name.rstrip('/')}/{name}"
+    return f"{source()}: {parent.name.rstrip('/')}/{name}"
 
 
 def _storable_name(key: str) -> str:

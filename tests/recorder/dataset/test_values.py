@@ -81,7 +81,7 @@ def test_columns_of_other_libraries_are_read_or_refused() -> None:
             _dataset(rewards=rewards)
     for flags in (pandas.array([False, None, True], "boolean"), arrow.array([False, None, True])):
         with pytest.raises(
-            SpaceError, match="terminated (has dtype object|are not flags).*row 1 is"
+            SpaceError, match=r"terminated (has dtype object|are not flags).*row 1 is"
         ):
             _dataset(terminated=flags)
 
