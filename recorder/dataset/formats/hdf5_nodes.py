@@ -29,7 +29,8 @@ from mcaprl.texts import printable
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 EXTRA = "interop"
-_HEAP = b"HEAP\0\0\0\0"
+_HEAP, _GLOBAL_HEAP = b"HEAP\0\0\0\0", b"GCOL\1\0\0\0"
+_MAX_GLOBAL_HEAP_BYTES = 64 << 20
 # HDF5's filters reach a compression ratio of at most 1032. If the declared size of an array exceeds
 # its stored size by a larger factor, some of its values were never written.
 _MAX_RATIO = 2_000
@@ -145,8 +146,11 @@ class _Input(FileIO):
         if count > self._size - place or self._left < 0:
             raise OSError(f"{count} bytes at {place} are not in the file")
         found = super().readinto(buffer)
-        if bytes(buffer[:8]) == _HEAP and count >= 32:
+        start = bytes(buffer[:8])
+        if start == _HEAP and count >= 32:
             self._check_heap(*struct.unpack_from("<QQQ", buffer, 8))
+        if start == _GLOBAL_HEAP and count >= 16:
+            self._check_global_heap(place, *struct.unpack_from("<Q", buffer, 8))
         return found
 
     def _check_heap(self, size: int, free: int, data: int) -> None:
@@ -166,6 +170,22 @@ class _Input(FileIO):
                 return
             free = int.from_bytes(os.pread(self.fileno(), 8, data + free), "little")
         raise OSError("a list of free blocks is circular")
+
+    def _check_global_heap(self, place: int, size: int) -> None:
+        """Check that each object in a collection of texts ends after its start.
+
+        Raises:
+            OSError: An object has no size.
+        """
+        data = os.pread(self.fileno(), min(size, _MAX_GLOBAL_HEAP_BYTES), place)
+        offset = 16
+        while offset + 16 <= len(data):
+            index, _, _, length = struct.unpack_from("<HHIQ", data, offset)
+            # The size of the free space includes its header.
+            step = length if index == 0 else 16 + (length + 7) // 8 * 8
+            if step < 16:
+                raise OSError("an object in a heap has no size")
+            offset += step
 
 
 class _Output(FileIO):

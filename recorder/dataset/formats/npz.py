@@ -354,7 +354,9 @@ def _own(arrays: Archive, path: Path) -> Dataset:
             for name, (array, dtype) in described.items()
         }
         steps = {name: arrays[name] for name in ("actions", "rewards", "behavior_probs")}
-        ends = {name: flags(name, arrays[name]) for name in ("terminations", "truncations")}
+        ends = {
+            name: flags(f"{path}: {name}", arrays[name]) for name in ("terminations", "truncations")
+        }
         times_ns = arrays["log_time_ns"]
         rows = [len(values) for values in (*steps.values(), *ends.values())]
         if min(lengths) < 1 or {*rows} != {sum(lengths)}:

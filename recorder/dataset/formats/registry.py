@@ -176,6 +176,8 @@ def read_format(path: str | Path, form: Format, **options: Any) -> Dataset:
         del given[name]
     if not source.exists():
         raise LogError(f"{path}: no such file or folder")
+    if not (source.is_file() or source.is_dir()):
+        raise LogError(f"{path} is neither a file nor a folder")
     dataset: Dataset = form.module.read(source, **given)
     dataset.sources = dataset.sources or (source,)
     return dataset

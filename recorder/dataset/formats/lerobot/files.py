@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, import_extra
+from mcaprl.errors import LogError, SpaceError, import_extra
 from mcaprl.files import parse_json
 from mcaprl.recorder.dataset.formats import parquet_files
 from mcaprl.recorder.dataset.formats.lerobot.features import (
@@ -136,8 +136,8 @@ class Files:
         column: Any = arrow.concat_tables(tables)[feature.name]
         try:
             return feature.decode(column)
-        except LogError as error:
-            raise LogError(f"{self.path}: {error}") from error
+        except (LogError, SpaceError) as error:
+            raise type(error)(f"{self.path}: {error}") from error
 
     def _video(self, feature: Feature) -> NDArray[np.uint8]:
         """Decode the images of a camera from the videos, in the order of the rows."""
