@@ -19,8 +19,18 @@ from mcaprl.texts import counted
 @click.argument("paths", nargs=-1, required=True, metavar="SRC... [DST]", type=PATH)
 @mapping_options
 @click.option("--from", "source_format", metavar="FORMAT", help="Format of SRC if not detected.")
+@click.option(
+    "--one-episode",
+    is_flag=True,
+    help="All of SRC is one episode if it marks no end of an episode.",
+)
+@click.option(
+    "--dones",
+    type=click.Choice(["terminated", "truncated"]),
+    help="Kind of the ends of episodes in SRC if SRC does not say it.",
+)
 @click.option("--to", metavar="FORMAT", help="Format of DST if not clear from its name.")
-@click.option("--lossy", is_flag=True, help="Convert or omit data that the format cannot store.")
+@click.option("--lossy", is_flag=True, help="Convert or omit data that DST or a log cannot store.")
 @click.option("--suggest", is_flag=True, help="Print a draft of a mapping for SRC; takes no DST.")
 @click.option(
     "--bins",
@@ -38,6 +48,8 @@ def convert(
     trust_code: bool,
     definitions: tuple[Path, ...],
     source_format: str | None,
+    one_episode: bool,
+    dones: str | None,
     to: str | None,
     lossy: bool,
     suggest: bool,
@@ -70,6 +82,8 @@ def convert(
             out,
             mapping=mapping,
             source_format=source_format,
+            one_episode=one_episode,
+            dones=dones,
             to=to,
             lossy=lossy,
             trust_code=trust_code,

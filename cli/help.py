@@ -124,7 +124,7 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         "Page, video and image": ("save", "video", "contact_sheet", "height", "overwrite"),
     },
     "convert": {
-        "Formats": ("source_format", "to", "lossy"),
+        "Formats": ("source_format", "one_episode", "dones", "to", "lossy"),
         "Bags of other robots": (
             "mapping",
             "definitions",

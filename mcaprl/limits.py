@@ -32,4 +32,16 @@ MAX_CHUNK_BYTES: Final = 2**28
 MAX_UNPACKED_BYTES: Final = 2**30
 """Decompressed size of a file that is decompressed to disk, whatever its compressed size."""
 MAX_UNPACKED_RATIO: Final = 200
-"""Ratio of the decompressed to the compressed size of a larger file."""
+"""Decompressed bytes for each compressed byte of a larger file; real data compresses less."""
+UNPACKED_ALLOWANCE_BYTES: Final = 256 << 20
+"""Bytes that a dataset's file may always unpack to, because small files compress better."""
+ARRAY_COST_BYTES: Final = 256
+"""Bytes that each array counts in addition, because many empty arrays also take memory."""
+MAX_NPY_HEADER_BYTES: Final = 10_000
+"""Length of the header of an array in an .npz file, which is parsed as a Python literal."""
+MAX_NESTED_GROUPS: Final = 32
+"""Depth of the groups in an HDF5 file, because a group may contain itself."""
+MAX_MEMBERS_SHOWN: Final = 20
+"""Names of unread arrays in one warning, because a file may have any number of arrays."""
+MAX_READ_RATIO: Final = 50
+"""Bytes read of an HDF5 file for each of its bytes, because damaged structures can be circular."""

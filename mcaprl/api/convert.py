@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,6 +116,8 @@ def convert(
     *,
     mapping: MappingFile | None = None,
     source_format: str | None = None,
+    one_episode: bool = False,
+    dones: str | None = None,
     to: str | None = None,
     lossy: bool = False,
     trust_code: bool = False,
@@ -130,9 +133,13 @@ def convert(
         out: Path of the log or dataset; None to write nothing.
         mapping: Mapping file, or its keys and values; see docs/bags.md.
         source_format: Name of the format of `source`; default: detected from the path.
+        one_episode: Whether flat arrays of another tool are one episode if nothing marks where an
+            episode ends; see `open`.
+        dones: Kind of the ends in flat arrays of another tool that no array distinguishes:
+            `terminated` or `truncated`; see `open`.
         to: Name of the format to write; default: a log if `out` ends with .mcap, otherwise the
             format with the suffix of `out`.
-        lossy: Whether data that the format cannot store may be dropped or converted.
+        lossy: Whether data that the format, or a log, cannot store may be dropped or converted.
         trust_code: Whether the mapping may name a Python function, which is imported.
         definitions: Files and folders with definitions of ROS types that a bag lacks; see
             docs/bags.md.
@@ -155,7 +162,8 @@ def convert(
         check_upload(upload, overwrite=overwrite)
         if out is None or (form is not None and not form.suffix):
             raise UsageError("upload copies one file: choose a file, not a folder, as the output")
-    dataset, report = _read(source, mapping, source_format, trust_code, definitions)
+    reading = {"one_episode": one_episode, "dones": dones, "lossy": lossy}
+    dataset, report = _read(source, mapping, source_format, trust_code, definitions, reading)
     lost: list[str] = []
     if out is not None and form is not None:
         lost = write_format(dataset, out, form, lossy=lossy, overwrite=overwrite)
@@ -172,9 +180,10 @@ def _read(
     source_format: str | None,
     trust_code: bool,
     definitions: Definitions,
+    reading: Mapping[str, Any],
 ) -> tuple[Dataset, MappingReport | None]:
-    if mapping is None:
-        return open_data(source, format=source_format), None
+    if mapping is None or reading["one_episode"] or reading["dones"]:
+        return open_data(source, mapping=mapping, format=source_format, **reading), None
     found = mapped(source, mapping, trust_code=trust_code, definitions=definitions)
     return found.dataset, found.report
 

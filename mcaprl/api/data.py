@@ -44,6 +44,9 @@ def open_data(
     trust_code: bool = False,
     definitions: Definitions = (),
     format: str | None = None,
+    one_episode: bool = False,
+    dones: str | None = None,
+    lossy: bool = False,
     columns: Sequence[str] | None = None,
     episodes: Episodes | None = None,
     images: Storage = "auto",
@@ -67,6 +70,12 @@ def open_data(
         definitions: Files and folders with definitions of ROS types that a bag lacks; see
             docs/bags.md.
         format: Name of the other tool's format; default: detected from the path.
+        one_episode: Whether flat arrays of another tool are one episode if nothing marks where an
+            episode ends. Otherwise, such arrays are refused.
+        dones: Kind of the ends in flat arrays of another tool that no array distinguishes:
+            `terminated` or `truncated`; see docs/formats.md for the default.
+        lossy: Whether parts of a Minari dataset that a log cannot store are left out. Otherwise,
+            such a dataset is refused.
         columns: Keys to read from a Dict observation space, for example `joints/q` for a nested
             key. The dataset's observation space contains only these keys. An empty sequence reads
             no observations. Actions, rewards and end flags are always read. Default: all keys.
@@ -82,12 +91,16 @@ def open_data(
         LogError: A file is missing, not an MCAP file, damaged, or has no finished episode.
         SpaceError: The logs' spaces differ.
         UnknownNameError: There is no such format or storage of images.
-        UsageError: A column or an episode does not exist, or the mapping does not fit the bag.
+        UsageError: A column or an episode does not exist, the mapping does not fit the bag, or an
+            option does not fit the data.
         MissingExtraError: A mapping needs the packages of the `bags` extra.
     """
     if images not in STORAGES:
         raise UnknownNameError("storage of images", str(images), STORAGES)
     other = None if mapping is not None else _other_format(data, format)
+    reading = {"one_episode": one_episode, "dones": dones, "lossy": lossy}
+    if other is None and (one_episode or dones):
+        raise UsageError("one_episode and dones are for datasets of other tools")
     if mapping is None and other is None:
         try:
             return open_logs(
@@ -114,7 +127,7 @@ def open_data(
         one = _only(data)
         if one is None:
             raise UsageError(f"only logs may have several paths: pass one {other.name} dataset")
-        return read_format(one, other)
+        return read_format(one, other, **reading)
     assert mapping is not None
     found = mapped(data, mapping, trust_code=trust_code, definitions=definitions, images=images)
     for problem in (*found.report.left_out, *found.report.images):

@@ -23,6 +23,7 @@ from mcaprl.offline.batches.items import n_step_returns, returns_to_go
 from mcaprl.offline.batches.observations import FramesOnDisk, ObservationEncoder, Observations
 from mcaprl.offline.batches.packing import Packing
 from mcaprl.offline.batches.share import ALONE, Share
+from mcaprl.recorder.dataset.values import is_beyond_float32
 from mcaprl.recorder.format.spaces import check_actions
 
 if TYPE_CHECKING:
@@ -139,6 +140,7 @@ class TransitionBuffer:
         if len(dataset) == 0:
             raise TrainingError("the dataset has no transitions to learn from")
         lengths = dataset.episode_lengths
+        _check_rewards(dataset.rewards)
         if reward_scale is None:
             spread = packing.scale_rewards and return_spread(dataset, packing.gamma, share)
             reward_scale = spread or 1.0
@@ -151,7 +153,7 @@ class TransitionBuffer:
                 f"the dataset has actions from {dataset.actions.min()} to {dataset.actions.max()},"
                 f" but its action space is {action_space}"
             )
-        _require_finite("rewards", _is_finite(torch.from_numpy(returns[0])))
+        _require_finite("sums of rewards", _is_finite(torch.from_numpy(returns[0])))
         _check_data(dataset, frames, actions)
         buffer = cls(
             encoder=encoder,
@@ -317,6 +319,15 @@ def _check_data(
         if not allowed.all():
             row = int(allowed.int().argmin())
             raise TrainingError(f"action {dataset.actions[row]} of row {row} is masked out")
+
+
+def _check_rewards(rewards: NDArray[np.float64]) -> None:
+    """Raise if a reward is not finite, or too large for float32."""
+    _require_finite("rewards", torch.from_numpy(np.isfinite(rewards)))
+    beyond = is_beyond_float32(rewards)
+    if beyond.any():
+        row = int(beyond.argmax())
+        raise TrainingError(f"reward {rewards[row]:g} of row {row} is beyond float32")
 
 
 def _is_finite(values: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -14,16 +14,22 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.dataset.values import exactly, flags, numbers, probabilities_of, rewards_of
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata, installed_versions
-from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
+from mcaprl.recorder.format.spaces import (
+    MAX_ACTIONS,
+    Leaf,
+    action_leaf,
+    observation_leaves,
+)
 
 _END_FLAGS = ("terminated", "truncated")
-_SCALARS = {
-    "rewards": np.float64,
-    "terminated": np.bool_,
-    "truncated": np.bool_,
-    "behavior_probs": np.float32,
+_SCALARS: Mapping[str, Callable[[str, Any], NDArray[Any]]] = {
+    "rewards": rewards_of,
+    "terminated": flags,
+    "truncated": flags,
+    "behavior_probs": probabilities_of,
 }
 
 
@@ -40,7 +46,7 @@ def description_of(
         registered = _registered_spaces(env_id, observations)
     return LogMetadata(
         observation_space=observation_space or registered[0] or _space_of(observations),
-        action_space=action_space or registered[1] or action_space_of(np.asarray(actions)),
+        action_space=action_space or registered[1] or action_space_of(numbers("actions", actions)),
         env_id=env_id,
         versions=installed_versions(),
         times=NO_TIMES,
@@ -55,7 +61,7 @@ def columns_of_arrays(
     Raises:
         SpaceError: Lengths or shapes do not agree with each other or with the spaces.
     """
-    steps = len(np.atleast_1d(np.asarray(given["rewards"])))
+    steps = len(np.atleast_1d(numbers("rewards", given["rewards"])))
     if steps == 0:
         raise SpaceError("no transitions: the arrays are empty")
     leaves = observation_leaves(description.observation_space)
@@ -65,9 +71,11 @@ def columns_of_arrays(
         given = {**given, "behavior_probs": np.full(steps, np.nan, np.float32)}
     action = action_leaf(description.action_space)
     columns = {"actions": _leaf_array("actions", given["actions"], action, steps)}
-    for name, dtype in _SCALARS.items():
-        columns[name] = _scalars(name, given[name], dtype, steps)
-    lasts = _last_steps(columns["terminated"] | columns["truncated"], here, there)
+    for name, convert in _SCALARS.items():
+        columns[name] = convert(name, given[name])
+        if columns[name].shape != (steps,):
+            raise SpaceError(f"{name} has shape {columns[name].shape}, expected {(steps,)}")
+    lasts = last_steps(columns["terminated"] | columns["truncated"], here, there)
     after = lasts + 1
     frames = tuple(
         np.insert(observation, after, following[lasts], axis=0)
@@ -136,12 +144,20 @@ def action_space_of(actions: NDArray[Any]) -> spaces.Space[Any]:
     """Infer a Discrete space from integers (N,), or an unbounded Box from other arrays.
 
     Raises:
-        SpaceError: An integer is negative, or the array is not numeric.
+        SpaceError: An integer is negative or too large, or the array is not numeric.
     """
     if actions.ndim == 1 and actions.dtype.kind in "iu" and actions.size:
-        if actions.min() < 0:
-            raise SpaceError(f"action {actions.min()} is negative; pass action_space")
-        return spaces.Discrete(int(actions.max()) + 1)
+        least, most = int(actions.min()), int(actions.max())
+        if least < 0:
+            row = int(actions.argmin())
+            raise SpaceError(f"action {least} in row {row} is negative; pass action_space")
+        if most >= MAX_ACTIONS:
+            row = int(actions.argmax())
+            raise SpaceError(
+                f"action {most} in row {row} is too large: at most {MAX_ACTIONS} discrete actions"
+                " can be used; pass action_space if it is not discrete"
+            )
+        return spaces.Discrete(most + 1)
     return box_of(actions)
 
 
@@ -165,45 +181,17 @@ def box_of(array: NDArray[Any]) -> spaces.Box:
 def _leaf_array(role: str, values: Any, leaf: Leaf, steps: int) -> NDArray[Any]:
     where = role + "".join(f"['{key}']" for key in leaf.path)
     try:
-        array = np.asarray(leaf.of(values))
+        found = leaf.of(values)
     except (KeyError, IndexError, TypeError) as error:
         raise SpaceError(f"{where} is missing") from error
+    array = numbers(where, found)
     if array.shape != (steps, *leaf.shape):
         raise SpaceError(f"{where} has shape {array.shape}, expected {(steps, *leaf.shape)}")
     return exactly(where, array, leaf.dtype)
 
 
-def _scalars(role: str, values: Any, dtype: Any, steps: int) -> Any:
-    array = np.asarray(values)
-    if array.shape != (steps,):
-        raise SpaceError(f"{role} has shape {array.shape}, expected {(steps,)}")
-    if array.dtype.kind not in "biuf" or (dtype is np.bool_ and not np.isin(array, (0, 1)).all()):
-        raise SpaceError(f"{role} are not {'flags' if dtype is np.bool_ else 'numbers'}")
-    return array.astype(dtype)
-
-
-def exactly(where: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Copy an array to another dtype without changing any value.
-
-    Args:
-        where: Name of the array for the error.
-        array: Any numeric array.
-        dtype: Data type of the result.
-
-    Raises:
-        SpaceError: The dtype cannot represent a value exactly.
-    """
-    if array.dtype == dtype:
-        return array.copy()
-    with np.errstate(all="ignore"):
-        cast = array.astype(dtype)
-    if not np.array_equal(cast, array, equal_nan=dtype.kind == "f" and array.dtype.kind == "f"):
-        raise SpaceError(f"{where} is {array.dtype} and cannot be converted exactly to {dtype}")
-    return cast
-
-
-def _last_steps(
-    ends: NDArray[np.bool_], here: list[NDArray[Any]], there: list[NDArray[Any]]
+def last_steps(
+    ends: NDArray[np.bool_], here: Sequence[NDArray[Any]], there: Sequence[NDArray[Any]]
 ) -> NDArray[np.int64]:
     """Return the index of each episode's last transition.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -75,15 +75,20 @@ class Conversions:
         return self._written("minari", path, lossy=lossy, overwrite=overwrite)
 
     @staticmethod
-    def from_minari(path: str | Path) -> Dataset:
+    def from_minari(path: str | Path, *, lossy: bool = False) -> Dataset:
         """Read a Minari dataset.
+
+        Args:
+            path: Path of the folder, or `minari:ID` for a dataset in Minari's local folder.
+            lossy: Whether to leave out the parts of observations and actions that a log cannot
+                store, such as texts.
 
         Raises:
             LogError: The files are missing, damaged or of another format.
             SpaceError: A log cannot hold a space or dtype of the data.
             MissingExtraError: A package of the format is not installed.
         """
-        return _read("minari", path)
+        return _read("minari", path, lossy=lossy)
 
     def to_parquet(
         self,
@@ -146,15 +151,29 @@ class Conversions:
         return self._written("hdf5", path, lossy=lossy, overwrite=overwrite)
 
     @staticmethod
-    def from_hdf5(path: str | Path) -> Dataset:
+    def from_hdf5(
+        path: str | Path,
+        *,
+        one_episode: bool = False,
+        dones: Literal["terminated", "truncated"] | None = None,
+    ) -> Dataset:
         """Read an HDF5 file in D4RL's form.
 
+        Args:
+            path: Path of the file.
+            one_episode: Whether all rows are one episode if nothing marks where an episode ends.
+                Otherwise, such a file is refused.
+            dones: Kind of the ends that no array distinguishes; see docs/formats.md for the
+                default.
+
         Raises:
-            LogError: The files are missing, damaged or of another format.
-            SpaceError: A log cannot hold a space or dtype of the data.
+            LogError: The files are missing, damaged or of another format, or nothing says where
+                episodes end.
+            SpaceError: A log cannot hold a space or dtype of the data, or a value is impossible.
+            UsageError: The options contradict the file.
             MissingExtraError: A package of the format is not installed.
         """
-        return _read("hdf5", path)
+        return _read("hdf5", path, one_episode=one_episode, dones=dones)
 
     def to_npz(
         self, path: str | Path, *, lossy: bool = False, overwrite: bool = False
@@ -178,15 +197,29 @@ class Conversions:
         return self._written("npz", path, lossy=lossy, overwrite=overwrite)
 
     @staticmethod
-    def from_npz(path: str | Path) -> Dataset:
+    def from_npz(
+        path: str | Path,
+        *,
+        one_episode: bool = False,
+        dones: Literal["terminated", "truncated"] | None = None,
+    ) -> Dataset:
         """Read a dataset from the NumPy arrays in an .npz file.
 
+        Args:
+            path: Path of the file.
+            one_episode: Whether all rows are one episode if nothing marks where an episode ends.
+                Otherwise, such a file is refused.
+            dones: Kind of the ends that no array distinguishes; see docs/formats.md for the
+                default.
+
         Raises:
-            LogError: The files are missing, damaged or of another format.
-            SpaceError: A log cannot hold a space or dtype of the data.
+            LogError: The files are missing, damaged or of another format, or nothing says where
+                episodes end.
+            SpaceError: A log cannot hold a space or dtype of the data, or a value is impossible.
+            UsageError: The options contradict the file.
             MissingExtraError: A package of the format is not installed.
         """
-        return _read("npz", path)
+        return _read("npz", path, one_episode=one_episode, dones=dones)
 
     def to_d3rlpy(self) -> Any:
         """Return a `d3rlpy.dataset.MDPDataset` with all transitions.
@@ -283,7 +316,7 @@ class Conversions:
         return write_format(dataset, path, form, lossy=lossy, overwrite=overwrite, **options)
 
 
-def _read(name: str, path: str | Path) -> Dataset:
+def _read(name: str, path: str | Path, **options: Any) -> Dataset:
     from mcaprl.recorder.dataset.formats.registry import format_named, read_format
 
-    return read_format(path, format_named(name))
+    return read_format(path, format_named(name), **options)

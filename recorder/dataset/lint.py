@@ -12,11 +12,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.masks import MASK_KEY, allowed_actions
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.mapped import blocks_of
+from mcaprl.recorder.dataset.values import is_beyond_float32
 from mcaprl.recorder.format.probability import is_impossible
 from mcaprl.recorder.format.spaces import Leaf, bounds_of, observation_leaves, outside
 
@@ -46,6 +48,14 @@ def _not_finite(dataset: Dataset) -> Iterator[Problem]:
     if bad:
         places = _places(dataset, lambda episode: ~np.isfinite(episode.rewards))
         yield Problem(f"{bad} rewards are NaN or infinite", places, effect)
+    beyond = is_beyond_float32(dataset.rewards)
+    if beyond.any():
+        yield Problem(
+            f"{_count(int(beyond.sum()), 'reward')} beyond float32, such as"
+            f" {dataset.rewards[beyond][0]:g}",
+            _places(dataset, lambda episode: is_beyond_float32(episode.rewards)),
+            "training rejects the dataset",
+        )
 
 
 def _out_of_range(dataset: Dataset) -> Iterator[Problem]:
@@ -75,6 +85,31 @@ def _impossible_actions(dataset: Dataset) -> Iterator[Problem]:
             _places(dataset, lambda episode: outside(dataset.action_space, episode.actions)),
             "training rejects the dataset",
         )
+
+
+def _masked_actions(dataset: Dataset) -> Iterator[Problem]:
+    space = dataset.action_space
+    masks = [leaf for leaf in _leaves(dataset) if leaf.path == (MASK_KEY,)]
+    if not isinstance(space, spaces.Discrete) or not masks or masks[0].shape != (space.n,):
+        return
+    forbidden = [_is_forbidden(space, episode) for episode in dataset.episodes]
+    count = sum(int(one.sum()) for one in forbidden)
+    if count:
+        yield Problem(
+            f"{_count(count, 'action')} that the log's own {MASK_KEY} forbids",
+            _places(dataset, functools.partial(_is_forbidden, space)),
+            "training rejects the dataset",
+        )
+
+
+def _is_forbidden(space: spaces.Discrete, episode: Episode) -> NDArray[np.bool_]:
+    """Mark the actions (T,) in their space that the mask of their observation forbids."""
+    allowed = allowed_actions(episode.observations)
+    assert allowed is not None, "the observations have a mask"
+    chosen = np.asarray(episode.actions) - space.start
+    inside = (chosen >= 0) & (chosen < space.n)
+    taken: NDArray[np.bool_] = allowed[np.arange(len(chosen)), np.where(inside, chosen, 0)]
+    return inside & ~taken
 
 
 def _constant(dataset: Dataset) -> Iterator[Problem]:
@@ -224,6 +259,7 @@ _CHECKS: Final[tuple[Callable[[Dataset], Iterator[Problem]], ...]] = (
     _not_finite,
     _out_of_range,
     _impossible_actions,
+    _masked_actions,
     _duplicates,
     _time_gaps,
     _rewards,

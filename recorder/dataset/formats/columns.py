@@ -10,12 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError
-from mcaprl.recorder.dataset.arrays import exactly, with_fresh_times
+from mcaprl.recorder.dataset.arrays import with_fresh_times
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.transitions import Transitions, joined_infos
+from mcaprl.recorder.dataset.values import (
+    check_finite,
+    check_inside,
+    exactly,
+    numbers,
+    probabilities_of,
+    rewards_of,
+)
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
+from mcaprl.texts import shortened
 
 
 @dataclass(frozen=True)
@@ -34,6 +43,8 @@ class EpisodeArrays:
             unknown.
         infos: Masked array of T + 1 rows for each info, by its dotted name.
         summary: Fields of `EpisodeSummary` that the format stores: seed, reason, policy, ...
+        first_row: Row of the first transition in a table of all transitions, for errors; None if
+            the format stores each episode separately.
     """
 
     observations: Any
@@ -45,9 +56,17 @@ class EpisodeArrays:
     times_ns: NDArray[np.int64] | None = None
     infos: Mapping[str, Any] = field(default_factory=dict)
     summary: Mapping[str, Any] = field(default_factory=dict)
+    first_row: int | None = None
 
 
-def dataset_of(episodes: Sequence[EpisodeArrays], metadata: LogMetadata, where: object) -> Dataset:
+def dataset_of(
+    episodes: Sequence[EpisodeArrays],
+    metadata: LogMetadata,
+    where: object,
+    *,
+    is_foreign: bool = False,
+    has_rewards: bool = True,
+) -> Dataset:
     """Return a dataset of these episodes.
 
     If the times of the episodes increase strictly from row to row, they become the log_times.
@@ -58,14 +77,84 @@ def dataset_of(episodes: Sequence[EpisodeArrays], metadata: LogMetadata, where: 
         episodes: Episodes in order; episodes without a transition are left out.
         metadata: Spaces and description of the data.
         where: Name of the source, for errors.
+        is_foreign: Whether another tool wrote the data. Then, all rewards and actions must be
+            finite, and discrete values must be in their space. A log may contain other values,
+            which `lint` reports, so they are accepted in data that this package wrote.
+        has_rewards: Whether the source has rewards; otherwise, they are NaN.
 
     Raises:
-        LogError: There is no transition.
-        SpaceError: An array does not fit its space exactly.
+        LogError: There is no transition, or the step duration is not positive.
+        SpaceError: An array does not fit its space exactly, or has an impossible value.
     """
-    kept = [episode for episode in episodes if len(episode.rewards)]
+    kept = [(index, episode) for index, episode in enumerate(episodes) if len(episode.rewards)]
     if not kept:
         raise LogError(f"{where} has no transitions")
+    check_duration(metadata, sum(len(episode.rewards) + 1 for _, episode in kept), where)
+    for index, episode in kept:
+        place = _place(where, index, episode)
+        _check_times_and_probabilities(episode, place)
+        if is_foreign:
+            _check_values(episode, metadata, place, has_rewards=has_rewards)
+    return _joined([episode for _, episode in kept], metadata, where)
+
+
+def check_duration(metadata: LogMetadata, frames: int, where: object) -> None:
+    """Check that log_times which increase by the step duration fit into 64 bits.
+
+    Raises:
+        LogError: The step duration is not positive, or too large.
+    """
+    if not 0 < metadata.step_duration_ns * frames < 2**62:
+        raise LogError(
+            f"{where}: step_duration_ns is {shortened(str(metadata.step_duration_ns), 40)},"
+            " expected a positive number of nanoseconds"
+        )
+
+
+def check_times(name: str, times_ns: NDArray[Any]) -> None:
+    """Check that the log_times of an episode do not fall.
+
+    Raises:
+        SpaceError: A time is earlier than the time before it.
+    """
+    falls = np.diff(times_ns) < 0
+    if falls.any():
+        row = int(falls.argmax())
+        before, after = times_ns[row].item(), times_ns[row + 1].item()
+        raise SpaceError(f"{name} falls from {before} to {after} ns after observation {row}")
+
+
+def _place(where: object, index: int, episode: EpisodeArrays) -> str:
+    return f"{where}" if episode.first_row is not None else f"{where}: episode {index}"
+
+
+def _check_times_and_probabilities(episode: EpisodeArrays, place: str) -> None:
+    first = episode.first_row or 0
+    if episode.times_ns is not None:
+        check_times(f"{place}: log_time_ns", episode.times_ns)
+    if episode.behavior_probs is not None:
+        probabilities_of(f"{place}: behavior_probs", episode.behavior_probs, first_row=first)
+
+
+def _check_values(
+    episode: EpisodeArrays, metadata: LogMetadata, place: str, *, has_rewards: bool
+) -> None:
+    """Check the values of another tool; see `dataset_of`."""
+    first = episode.first_row or 0
+    actions = numbers(f"{place}: actions", episode.actions)
+    check_finite(f"{place}: actions", actions, first_row=first)
+    check_inside(f"{place}: actions", actions, metadata.action_space, first_row=first)
+    rewards = numbers(f"{place}: rewards", episode.rewards)
+    if has_rewards:
+        check_finite(f"{place}: rewards", rewards, first_row=first)
+    for leaf in metadata.leaves:
+        name = f"{place}: {leaf.name}"
+        space = leaf.of(metadata.observation_space)
+        check_inside(name, np.asarray(leaf.of(episode.observations)), space, first_row=first)
+
+
+def _joined(kept: Sequence[EpisodeArrays], metadata: LogMetadata, where: object) -> Dataset:
+    """Return a dataset of episodes with valid values; see `dataset_of`."""
     leaves = observation_leaves(metadata.observation_space)
     action = action_leaf(metadata.action_space)
     lengths = np.array([len(episode.rewards) for episode in kept])
@@ -79,7 +168,7 @@ def dataset_of(episodes: Sequence[EpisodeArrays], metadata: LogMetadata, where: 
             ),
             log_time_ns=_times(kept),
             actions=np.concatenate([_rows(action, e.actions, len(e.rewards)) for e in kept]),
-            rewards=np.concatenate([np.asarray(e.rewards, np.float64) for e in kept]),
+            rewards=np.concatenate([rewards_of("rewards", e.rewards) for e in kept]),
             terminated=_last_rows(lengths, [e.terminated for e in kept]),
             truncated=_last_rows(lengths, [e.truncated for e in kept]),
             behavior_probs=np.concatenate([_probabilities(e) for e in kept]),
@@ -106,7 +195,7 @@ def episode_slices(dataset: Dataset) -> list[tuple[slice, slice]]:
 
 
 def _rows(leaf: Leaf, values: Any, count: int) -> NDArray[Any]:
-    array = np.asarray(values)
+    array = numbers(leaf.name, values)
     if array.shape != (count, *leaf.shape):
         raise SpaceError(f"{leaf.name} has shape {array.shape}, expected {(count, *leaf.shape)}")
     return exactly(leaf.name, array, leaf.dtype)

@@ -9,11 +9,16 @@ observation, a zero action and a zero reward.
 Images have their channels first, other tensors are vectors, and a Dict is a list of arrays. The
 group `mcaprl` of the file contains the data that d3rlpy's format cannot store; d3rlpy does not read
 this group.
+
+d3rlpy 1 wrote flat arrays, in which `episode_terminals` marks the last step of each episode. They
+are read as d3rlpy 2 reads them.
 """
 
 from __future__ import annotations
 
 import itertools
+import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,8 +33,11 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats import hdf5_nodes as nodes
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
 from mcaprl.recorder.dataset.formats.d3rlpy_own import read_own, stored_rows, write_own
+from mcaprl.recorder.dataset.formats.ends import Kind
+from mcaprl.recorder.dataset.formats.flat import NAMES, FlatOptions, flat_dataset, unread_note
 from mcaprl.recorder.dataset.formats.infos import infos_of, stored_infos
 from mcaprl.recorder.dataset.formats.npz import OWN
+from mcaprl.recorder.dataset.values import exactly, flags, numbers
 from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
 from mcaprl.recorder.format.spaces import (
     MIN_IMAGE_EDGE,
@@ -46,7 +54,8 @@ def matches(path: Path) -> bool:
     if not nodes.is_hdf5(path):
         return False
     with nodes.opened(path) as file:
-        return all(nodes.has(file, name) for name in ("columns", "num_episodes", "version"))
+        is_new = all(nodes.has(file, name) for name in ("columns", "num_episodes", "version"))
+        return is_new or _is_version_1(file)
 
 
 def to_mdp_dataset(dataset: Dataset) -> Any:
@@ -150,18 +159,26 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     return lost
 
 
-def read(path: Path) -> Dataset:
+def read(path: Path, *, one_episode: bool = False, dones: Kind | None = None) -> Dataset:
     """Read a file that d3rlpy's `dump` or `write` wrote.
 
-    The file does not state whether actions are discrete. They are read as discrete if each step has
-    one integer.
+    A file of version 2 does not state whether actions are discrete. They are read as discrete if
+    each step has one integer.
+
+    Args:
+        path: File.
+        one_episode: See `FlatOptions`; ignored for files of version 2.
+        dones: See `FlatOptions`; ignored for files of version 2.
 
     Raises:
         LogError: The file is damaged, or of another version.
-        SpaceError: A log cannot hold a space or dtype of the data.
+        SpaceError: A log cannot hold a space or dtype of the data, or a value is impossible.
+        UsageError: The options contradict the arrays.
         MissingExtraError: h5py is not installed.
     """
     with nodes.opened(path) as file:
+        if _is_version_1(file):
+            return _version_1(file, path, FlatOptions(one_episode, dones))
         version = str(nodes.array_in(file, "version"))
         if version != VERSION:
             raise LogError(
@@ -175,7 +192,49 @@ def read(path: Path) -> Dataset:
         for index, episode in enumerate(episodes):
             _check_arrays(episode, f"{path}: episode {index}")
         own = read_own(file, episodes, path) if nodes.has(file, OWN) else None
-    return own or _dataset_of(episodes, None, path)
+        unread = [] if own else _unread(file, count)
+    found = own or _dataset_of(episodes, None, path)
+    if unread:
+        warnings.warn(f"{path}: {unread_note(unread)}", stacklevel=4)
+    return found
+
+
+def _is_version_1(file: Any) -> bool:
+    """Return whether d3rlpy 1 wrote a file, as far as the names of its arrays tell."""
+    names = ("observations", "actions", "rewards", "terminals", "discrete_action")
+    return all(nodes.has(file, name) for name in names)
+
+
+def _version_1(file: Any, path: Path, options: FlatOptions) -> Dataset:
+    """Read the flat arrays of d3rlpy 1.
+
+    Without next observations, the last row of an episode that is not terminated is only an
+    observation, as in d3rlpy.
+    """
+    names = nodes.names_in(file)
+    arrays = {name: nodes.tree_in(file, name) for name in names if name in NAMES}
+    actions, is_discrete = arrays["actions"], nodes.array_in(file, "discrete_action")
+    if flags(f"{path}: discrete_action", is_discrete).reshape(-1)[:1].all():
+        actions = numbers(f"{path}: actions", actions)
+        arrays["actions"] = exactly(f"{path}: actions", actions, np.dtype(np.int64)).reshape(-1)
+    elif np.ndim(actions) == 1:
+        arrays["actions"] = actions[:, None]
+    if isinstance(arrays["observations"], np.ndarray):
+        arrays["observations"] = _channels_last(arrays["observations"])
+    unread = [name for name in names if name not in NAMES and nodes.has_rows(file, name)]
+    return flat_dataset(arrays, path, options=options, unread=unread)
+
+
+def _unread(file: Any, count: int) -> list[str]:
+    """Return the names of the arrays of a file of version 2 that are not those of its episodes."""
+    known = re.compile(rf"({'|'.join(_KEYS)})_(\d+)(_\d+)?")
+
+    def is_known(name: str) -> bool:
+        found = known.fullmatch(name)
+        return name in ("columns", OWN) or (found is not None and int(found[2]) < count)
+
+    names = nodes.names_in(file)
+    return [name for name in names if not is_known(name) and nodes.has_rows(file, name)]
 
 
 def _check_action_space(space: spaces.Space[Any]) -> None:
@@ -244,7 +303,7 @@ def _dataset_of(
             truncated=not terminated,
         )
         found.append(arrays)
-    return dataset_of(found, metadata, where)
+    return dataset_of(found, metadata, where, is_foreign=True)
 
 
 def _frames(episode: Mapping[str, Any]) -> Any:
@@ -254,9 +313,14 @@ def _frames(episode: Mapping[str, Any]) -> Any:
         parts = [_frames({**episode, "observations": part}) for part in stored]
         return {str(index): part for index, part in enumerate(parts)}
     values = np.concatenate([stored, stored[-1:]]) if episode["terminated"] else stored
+    return _channels_last(values)
+
+
+def _channels_last(values: NDArray[Any]) -> NDArray[Any]:
+    """Return images (N, C, H, W) as (N, H, W, C), and other arrays unchanged."""
     is_image = values.dtype == np.uint8 and values.ndim == 4
     if is_image and values.shape[1] < MIN_IMAGE_EDGE <= min(values.shape[2:]):
-        values = np.moveaxis(values, 1, -1)
+        return np.moveaxis(values, 1, -1)
     return values
 
 
@@ -298,3 +362,4 @@ def _check_arrays(episode: Mapping[str, Any], where: str) -> None:
         raise LogError(f"{where} has arrays that are not numbers")
     if not parts[-1].size or parts[-1].shape[1] != 1 or episode["terminated"].ndim:
         raise LogError(f"{where} has no rewards, or several rewards for each step")
+    flags(f"{where}: terminated", episode["terminated"])

@@ -3,73 +3,231 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, SpaceError
-from mcaprl.recorder.dataset.arrays import description_of
+from mcaprl.errors import LogError, SpaceError, UsageError
+from mcaprl.limits import MAX_MEMBERS_SHOWN
+from mcaprl.recorder.dataset.arrays import description_of, last_steps
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
+from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.dataset.formats.ends import MEANINGS, Ends, Kind, ends_of
 from mcaprl.recorder.dataset.formats.infos import masked
+from mcaprl.recorder.dataset.values import exactly, numbers
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.texts import counted
+from mcaprl.texts import counted, printable
 
-NAMES = {
-    "observations": ("observations",),
-    "actions": ("actions",),
-    "rewards": ("rewards",),
-    "terminated": ("terminals", "terminations", "terminated"),
-    "truncated": ("timeouts", "truncations", "truncated"),
-    "next_observations": ("next_observations",),
-    "behavior_probs": ("behavior_probs",),
-}
-"""Names that a file may use for each array of `Dataset.from_arrays`.
+COLUMNS = ("observations", "actions", "rewards", "next_observations", "behavior_probs")
+NAMES = frozenset((*COLUMNS, *MEANINGS))
+"""Names of the arrays that are read."""
+_REQUIRED = ("observations", "actions", "rewards")
+_TERMINATED = "terminals or terminations or terminated (or another name of docs/formats.md)"
 
-A file must not contain two of the names of the same array.
-"""
-_REQUIRED = ("observations", "actions", "rewards", "terminated")
-_COLUMNS = ("rewards", "terminated", "truncated", "behavior_probs")
+
+@dataclass(frozen=True)
+class FlatOptions:
+    """What the user says about flat arrays that do not say it.
+
+    Attributes:
+        one_episode: Whether all rows are one episode if nothing marks its end.
+        dones: Kind of the ends whose kind is unknown.
+    """
+
+    one_episode: bool = False
+    dones: Kind | None = None
 
 
 def flat_dataset(
-    found: Mapping[str, Any], where: object, infos: Mapping[str, NDArray[Any]] | None = None
+    found: Mapping[str, Any],
+    where: object,
+    infos: Mapping[str, NDArray[Any]] | None = None,
+    *,
+    options: FlatOptions | None = None,
+    unread: Sequence[str] = (),
 ) -> Dataset:
     """Return a dataset of flat arrays.
 
     If there are no next observations, the observation of a terminal transition is repeated as its
-    next observation. The last transition before a timeout is left out, because its next observation
-    is unknown.
+    next observation. The last transition of any other episode is left out, because its next
+    observation is unknown.
 
     Args:
         found: Arrays of N rows by the names in `NAMES`. The observations may be nested dicts.
         where: Name of the source, for errors and warnings.
         infos: Arrays by dotted name. An array of N rows is read as an info of the N observations;
-            the final observations have no infos. Other arrays are ignored.
+            the final observations have no infos. Other arrays are named in a warning.
+        options: What the user says about the arrays.
+        unread: Names of other arrays of the source, for a warning.
 
     Raises:
-        LogError: An array is missing.
-        SpaceError: The arrays have different lengths, or a log cannot store their dtype.
+        LogError: An array is missing, nothing says where episodes end, or arrays contradict each
+            other.
+        SpaceError: The arrays have different lengths, or values that are impossible.
+        UsageError: The user says that there is one episode, but there are several.
     """
-    arrays = _named(found, where)
-    missing = [" or ".join(NAMES[name]) for name in _REQUIRED if name not in arrays]
+    options = options or FlatOptions()
+    says_ends = any(MEANINGS.get(name) not in (None, "truncated") for name in found)
+    missing = [name for name in _REQUIRED if name not in found]
+    missing += [] if says_ends else [_TERMINATED]
     if missing:
-        raise LogError(f"{where} has no {', '.join(missing)}; it has {', '.join(sorted(found))}")
-    for name in _COLUMNS:
-        if name in arrays:
-            arrays[name] = _one_column(arrays[name])
-    arrays.setdefault("truncated", np.zeros(len(arrays["rewards"]), bool))
-    count = len(arrays["rewards"])
-    rows = {name: values for name, values in (infos or {}).items() if _is_info(values, count)}
+        has = ", ".join(sorted([*found, *unread])[:MAX_MEMBERS_SHOWN])
+        raise LogError(f"{where} has no {', '.join(missing)}; it has {printable(has) or 'none'}")
+    columns = {name: _one_column(name, values, where) for name, values in found.items()}
+    for name in ("actions", "rewards", "behavior_probs"):
+        if isinstance(columns.get(name), Mapping):
+            raise LogError(f"{where}: {name} is a group; a log can store one array of {name}")
+    if columns["rewards"].ndim != 1:
+        shape = columns["rewards"].shape
+        raise SpaceError(f"{where}: rewards has shape {shape}, expected one reward for each step")
+    count, unread = len(columns["rewards"]), list(unread)
+    for name in [name for name in columns if name in MEANINGS]:
+        # Files also have groups with these names, or masks of actions.
+        is_group = isinstance(columns[name], Mapping)
+        if is_group or (name == "masks" and columns[name].shape != (count,)):
+            del columns[name]
+            unread.append(name)
     try:
-        if "next_observations" in arrays:
-            data = Dataset.from_arrays(**arrays)
-            return _with_infos(data, rows, where) if rows else data
-        return _without_next(arrays, rows, where)
-    except SpaceError as error:
-        raise SpaceError(f"{where}: {error}") from error
+        steps = _Steps(columns, ends_of(columns, count, dones=options.dones))
+        steps.check_ends(options)
+        rows = {name: values for name, values in (infos or {}).items() if _is_info(values, count)}
+        unread += [f"infos/{name}" for name in infos or {} if name not in rows]
+        episodes = list(steps.episodes(rows))
+    except (LogError, SpaceError, UsageError) as error:
+        raise type(error)(f"{where}: {error}") from error
+    for note in (*steps.notes(), *_unread(unread)):
+        warnings.warn(f"{where}: {note}", stacklevel=4)
+    description = _described(columns, where)
+    return dataset_of(episodes, description, where, is_foreign=True)
+
+
+class _Steps:
+    """Columns of N transitions, divided into episodes."""
+
+    def __init__(self, columns: Mapping[str, Any], ends: Ends) -> None:
+        self._columns, self._ends = columns, ends
+        self._count = len(columns["rewards"])
+        self._next = columns.get("next_observations")
+        # With next observations, a row is a transition in every format.
+        self._is_rlds = ends.is_rlds and self._next is None
+        self._check_lengths()
+        self._last = ends.last.copy()
+        self._breaks = np.zeros(self._count, np.bool_)
+        if self._next is not None:
+            self._next = _like(columns["observations"], self._next, "next_observations")
+            here, there = _leaves(columns["observations"]), _leaves(self._next)
+            self._breaks[last_steps(self._breaks, here, there)] = True
+            self._last |= self._breaks
+        self._last[-1:] = True
+        stops = (np.flatnonzero(self._last) + 1).tolist()
+        self._spans = list(zip([0, *stops[:-1]], stops, strict=True))
+
+    def check_ends(self, options: FlatOptions) -> None:
+        """Check that something says where episodes end, or that the user does.
+
+        Raises:
+            LogError: Nothing says where episodes end.
+            UsageError: The user says that there is one episode, but there are several.
+        """
+        is_marked = bool((self._ends.terminated | self._ends.truncated).any())
+        if len(self._spans) > 1 and options.one_episode:
+            raise UsageError(
+                f"one_episode is set, but the arrays have {counted(len(self._spans), 'episode')}"
+            )
+        if len(self._spans) > 1 or is_marked or self._ends.is_stated or options.one_episode:
+            return
+        raise LogError(
+            f"nothing says where the episodes of {counted(self._count, 'row')} end: no end flag is"
+            " set; add the flags, or, if it is one episode, convert it with --one-episode"
+            " (one_episode=True in Python)"
+        )
+
+    def episodes(self, infos: Mapping[str, NDArray[Any]]) -> Iterator[EpisodeArrays]:
+        """Yield the episodes; see `flat_dataset`."""
+        actions, rewards = self._columns["actions"], self._columns["rewards"]
+        observations, probs = self._columns["observations"], self._columns.get("behavior_probs")
+        for start, stop in self._spans:
+            last = stop - self._is_left_out(stop - 1)
+            steps, frames = slice(start, last), np.arange(start, last + 1)
+            if self._next is None:
+                rows = rows_of_tree(observations, np.minimum(frames, stop - 1))
+            else:
+                final = rows_of_tree(self._next, slice(stop - 1, stop))
+                rows = joined_trees([rows_of_tree(observations, slice(start, stop)), final])
+            info_stop = min(last + 1, stop)
+            yield EpisodeArrays(
+                observations=rows,
+                actions=actions[steps],
+                rewards=rewards[steps],
+                terminated=bool(self._ends.terminated[stop - 1]),
+                truncated=bool(self._ends.truncated[stop - 1]),
+                behavior_probs=None if probs is None else probs[steps],
+                infos=_info_rows(infos, start, info_stop, len(frames)),
+                first_row=start,
+            )
+
+    def notes(self) -> Iterator[str]:
+        """Yield what the user has to know."""
+        yield from self._ends.notes
+        lasts = np.array([stop - 1 for _, stop in self._spans])
+        if not self._ends.has_truncations and (self._next is None or self._is_shifted(lasts)):
+            yield (
+                "there are no timeouts (or truncations): if a time limit ended an episode, nothing"
+                " marks that end, and a transition leads from there into the next episode"
+            )
+        if self._next is not None:
+            yield from self._wrong_next(lasts)
+            return
+        dropped = sum(self._is_left_out(row) for row in lasts.tolist())
+        repeated = len(lasts) - dropped
+        found = []
+        if self._is_rlds:
+            episodes = counted(dropped, "episode")
+            found.append(f"the last row of {episodes} is the final observation, as RLDS stores it")
+        elif dropped:
+            episodes = counted(dropped, "episode")
+            found.append(f"the last steps of {episodes} without a terminal step are left out")
+        if repeated:
+            episodes = counted(repeated, "terminated episode")
+            text = f"the last observation of {episodes} is repeated as next observation"
+            found.insert(0, text)
+        yield f"there are no next_observations: {', and '.join(found)}"
+
+    def _wrong_next(self, lasts: NDArray[np.int64]) -> Iterator[str]:
+        """Yield a note if the next observations of truncated episodes are of the next episodes."""
+        cut = lasts[:-1][~self._ends.terminated[lasts[:-1]]]
+        if len(cut) and not self._breaks[cut].any():
+            yield (
+                f"next_observations are those of the following row, also at the ends of"
+                f" {counted(len(cut), 'truncated episode')}: there, they are of another episode"
+            )
+
+    def _is_left_out(self, row: int) -> bool:
+        """Return whether the last row of an episode is not a transition."""
+        return self._next is None and (self._is_rlds or not self._ends.terminated[row])
+
+    def _is_shifted(self, lasts: NDArray[np.int64]) -> bool:
+        """Return whether next observations are those of the following row, even at all ends."""
+        inner = lasts[:-1]
+        return len(inner) > 0 and not self._breaks[inner].any()
+
+    def _check_lengths(self) -> None:
+        """Check that each column has a row for each reward.
+
+        Raises:
+            SpaceError: A column has another number of rows, or is not numeric.
+        """
+        for name in COLUMNS:
+            for path, array in _named_leaves(name, self._columns.get(name)):
+                if not array.ndim or len(array) != self._count:
+                    rows = len(array) if array.ndim else 1
+                    raise SpaceError(
+                        f"{path} has shape {array.shape}: there are {rows} {path}, but"
+                        f" {self._count} rewards"
+                    )
 
 
 def rows_of_tree(tree: Any, rows: Any) -> Any:
@@ -86,21 +244,61 @@ def joined_trees(trees: list[Any]) -> Any:
     return np.concatenate(trees)
 
 
-def _named(found: Mapping[str, Any], where: object) -> dict[str, Any]:
-    arrays = {}
-    for name, others in NAMES.items():
-        present = [other for other in others if other in found]
-        if len(present) > 1:
-            raise LogError(f"{where} has both {' and '.join(present)}: remove one of them")
-        if present:
-            arrays[name] = found[present[0]]
-    return arrays
+def unread_note(names: Sequence[str]) -> str:
+    """Return a sentence that names the arrays of a source that are not read."""
+    shown = ", ".join(printable(name) for name in names[:MAX_MEMBERS_SHOWN])
+    more = len(names) - MAX_MEMBERS_SHOWN
+    return f"not read: {shown}{f' and {more} more' if more > 0 else ''}"
 
 
-def _one_column(values: Any) -> NDArray[Any]:
-    """Convert an array (N, 1) to (N,); return other arrays unchanged."""
-    array = np.asarray(values)
-    return array[:, 0] if array.ndim == 2 and array.shape[1] == 1 else array
+def _described(columns: Mapping[str, Any], where: object) -> LogMetadata:
+    try:
+        return description_of("", columns["observations"], columns["actions"], None, None)
+    except SpaceError as error:
+        raise SpaceError(f"{where}: {error}") from error
+
+
+def _one_column(name: str, values: Any, where: object) -> Any:
+    """Check that a column of `COLUMNS` is numeric; convert arrays (N, 1) to (N,) if they are flat.
+
+    Raises:
+        SpaceError: The column is not numeric.
+    """
+    try:
+        if isinstance(values, Mapping):
+            return {key: _one_column(f"{name}/{key}", values[key], where) for key in values}
+        array = numbers(name, values) if name.split("/")[0] in COLUMNS else np.asarray(values)
+    except SpaceError as error:
+        raise SpaceError(f"{where}: {error}") from error
+    is_flat = name in MEANINGS or name in ("rewards", "behavior_probs")
+    return array[:, 0] if is_flat and array.ndim == 2 and array.shape[1] == 1 else array
+
+
+def _like(tree: Any, other: Any, name: str) -> Any:
+    """Return `other` with the keys and dtypes of `tree`.
+
+    Raises:
+        SpaceError: The keys or shapes differ, or a value cannot be converted exactly.
+    """
+    if isinstance(tree, Mapping) and isinstance(other, Mapping) and tree.keys() == other.keys():
+        return {key: _like(part, other[key], f"{name}/{key}") for key, part in tree.items()}
+    if isinstance(tree, Mapping) or isinstance(other, Mapping) or tree.shape != other.shape:
+        raise SpaceError(f"{name} does not have the keys and shapes of the observations")
+    return other if other.dtype == tree.dtype else exactly(name, other, tree.dtype)
+
+
+def _named_leaves(name: str, tree: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield the name and the values of each array in nested dicts."""
+    if isinstance(tree, Mapping):
+        for key, part in tree.items():
+            yield from _named_leaves(f"{name}/{key}", part)
+    elif tree is not None:
+        yield name, tree
+
+
+def _leaves(tree: Any) -> list[NDArray[Any]]:
+    """Return the arrays in nested dicts, in the order of their names."""
+    return [array for _, array in sorted(_named_leaves("", tree), key=lambda found: found[0])]
 
 
 def _is_info(values: NDArray[Any], count: int) -> bool:
@@ -116,61 +314,5 @@ def _info_rows(infos: Mapping[str, NDArray[Any]], first: int, last: int, count: 
     }
 
 
-def _with_infos(data: Dataset, infos: Mapping[str, NDArray[Any]], where: object) -> Dataset:
-    episodes = [
-        EpisodeArrays(
-            observations=rows_of_tree(data.frames, frames),
-            actions=data.actions[steps],
-            rewards=data.rewards[steps],
-            terminated=bool(data.terminated[steps.stop - 1]),
-            truncated=bool(data.truncated[steps.stop - 1]),
-            behavior_probs=data.behavior_probs[steps],
-            infos=_info_rows(infos, steps.start, steps.stop, frames.stop - frames.start),
-        )
-        for steps, frames in episode_slices(data)
-    ]
-    return dataset_of(episodes, LogMetadata.from_strings(data.metadata), where)
-
-
-def _without_next(
-    arrays: Mapping[str, Any], infos: Mapping[str, NDArray[Any]], where: object
-) -> Dataset:
-    observations, actions = arrays["observations"], np.asarray(arrays["actions"])
-    rewards, probs = arrays["rewards"], arrays.get("behavior_probs")
-    terminated, truncated = (arrays[name].astype(bool) for name in ("terminated", "truncated"))
-    for name in ("actions", *_COLUMNS):
-        if name in arrays and len(arrays[name]) != len(rewards):
-            raise SpaceError(f"there are {len(arrays[name])} {name}, but {len(rewards)} rewards")
-    ends = terminated | truncated
-    ends[-1:] = True
-    stops = (np.flatnonzero(ends) + 1).tolist()
-    episodes, dropped = [], 0
-    for start, stop in zip([0, *stops[:-1]], stops, strict=True):
-        is_terminal = bool(terminated[stop - 1])
-        last = stop if is_terminal else stop - 1
-        dropped += stop - last
-        steps, frames = slice(start, last), np.arange(start, last + 1)
-        episode = EpisodeArrays(
-            observations=rows_of_tree(observations, np.minimum(frames, stop - 1)),
-            actions=actions[steps],
-            rewards=rewards[steps],
-            terminated=is_terminal,
-            truncated=bool(truncated[stop - 1]),
-            behavior_probs=None if probs is None else probs[steps],
-            infos=_info_rows(infos, start, min(last + 1, stop), last - start + 1),
-        )
-        episodes.append(episode)
-    _warn(where, int(terminated.sum()), dropped)
-    return dataset_of(episodes, description_of("", observations, actions, None, None), where)
-
-
-def _warn(where: object, terminal: int, dropped: int) -> None:
-    found = []
-    if terminal:
-        episodes = counted(terminal, "terminated episode")
-        found.append(f"the last observation of {episodes} is repeated as next observation")
-    if dropped:
-        episodes = counted(dropped, "episode")
-        found.append(f"the last steps of {episodes} without a terminal step are left out")
-    if found:
-        warnings.warn(f"{where} has no next_observations: {', and '.join(found)}", stacklevel=5)
+def _unread(names: Sequence[str]) -> list[str]:
+    return [unread_note(sorted(names))] if names else []

@@ -19,7 +19,8 @@ from mcaprl.errors import LogError, SpaceError, import_extra
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats import hdf5_nodes as nodes
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
-from mcaprl.recorder.dataset.formats.flat import NAMES, flat_dataset
+from mcaprl.recorder.dataset.formats.ends import Kind
+from mcaprl.recorder.dataset.formats.flat import NAMES, FlatOptions, flat_dataset
 from mcaprl.recorder.dataset.formats.infos import (
     StoredInfo,
     infos_of,
@@ -36,6 +37,7 @@ from mcaprl.recorder.dataset.formats.npz import (
     parse_infos,
 )
 from mcaprl.recorder.dataset.formats.robomimic import read_demos
+from mcaprl.recorder.dataset.values import flags
 from mcaprl.recorder.format.spaces import leaves_of, nest, observation_leaves
 from mcaprl.texts import counted
 
@@ -103,12 +105,18 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     return lost
 
 
-def read(path: Path) -> Dataset:
+def read(path: Path, *, one_episode: bool = False, dones: Kind | None = None) -> Dataset:
     """Read a file in D4RL's or robomimic's form.
+
+    Args:
+        path: File.
+        one_episode: See `FlatOptions`; ignored for robomimic's form.
+        dones: See `FlatOptions`; ignored for robomimic's form.
 
     Raises:
         LogError: The file is damaged, or has another form.
-        SpaceError: A log cannot store a dtype.
+        SpaceError: A log cannot store a dtype, or a value is impossible.
+        UsageError: The options contradict the arrays.
         MissingExtraError: h5py is not installed.
     """
     with nodes.opened(path) as file:
@@ -120,11 +128,22 @@ def read(path: Path) -> Dataset:
             found = _own(file, path)
             if found is not None:
                 return found
-        known = [name for names in NAMES.values() for name in names]
-        arrays = {name: nodes.tree_in(file, name) for name in nodes.names_in(file) if name in known}
-        has_infos = nodes.has(file, INFOS) and nodes.is_group(file, INFOS)
-        infos = dict(nodes.arrays_below(nodes.group_in(file, INFOS))) if has_infos else {}
-        return flat_dataset(arrays, path, infos)
+        return read_flat(file, path, FlatOptions(one_episode, dones))
+
+
+def read_flat(file: Any, path: Path, options: FlatOptions) -> Dataset:
+    """Read flat arrays of transitions, and name those that are not read in a warning.
+
+    Raises:
+        LogError, SpaceError, UsageError: See `flat_dataset`.
+    """
+    names = nodes.names_in(file)
+    arrays = {name: nodes.tree_in(file, name) for name in names if name in NAMES}
+    has_infos = nodes.has(file, INFOS) and nodes.is_group(file, INFOS)
+    infos = dict(nodes.arrays_below(nodes.group_in(file, INFOS))) if has_infos else {}
+    taken = {*arrays, OWN, *([INFOS] if has_infos else [])}
+    unread = [name for name in names if name not in taken and nodes.has_rows(file, name)]
+    return flat_dataset(arrays, path, infos, options=options, unread=unread)
 
 
 def _own(file: Any, path: Path) -> Dataset | None:
@@ -143,9 +162,12 @@ def _own(file: Any, path: Path) -> Dataset | None:
         for name in ("episode_lengths", "truncated", "behavior_probs", "log_time_ns")
     }
     lengths, count = parts["episode_lengths"].astype(int).tolist(), len(steps["rewards"])
+    terminals = flags(f"{path}: terminals", steps["terminals"])
+    truncated = flags(f"{path}: {OWN}/truncated", parts["truncated"])
     rows = [*steps.values(), *columns[0], *columns[1], parts["behavior_probs"]]
     same = sum(lengths) == count and all(len(array) == count for array in rows)
-    if not same or len(parts["log_time_ns"]) != count + len(lengths) or min(lengths) < 1:
+    same &= len(truncated) == len(lengths) == len(summaries)
+    if not same or len(parts["log_time_ns"]) != count + len(lengths) or min(lengths, default=0) < 1:
         warnings.warn(
             f"{path}: the group {OWN} is ignored, because the arrays were changed afterwards",
             stacklevel=4,
@@ -166,8 +188,8 @@ def _own(file: Any, path: Path) -> Dataset | None:
                 observations=nest(leaves, observations),
                 actions=steps["actions"][taken],
                 rewards=steps["rewards"][taken],
-                terminated=bool(steps["terminals"][last - 1]),
-                truncated=bool(parts["truncated"][index]),
+                terminated=bool(terminals[last - 1]),
+                truncated=bool(truncated[index]),
                 behavior_probs=parts["behavior_probs"][taken],
                 times_ns=parts["log_time_ns"][frames],
                 infos={name: values[frames] for name, values in infos.items()},
@@ -191,7 +213,7 @@ def _own_infos(
         )
         if len(steps) != sum(lengths) or len(last) != len(finals):
             raise LogError(
-                f"{file.filename}: {INFOS}/{array} has {len(steps)} rows, which does not fit"
+                f"{nodes.source()}: {INFOS}/{array} has {len(steps)} rows, which does not fit"
                 " episode_lengths"
             )
         steps = steps.astype(np.result_type(steps, last))

@@ -1,15 +1,19 @@
 """Names and arrays in HDF5 files.
 
-The files may come from untrusted sources, so sizes are checked, and links to other files are not
-followed.
+The files may come from untrusted sources, so sizes are checked before anything is read, and links
+to other files are not followed. The sizes of all arrays count together, because several names may
+belong to one array.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import re
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -19,20 +23,43 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, McaprlError, import_extra
+from mcaprl.limits import MAX_NESTED_GROUPS, MAX_READ_RATIO, UNPACKED_ALLOWANCE_BYTES
+from mcaprl.recorder.dataset.formats.budget import Budget
+from mcaprl.texts import printable
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 EXTRA = "interop"
+_HEAP, _GLOBAL_HEAP = b"HEAP\0\0\0\0", b"GCOL\1\0\0\0"
+_MAX_GLOBAL_HEAP_BYTES = 64 << 20
 # HDF5's filters reach a compression ratio of at most 1032. If the declared size of an array exceeds
 # its stored size by a larger factor, some of its values were never written.
 _MAX_RATIO = 2_000
 _SMALL_BYTES = 1 << 20
 _CHUNK_BYTES = 1 << 18
 _ELSEWHERE = "is stored in another file: copy it into this file"
+_GROUP_COST_BYTES = 16 << 10
+"""Bytes that each opened group counts, because groups may contain each other."""
+_DAMAGED = (
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    KeyError,
+    MemoryError,
+    OverflowError,
+    SystemError,
+)
+"""Errors that h5py raises for damaged structures."""
+_budget: ContextVar[Budget] = ContextVar("budget")
+"""Limit of the file that is open."""
 
 
 def is_hdf5(path: Path) -> bool:
     """Return whether a path is a file that starts with the HDF5 signature."""
     try:
+        # Opening a named pipe would wait for its writer.
+        if not path.is_file():
+            return False
         with path.open("rb") as file:
             return file.read(len(SIGNATURE)) == SIGNATURE
     except OSError:
@@ -48,14 +75,17 @@ def opened(path: Path) -> Iterator[Any]:
         MissingExtraError: h5py is not installed.
     """
     h5py = import_extra("h5py", EXTRA)
+    before = _budget.set(Budget.of_files(path, [path]))
     try:
-        with h5py.File(path, "r") as file:
+        with _Input(path) as source, h5py.File(source, "r") as file:
             yield file
     except McaprlError:
         raise
-    # h5py raises errors of many types for damaged structures.
-    except (OSError, RuntimeError, TypeError, ValueError) as error:
-        raise LogError(f"{path}: not a readable HDF5 file: {error}") from error
+    except _DAMAGED as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise LogError(f"{path}: not a readable HDF5 file: {printable(reason)}") from error
+    finally:
+        _budget.reset(before)
 
 
 @contextmanager
@@ -79,6 +109,83 @@ def created(path: Path, **options: Any) -> Iterator[Any]:
             # HDF5 continues after an error, and then raises others.
             if output.error is not None:
                 raise output.error
+
+
+class _Input(FileIO):
+    """File that refuses what HDF5's library does not check in damaged files.
+
+    The library allocates what a structure declares, and fills what is past the end of the file with
+    zeros; memory that is never written takes no space. It follows circular lists of free space
+    without end.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file.
+
+        Raises:
+            OSError: The file has addresses or lengths of another size than 8 bytes.
+        """
+        super().__init__(path, "rb")
+        self._size = path.stat().st_size
+        self._left = MAX_READ_RATIO * self._size + UNPACKED_ALLOWANCE_BYTES
+        start = self.read(16)
+        is_old = start[8:9] in (b"\0", b"\1")
+        if start.startswith(SIGNATURE) and start[13:15] != b"\x08\x08" and is_old:
+            raise OSError("its addresses do not have 8 bytes")
+        if start.startswith(SIGNATURE) and start[9:11] != b"\x08\x08" and not is_old:
+            raise OSError("its addresses do not have 8 bytes")
+
+    def readinto(self, buffer: Any) -> int:
+        """Read bytes, and return their number.
+
+        Raises:
+            OSError: The bytes are not in the file, too many are read, or a structure is circular.
+        """
+        count, place = memoryview(buffer).nbytes, self.tell()
+        self._left -= count
+        if count > self._size - place or self._left < 0:
+            raise OSError(f"{count} bytes at {place} are not in the file")
+        found = super().readinto(buffer)
+        start = bytes(buffer[:8])
+        if start == _HEAP and count >= 32:
+            self._check_heap(*struct.unpack_from("<QQQ", buffer, 8))
+        if start == _GLOBAL_HEAP and count >= 16:
+            self._check_global_heap(place, *struct.unpack_from("<Q", buffer, 8))
+        return found
+
+    def _check_heap(self, size: int, free: int, data: int) -> None:
+        """Check that the list of free blocks in a local heap ends.
+
+        Args:
+            size: Size of the heap, bytes.
+            free: Offset of the first free block; 1 if there is none.
+            data: Address of the heap.
+
+        Raises:
+            OSError: The list has more blocks than fit into the heap.
+        """
+        # A free block has at least 16 bytes: the offset of the next one, and its size.
+        for _ in range(min(size, self._size) // 16 + 1):
+            if not 1 < free <= size - 16:
+                return
+            free = int.from_bytes(os.pread(self.fileno(), 8, data + free), "little")
+        raise OSError("a list of free blocks is circular")
+
+    def _check_global_heap(self, place: int, size: int) -> None:
+        """Check that each object in a collection of texts ends after its start.
+
+        Raises:
+            OSError: An object has no size.
+        """
+        data = os.pread(self.fileno(), min(size, _MAX_GLOBAL_HEAP_BYTES), place)
+        offset = 16
+        while offset + 16 <= len(data):
+            index, _, _, length = struct.unpack_from("<HHIQ", data, offset)
+            # The size of the free space includes its header.
+            step = length if index == 0 else 16 + (length + 7) // 8 * 8
+            if step < 16:
+                raise OSError("an object in a heap has no size")
+            offset += step
 
 
 class _Output(FileIO):
@@ -116,6 +223,11 @@ def image_settings(shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, An
     return {"chunks": (rows, *shape[1:]), "compression": "lzf"}
 
 
+def source() -> object:
+    """Return the name of the file that is open, for errors."""
+    return _budget.get().where
+
+
 def has(group: Any, name: str) -> bool:
     """Return whether a group has a member with this name."""
     return bool(group.id.links.exists(name.encode()))
@@ -129,7 +241,7 @@ def names_in(group: Any) -> list[str]:
     """
     names = list(group)
     if not all(isinstance(name, str) for name in names):
-        raise LogError(f"{group.file.filename}: {group.name} has a name that is not UTF-8")
+        raise LogError(f"{source()}: {group.name} has a name that is not UTF-8")
     return names
 
 
@@ -142,6 +254,7 @@ def group_in(parent: Any, name: str) -> Any:
     h5py, found = import_extra("h5py", EXTRA), _identifier(parent, name)
     if not isinstance(found, h5py.h5g.GroupID):
         raise LogError(f"{_place(parent, name)} is not a group")
+    _budget.get().take(_place(parent, name), (), _GROUP_COST_BYTES)
     return h5py.Group(found)
 
 
@@ -165,8 +278,11 @@ def array_in(parent: Any, name: str) -> NDArray[Any]:
         raise LogError(
             f"{_place(parent, name)} has shape {shape}, but only {stored} bytes are stored"
         )
+    if stored > parent.file.id.get_filesize():
+        raise LogError(f"{_place(parent, name)} is larger than the file, which is damaged")
     if dtype.kind == "V":
         raise LogError(f"{_place(parent, name)} has a compound type, expected numbers")
+    _budget.get().take(_place(parent, name), shape, dtype.itemsize)
     if dtype.kind == "O":
         return _objects(h5py.Dataset(found), _place(parent, name))
     values = np.empty(shape, dtype)
@@ -189,23 +305,45 @@ def array_at(parent: Any, path: Sequence[str | int]) -> NDArray[Any]:
     return array_in(parent, last)
 
 
-def tree_in(parent: Any, name: str) -> Any:
+def tree_in(parent: Any, name: str, depth: int = 0) -> Any:
     """Read an array, or the arrays of a group as nested dicts.
 
+    Args:
+        parent: Group.
+        name: Name of the member.
+        depth: Number of groups above the member.
+
     Raises:
-        LogError: There is no such member, or it is not stored in this file.
+        LogError: There is no such member, it is not stored in this file, or groups are nested too
+            deeply.
     """
     if not is_group(parent, name):
         return array_in(parent, name)
-    group = group_in(parent, name)
-    return {key: tree_in(group, key) for key in names_in(group)}
+    group = _nested_group(parent, name, depth)
+    return {key: tree_in(group, key, depth + 1) for key in names_in(group)}
+
+
+def has_rows(parent: Any, name: str, depth: int = 0) -> bool:
+    """Return whether a member is an array with dimensions, or a group with such an array."""
+    if is_group(parent, name):
+        group = _nested_group(parent, name, depth)
+        return any(has_rows(group, key, depth + 1) for key in names_in(group))
+    return bool(getattr(_identifier(parent, name), "shape", ()))
+
+
+def _nested_group(parent: Any, name: str, depth: int) -> Any:
+    """Return a group; refuse groups that contain themselves."""
+    if depth > MAX_NESTED_GROUPS:
+        raise LogError(f"{_place(parent, name)} is nested too deeply: it may contain itself")
+    return group_in(parent, name)
 
 
 def arrays_below(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield the dotted name and the values of each array in a group and its subgroups."""
     for name in names_in(group):
         if is_group(group, name):
-            yield from arrays_below(group_in(group, name), (*path, name))
+            inner = _nested_group(group, name, len(path))
+            yield from arrays_below(inner, (*path, name))
         else:
             yield ".".join((*path, name)), array_in(group, name)
 
@@ -223,7 +361,7 @@ def attributes_of(group: Any) -> dict[str, Any]:
         for key in groups:
             inner = inner.setdefault(key, {})
             if not isinstance(inner, dict):
-                raise LogError(f"{group.file.filename}: {group.name} has both {key} and {path}")
+                raise LogError(f"{source()}: {group.name} has both {key} and {path}")
         inner[name] = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
     return found
 
@@ -274,13 +412,16 @@ def _objects(array: Any, place: str) -> NDArray[Any]:
     if import_extra("h5py", EXTRA).check_string_dtype(array.dtype) is None:
         return np.asarray(array[()])
     try:
-        return np.asarray(array.asstr()[()]).astype(np.str_)
+        texts = np.asarray(array.asstr()[()])
     except UnicodeDecodeError as error:
         raise LogError(f"{place} is not UTF-8 text") from error
+    longest = max((len(text) for text in texts.flat), default=0) if texts.ndim else 0
+    _budget.get().take(place, texts.shape, 4 * longest)
+    return texts.astype(np.str_)
 
 
 def _place(parent: Any, name: str) -> str:
-    return f"{parent.file.filename}: {parent.name.rstrip('/')}/{name}"
+    return f"{source()}: {parent.name.rstrip('/')}/{name}"
 
 
 def _storable_name(key: str) -> str:

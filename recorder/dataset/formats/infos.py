@@ -68,6 +68,9 @@ def masked(
     """
     dtype = values.dtype if dtype is None else dtype
     mask = np.broadcast_to(is_missing.reshape(-1, *[1] * (values.ndim - 1)), values.shape)
+    if dtype.kind == "U" and values.dtype.kind == "U":
+        # A description may declare texts of any length.
+        dtype = values.dtype
     if values.dtype.kind == "f" and dtype.kind != "f":
         values = np.where(mask, 0, values)
     with np.errstate(all="ignore"):

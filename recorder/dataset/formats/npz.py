@@ -16,21 +16,30 @@ Other archives have the arrays of `flat.NAMES`. Pickled objects are never loaded
 from __future__ import annotations
 
 import json
+import lzma
+import math
 import re
+import struct
+import tokenize
 import zipfile
-from collections.abc import Iterable, Mapping
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, SpaceError
+from mcaprl.errors import LogError, McaprlError, SpaceError
 from mcaprl.files import parse_json
+from mcaprl.limits import MAX_NPY_HEADER_BYTES
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats.budget import Budget
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
-from mcaprl.recorder.dataset.formats.flat import flat_dataset
+from mcaprl.recorder.dataset.formats.ends import Kind
+from mcaprl.recorder.dataset.formats.flat import NAMES, FlatOptions, flat_dataset
 from mcaprl.recorder.dataset.formats.infos import (
     StoredInfo,
     info_type,
@@ -38,9 +47,11 @@ from mcaprl.recorder.dataset.formats.infos import (
     masked,
     stored_infos,
 )
+from mcaprl.recorder.dataset.values import flags
 from mcaprl.recorder.format.messages import MAX_SEED
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, leaves_of, nest
+from mcaprl.texts import printable, shortened
 
 OWN = "mcaprl"
 SUMMARY = ("reason", "policy", "epsilon", "seed", "options")
@@ -48,6 +59,21 @@ _OBSERVATIONS, _FINALS = "observations", "final_observations"
 INFOS, MISSING = "infos", "missing_infos"
 _PLAIN = re.compile(r"[A-Za-z0-9_.-]+")
 _BLOCK_ROWS = 1024
+_DAMAGED = (
+    OSError,
+    ValueError,
+    TypeError,
+    KeyError,
+    EOFError,
+    MemoryError,
+    OverflowError,
+    SyntaxError,
+    struct.error,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+)
 
 
 def matches(path: Path) -> bool:
@@ -100,27 +126,132 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     return lost
 
 
-def read(path: Path) -> Dataset:
-    """Read an archive.
+def read(path: Path, *, one_episode: bool = False, dones: Kind | None = None) -> Dataset:
+    """Read an archive. Only the arrays that are needed are read.
+
+    Args:
+        path: File.
+        one_episode: See `FlatOptions`.
+        dones: See `FlatOptions`.
 
     Raises:
         LogError: The file is damaged, or an array is missing.
-        SpaceError: A log cannot store a dtype.
+        SpaceError: A log cannot store a dtype, or a value is impossible.
+        UsageError: The options contradict the arrays.
     """
-    try:
-        # NumPy does not close a file that is not an archive.
-        with path.open("rb") as file, zipfile.ZipFile(file):
-            file.seek(0)
-            with np.load(file, allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
-    # NumPy and zipfile raise these errors if the file is damaged, or contains Python objects.
-    except (OSError, ValueError, EOFError, MemoryError, KeyError, zipfile.BadZipFile) as error:
-        raise LogError(f"{path} is not a readable .npz file: {error}") from error
-    except (NotImplementedError, RuntimeError) as error:
-        raise LogError(f"{path} is compressed or encrypted in an unknown way: {error}") from error
-    if OWN in arrays:
-        return _own(arrays, path)
-    return flat_dataset(_nested(arrays), path)
+    with Archive.opened(path) as archive:
+        if OWN in archive.names:
+            return _own(archive, path)
+        taken = [name for name in archive.names if name.split("/")[0] in (*NAMES, INFOS)]
+        found = _nested({name: archive[name] for name in taken})
+        unread = [name for name in archive.names if name not in taken and archive.is_array(name)]
+    infos = found.pop(INFOS, {})
+    if not isinstance(infos, dict):
+        infos, unread = {}, [*unread, INFOS]
+    return flat_dataset(
+        found,
+        path,
+        dict(_dotted(infos)),
+        options=FlatOptions(one_episode, dones),
+        unread=unread,
+    )
+
+
+class Archive:
+    """An .npz file whose sizes are checked before an array is read.
+
+    Attributes:
+        names: Names of the members, without the suffix `.npy`.
+    """
+
+    def __init__(self, path: Path, file: zipfile.ZipFile) -> None:
+        """Read the list of members; use `Archive.opened` instead."""
+        self._file, self._budget = file, Budget.of_files(path, [path])
+        self._members = {}
+        for member in file.infolist():
+            name = member.filename.removesuffix(".npy")
+            if name in self._members:
+                raise LogError(f"{path} has two arrays with the name '{name}': remove one of them")
+            self._members[name] = member
+        self.names = list(self._members)
+
+    @classmethod
+    @contextmanager
+    def opened(cls, path: Path) -> Iterator[Archive]:
+        """Open a file.
+
+        Raises:
+            LogError: The file is damaged, or contains Python objects.
+        """
+        try:
+            with zipfile.ZipFile(path) as file:
+                yield cls(path, file)
+        except McaprlError:
+            raise
+        except (NotImplementedError, RuntimeError) as error:
+            if isinstance(error, RecursionError):
+                raise LogError(
+                    f"{path} is not a readable .npz file: its header is nested"
+                ) from error
+            raise LogError(
+                f"{path} is compressed or encrypted in an unknown way: {error}"
+            ) from error
+        # NumPy, its parser of headers, zipfile and its decompressors raise these for damaged files.
+        except _DAMAGED as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise LogError(f"{path} is not a readable .npz file: {printable(reason)}") from error
+
+    def is_array(self, name: str) -> bool:
+        """Return whether a member is an array with dimensions, or something unknown."""
+        if not self._members[name].filename.endswith(".npy"):
+            return True
+        with self._file.open(self._members[name]) as file:
+            return len(_header(file)[0]) > 0
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Read an array.
+
+        Raises:
+            KeyError: There is no such array.
+            ValueError: The array is damaged, or contains Python objects.
+            LogError: The array is too large.
+        """
+        member = self._members[name]
+        with self._file.open(member) as file:
+            shape, dtype = _header(file)
+            if dtype.hasobject:
+                raise ValueError(f"'{name}' contains Python objects, which are not loaded")
+            if math.prod(shape) * dtype.itemsize != member.file_size - file.tell():
+                raise ValueError(f"'{name}' has another size than its shape {shape} declares")
+            self._budget.take(name, shape, dtype.itemsize)
+        with self._file.open(member) as file:
+            found: NDArray[Any] = npy.read_array(file, max_header_size=MAX_NPY_HEADER_BYTES)
+        return found
+
+
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Read the header of an array: its shape and dtype.
+
+    Raises:
+        ValueError: The header is damaged or too long.
+    """
+    version = npy.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {version} of the format")
+    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, _, dtype = read(file, max_header_size=MAX_NPY_HEADER_BYTES)
+    if not all(0 <= size < 2**63 for size in shape):
+        raise ValueError(f"an array has the shape {shortened(str(shape), 80)}")
+    return shape, dtype
+
+
+def _dotted(tree: Mapping[str, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield the dotted name and the values of each array in nested dicts."""
+    for name, part in tree.items():
+        if isinstance(part, Mapping):
+            yield from ((f"{name}.{rest}", values) for rest, values in _dotted(part))
+        else:
+            yield name, part
 
 
 def array_name(leaf: Leaf) -> str:
@@ -210,42 +341,50 @@ def parse_infos(text: str, where: object) -> dict[str, tuple[str, np.dtype[Any]]
         raise LogError(f"{where}: the array {OWN} is damaged: {error}") from error
 
 
-def _own(arrays: Mapping[str, NDArray[Any]], path: Path) -> Dataset:
-    metadata, summaries, names = parse_description(str(arrays[OWN]), path)
-    described = parse_infos(str(arrays[OWN]), path)
+def _own(arrays: Archive, path: Path) -> Dataset:
+    text = str(arrays[OWN])
+    metadata, summaries, names = parse_description(text, path)
+    described = parse_infos(text, path)
     leaves = leaves_of(metadata.observation_space)
     try:
-        lengths = arrays["episode_lengths"].tolist()
+        lengths = [int(length) for length in arrays["episode_lengths"].tolist()]
         columns = [(arrays[_OBSERVATIONS + name], arrays[_FINALS + name]) for name in names]
         infos = {
             name: masked(arrays[INFOS + array], arrays[MISSING + array].astype(bool), dtype)
             for name, (array, dtype) in described.items()
         }
+        steps = {name: arrays[name] for name in ("actions", "rewards", "behavior_probs")}
+        ends = {
+            name: flags(f"{path}: {name}", arrays[name]) for name in ("terminations", "truncations")
+        }
+        times_ns = arrays["log_time_ns"]
+        rows = [len(values) for values in (*steps.values(), *ends.values())]
+        if min(lengths) < 1 or {*rows} != {sum(lengths)}:
+            raise ValueError(f"columns of {rows} rows, and episodes of {sum(lengths)}")
         episodes, first = [], 0
         for index, (length, summary) in enumerate(zip(lengths, summaries, strict=True)):
-            steps, frames = (
+            taken, frames = (
                 slice(first, first + length),
                 slice(first + index, first + index + length + 1),
             )
             parts = [
-                np.concatenate([rows[steps], finals[index : index + 1]]) for rows, finals in columns
+                np.concatenate([rows[taken], finals[index : index + 1]]) for rows, finals in columns
             ]
+            last = first + length - 1
             episode = EpisodeArrays(
                 observations=nest(leaves, parts),
-                actions=arrays["actions"][steps],
-                rewards=arrays["rewards"][steps],
-                terminated=bool(arrays["terminations"][steps][-1]),
-                truncated=bool(arrays["truncations"][steps][-1]),
-                behavior_probs=arrays["behavior_probs"][steps],
-                times_ns=arrays["log_time_ns"][frames],
+                terminated=bool(ends["terminations"][last]),
+                truncated=bool(ends["truncations"][last]),
+                times_ns=times_ns[frames],
                 infos={name: values[frames] for name, values in infos.items()},
                 summary=summary,
+                **{name: values[taken] for name, values in steps.items()},
             )
             episodes.append(episode)
             first += length
-    except (KeyError, ValueError, TypeError, IndexError) as error:
+        return dataset_of(episodes, metadata, path)
+    except (KeyError, ValueError, TypeError, IndexError, AssertionError) as error:
         raise LogError(f"{path}: an array is missing or too short: {error}") from error
-    return dataset_of(episodes, metadata, path)
 
 
 def _info_name(name: str, number: int) -> str:

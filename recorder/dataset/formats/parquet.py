@@ -17,7 +17,8 @@ reset; an array is a list. A null means that the environment returned no info.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,11 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError, import_extra
 from mcaprl.files import parse_json
-from mcaprl.recorder.dataset.arrays import exactly
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats.budget import Budget
+from mcaprl.recorder.dataset.formats.columns import check_duration, check_times
 from mcaprl.recorder.dataset.formats.infos import info_type, masked
+from mcaprl.recorder.dataset.formats.parquet_files import read_table
 from mcaprl.recorder.dataset.tables import (
     episode_table,
     field_of,
@@ -39,8 +42,10 @@ from mcaprl.recorder.dataset.tables import (
     transition_table,
 )
 from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.dataset.values import exactly, probabilities_of
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.infos import Masked
+from mcaprl.recorder.format.messages import MAX_SEED
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of
 
@@ -111,6 +116,9 @@ def read(path: Path) -> Dataset:
     lengths = episodes.values("length", (), _TIME)
     if not len(lengths) or (lengths < 1).any():
         raise LogError(f"{path / EPISODES} has no episodes, or has an episode without transitions")
+    if (lengths > len(steps)).any() or lengths.sum() != len(steps):
+        raise LogError(f"{path}: {TRANSITIONS} and {EPISODES} contain different or reordered steps")
+    check_duration(metadata, len(steps) + len(lengths), path)
     numbers = steps.values("episode", (), _TIME), steps.values("step", (), _TIME)
     first_steps = np.cumsum(lengths) - lengths
     expected = (
@@ -138,13 +146,17 @@ def read(path: Path) -> Dataset:
         rewards=steps.values("reward", (), np.dtype(np.float64)),
         terminated=steps.values("terminated", (), _FLAG),
         truncated=steps.values("truncated", (), _FLAG),
-        behavior_probs=steps.values("behavior_prob", (), np.dtype(np.float32)),
+        behavior_probs=probabilities_of(
+            f"{path / TRANSITIONS}: behavior_prob",
+            steps.values("behavior_prob", (), np.dtype(np.float32)),
+        ),
         episodes=episodes.summaries(),
         infos={
             name: _info(steps.info("info", name), episodes.info("reset_info", name), lengths)
             for name in steps.info_names()
         },
     )
+    _check_ends(columns, path)
     return Dataset(columns, metadata)
 
 
@@ -156,17 +168,12 @@ class _Table:
     """
 
     def __init__(self, path: Path) -> None:
-        arrow, parquet = _pyarrow()
-        self._path = path
-        try:
-            names = [n for n in parquet.read_schema(path).names if not n.startswith("next_")]
-            # Do not treat a parent folder named `key=value` as a partition.
-            self._table = parquet.read_table(
-                path, columns=names, partitioning=None, page_checksum_verification=True
-            )
-        # Names that are not UTF-8 raise a ValueError. Many PyArrow errors are also ValueErrors.
-        except (OSError, ValueError, arrow.ArrowException) as error:
-            raise LogError(f"{path} cannot be read: {error}") from error
+        self._path, self._budget = path, Budget.of_files(path, [path])
+        self._table = read_table(path, lambda name: not name.startswith("next_"))
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self._table)
 
     def metadata(self) -> LogMetadata:
         """Return the log's metadata.
@@ -233,8 +240,20 @@ class _Table:
             found = array.flatten() if shape else array.drop_null()
             if found.null_count:
                 raise ValueError("a list has nulls")
+            if (
+                len(found) != math.prod(shape) * int((~is_missing).sum())
+                or min(shape, default=0) < 0
+            ):
+                raise ValueError(f"its rows do not have the shape {shape}")
+            rows = found.to_numpy(zero_copy_only=False).reshape(-1, *shape)
+            if dtype.kind == "U":
+                longest = max(map(len, rows.flat), default=0)
+                self._budget.take(column, (len(array), *shape), 4 * longest)
+                rows = rows.astype(np.str_)
+                dtype = rows.dtype
+            self._budget.take(column, (len(array), *shape), dtype.itemsize)
             values = np.zeros((len(array), *shape), dtype)
-            values[~is_missing] = found.to_numpy(zero_copy_only=False).reshape(-1, *shape)
+            values[~is_missing] = rows
         except (AttributeError, KeyError, TypeError, ValueError, arrow.ArrowException) as error:
             raise LogError(f"{self._path}: {column} is damaged: {error}") from error
         return masked(values, is_missing, dtype)
@@ -243,13 +262,60 @@ class _Table:
         """Return the rows of the table of episodes.
 
         Raises:
-            LogError: A column is missing.
+            LogError: A column is missing, or has a value of another type.
         """
         missing = [n for n in EpisodeSummary._fields if n not in self._table.column_names]
         if missing:
             raise LogError(f"{self._path} has no column '{missing[0]}'")
         rows = self._table.select(list(EpisodeSummary._fields)).to_pylist()
-        return tuple(EpisodeSummary(**row | {"episode": k}) for k, row in enumerate(rows))
+        try:
+            return tuple(_summary(k, row) for k, row in enumerate(rows))
+        except (TypeError, ValueError) as error:
+            raise LogError(f"{self._path}: an episode is damaged: {error}") from error
+
+
+def _summary(index: int, row: Mapping[str, Any]) -> EpisodeSummary:
+    """Return a row of the table of episodes.
+
+    Raises:
+        TypeError, ValueError: A value has another type, or cannot be stored in a log.
+    """
+    seed = row["seed"]
+    if seed is not None and not 0 <= int(seed) <= MAX_SEED:
+        raise ValueError(f"seed {seed}")
+    counts = ("length", "start_time_ns", "end_time_ns")
+    return EpisodeSummary(
+        episode=index,
+        seed=seed,
+        **{name: int(row[name]) for name in counts},
+        **{name: float(row[name]) for name in ("total_reward", "epsilon")},
+        **{name: bool(row[name]) for name in ("terminated", "truncated")},
+        **{name: str(row[name]) for name in ("reason", "policy", "options")},
+    )
+
+
+def _check_ends(columns: Transitions, path: Path) -> None:
+    """Check that flags and times do not contradict the lengths of the episodes.
+
+    Raises:
+        LogError: An end flag is set before the last row of an episode.
+        SpaceError: The log_times of an episode fall.
+    """
+    lasts = columns.first_steps + columns.lengths - 1
+    inner = np.ones(len(columns.rewards), np.bool_)
+    inner[lasts] = False
+    for name in ("terminated", "truncated"):
+        wrong = getattr(columns, name) & inner
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise LogError(
+                f"{path / TRANSITIONS}: {name} of row {row} is set, but its episode goes on"
+            )
+    for index, (first, length) in enumerate(
+        zip(columns.first_frames.tolist(), columns.lengths.tolist(), strict=True)
+    ):
+        times = columns.log_time_ns[first : first + length + 1]
+        check_times(f"{path}: log_time_ns of episode {index}", times)
 
 
 def _pyarrow() -> tuple[Any, Any]:

@@ -4,7 +4,8 @@ The module of a format has these functions. A format that can only be written ha
 `read`:
 
     matches(path: Path) -> bool                 whether a file or folder is of the format
-    read(path: Path) -> Dataset                 all episodes
+    read(path: Path, ...) -> Dataset            all episodes; `one_episode`, `dones` and
+                                                `lossy` are options of some formats
     write(dataset: Dataset, path: Path, *, lossy: bool) -> list[str]
                                                 writes the new file or the empty folder `path`;
                                                 returns one sentence for each thing lost
@@ -14,7 +15,9 @@ The module of a format has these functions. A format that can only be written ha
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +25,9 @@ from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.files import replacing, replacing_folder
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.remote import is_url
+
+KINDS = ("terminated", "truncated")
+"""Kinds of the end of an episode."""
 
 
 class Format(NamedTuple):
@@ -128,20 +134,51 @@ def target_path(path: str | Path, form: Format) -> Path:
     return Path(path)
 
 
-def read_format(path: str | Path, form: Format) -> Dataset:
+def _given(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of reading that differ from their defaults.
+
+    Raises:
+        UnknownNameError: `dones` is not one of `KINDS`.
+    """
+    dones = options.get("dones")
+    if dones is not None and dones not in KINDS:
+        raise UnknownNameError("kind of ends", str(dones), KINDS)
+    return {name: value for name, value in options.items() if value not in (None, False)}
+
+
+def _options(form: Format) -> set[str]:
+    """Return the names of the options of a format's reader."""
+    return set(signature(form.module.read).parameters)
+
+
+def read_format(path: str | Path, form: Format, **options: Any) -> Dataset:
     """Read a file or folder of another format.
+
+    Args:
+        path: File or folder.
+        form: Format of the data.
+        options: Options of the format's reader; those that are None or False are ignored.
 
     Raises:
         LogError: The file is missing or damaged.
-        SpaceError: The data has a space that a log cannot hold.
+        SpaceError: The data has a space that a log cannot hold, or impossible values.
+        UsageError: The format does not have an option, or the option contradicts the data.
         MissingExtraError: The format needs a package that is not installed.
     """
     if not form.reads:
         raise UsageError(f"{form.name} can only be written, not read")
-    source = target_path(path, form)
+    source, given = target_path(path, form), _given(options)
+    for name in [name for name in given if name not in _options(form)]:
+        # What is stored in other formats, a log can store.
+        if name != "lossy":
+            having = ", ".join(one.name for one in FORMATS.values() if name in _options(one))
+            raise UsageError(f"{name} is an option of reading {having}, not {form.name}")
+        del given[name]
     if not source.exists():
         raise LogError(f"{path}: no such file or folder")
-    dataset: Dataset = form.module.read(source)
+    if not (source.is_file() or source.is_dir()):
+        raise LogError(f"{path} is neither a file nor a folder")
+    dataset: Dataset = form.module.read(source, **given)
     dataset.sources = dataset.sources or (source,)
     return dataset
 

@@ -9,12 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError
+from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.dataset.arrays import description_of
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats import hdf5_nodes as nodes
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
-from mcaprl.recorder.dataset.formats.flat import joined_trees, rows_of_tree
+from mcaprl.recorder.dataset.formats.flat import joined_trees, rows_of_tree, unread_note
+from mcaprl.recorder.dataset.values import flags
+
+_KNOWN = ("data", "mask")
+"""Groups of a file; `mask` contains names of demonstrations only."""
+_DEMO = ("obs", "next_obs", "actions", "rewards", "dones")
 
 
 def read_demos(file: Any, path: Path) -> Dataset:
@@ -37,12 +42,27 @@ def read_demos(file: Any, path: Path) -> Dataset:
     if not names:
         raise LogError(f"{path}: the group data has no demo_0, demo_1, ...: unknown form of HDF5")
     notes: dict[str, None] = {}
-    episodes = [_demo(nodes.group_in(data, name), f"{path}: {name}", notes) for name in names]
+    unread = {
+        name: None
+        for name in nodes.names_in(file)
+        if name not in _KNOWN and nodes.has_rows(file, name)
+    }
+    episodes = []
+    for name in names:
+        group = nodes.group_in(data, name)
+        episodes.append(_demo(group, f"{path}: {name}", notes))
+        others = (key for key in nodes.names_in(group) if key not in _DEMO)
+        unread |= {f"demo_<i>/{key}": None for key in others if nodes.has_rows(group, key)}
     if notes:
         warnings.warn(f"{path}: {', and '.join(notes)}", stacklevel=4)
-    actions = np.concatenate([episode.actions for episode in episodes])
-    metadata = description_of("", episodes[0].observations, actions, None, None)
-    return dataset_of(episodes, metadata, path)
+    if unread:
+        warnings.warn(f"{path}: {unread_note(list(unread))}", stacklevel=4)
+    try:
+        actions = np.concatenate([episode.actions for episode in episodes])
+        metadata = description_of("", episodes[0].observations, actions, None, None)
+    except (SpaceError, ValueError) as error:
+        raise SpaceError(f"{path}: {error}") from error
+    return dataset_of(episodes, metadata, path, is_foreign=True)
 
 
 def _demo(group: Any, where: str, notes: dict[str, None]) -> EpisodeArrays:
@@ -50,7 +70,13 @@ def _demo(group: Any, where: str, notes: dict[str, None]) -> EpisodeArrays:
         raise LogError(f"{where} has no observations: extract them with robomimic's scripts")
     observations = nodes.tree_in(group, "obs")
     actions, rewards = nodes.array_in(group, "actions"), nodes.array_in(group, "rewards")
-    dones = nodes.array_in(group, "dones").astype(bool) if nodes.has(group, "dones") else None
+    dones = None
+    if nodes.has(group, "dones"):
+        dones = flags(f"{where}: dones", nodes.array_in(group, "dones"))
+    columns = [actions, rewards, *([] if dones is None else [dones])]
+    if rewards.ndim != 1 or any(np.shape(values)[:1] != rewards.shape for values in columns):
+        shapes = [values.shape for values in columns]
+        raise LogError(f"{where}: actions, rewards and dones have shapes {shapes}")
     count = len(rewards)
     is_done = dones is not None and count > 0 and bool(dones[-1])
     if dones is not None and dones[:-1].any():

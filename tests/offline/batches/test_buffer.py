@@ -272,6 +272,16 @@ def test_a_value_that_is_not_finite_is_reported(column: str, bad: float) -> None
         TransitionBuffer.from_dataset(numbered(4, **{column: values}))
 
 
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_a_reward_beyond_float32_is_reported(n_steps: int) -> None:
+    dataset = numbered(4, rewards=[0.0, 1.0, 1e300, 1.0])
+    with pytest.raises(TrainingError, match=r"reward 1e\+300 of row 2 is beyond float32"):
+        TransitionBuffer.from_dataset(dataset, Packing(n_steps=n_steps))
+    dataset = numbered(4, rewards=[0.0, 1.0, math.nan, 1.0])
+    with pytest.raises(TrainingError, match="rewards of row 2 have NaN or infinite numbers"):
+        TransitionBuffer.from_dataset(dataset, Packing(n_steps=n_steps))
+
+
 def test_rewards_are_scaled_by_the_spread_of_returns() -> None:
     # With gamma .5, the returns are 1 + .5 x 2 = 2 and 2 in the first episode, and -2 + .5 x 4 = 0
     # and 4 in the second one. Their standard deviation is sqrt(2).

@@ -31,7 +31,10 @@ def dataset(**changes: Any) -> Dataset:
         "observation_space": spaces.Box(0, 1, (2,), np.float32),
         "action_space": spaces.Discrete(3),
     }
-    return Dataset.from_arrays(**(columns | changes))
+    columns |= changes
+    # `from_arrays` refuses impossible probabilities, which logs of other writers may have.
+    probs = columns.pop("behavior_probs")
+    return Dataset.from_arrays(**columns).with_behavior_probs(probs)
 
 
 def changed(column: str, at: Any, value: float) -> dict[str, Any]:
@@ -69,6 +72,11 @@ def test_the_reward_of_a_terminal_step_may_be_special() -> None:
             changed("rewards", 4, -math.inf),
             "problem",
             "1 rewards are NaN or infinite (episode 1 step 1)",
+        ),
+        (
+            {"rewards": np.array([1.0, 3.0, 3.0, 1.0, -1e300, 1e39])},
+            "problem",
+            "2 rewards beyond float32, such as -1e+300 (episode 1 step 1, episode 1 step 2)",
         ),
         (
             changed("next_observations", (5, 1), 1.5),
@@ -118,6 +126,25 @@ def test_findings(changes: dict[str, Any], severity: str, text: str) -> None:
     found = [finding for finding in lint(dataset(**changes)) if text in str(finding)]
     assert [finding.severity for finding in found] == [severity], lint(dataset(**changes))
     assert found[0].effect
+
+
+def test_actions_that_the_mask_forbids_are_found() -> None:
+    mask = np.array([[0, 1], [0, 1], [1, 0], [0, 0]], np.int8)
+    found = lint(
+        Dataset.from_arrays(
+            observations={"action_mask": mask[:3], "x": np.arange(3.0)},
+            next_observations={"action_mask": mask[1:], "x": np.arange(1, 4.0)},
+            actions=[3, 2, 3],
+            rewards=[1, 2, 3],
+            terminated=[False, False, True],
+            truncated=[False] * 3,
+            action_space=spaces.Discrete(2, start=2),
+        )
+    )
+    (problem,) = [one for one in found if "forbids" in one.what]
+    assert problem.what == "2 actions that the log's own action_mask forbids"
+    assert problem.where == "episode 0 step 1, episode 0 step 2"
+    assert problem.severity == "problem"
 
 
 @pytest.mark.parametrize(

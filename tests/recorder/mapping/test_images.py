@@ -451,7 +451,6 @@ def test_images_of_foxglove(foxglove_log: Path) -> None:
         assert found.observations[:, 3, 4, 1].tolist() == [10 * k for k in range(11)]
     with pytest.warns(UserWarning, match="no topic looks like a command"):
         text = mcaprl.suggest_mapping(foxglove_log)
-    print(text)
-    assert "# camera: {image: /raw, resize: [84, 84]}  # foxglove.RawImage, 12" in text
-    assert "# camera: {image: /compressed, resize: [84, 84]}" in text
+    assert "# camera: {image: /compressed, resize: [84, 84]}  # foxglove.CompressedImage" in text
+    assert "# camera1: {image: /raw, resize: [84, 84]}  # foxglove.RawImage, 12" in text
     assert "height" not in text

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, import_extra
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.image_files import decoded_file
+from mcaprl.recorder.dataset.values import exactly
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, check_elements
 
 STATE, IMAGE, IMAGES = "observation.state", "observation.image", "observation.images."
@@ -135,7 +136,12 @@ class Feature:
         flat = np.concatenate(parts) if parts else np.zeros(0, self.dtype)
         if flat.size != len(column) * math.prod(self.shape):
             raise LogError(f"the values of {self.name} do not have the shape {self.shape}")
-        return flat.astype(self.dtype, copy=False).reshape(len(column), *self.shape)
+        dtype, rows = np.dtype(self.dtype), flat.reshape(len(column), *self.shape)
+        if dtype.kind == "f" or dtype == rows.dtype:
+            with np.errstate(over="ignore"):
+                return rows.astype(dtype, copy=False)
+        # Numbers must not lose their fraction.
+        return exactly(self.name, rows, dtype)
 
 
 def default_features() -> list[Feature]:

@@ -10,12 +10,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, import_extra
+from mcaprl.errors import LogError, SpaceError, import_extra
 from mcaprl.files import parse_json
-from mcaprl.recorder.dataset.formats.lerobot.features import STEPS, VIDEO_PATH, Feature
+from mcaprl.recorder.dataset.formats import parquet_files
+from mcaprl.recorder.dataset.formats.lerobot.features import (
+    ACTION,
+    DEFAULTS,
+    DONE,
+    STEPS,
+    TRUNCATED,
+    VIDEO_PATH,
+    Feature,
+)
 from mcaprl.recorder.dataset.formats.lerobot.video import read_frames
+from mcaprl.recorder.dataset.values import flags
 
 _VERSIONS = "v3."
+_MAX_TIME_S = 2.0**32
+"""Longer times in nanoseconds do not fit into 64 bits."""
 
 
 class Files:
@@ -77,13 +89,42 @@ class Files:
         return self._video(feature) if feature.dtype == "video" else self._column(feature)
 
     def steps(self) -> dict[str, NDArray[Any]]:
-        """Return the values (N, *shape) of each feature in `STEPS` that the dataset has."""
-        known = [self.features[name] for name in STEPS if name in self.features]
-        return {feature.name: self.values(feature) for feature in known}
+        """Return the values (N, *shape) of each feature in `STEPS` that the dataset has.
+
+        Raises:
+            LogError: A feature other than the action has several values for each step.
+            SpaceError: A flag is neither 0 nor 1.
+        """
+        found = {}
+        for name in (name for name in STEPS if name in self.features):
+            feature = self.features[name]
+            if name != ACTION and feature.shape != (1,):
+                raise LogError(f"{self.path}: {name} has shape {feature.shape}, expected (1,)")
+            values = self.values(feature)
+            is_flag = name in (DONE, TRUNCATED)
+            found[name] = flags(f"{self.path}: {name}", values) if is_flag else values
+        return found
+
+    def unread(self) -> list[str]:
+        """Return the names of columns of the data files that are not features."""
+        parquet = import_extra("pyarrow.parquet", "tables")
+        names = {name for file in self._files for name in parquet.read_schema(file).names}
+        return sorted(names.difference(self.features, DEFAULTS))
 
     def times_s(self) -> NDArray[np.float64]:
-        """Return the time (N,) of each frame since the start of its episode, seconds."""
-        return self._column(Feature("timestamp", "float32", (1,)))[:, 0].astype(np.float64)
+        """Return the time (N,) of each frame since the start of its episode, seconds.
+
+        Raises:
+            LogError: A time is not a number of seconds.
+        """
+        times = self._column(Feature("timestamp", "float32", (1,)))[:, 0].astype(np.float64)
+        wrong = ~(np.abs(times) < _MAX_TIME_S)
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise LogError(
+                f"{self.path}: timestamp of row {row} is {times[row]:g}, expected seconds"
+            )
+        return times
 
     def _column(self, feature: Feature) -> NDArray[Any]:
         arrow = import_extra("pyarrow", "tables")
@@ -95,8 +136,8 @@ class Files:
         column: Any = arrow.concat_tables(tables)[feature.name]
         try:
             return feature.decode(column)
-        except LogError as error:
-            raise LogError(f"{self.path}: {error}") from error
+        except (LogError, SpaceError) as error:
+            raise type(error)(f"{self.path}: {error}") from error
 
     def _video(self, feature: Feature) -> NDArray[np.uint8]:
         """Decode the images of a camera from the videos, in the order of the rows."""
@@ -145,6 +186,6 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
         path: File.
         columns: Columns to read; default: all.
     """
-    parquet = import_extra("pyarrow.parquet", "tables")
-    names = None if columns is None else list(columns)
-    return parquet.ParquetFile(path, page_checksum_verification=True).read(names)
+    if columns is None:
+        return parquet_files.read_table(path)
+    return parquet_files.read_table(path, set(columns).__contains__)

@@ -16,6 +16,7 @@ from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.dataset.arrays import action_space_of, box_of
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.dataset.formats.flat import unread_note
 from mcaprl.recorder.dataset.formats.lerobot import features
 from mcaprl.recorder.dataset.formats.lerobot.features import Feature
 from mcaprl.recorder.dataset.formats.lerobot.files import Files
@@ -59,6 +60,8 @@ def foreign_dataset(files: Files) -> Dataset:
     if features.ACTION not in steps:
         raise LogError(f"{files.path} has no feature '{features.ACTION}'")
     _warn_of_steps(files, steps)
+    if unread := files.unread():
+        _warn(files, unread_note(unread))
     actions, action_space = _values_and_space(steps[features.ACTION], is_action=True)
     is_single = len(parts) == 1
     metadata = LogMetadata(
@@ -85,7 +88,13 @@ def foreign_dataset(files: Files) -> Dataset:
             summary={"options": _options(files, part.source)},
         )
         episodes.append(episode)
-    return dataset_of(episodes, metadata, files.path)
+    return dataset_of(
+        episodes,
+        metadata,
+        files.path,
+        is_foreign=True,
+        has_rewards=features.REWARD in steps,
+    )
 
 
 def _observations(
@@ -156,8 +165,8 @@ def _warn_of_steps(files: Files, steps: Mapping[str, Any]) -> None:
 def _parts(files: Files, steps: Mapping[str, NDArray[Any]]) -> list[_Part]:
     """Divide the rows into episodes; `next.done` or `next.truncated` ends an episode."""
     none = np.zeros((sum(files.lengths), 1), bool)
-    done = steps.get(features.DONE, none)[:, 0] != 0
-    truncated = steps.get(features.TRUNCATED, none)[:, 0] != 0
+    done = steps.get(features.DONE, none)[:, 0]
+    truncated = steps.get(features.TRUNCATED, none)[:, 0]
     found: list[_Part] = []
     repeated = dropped = 0
     for source, start, stop, is_last in _stretches(files, done | truncated):

@@ -16,7 +16,16 @@ from mcaprl.recorder.dataset.formats.lerobot.own import Own, read_own
 from mcaprl.recorder.format.spaces import action_leaf, leaves_of, nest
 
 # Types of the errors that invalid values in damaged files cause.
-_DAMAGED = (KeyError, TypeError, ValueError, AttributeError, OSError)
+_DAMAGED = (
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    ArithmeticError,
+    MemoryError,
+    RecursionError,
+    OSError,
+)
 
 
 def read(path: Path) -> Dataset:

@@ -59,16 +59,22 @@ class Description:
     Attributes:
         metadata: Metadata of the log.
         keys: Path of each leaf of the observation in the files; see `StoredSpace`.
+        action_keys: Path of the action, or of each of its parts.
         form: `hdf5`, `arrow` or `parquet`.
         is_jpeg: Whether large images are stored as JPEG.
         episodes: Number of episodes.
+        is_own: Whether the writer of this package wrote the dataset.
+        lost: One sentence for each part of the spaces that is left out or changed.
     """
 
     metadata: LogMetadata
     keys: tuple[tuple[str | int, ...], ...]
+    action_keys: tuple[tuple[str | int, ...], ...]
     form: str
     is_jpeg: bool
     episodes: int
+    is_own: bool
+    lost: tuple[str, ...] = ()
 
 
 def datasets_folder() -> Path:
@@ -130,8 +136,12 @@ def raw_metadata(path: Path) -> dict[str, Any]:
     return found
 
 
-def read_description(path: Path) -> Description:
+def read_description(path: Path, *, lossy: bool = False) -> Description:
     """Read the description of a dataset.
+
+    Args:
+        path: Folder of the dataset.
+        lossy: Whether to leave out the parts of the spaces that a log cannot store.
 
     Raises:
         LogError: The metadata is missing or damaged.
@@ -140,27 +150,30 @@ def read_description(path: Path) -> Description:
     raw = raw_metadata(path)
     env_id, env_kwargs = _env_of(raw)
     try:
-        observation, action = _spaces(raw, env_id)
-        action_leaf(action)
+        observation, action = _spaces(raw, env_id, lossy=lossy)
+        action_leaf(action.space)
         leaves_of(observation.space)
         metadata = LogMetadata(
             observation_space=observation.space,
-            action_space=action,
+            action_space=action.space,
             env_id=env_id,
             env_kwargs=env_kwargs,
             policy=str(raw.get("algorithm_name") or ""),
             versions={"minari": str(raw.get("minari_version", ""))},
             about={name: raw[name] for name in _ABOUT if raw.get(name) is not None},
         )
-        metadata = _own_metadata(raw, metadata)
+        own = _own_metadata(raw, metadata)
     except (SpaceError, LogError) as error:
         raise type(error)(f"{path}: {error}") from error
     return Description(
-        metadata=metadata,
+        metadata=own or metadata,
         keys=observation.keys,
+        action_keys=action.keys,
         form=str(raw.get("data_format", "hdf5")),
         is_jpeg=bool(raw.get("jpeg_encoding", True)),
         episodes=raw["total_episodes"],
+        is_own=own is not None,
+        lost=(*observation.lost, *action.lost),
     )
 
 
@@ -194,14 +207,14 @@ def description_text(
     return json.dumps(raw)
 
 
-def _spaces(raw: dict[str, Any], env_id: str) -> tuple[StoredSpace, spaces.Space[Any]]:
+def _spaces(raw: dict[str, Any], env_id: str, *, lossy: bool) -> tuple[StoredSpace, StoredSpace]:
     texts = {role: raw.get(f"{role}_space") for role in ("observation", "action")}
     for role, text in texts.items():
         if text is None:
             # Datasets of old Minari versions contain no spaces: use the spaces of the environment.
             texts[role] = space_to_text(getattr(_registered(env_id), f"{role}_space"))
-    observation, action = (space_from_text(str(texts[role]), role) for role in texts)
-    return observation, action.space
+    observation, action = (space_from_text(str(texts[role]), role, lossy=lossy) for role in texts)
+    return observation, action
 
 
 def _registered(env_id: str) -> gym.Env[Any, Any]:
@@ -220,20 +233,20 @@ def _registered(env_id: str) -> gym.Env[Any, Any]:
         ) from error
 
 
-def _own_metadata(raw: dict[str, Any], found: LogMetadata) -> LogMetadata:
+def _own_metadata(raw: dict[str, Any], found: LogMetadata) -> LogMetadata | None:
     """Return the metadata that this package's writer stored under the key `OWN`.
 
-    If it is missing, or if its spaces differ from the spaces of `found`, return `found`.
+    If it is missing, or if its spaces differ from the spaces of `found`, return None.
     """
     strings = raw.get(OWN)
     if not isinstance(strings, dict):
-        return found
+        return None
     own = LogMetadata.from_strings(strings)
     same = (own.observation_space, own.action_space) == (
         found.observation_space,
         found.action_space,
     )
-    return own if same else found
+    return own if same else None
 
 
 def _env_of(raw: dict[str, Any]) -> tuple[str, dict[str, Any]]:

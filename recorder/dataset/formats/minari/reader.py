@@ -24,6 +24,7 @@ from mcaprl.files import parse_json
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats import hdf5_nodes as hdf5
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.dataset.formats.flat import unread_note
 from mcaprl.recorder.dataset.formats.infos import info_type, masked
 from mcaprl.recorder.dataset.formats.minari import arrow_nodes as arrow
 from mcaprl.recorder.dataset.formats.minari.description import (
@@ -35,11 +36,13 @@ from mcaprl.recorder.dataset.formats.minari.description import (
     read_description,
 )
 from mcaprl.recorder.dataset.formats.minari.spaces import may_be_jpeg
+from mcaprl.recorder.dataset.values import flags
 from mcaprl.recorder.format.messages import MAX_SEED
-from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of, nest
 
 _FLAGS = ("terminations", "truncations")
+_KNOWN = ("observations", "actions", "rewards", *_FLAGS, "infos", "id", OWN)
+"""Members of an episode that are read."""
 _OWN_TEXTS = ("reason", "policy", "options")
 
 
@@ -55,6 +58,7 @@ class _Stored:
         own: Arrays that only the writer of this package stores: `behavior_probs` and `log_time_ns`.
         missing: Flags (T + 1,) of the rows without an info, and the dtype of this info. The keys
             are the dotted names of the infos.
+        unread: Names of other arrays.
     """
 
     observations: Sequence[Any]
@@ -63,26 +67,22 @@ class _Stored:
     attributes: Mapping[str, Any]
     own: Mapping[str, Any] = field(default_factory=dict)
     missing: Mapping[str, tuple[NDArray[np.bool_], np.dtype[Any]]] = field(default_factory=dict)
+    unread: Sequence[str] = ()
 
 
-def read(path: Path) -> Dataset:
+def read(path: Path, *, lossy: bool = False) -> Dataset:
     """Read a dataset.
 
     Args:
         path: Folder of the dataset, or its folder `data`.
+        lossy: Whether to leave out the parts of observations and actions that a log cannot store.
 
     Raises:
         LogError: A file is missing or damaged.
         SpaceError: A log cannot store a space.
         MissingExtraError: h5py, PyArrow or Pillow is not installed.
     """
-    metadata, episodes = read_episodes(path)
-    return dataset_of(episodes, metadata, path)
-
-
-def read_episodes(path: Path) -> tuple[LogMetadata, list[EpisodeArrays]]:
-    """Read the metadata and the episodes of a dataset; see `read`."""
-    description = read_description(path)
+    description = read_description(path, lossy=lossy)
     forms = {"hdf5": _in_hdf5, "arrow": _in_arrow, "parquet": _in_arrow}
     if description.form not in forms:
         raise LogError(f"{path}: unknown data format '{description.form}' of Minari")
@@ -92,7 +92,7 @@ def read_episodes(path: Path) -> tuple[LogMetadata, list[EpisodeArrays]]:
         episodes = [reader.episode(index, part) for index, part in enumerate(stored)]
     episodes = reader.with_equal_infos(episodes)
     reader.warn()
-    return description.metadata, episodes
+    return dataset_of(episodes, description.metadata, path, is_foreign=not description.is_own)
 
 
 class _Reader:
@@ -108,6 +108,8 @@ class _Reader:
         ]
         self._tuples = any(isinstance(key, int) for keys in description.keys for key in keys)
         self._odd_infos: set[str] = set()
+        self._unread: dict[str, None] = {}
+        self._lost = description.lost
 
     def episode(self, index: int, stored: _Stored) -> EpisodeArrays:
         where = f"{self._path}: episode {index}"
@@ -117,16 +119,17 @@ class _Reader:
         for name in _FLAGS:
             if len(steps[name]) != count:
                 raise LogError(f"{where} has {len(steps[name])} {name}, but {count} rewards")
-            flags = steps[name].astype(bool)
-            if flags[:-1].any():
-                raise LogError(f"{where} has steps after {name} at step {int(flags.argmax())}")
-            ends.append(bool(flags.any()))
+            ended = flags(f"{where}: {name}", steps[name])
+            if ended[:-1].any():
+                raise LogError(f"{where} has steps after {name} at step {int(ended.argmax())}")
+            ends.append(bool(ended.any()))
         observations = [
             self._images(leaf, values, where) if is_jpeg else values
             for leaf, values, is_jpeg in zip(
                 self._leaves, stored.observations, self._is_jpeg, strict=True
             )
         ]
+        self._unread |= dict.fromkeys(stored.unread)
         return EpisodeArrays(
             observations=nest(self._leaves, observations),
             actions=stored.steps["actions"].reshape(-1, *self._action.shape),
@@ -174,6 +177,10 @@ class _Reader:
                 " '0', '1', ...",
                 stacklevel=4,
             )
+        for sentence in self._lost:
+            warnings.warn(f"{self._path}: {sentence}", stacklevel=4)
+        if self._unread:
+            warnings.warn(f"{self._path}: {unread_note(sorted(self._unread))}", stacklevel=4)
         if self._odd_infos:
             warnings.warn(
                 f"{self._path}: infos whose type, row shape or row count does not fit are left out:"
@@ -246,6 +253,7 @@ def _seed(seed: int) -> int:
 
 def _in_hdf5(folder: Path, description: Description) -> Generator[_Stored]:
     with hdf5.opened(folder / MAIN) as file:
+        more = [name for name in hdf5.names_in(file) if not _is_episode(name, description)]
         for index in range(description.episodes):
             group = hdf5.group_in(file, f"episode_{index}")
             own = hdf5.group_in(group, OWN) if hdf5.has(group, OWN) else None
@@ -255,7 +263,10 @@ def _in_hdf5(folder: Path, description: Description) -> Generator[_Stored]:
                     hdf5.array_at(group, ("observations", *keys)) for keys in description.keys
                 ],
                 steps={
-                    name: hdf5.array_in(group, name) for name in ("actions", "rewards", *_FLAGS)
+                    "actions": _joined(
+                        [hdf5.array_at(group, ("actions", *k)) for k in description.action_keys]
+                    ),
+                    **{name: hdf5.array_in(group, name) for name in ("rewards", *_FLAGS)},
                 },
                 infos={} if infos is None else dict(hdf5.arrays_below(infos)),
                 attributes=hdf5.attributes_of(group),
@@ -265,7 +276,30 @@ def _in_hdf5(folder: Path, description: Description) -> Generator[_Stored]:
                     name: hdf5.array_in(own, name) for name in hdf5.names_in(own) if name != MISSING
                 },
                 missing=_missing(own),
+                unread=[
+                    *more,
+                    *(
+                        f"episode_<i>/{name}"
+                        for name in hdf5.names_in(group)
+                        if name not in _KNOWN and hdf5.has_rows(group, name)
+                    ),
+                ],
             )
+
+
+def _joined(actions: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Return the action (T, *shape), or the parts of the action as vectors (T, size)."""
+    if len(actions) == 1:
+        return actions[0]
+    if len({len(part) for part in actions}) != 1:
+        raise LogError("the parts of the action have different numbers of steps")
+    return np.concatenate([part.reshape(len(part), -1) for part in actions], axis=1)
+
+
+def _is_episode(name: str, description: Description) -> bool:
+    """Return whether a group of the file is one of the episodes that the description counts."""
+    number = name.removeprefix("episode_")
+    return number.isdecimal() and int(number) < description.episodes
 
 
 def _missing(own: Any) -> dict[str, tuple[NDArray[np.bool_], np.dtype[Any]]]:
@@ -278,7 +312,7 @@ def _missing(own: Any) -> dict[str, tuple[NDArray[np.bool_], np.dtype[Any]]]:
             for name, rows in hdf5.arrays_below(group)
         }
     except ValueError as error:
-        raise LogError(f"{own.file.filename}: {own.name}/{MISSING} is damaged: {error}") from error
+        raise LogError(f"{hdf5.source()}: {own.name}/{MISSING} is damaged: {error}") from error
 
 
 def _in_arrow(folder: Path, description: Description) -> Generator[_Stored]:
@@ -295,9 +329,17 @@ def _in_arrow(folder: Path, description: Description) -> Generator[_Stored]:
             ],
             # The last row contains the final observation; its other columns are padding.
             steps={
-                name: arrow.array_at(table, (name,), None)[:-1]
-                for name in ("actions", "rewards", *_FLAGS)
+                "actions": _joined(
+                    [
+                        arrow.array_at(table, ("actions", *keys), None)[:-1]
+                        for keys in description.action_keys
+                    ]
+                ),
+                **{
+                    name: arrow.array_at(table, (name,), None)[:-1] for name in ("rewards", *_FLAGS)
+                },
             },
+            unread=[name for name in table.column_names if name not in _KNOWN],
             infos=arrow.infos_of(table),
             attributes=arrow.attributes_of(folder / str(index)),
         )

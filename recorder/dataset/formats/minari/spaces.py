@@ -7,7 +7,6 @@ Minari ignores it, and `space_from_text` reads it.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,10 +14,12 @@ from gymnasium import spaces
 
 from mcaprl.errors import SpaceError
 from mcaprl.files import parse_json
-from mcaprl.recorder.format.spaces import Leaf, space_from_json
+from mcaprl.recorder.format.spaces import Leaf, leaves_of, space_from_json
 
 # Shortest edge, in pixels, of the images that Minari may store as JPEG.
 _MIN_JPEG_EDGE = 32
+_STORABLE = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
+_REMEDY = "convert it with --lossy (lossy=True in Python) to {}"
 
 
 class StoredSpace(NamedTuple):
@@ -27,11 +28,14 @@ class StoredSpace(NamedTuple):
     Attributes:
         space: Space of the log. A Tuple becomes a Dict with the keys `0`, `1`, ...
         keys: Path of each leaf of `space` in Minari's files, in order. Keys of a Dict are strings,
-            indexes of a Tuple are integers.
+            indexes of a Tuple are integers. If several leaves of an action are joined to one, these
+            are their paths.
+        lost: One sentence for each part that is left out or changed.
     """
 
     space: spaces.Space[Any]
     keys: tuple[tuple[str | int, ...], ...]
+    lost: tuple[str, ...] = ()
 
 
 def space_to_text(space: spaces.Space[Any]) -> str:
@@ -39,30 +43,41 @@ def space_to_text(space: spaces.Space[Any]) -> str:
     return json.dumps(_to_plain(space))
 
 
-def space_from_text(text: str, role: str) -> StoredSpace:
+def space_from_text(text: str, role: str, *, lossy: bool = False) -> StoredSpace:
     """Read a space.
 
     Args:
         text: Space in Minari's JSON text.
         role: `observation` or `action`, for errors.
+        lossy: Whether to leave out the parts that a log cannot store, and to join the parts of an
+            action.
 
     Raises:
         SpaceError: The text does not describe a space, or a log cannot store the space.
     """
     try:
         plain = parse_json(text)
-        if role == "action" and _members(plain) is not None:
+        is_joined = role == "action" and _members(plain) is not None
+        if is_joined and not lossy:
             raise SpaceError(
                 f"action is a {plain['type']} space; a log can store Box, Discrete, MultiDiscrete,"
-                " MultiBinary"
+                f" MultiBinary; {_REMEDY.format('join its parts')}"
             )
-        ours, keys = _ours(plain, role), tuple(_leaf_keys(plain))
+        lost: list[str] = []
+        leaves: list[tuple[str | int, ...]] = []
+        ours = _ours(plain, role, (), leaves, lost if lossy else None)
+        if ours is None:
+            raise SpaceError(f"nothing is left of the {role}: {'; '.join(lost)}")
+        space = space_from_json(json.dumps(ours))
     except SpaceError:
         raise
     # The JSON text can have any structure, so these errors can occur.
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise SpaceError(f"not a description of a space: {str(text)[:80]!r}") from error
-    return StoredSpace(space_from_json(json.dumps(ours)), keys)
+    if is_joined:
+        space, sentence = _joined(space)
+        lost.append(sentence)
+    return StoredSpace(space, tuple(leaves), tuple(lost))
 
 
 def may_be_jpeg(space: spaces.Space[Any], leaf: Leaf) -> bool:
@@ -120,35 +135,83 @@ def _members(plain: dict[str, Any]) -> list[tuple[str | int, dict[str, Any]]] | 
     return None
 
 
-def _leaf_keys(
-    plain: dict[str, Any], path: tuple[str | int, ...] = ()
-) -> Iterator[tuple[str | int, ...]]:
-    members = _members(plain)
-    if members is None:
-        yield path
-    for key, part in members or ():
-        yield from _leaf_keys(part, (*path, key))
+def _ours(
+    plain: dict[str, Any],
+    where: str,
+    path: tuple[str | int, ...],
+    leaves: list[tuple[str | int, ...]],
+    lost: list[str] | None,
+) -> dict[str, Any] | None:
+    """Convert Minari's description of a space to the form that `space_from_json` reads.
 
+    Args:
+        plain: Minari's description.
+        where: Name of the space, for errors.
+        path: Path of the space in Minari's files.
+        leaves: List to which the path of each leaf is appended.
+        lost: List to which a sentence is appended for each leaf that is left out; None to refuse
+            such leaves.
 
-def _ours(plain: dict[str, Any], where: str) -> dict[str, Any]:
-    """Convert Minari's description of a space to the form that `space_from_json` reads."""
+    Returns:
+        The description; None if the space is left out.
+    """
     members = _members(plain)
     if members is not None:
-        parts = [[str(key), _ours(part, f"{where}['{key}']")] for key, part in members]
-        return {"type": "Dict", "spaces": parts}
+        parts = []
+        for key, part in members:
+            inner = _ours(part, f"{where}['{key}']", (*path, key), leaves, lost)
+            if inner is not None:
+                parts.append([str(key), inner])
+        return {"type": "Dict", "spaces": parts} if parts or not members else None
+    if plain["type"] not in _STORABLE:
+        sentence = f"{where} is a {plain['type']} space"
+        if lost is None:
+            remedy = f"; {_REMEDY.format('leave it out')}" if path else ""
+            raise SpaceError(
+                f"{sentence}; a log can store Box, Discrete, MultiDiscrete, MultiBinary, and for"
+                f" observations Dict and Tuple of these{remedy}"
+            )
+        lost.append(f"{sentence}, which is left out")
+        return None
+    leaves.append(path)
     match plain["type"]:
         case "Box":
             bounds = {name: _flat(plain[name]) for name in ("low", "high")}
             return {**plain, **bounds}
         case "Discrete" | "MultiBinary":
             return plain
-        case "MultiDiscrete":
+        case _:
             return {**plain, "start": plain.get("start", np.zeros_like(plain["nvec"]).tolist())}
-        case other:
-            raise SpaceError(
-                f"{where} is a {other} space; a log can store Box, Discrete, MultiDiscrete,"
-                " MultiBinary, and for observations Dict and Tuple of these"
-            )
+
+
+def _joined(space: spaces.Space[Any]) -> tuple[spaces.Space[Any], str]:
+    """Join the leaves of a Dict to one space; return the space and a sentence about it.
+
+    Raises:
+        SpaceError: The leaves are of different kinds.
+    """
+    parts = [leaf.of(space) for leaf in leaves_of(space)]
+    names = ", ".join("/".join(leaf.path) for leaf in leaves_of(space))
+    if len(parts) == 1:
+        return parts[0], f"the action is its only part {names}"
+    if parts and all(isinstance(part, spaces.Box) for part in parts):
+        low, high = (
+            np.concatenate([np.ravel(getattr(part, name)) for part in parts])
+            for name in ("low", "high")
+        )
+        joined: spaces.Space[Any] = spaces.Box(low, high, dtype=low.dtype.type)
+    elif parts and all(isinstance(part, spaces.Discrete | spaces.MultiDiscrete) for part in parts):
+        counts = [getattr(part, "nvec", getattr(part, "n", None)) for part in parts]
+        joined = spaces.MultiDiscrete(
+            np.concatenate([np.ravel(count) for count in counts]),
+            start=np.concatenate([np.ravel(part.start) for part in parts]),
+        )
+    else:
+        kinds = ", ".join(type(part).__name__ for part in parts) or "nothing"
+        raise SpaceError(
+            f"the parts of the action are {kinds}; only parts of one kind can be joined"
+        )
+    return joined, f"the parts {names} of the action are joined to one vector"
 
 
 def _flat(bounds: Any) -> Any:

@@ -4,6 +4,7 @@ python run_d3rlpy.py COMMAND ARGUMENT... [-- COMMAND ARGUMENT...]
 
 transitions LOG OUT.npz   write the transitions of `Dataset.to_d3rlpy`
 load FILE OUT.npz         write the transitions that d3rlpy loads from a file
+load_v1 FILE OUT.npz      write the transitions that d3rlpy loads from a file of d3rlpy 1
 dump LOG FILE             convert a log with `to_d3rlpy`, and write it with d3rlpy's `dump`
 back LOG OUT              convert a log with `to_d3rlpy`, and back with `from_d3rlpy`
 collect FILE              write steps that d3rlpy's replay buffer collects
@@ -28,6 +29,7 @@ def main(*arguments: str) -> None:
     commands: dict[str, Any] = {
         "transitions": lambda log, out: save(mcaprl.open(log).to_d3rlpy(), out),
         "load": load,
+        "load_v1": load_v1,
         "dump": dump,
         "back": lambda log, out: Dataset.from_d3rlpy(mcaprl.open(log).to_d3rlpy()).save(out),
         "collect": collect,
@@ -70,6 +72,14 @@ def load(file: str, out: str) -> None:
     d3rlpy = _d3rlpy()
     with open(file, "rb") as opened:
         save(d3rlpy.dataset.ReplayBuffer.load(opened, d3rlpy.dataset.InfiniteBuffer()), out)
+
+
+def load_v1(file: str, out: str) -> None:
+    """Load a file of d3rlpy 1 with d3rlpy's own reader."""
+    dataset = _d3rlpy().dataset
+    with open(file, "rb") as opened:
+        episodes = dataset.load_v1(opened)
+    save(dataset.ReplayBuffer(dataset.InfiniteBuffer(), episodes=episodes), out)
 
 
 def dump(log: str, file: str) -> None:

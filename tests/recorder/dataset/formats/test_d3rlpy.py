@@ -184,7 +184,10 @@ def test_episodes_that_were_changed_since_are_read_as_they_are(tmp_path: Path) -
     _write(_vectors(), tmp_path / "out.h5")
     with h5py.File(tmp_path / "out.h5", "r+") as file:
         file["num_episodes"][()] = 1
-    with pytest.warns(UserWarning, match="mcaprl is ignored, because the episodes were changed"):
+    with (
+        pytest.warns(UserWarning, match="mcaprl is ignored, because the episodes were changed"),
+        pytest.warns(UserWarning, match="not read: actions_1, observations_1, rewards_1$"),
+    ):
         found = mcaprl.open(tmp_path / "out.h5")
     assert found.frames[:, 0].tolist() == [0, 1, 2, 2]
 
@@ -264,7 +267,7 @@ def test_d3rlpys_picker_gives_every_transition(tmp_path: Path) -> None:
     log = _saved(_vectors(), tmp_path / "log.mcap")
     mcaprl.convert(log, tmp_path / "out.h5", to="d3rlpy")
     direct = ["transitions", log, tmp_path / "direct.npz"]
-    _run(*direct, "--", "load", tmp_path / "out.h5", tmp_path / "loaded.npz")
+    run_d3rlpy(*direct, "--", "load", tmp_path / "out.h5", tmp_path / "loaded.npz")
     for name in ("direct", "loaded"):
         with np.load(tmp_path / f"{name}.npz") as found:
             assert found["observation"][:, 0].tolist() == [0, 1, 2, 10, 11]
@@ -290,7 +293,7 @@ def test_d3rlpy_has_images_with_the_channels_first_and_trains(tmp_path: Path) ->
     dataset = _images()
     log = _saved(dataset, tmp_path / "log.mcap")
     vectors = _saved(_vectors(), tmp_path / "vectors.mcap")
-    _run("transitions", log, tmp_path / "out.npz", "--", "train", vectors)
+    run_d3rlpy("transitions", log, tmp_path / "out.npz", "--", "train", vectors)
     with np.load(tmp_path / "out.npz") as found:
         camera, gray = (dataset.frames[key] for key in ("camera", "gray"))
         np.testing.assert_array_equal(found["observation_0"], np.moveaxis(camera[:2], -1, 1))
@@ -303,7 +306,7 @@ def test_d3rlpy_has_images_with_the_channels_first_and_trains(tmp_path: Path) ->
 def test_d3rlpys_own_files_are_read(tmp_path: Path) -> None:
     log = _saved(_vectors(), tmp_path / "log.mcap")
     dump, back = ["dump", log, tmp_path / "dumped.h5"], ["back", log, tmp_path / "back.mcap"]
-    _run(*dump, "--", *back, "--", "collect", tmp_path / "collected.h5")
+    run_d3rlpy(*dump, "--", *back, "--", "collect", tmp_path / "collected.h5")
     for path in (tmp_path / "dumped.h5", tmp_path / "back.mcap"):
         found = mcaprl.open(path)
         assert found.frames[:, 0].tolist() == [0, 1, 2, 2, 10, 11, 12]
@@ -317,7 +320,7 @@ def test_d3rlpys_own_files_are_read(tmp_path: Path) -> None:
     assert found.truncated.tolist() == [False, False, False, False, True]
 
 
-def _run(*arguments: object) -> None:
+def run_d3rlpy(*arguments: object) -> None:
     """Run d3rlpy; skip the test if d3rlpy is not installed."""
     python = os.environ.get("MCAPRL_D3RLPY_PYTHON", f"{sys.prefix}/rivals/bin/python")
     need(Path(python).exists(), "d3rlpy is not installed: make .venv/.rivals")

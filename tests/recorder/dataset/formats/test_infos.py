@@ -155,10 +155,14 @@ def test_infos_of_d4rl_belong_to_the_observations(tmp_path: Path, with_next: boo
         file["infos/goal"] = np.zeros(3)
     rows: list[Any]
     if with_next:
-        found = mcaprl.open(tmp_path / "their.hdf5")
+        with pytest.warns(UserWarning, match="not read: infos/goal$"):
+            found = mcaprl.open(tmp_path / "their.hdf5")
         rows = [[0, 1], [2, 3], None, [4, 5], [6, 7], None]
     else:
-        with pytest.warns(UserWarning, match="no next_observations"):
+        with (
+            pytest.warns(UserWarning, match="no next_observations"),
+            pytest.warns(UserWarning, match="not read: infos/goal$"),
+        ):
             found = mcaprl.open(tmp_path / "their.hdf5")
         rows = [[0, 1], [2, 3], None, [4, 5], [6, 7]]
     assert set(found.infos) == {"sim.qpos"}

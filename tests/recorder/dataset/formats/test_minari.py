@@ -19,6 +19,8 @@ import mcaprl
 from mcaprl import Dataset
 from mcaprl.errors import LogError, OutputExistsError, SpaceError, UsageError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.dataset.formats.minari.description import local_path
+from mcaprl.recorder.dataset.formats.minari.spaces import space_to_text
 from mcaprl.recorder.format.metadata import LogMetadata
 from tests.conftest import need
 from tests.recorder.dataset.formats.minari_sets import Cameras, collect
@@ -362,6 +364,143 @@ def test_tuple_observations_become_a_dict(minari: Any, form: str) -> None:
     assert found.frames["0"].tolist() == [[1, 2], [3, 4]]
     assert found.frames["1"]["y"].tolist() == [3, 0]
     assert found.truncated.tolist() == [True]
+
+
+def _episode(
+    minari: Any, form: str, action_space: spaces.Space[Any], actions: Any, *, text: bool = False
+) -> Path:
+    """Create a dataset of one episode of two steps; its observation may contain a text."""
+    space = spaces.Dict({"x": spaces.Box(0, 9, (1,), np.float32)})
+    observations: dict[str, Any] = {"x": np.array([[1], [2], [3]], np.float32)}
+    if text:
+        space = spaces.Dict({"mission": spaces.Text(9), **space.spaces})
+        observations = {"mission": ["go"] * 3, **observations}
+    buffer = minari.data_collector.EpisodeBuffer(
+        observations=observations,
+        actions=actions,
+        rewards=np.array([0.5, 1]),
+        terminations=np.array([False, True]),
+        truncations=np.array([False, False]),
+        infos={},
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        minari.create_dataset_from_buffers(
+            "text-v0",
+            [buffer],
+            observation_space=space,
+            action_space=action_space,
+            data_format=form,
+        )
+    return local_path("text-v0")
+
+
+@pytest.mark.parametrize("form", _FORMS)
+def test_texts_are_refused_or_left_out(minari: Any, form: str, tmp_path: Path) -> None:
+    path = _episode(minari, form, spaces.Discrete(2), np.array([1, 0]), text=True)
+    message = r"observation\['mission'\] is a Text space; .*--lossy \(lossy=True .* leave it out"
+    with pytest.raises(SpaceError, match=message):
+        mcaprl.open(path)
+    for read in (mcaprl.open, Dataset.from_minari):
+        with pytest.warns(UserWarning, match=r"\['mission'\] is a Text space, which is left out"):
+            found = read(path, lossy=True)
+        assert found.frames["x"].tolist() == [[1], [2], [3]]
+        assert list(found.observation_space) == ["x"]
+    with pytest.warns(UserWarning, match="left out"):
+        mcaprl.convert(path, tmp_path / "log.mcap", lossy=True)
+    assert mcaprl.open(tmp_path / "log.mcap").actions.tolist() == [1, 0]
+
+
+@pytest.mark.parametrize("form", _FORMS)
+def test_parts_of_an_action_are_refused_or_joined(minari: Any, form: str) -> None:
+    arm, turn = spaces.Box(-1, 2, (2,), np.float32), spaces.Box(-3, 3, (1,), np.float32)
+    path = _episode(
+        minari,
+        form,
+        spaces.Dict({"arm": arm, "say": spaces.Text(4), "turn": turn}),
+        {
+            "arm": np.array([[1, 2], [-1, 0]], np.float32),
+            "say": ["a", "b"],
+            "turn": np.array([[3], [-3]], np.float32),
+        },
+    )
+    with pytest.raises(SpaceError, match=r"action is a Dict space; .*--lossy .*to join its parts"):
+        mcaprl.open(path)
+    with (
+        pytest.warns(UserWarning, match="the parts arm, turn of the action are joined"),
+        pytest.warns(UserWarning, match=r"action\['say'\] is a Text space, which is left out"),
+    ):
+        found = mcaprl.open(path, lossy=True)
+    assert found.actions.tolist() == [[1, 2, 3], [-1, 0, -3]]
+    assert found.action_space == spaces.Box(
+        np.array([-1, -1, -3], np.float32), np.array([2, 2, 3], np.float32)
+    )
+
+
+@pytest.mark.parametrize("form", _FORMS)
+def test_discrete_parts_of_an_action_are_joined(minari: Any, form: str) -> None:
+    action_space = spaces.Tuple([spaces.Discrete(3), spaces.Discrete(2, start=5)])
+    path = _episode(minari, form, action_space, (np.array([0, 2]), np.array([5, 6])))
+    with pytest.warns(UserWarning, match="the parts 0, 1 of the action are joined"):
+        found = mcaprl.open(path, lossy=True)
+    assert found.actions.tolist() == [[0, 5], [2, 6]]
+    assert found.action_space == spaces.MultiDiscrete([3, 2], start=[0, 5])
+
+
+def test_parts_of_different_kinds_are_not_joined(tmp_path: Path) -> None:
+    _vector().to_minari(tmp_path / "toy-v0")
+    parts = [spaces.Discrete(2), spaces.Box(0, 1, (1,))]
+    text = json.dumps({"type": "Tuple", "subspaces": [json.loads(space_to_text(s)) for s in parts]})
+    _change(tmp_path / "toy-v0", action_space=text)
+    with pytest.raises(
+        SpaceError, match="parts of the action are Discrete, Box; only parts of one"
+    ):
+        mcaprl.open(tmp_path / "toy-v0", lossy=True)
+    _change(tmp_path / "toy-v0", observation_space='{"type": "Text"}')
+    with pytest.raises(SpaceError, match="nothing is left of the observation"):
+        mcaprl.open(tmp_path / "toy-v0", lossy=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("terminations", [0.0, 0.3], "episode 1: terminations are not flags: row 1 is 0.3"),
+        ("truncations", [0, 2], "episode 1: truncations are not flags: row 1 is 2"),
+        ("rewards", [0.0, np.nan], "episode 1: rewards: row 1 is nan, which is not finite"),
+        ("rewards", [b"1", b"2"], "episode 1: rewards has dtype"),
+        ("actions", [0, 7], r"episode 1: actions: row 1 is 7, which is outside of Discrete"),
+        ("actions", [0, -1], r"episode 1: actions: row 1 is -1, which is outside of Discrete"),
+    ],
+)
+def test_impossible_values_of_other_writers_are_refused(
+    tmp_path: Path, name: str, values: Any, message: str
+) -> None:
+    steps = Dataset.from_arrays(
+        observations=np.arange(4.0)[:, None],
+        next_observations=np.arange(1, 5.0)[:, None],
+        actions=np.array([0, 1, 0, 1]),
+        rewards=np.zeros(4),
+        terminated=[False, True, False, True],
+        truncated=[False] * 4,
+    )
+    path = tmp_path / "toy-v0"
+    steps.to_minari(path)
+    _change(path, mcaprl=None)
+    with h5py.File(path / "data/main_data.hdf5", "a") as file:
+        del file[f"episode_1/{name}"]
+        file[f"episode_1/{name}"] = np.array(values)
+    with pytest.raises(SpaceError, match=message):
+        mcaprl.open(path)
+
+
+def test_members_that_are_not_read_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "toy-v0"
+    _vector().to_minari(path)
+    with h5py.File(path / "data/main_data.hdf5", "a") as file:
+        file["episode_0/costs"] = np.zeros(3)
+        file["episode_9/rewards"] = np.zeros(3)
+    with pytest.warns(UserWarning, match="not read: episode_9, episode_<i>/costs$"):
+        mcaprl.open(path)
 
 
 @pytest.mark.parametrize(

@@ -174,9 +174,13 @@ def _usual(**changes: Any) -> dict[str, Any]:
         ({"terminations": np.zeros(2)}, LogError, "both terminals and terminations"),
         ({"actions": np.zeros(3, np.int64)}, SpaceError, r"actions has shape \(3,\)"),
         ({"actions": np.zeros(3, int), "next_observations": None}, SpaceError, "3 actions"),
-        ({"observations": np.array([["a"], ["b"]])}, SpaceError, "no Box can hold"),
+        (
+            {"observations": np.array([["a"], ["b"]])},
+            SpaceError,
+            "observations has dtype <U1.*row 0 is 'a'",
+        ),
         ({"rewards": np.array([object(), None])}, LogError, "not a readable .npz"),
-        ({"terminals": np.array([0.5, 0])}, SpaceError, "terminated are not flags"),
+        ({"terminals": np.array([0.5, 0])}, SpaceError, "terminals are not flags: row 0 is 0.5"),
     ],
 )
 def test_other_arrays_are_refused_by_name(
