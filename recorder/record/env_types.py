@@ -1,0 +1,67 @@
+"""Checks that an object is an environment that can be recorded, with advice for other packages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+
+from mcaprl.errors import UsageError
+
+
+def check_single(env: Any) -> None:
+    """Check that an object is a single environment of Gymnasium.
+
+    Raises:
+        UsageError: It is a vector environment, or an environment of another package.
+    """
+    if isinstance(env, gym.vector.VectorEnv):
+        raise UsageError("RecordMcap wraps single environments; RecordVecMcap wraps vector ones")
+    if not isinstance(env, gym.Env):
+        raise _refused("RecordMcap", "an environment", env)
+
+
+def check_vector(env: Any) -> None:
+    """Check that an object is a vector environment of Gymnasium.
+
+    Raises:
+        UsageError: It is a single environment, or an environment of another package.
+    """
+    if isinstance(env, gym.vector.VectorEnv):
+        return
+    if not isinstance(env, gym.Env):
+        raise _refused("RecordVecMcap", "a vector environment", env)
+    advice = ""
+    if getattr(env.unwrapped, "num_envs", 1) != 1:
+        advice = (
+            f"; {type(env.unwrapped).__name__} has several environments, but is not a VectorEnv:"
+            " use the vector wrapper of its package"
+        )
+    raise UsageError(
+        f"RecordVecMcap wraps vector environments; RecordMcap wraps single ones{advice}"
+    )
+
+
+def _refused(wrapper: str, expected: str, env: Any) -> UsageError:
+    kind = f"{type(env).__module__}.{type(env).__qualname__}"
+    return UsageError(f"{wrapper} needs {expected} of Gymnasium, not {kind}: {_advice(env)}")
+
+
+def _advice(env: Any) -> str:
+    """Return what to do with an object that is not an environment of Gymnasium."""
+    names = {f"{one.__module__.split('.')[0]}.{one.__name__}" for one in type(env).__mro__}
+    if "stable_baselines3.VecEnv" in names:
+        return (
+            "record with RecordVecMcap(gymnasium.make_vec(ID, N), ...), or wrap each environment in"
+            " RecordMcap, with its own file, before Stable-Baselines3's VecEnv"
+        )
+    if hasattr(env, "possible_agents"):
+        return (
+            "PettingZoo's environments have several agents: wrap the one to record as a"
+            " gymnasium.Env of a single agent"
+        )
+    if "gym.Env" in names:
+        return "convert the old gym.Env with gymnasium.make('GymV26Environment-v0', env=...)"
+    if hasattr(env, "observation_spec"):
+        return "convert the dm_env environment with shimmy's DmControlCompatibilityV0"
+    return "wrap it in a class derived from gymnasium.Env"
