@@ -16,6 +16,7 @@ from mcaprl.cli.options import (
     integer_option,
     json_option,
     mapping_options,
+    max_steps_option,
     ray_options,
     sim_options,
 )
@@ -50,6 +51,7 @@ _OF_DATA = ("gamma", "epsilon", "updates", "estimate_behavior", "threads", "mapp
     type=click.IntRange(1),
     help="Number of episodes for each policy and training seed.  [default: 30]",
 )
+@max_steps_option
 @integer_option(
     "--seed",
     "Seed of the episodes; with --data, seed of the model and of the resampling.",

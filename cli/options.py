@@ -50,6 +50,13 @@ def sim_options(command: F) -> F:
     return click.option("--observation", help=text)(rules(command))
 
 
+max_steps_option = click.option(
+    "--max-steps",
+    type=click.IntRange(1),
+    help="Steps after which an episode is truncated.  [default: 27000 if SIM has no time limit]",
+)
+
+
 def integer_option(
     name: str, help: str, *, least: int, most: int | None = None, default: int | None = None
 ) -> Callable[[F], F]:

@@ -11,7 +11,7 @@ import click
 import mcaprl
 from mcaprl.cli.completion import Name, policies, sims
 from mcaprl.cli.help import Command
-from mcaprl.cli.options import integer_option, ray_options, sim_options
+from mcaprl.cli.options import integer_option, max_steps_option, ray_options, sim_options
 from mcaprl.cli.progress import keeping, working
 from mcaprl.cli.show import echo
 from mcaprl.texts import counted, size
@@ -46,6 +46,7 @@ def _compressions() -> Iterable[str]:
     type=click.IntRange(1),
     help="Number of steps to record, instead of a number of episodes.",
 )
+@max_steps_option
 @integer_option("--seed", "Seed of the recording.", least=0)
 @integer_option(
     "--envs",

@@ -13,7 +13,7 @@ import contextlib
 import importlib
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
@@ -61,7 +61,12 @@ def make_sim(name: str, /, **kwargs: Any) -> gym.Env[Any, Any]:
 
 
 def make_sims(
-    name: str, num_envs: int, *, autoreset_mode: str = "NextStep", **kwargs: Any
+    name: str,
+    num_envs: int,
+    *,
+    autoreset_mode: str = "NextStep",
+    wrappers: Sequence[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]] = (),
+    **kwargs: Any,
 ) -> gym.vector.VectorEnv[Any, Any, Any]:
     """Make environments that are stepped together in this process.
 
@@ -73,6 +78,8 @@ def make_sims(
         num_envs: Number of environments.
         autoreset_mode: `NextStep`, `SameStep` or `Disabled`; see
             `gymnasium.vector.AutoresetMode`.
+        wrappers: Wrappers of each environment, the innermost first. With wrappers, environments are
+            stepped one after the other.
         **kwargs: As in `make_sim`.
 
     Raises:
@@ -83,10 +90,13 @@ def make_sims(
         raise UnknownNameError("autoreset_mode", autoreset_mode, modes)
     env_id, spec = _resolve(name)
     with _clear_errors(name, spec, kwargs):
-        if spec is not None and spec.vector_entry_point:
+        if spec is not None and spec.vector_entry_point and not wrappers:
             return gym.make_vec(env_id, num_envs, autoreset_mode=autoreset_mode, **kwargs)
         options = {"autoreset_mode": autoreset_mode}
-        envs = gym.make_vec(env_id, num_envs, "sync", vector_kwargs=options, **kwargs)
+        wraps: Any = list(wrappers)
+        envs = gym.make_vec(
+            env_id, num_envs, "sync", vector_kwargs=options, wrappers=wraps, **kwargs
+        )
     _set_module(getattr(envs.unwrapped, "envs", ()), env_id)
     return envs
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -24,7 +25,7 @@ from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.open import find_logs, open_logs
 from mcaprl.recorder.format.metadata import same_env
 from mcaprl.recorder.record.wrapper import RecordMcap
-from mcaprl.sims import make_sim, make_sims
+from mcaprl.sims import make_sims
 from mcaprl.sims.evaluation.evaluate import (
     Improvement,
     PolicyScore,
@@ -34,6 +35,7 @@ from mcaprl.sims.evaluation.evaluate import (
     score_of,
 )
 from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
+from mcaprl.sims.evaluation.limits import StepLimit, make_limited, warn_of_cuts
 from mcaprl.sims.evaluation.pilots import has_pilot
 from mcaprl.sims.evaluation.rollout import Policy
 from mcaprl.sims.evaluation.statistics import mean_interval
@@ -95,6 +97,7 @@ def evaluate(
     sim: str,
     *,
     episodes: int = 30,
+    max_steps: int | None = None,
     seed: int = 1_000_000,
     observation: str | None = None,
     rules: str | None = None,
@@ -117,6 +120,8 @@ def evaluate(
             a run is evaluated.
         sim: Short name of a sim, or a Gymnasium id.
         episodes: Number of episodes for each policy and training seed.
+        max_steps: Steps after which an episode is truncated, with the reason `step_limit`. None
+            selects 27,000 if the environment has no time limit.
         seed: Seed of the episodes.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
@@ -143,7 +148,7 @@ def evaluate(
         ReportError: The report cannot be written.
         ClusterError: The Ray cluster cannot be used, or its workers died repeatedly.
     """
-    check_least(1, episodes=episodes)
+    check_least(1, episodes=episodes, max_steps=max_steps)
     check_least(0, seed=seed)
     on_cluster = ClusterOptions(ray, workers, address)
     on_cluster.check()
@@ -153,7 +158,7 @@ def evaluate(
     log, folder = (None if path is None else Path(path) for path in (record, report))
     if log is not None:
         check_log_name(log)
-    env = make_sim(sim, **options)
+    env = make_limited(sim, max_steps, **options)
     with closing(env):
         # Arguments are checked first, because the episodes may take minutes.
         logged = None if behavior is None else _behavior(behavior, env, log)
@@ -164,14 +169,16 @@ def evaluate(
         if log is not None:
             check_target(log, overwrite=overwrite)
         world = list(getattr(env.unwrapped, "static_scene", list)())
-        is_batched = env.spec is not None and bool(env.spec.vector_entry_point) and log is None
+        # Batched sims have no other limit than their own, and no recorder of single episodes.
+        is_plain = log is None and not isinstance(env, StepLimit)
+        is_batched = is_plain and env.spec is not None and bool(env.spec.vector_entry_point)
         found = _policies(names, env)
         shown, scores = policy_names(list(found)), {}
         with ExitStack() as stack:
             total = sum(map(len, found.values())) * episodes
             advance = stack.enter_context(progress("evaluating", total))
             if ray:
-                request = Part(sim, options, seed, is_batched)
+                request = Part(sim, options, seed, is_batched, max_steps)
                 results = results_on_ray(request, found, episodes, on_cluster, advance)
                 scores = {name: score_of(shown[name], results[name], env) for name in found}
                 found = {}
@@ -192,6 +199,8 @@ def evaluate(
                     on_policy=partial(_set_policy, recorded),
                     on_episode=lambda result: advance(1),
                 )
+        for score in scores.values():
+            warn_of_cuts(itertools.chain(*score.results), score.policy, sim)
     random, pilot = scores["random"], scores.get("pilot")
     normalized = [normalize(score, random, pilot) for score in scores.values()]
     if logged is not None:

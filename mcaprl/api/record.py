@@ -21,6 +21,7 @@ from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.manifest import MANIFEST_NAME
 from mcaprl.remote import check_upload, upload_all
 from mcaprl.settings import flag
+from mcaprl.sims.evaluation.limits import warn_of_cuts
 from mcaprl.sims.evaluation.rollout import EpisodeResult
 
 
@@ -58,6 +59,7 @@ def record(
     epsilon: float = 0.0,
     episodes: int | None = None,
     steps: int | None = None,
+    max_steps: int | None = None,
     seed: int = 0,
     envs: int = 1,
     observation: str | None = None,
@@ -86,6 +88,8 @@ def record(
         epsilon: Probability of a random action instead of the policy's.
         episodes: Number of episodes; exclusive with `steps`.
         steps: Number of steps; exclusive with `episodes`.
+        max_steps: Steps after which an episode is truncated, with the reason `step_limit`. None
+            selects 27,000 if the environment has no time limit and `episodes` is given.
         seed: Seed of the recording.
         envs: Number of processes. With more than one, a script needs
             `if __name__ == "__main__"`, because each process imports the script.
@@ -135,6 +139,7 @@ def record(
         overwrite=overwrite,
         append=append,
         rotate_mb=rotate_mb,
+        max_steps=max_steps,
     )
     _check_request(request, envs)
     on_cluster = ClusterOptions(ray, workers, address)
@@ -156,6 +161,7 @@ def record(
             results = record_file(request, on_episode)
         else:
             results = record_shards(request, envs, on_episode)
+    warn_of_cuts(results, request.policy, sim)
     files = _files(request.out, rotated=request.rotate_mb is not None)
     if upload is not None:
         upload_all([*files, request.out / MANIFEST_NAME] if ray else files, upload)
@@ -178,7 +184,13 @@ def _check_request(request: FileRequest, envs: int) -> None:
     check_fraction(epsilon=request.epsilon)
     if request.rotate_mb is not None:
         check_positive(rotate_mb=request.rotate_mb)
-    check_least(1, episodes=request.episodes, steps=request.steps, envs=envs)
+    check_least(
+        1,
+        episodes=request.episodes,
+        steps=request.steps,
+        max_steps=request.max_steps,
+        envs=envs,
+    )
     check_least(0, seed=request.seed)
     if envs > 1 and request.append:
         raise UsageError("--append needs one file, but --envs writes several: omit one option")

@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.ends import STEP_LIMIT
 from mcaprl.errors import LogError, McaprlError, SpaceError
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -254,7 +255,7 @@ def _transition_differences(episode: Episode, step: int, now: _Frame) -> list[Fi
         ("reward", episode.rewards[step], np.float64(reward)),
         ("terminated", episode.terminated[step], np.bool_(terminated)),
     ]
-    broken_off = episode.reason == INTERRUPTED and step == episode.length - 1
+    broken_off = episode.reason in (INTERRUPTED, STEP_LIMIT) and step == episode.length - 1
     if not broken_off:
         pairs.append(("truncated", episode.truncated[step], np.bool_(truncated)))
     return [
