@@ -15,10 +15,12 @@ from mcaprl.cli.help import Command
 from mcaprl.cli.options import (
     integer_option,
     json_option,
+    keys_option,
     mapping_options,
     max_steps_option,
     ray_options,
     sim_options,
+    trust_run_option,
 )
 from mcaprl.cli.progress import keeping, working
 from mcaprl.cli.show import echo, print_json, print_table
@@ -59,6 +61,7 @@ _OF_DATA = ("gamma", "epsilon", "updates", "estimate_behavior", "threads", "mapp
     default=1_000_000,
 )
 @sim_options
+@trust_run_option
 @click.option("--gamma", type=click.FloatRange(0, 1), help="With --data: discount. [default: 0.97]")
 @click.option(
     "--epsilon",
@@ -84,6 +87,7 @@ _OF_DATA = ("gamma", "epsilon", "updates", "estimate_behavior", "threads", "mapp
 @mapping_options
 @click.option("--behavior", metavar="DATA", help="Logs whose returns are shown for comparison.")
 @click.option("--record", type=click.Path(path_type=Path), help="Log to write.")
+@keys_option
 @click.option("--report", type=click.Path(path_type=Path), help="Output folder of the HTML report.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing log.")
 @ray_options
@@ -131,7 +135,8 @@ def evaluate(
 def _refuse_unused(given: dict[str, Any], names: Sequence[str], needed: str) -> None:
     for name in names:
         if name in given:
-            raise UsageError(f"{flag(name)} requires --{needed}")
+            shown = "--env-arg" if name == "sim_options" else flag(name)
+            raise UsageError(f"{shown} requires --{needed}")
 
 
 def _print_scores(found: Evaluation) -> None:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
 
-from mcaprl.errors import UnknownNameError, UsageError, import_extra
+from mcaprl.errors import McaprlError, UnknownNameError, UsageError, import_extra
 from mcaprl.lazy import lazy_attributes
 from mcaprl.sims import highway, lane, powerline, racer
 from mcaprl.sims.spec import SimCatalog, SimSpec
@@ -165,12 +165,17 @@ def _clear_errors(name: str, spec: SimSpec | None, kwargs: dict[str, Any]) -> It
     except gym.error.UnregisteredEnv as error:
         known = [*SIMS, "any Gymnasium id"]
         raise UnknownNameError("sim", name, known, gym.registry) from error
-    except (TypeError, ValueError, gym.error.Error, ModuleNotFoundError) as error:
+    except (McaprlError, OSError):
+        raise
+    # An environment may raise any exception, for example for an argument with a wrong type.
+    except Exception as error:
         given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
         reason = str(error).split(" was raised from the environment creator")[0]
         unknown = re.search(r"unexpected keyword argument '(\w+)'", reason)
         if unknown and unknown[1] in kwargs:
             raise UsageError(f"sim '{name}' has no argument {unknown[1]}: omit it") from error
+        if not isinstance(error, TypeError | ValueError | gym.error.Error | ModuleNotFoundError):
+            reason = f"{type(error).__name__}: {reason}"
         raise UsageError(f"cannot make sim '{name}' with {given}: {reason}") from error
 
 

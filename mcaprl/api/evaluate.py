@@ -14,7 +14,7 @@ from typing import Any
 import gymnasium as gym
 
 from mcaprl.api.cluster import ClusterOptions
-from mcaprl.api.environments import all_options
+from mcaprl.api.environments import all_options, trained_options
 from mcaprl.api.evaluate_parts import Part, results_on_ray
 from mcaprl.api.policies import SCRIPTED, Names, as_names, policies_of, policy_names
 from mcaprl.api.ranges import check_least
@@ -102,8 +102,10 @@ def evaluate(
     observation: str | None = None,
     rules: str | None = None,
     sim_options: Mapping[str, Any] | None = None,
+    trust_env: bool = False,
     behavior: str | None = None,
     record: str | Path | None = None,
+    keys: Sequence[str] | None = None,
     report: str | Path | None = None,
     overwrite: bool = False,
     ray: bool = False,
@@ -125,9 +127,13 @@ def evaluate(
         seed: Seed of the episodes.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
-        sim_options: Other arguments of the environment.
+        sim_options: Other arguments of the environment. Without any argument, the environment has
+            the arguments with which `policies` were trained in it.
+        trust_env: Whether the arguments of the training may be passed to environments other than
+            the sims of `SIMS`.
         behavior: Logs of the sim that the policies are compared with.
         record: Output log of the episodes of `policies`.
+        keys: Keys of the parts of a Dict or Tuple observation that `record` contains; default: all.
         report: Output folder of the HTML report, images and JSON.
         overwrite: Whether an existing log is replaced.
         ray: Whether the episodes run on Ray workers. The results are the same. All workers must be
@@ -154,7 +160,10 @@ def evaluate(
     on_cluster.check()
     if ray and record is not None:
         raise UsageError("--record needs one process: omit --ray")
+    if keys is not None and record is None:
+        raise UsageError("--keys selects what --record writes: omit it, or pass --record")
     names, options = as_names(policies), all_options(observation, rules, sim_options)
+    options = trained_options(names, sim, options, trust_env=trust_env)
     log, folder = (None if path is None else Path(path) for path in (record, report))
     if log is not None:
         check_log_name(log)
@@ -185,7 +194,9 @@ def evaluate(
             envs = make_sims(sim, episodes, **options) if is_batched and found else None
             recorder = None
             if log is not None:
-                recorder = RecordMcap(env, log, seed=seed, overwrite=overwrite, epsilon=0.0)
+                recorder = RecordMcap(
+                    env, log, seed=seed, overwrite=overwrite, epsilon=0.0, keys=keys
+                )
                 stack.enter_context(closing(recorder))
             for name, candidates in found.items():
                 recorded = recorder if name in names else None

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mcaprl.api.cluster import ClusterOptions
-from mcaprl.api.environments import all_options
+from mcaprl.api.environments import all_options, trained_options
 from mcaprl.api.ranges import check_fraction, check_least, check_positive
 from mcaprl.api.record_file import FileRequest, record_file
 from mcaprl.api.shards import record_on_ray, record_shards
@@ -65,9 +65,11 @@ def record(
     observation: str | None = None,
     rules: str | None = None,
     sim_options: Mapping[str, Any] | None = None,
+    trust_env: bool = False,
     scene: bool = True,
     camera: bool = False,
     infos: bool | Sequence[str] = False,
+    keys: Sequence[str] | None = None,
     compression: str = "zstd",
     overwrite: bool = False,
     append: bool = False,
@@ -95,10 +97,14 @@ def record(
             `if __name__ == "__main__"`, because each process imports the script.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
-        sim_options: Other arguments of the environment.
+        sim_options: Other arguments of the environment. Without any argument, a trained policy acts
+            with the arguments of its training if that was in the same environment.
+        trust_env: Whether the arguments of the training may be passed to environments other than
+            the sims of `SIMS`.
         scene: Whether topics that only viewers use are recorded.
         camera: Whether metric depth images are recorded.
         infos: Whether the infos of the environment are recorded, or the names of infos to record.
+        keys: Keys of the parts of a Dict or Tuple observation that are recorded; default: all.
         compression: Compression of chunks: `zstd`, `lz4` or `none`.
         overwrite: Whether existing logs are replaced.
         append: Whether the episodes are added to an existing file.
@@ -123,6 +129,7 @@ def record(
         ClusterError: The Ray cluster cannot be used.
         MissingExtraError: Ray is not installed.
     """
+    options = all_options(observation, rules, sim_options)
     request = FileRequest(
         sim=sim,
         out=Path(out),
@@ -131,10 +138,11 @@ def record(
         episodes=episodes,
         steps=steps,
         seed=seed,
-        sim_options=all_options(observation, rules, sim_options),
+        sim_options=trained_options([str(policy)], sim, options, trust_env=trust_env),
         scene=scene,
         camera=camera,
         infos=infos,
+        keys=keys,
         compression=compression,
         overwrite=overwrite,
         append=append,

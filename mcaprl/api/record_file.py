@@ -38,6 +38,7 @@ class FileRequest:
     scene: bool
     camera: bool
     infos: bool | Sequence[str]
+    keys: Sequence[str] | None
     compression: str
     overwrite: bool
     append: bool
@@ -111,4 +112,5 @@ def _recorder(request: FileRequest, env: gym.Env[Any, Any], behavior: EpsilonGre
         scene=request.scene,
         camera=request.camera,
         infos=request.infos,
+        keys=request.keys,
     )
