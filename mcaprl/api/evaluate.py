@@ -215,8 +215,8 @@ def evaluate(
     random, pilot = scores["random"], scores.get("pilot")
     normalized = [normalize(score, random, pilot) for score in scores.values()]
     if logged is not None:
-        score = Scale.of(random, pilot).score(logged.mean_return)
-        logged = replace(logged, normalized_score=None if math.isnan(score) else score)
+        value = Scale.of(random, pilot).score(logged.mean_return)
+        logged = replace(logged, normalized_score=None if math.isnan(value) else value)
     result = Evaluation(sim, seed, logged, tuple(normalized), tuple(improvements(normalized)))
     if folder is not None:
         _write_report(folder, result, world, log, names)

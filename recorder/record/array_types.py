@@ -104,7 +104,7 @@ def _row(values: Any, number: int, count: int, space: spaces.Space[Any]) -> Any:
     return row
 
 
-def _is_batched(values: Any, number: int, space: spaces.Tuple) -> bool:
+def _is_batched(values: Any, number: int, space: spaces.Tuple[Any]) -> bool:
     """Return whether values are the batched parts of a Tuple, and not one tuple per environment."""
     if not isinstance(values, list | tuple) or len(values) != len(space.spaces):
         return False

@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -267,7 +267,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             # The environments may have made a step that the log lacks, so all episodes end here.
             self._interrupt(self._every)
             raise
-        return cast(tuple[Any, Any, Any, Any, dict[str, Any]], transition)
+        return transition
 
     def close(self, **kwargs: Any) -> None:
         """Finish the log and close the environments; a second call has no effect."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -121,7 +121,7 @@ def test_keys_select_the_recorded_parts(log_path: Path) -> None:
         assert observation["mission"] == "get the key"
         env.step(1)
     data = mcaprl.open(log_path)
-    assert list(data.observation_space) == ["direction", "image"]
+    assert list(data.frames) == ["direction", "image"]
     assert (data.frames["image"] == data.frames["direction"][:, None, None, None]).all()
 
 
@@ -145,7 +145,7 @@ def test_keys_of_vector_environments(log_path: Path, mode: AutoresetMode) -> Non
 
 
 def test_logs_of_a_part_are_verified(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    gym.register("Grid-v0", Grid, disable_env_checker=True)
+    gym.register("Grid-v0", cast(Any, Grid), disable_env_checker=True)
     try:
         with closing(mcaprl.RecordMcap(gym.make("Grid-v0"), log_path, keys=["direction"])) as env:
             for seed in range(3):
@@ -167,7 +167,7 @@ def test_logs_of_tuples_are_verified(log_path: Path) -> None:
         for seed in range(5):
             env.reset(seed=seed)
             env.step(0)
-    assert list(mcaprl.open(log_path).observation_space) == ["0", "1", "2"]
+    assert list(mcaprl.open(log_path).frames) == ["0", "1", "2"]
     found = mcaprl.verify(log_path, trust_env=True)
     assert (found.episodes, found.difference) == (5, None)
 
@@ -268,7 +268,11 @@ def test_old_logs_with_other_keys_are_read_with_texts(
 
 @pytest.mark.parametrize(
     "space",
-    [spaces.Text(4), spaces.Tuple([spaces.Discrete(2)]), spaces.Dict({0: spaces.Discrete(2)})],
+    [
+        spaces.Text(4),
+        spaces.Tuple([spaces.Discrete(2)]),
+        spaces.Dict(cast(Any, {0: spaces.Discrete(2)})),
+    ],
 )
 def test_actions_that_cannot_be_recorded_are_refused(log_path: Path, space: Any) -> None:
     env = ScriptedEnv(spaces.Discrete(2), space, [])

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -46,8 +46,8 @@ class Endless(gym.Env[Any, Any]):
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(limits, "DEFAULT_MAX_STEPS", 70)
-    gym.register("Endless-v0", Endless, disable_env_checker=True)
-    gym.register("Ending-v0", Endless, disable_env_checker=True, max_episode_steps=20)
+    gym.register("Endless-v0", cast(Any, Endless), disable_env_checker=True)
+    gym.register("Ending-v0", cast(Any, Endless), disable_env_checker=True, max_episode_steps=20)
     yield
     for name in ("Endless-v0", "Ending-v0"):
         gym.registry.pop(name)
@@ -135,10 +135,11 @@ def test_an_argument_of_the_environment_may_have_the_same_name() -> None:
         def __init__(self, max_steps: int = 3, name: str = "") -> None:
             self.limit, self.name = max_steps, name
 
-    gym.register("Own-v0", Own, disable_env_checker=True)
+    gym.register("Own-v0", cast(Any, Own), disable_env_checker=True)
     try:
         with closing(make_limited("Own-v0", 8, max_steps=5, name="x")) as env:
-            assert (env.unwrapped.limit, env.unwrapped.name) == (5, "x")
+            own: Any = env.unwrapped
+            assert (own.limit, own.name) == (5, "x")
             assert isinstance(env, StepLimit)
             assert env.max_steps == 8
     finally:
