@@ -16,6 +16,7 @@ from mcaprl.cli.options import (
     env_arg_option,
     integer_option,
     json_option,
+    keys_option,
     mapping_options,
     trust_option,
 )
@@ -113,12 +114,13 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
     help="JSON file to write; - for the standard output.",
 )
 @env_arg_option
+@keys_option
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-def layout(source: str, out: Path, sim_options: dict[str, Any] | None, overwrite: bool) -> None:
+def layout(source: str, out: Path, **request: Any) -> None:
     """Write the Foxglove layout of a log, or of the logs of a sim."""
     with working("reading the topics"):
         target = None if str(out) == "-" else out
-        found = mcaprl.layout(source, target, sim_options=sim_options, overwrite=overwrite)
+        found = mcaprl.layout(source, target, **request)
     if str(out) == "-":
         print_json(found)
         return

@@ -8,6 +8,11 @@ import gymnasium as gym
 
 from mcaprl.errors import UsageError
 
+_ADVICE_FOR_BATCH = (
+    "; this one steps several environments, but is not a gymnasium.vector.VectorEnv: use the vector"
+    " wrapper of its package, and RecordVecMcap"
+)
+
 
 def check_single(env: Any) -> None:
     """Check that an object is a single environment of Gymnasium.
@@ -19,6 +24,8 @@ def check_single(env: Any) -> None:
         raise UsageError("RecordMcap wraps single environments; RecordVecMcap wraps vector ones")
     if not isinstance(env, gym.Env):
         raise _refused("RecordMcap", "an environment", env)
+    if _is_batch(env):
+        raise UsageError(f"RecordMcap wraps single environments{_ADVICE_FOR_BATCH}")
 
 
 def check_vector(env: Any) -> None:
@@ -31,15 +38,16 @@ def check_vector(env: Any) -> None:
         return
     if not isinstance(env, gym.Env):
         raise _refused("RecordVecMcap", "a vector environment", env)
-    advice = ""
-    if getattr(env.unwrapped, "num_envs", 1) != 1:
-        advice = (
-            f"; {type(env.unwrapped).__name__} has several environments, but is not a VectorEnv:"
-            " use the vector wrapper of its package"
-        )
+    advice = _ADVICE_FOR_BATCH if _is_batch(env) else ""
     raise UsageError(
         f"RecordVecMcap wraps vector environments; RecordMcap wraps single ones{advice}"
     )
+
+
+def _is_batch(env: gym.Env[Any, Any]) -> bool:
+    """Return whether an environment steps several environments, as those of some simulators."""
+    count = getattr(env.unwrapped, "num_envs", 1)
+    return isinstance(count, int) and count > 1
 
 
 def _refused(wrapper: str, expected: str, env: Any) -> UsageError:

@@ -158,6 +158,9 @@ def rollout(
 ) -> list[EpisodeResult]:
     """Run a number of episodes, or a number of steps.
 
+    In an environment without a time limit, an episode may never end: add one with
+    `gymnasium.wrappers.TimeLimit`.
+
     Args:
         env: Environment.
         behavior: Exploration policy.

@@ -334,3 +334,14 @@ def test_a_policy_of_a_tuple_acts_in_its_environment(tmp_path: Path) -> None:
     data = mcaprl.open(again)
     policy = mcaprl.load_policy(tmp_path / "run")
     assert data.actions.tolist() == policy.act(data.observations).tolist()
+
+
+def test_a_layout_of_some_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gym.register("Noted-v0", cast(Any, Noted), disable_env_checker=True)
+    try:
+        out = ["--out", str(tmp_path / "layout.json")]
+        assert run(["layout", "Noted-v0", *out]) == 1
+        assert "--keys x" in capsys.readouterr().err
+        assert run(["layout", "Noted-v0", *out, "--keys", "x"]) == 0
+    finally:
+        gym.registry.pop("Noted-v0")

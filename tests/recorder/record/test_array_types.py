@@ -65,8 +65,18 @@ class Cupy:
         return self._values
 
 
-def jax_array(values: Any) -> Any:
-    return importlib.import_module("jax.numpy").asarray(values)
+class Jax:
+    """An array that NumPy reads with `__array__`, like JAX's.
+
+    JAX itself is not imported, because it warns when a later test starts a process.
+    """
+
+    def __init__(self, values: Any) -> None:
+        self._values = np.asarray(values)
+        self._values.flags.writeable = False
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
+        return self._values if dtype is None else self._values.astype(dtype)
 
 
 TYPES: dict[str, Callable[[Any], Any]] = {
@@ -237,7 +247,7 @@ def two(path: Path, *given: Any, **options: Any) -> mcaprl.RecordVecMcap:
         (torch.tensor([1.0, 2.0], dtype=torch.bfloat16), torch.tensor([1, 0], dtype=torch.uint8)),
         ([1, 2.0], [True, False]),
         ([torch.tensor(1.0, requires_grad=True), torch.tensor(2.0)], (1, 0)),
-        (jax_array([1.0, 2.0]), jax_array([True, False])),
+        (Jax([1.0, 2.0]), Jax([True, False])),
         (OnlyDlpack([1.0, 2.0]), np.array([True, False])),
         (Cupy([1.0, 2.0]), Cupy([True, False])),
         (np.array([1.0, 2.0]), torch.tensor([True, False])),
@@ -339,7 +349,7 @@ def test_a_single_environment_may_return_tensors(log_path: Path) -> None:
 
 
 def test_arrays_in_nested_dicts() -> None:
-    tree = {"a": torch.tensor([1, 2]), "b": {"c": jax_array([3.0])}, "d": "text", "e": [1]}
+    tree = {"a": torch.tensor([1, 2]), "b": {"c": Jax([3.0])}, "d": "text", "e": [1]}
     found = as_arrays(tree)
     assert type(found["a"]) is type(found["b"]["c"]) is np.ndarray
     assert (found["d"], found["e"]) == ("text", [1])
@@ -350,6 +360,12 @@ class OtherVecEnv:
 
 
 OtherVecEnv.__name__, OtherVecEnv.__module__ = "VecEnv", "stable_baselines3.common.vec_env"
+
+
+class Batch(Wanderer):
+    """A single environment by its class, which steps several environments, like Isaac Lab's."""
+
+    num_envs = 4
 
 
 class Agents:
@@ -364,6 +380,7 @@ class Agents:
     [
         (OtherVecEnv(), r"not stable_baselines3.*VecEnv: record with RecordVecMcap\(gymnasium"),
         (Agents(), "several agents"),
+        (Batch(VECTOR, [1], 1), "steps several environments, but is not a gymnasium.vector.Vec"),
         (object(), r"not builtins.object: wrap it in a class derived from gymnasium.Env"),
     ],
 )
