@@ -56,6 +56,23 @@ def is_other_array(value: Any) -> bool:
     return has_data and not isinstance(value, np.ndarray | np.generic)
 
 
+def one_each(what: str, values: NDArray[Any], count: int) -> NDArray[Any]:
+    """Return one value for each of `count` environments, (N,).
+
+    Raises:
+        SpaceError: There is another number of values.
+    """
+    if values.shape == (count,):
+        return values
+    if values.size != count:
+        cure = "; combine several rewards with a wrapper" if what == "reward" else ""
+        raise SpaceError(
+            f"each environment must have one {what}, but those of {count} environments have shape"
+            f" {values.shape}{cure}"
+        )
+    return values.reshape(count)
+
+
 def final_observation(
     infos: Mapping[str, Any], number: int, count: int, space: spaces.Space[Any]
 ) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.vector import AutoresetMode
 
 from mcaprl.errors import UsageError
 
@@ -42,6 +43,23 @@ def check_vector(env: Any) -> None:
     raise UsageError(
         f"RecordVecMcap wraps vector environments; RecordMcap wraps single ones{advice}"
     )
+
+
+def autoreset_mode(env: gym.vector.VectorEnv[Any, Any, Any]) -> AutoresetMode:
+    """Return the autoreset mode that a vector environment declares.
+
+    Raises:
+        UsageError: It declares none.
+    """
+    declared = env.metadata.get("autoreset_mode")
+    try:
+        return AutoresetMode(declared)
+    except ValueError:
+        known = ", ".join(mode.value for mode in AutoresetMode)
+        raise UsageError(
+            f"metadata['autoreset_mode'] of {env} is {declared!r}, expected one of {known}:"
+            " set it to the way in which the environment resets itself"
+        ) from None
 
 
 def _is_batch(env: gym.Env[Any, Any]) -> bool:

@@ -114,3 +114,19 @@ def info_of(infos: Any, number: int, count: int) -> dict[str, Any]:
         elif isinstance(value, np.ndarray | list | tuple):
             found[name] = value[number] if np.shape(value)[:1] == (count,) else value
     return found
+
+
+def final_info(infos: dict[str, Any]) -> Any:
+    """Return the infos of the episodes that ended in same-step mode."""
+    found = infos.get("final_info")
+    return {} if found is None else found
+
+
+def info_reason(infos: Any, number: int) -> Any:
+    """Return the reason in the infos of one environment; None if there is none."""
+    if not isinstance(infos, Mapping):
+        # Some vector environments return one dict for each environment.
+        one = infos[number] if isinstance(infos, np.ndarray | list | tuple) else None
+        return one.get("reason") if isinstance(one, Mapping) else None
+    found = infos.get("reason")
+    return found[number] if isinstance(found, np.ndarray | list | tuple) else None

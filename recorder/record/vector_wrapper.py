@@ -10,7 +10,7 @@ No scene is recorded. To get a scene, replay the seeds and actions in a single e
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,7 +20,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from mcaprl.errors import SpaceError, UsageError
+from mcaprl.errors import SpaceError
 from mcaprl.recorder.format.episode_summary import INTERRUPTED, EpisodeSummary
 from mcaprl.recorder.format.info_topics import InfoTopics
 from mcaprl.recorder.format.metadata import LogMetadata
@@ -28,10 +28,15 @@ from mcaprl.recorder.format.probability import check_probability, is_impossible
 from mcaprl.recorder.format.rows import TopicRows
 from mcaprl.recorder.format.spaces import action_leaf
 from mcaprl.recorder.format.writing import HoldSignals
-from mcaprl.recorder.record.array_types import as_array, as_arrays, final_observation
+from mcaprl.recorder.record.array_types import (
+    as_array,
+    as_arrays,
+    final_observation,
+    one_each,
+)
 from mcaprl.recorder.record.display import Display
-from mcaprl.recorder.record.env_types import check_vector
-from mcaprl.recorder.record.infos import EpisodeInfos, info_of
+from mcaprl.recorder.record.env_types import autoreset_mode, check_vector
+from mcaprl.recorder.record.infos import EpisodeInfos, final_info, info_of, info_reason
 from mcaprl.recorder.record.recorded_space import recorded_space
 from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
 from mcaprl.recorder.record.step_rows import converter, converters
@@ -125,7 +130,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         recorded = recorded_space(env.single_observation_space, keys)
         action_leaf(env.single_action_space)
         super().__init__(env)
-        self._autoreset = _autoreset_mode(env)
+        self._autoreset = autoreset_mode(env)
         self.policy, self.epsilon, self.policy_version = policy, epsilon, policy_version
         self.behavior_probs: Any = math.nan
         description = LogMetadata.of_env(
@@ -242,10 +247,10 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             observations, rewards, terminated, truncated, infos = transition
             if not (type(rewards) is type(terminated) is type(truncated) is np.ndarray):
                 rewards, terminated, truncated = map(as_array, (rewards, terminated, truncated))
-            rewards_64 = self._one_each("reward", rewards).astype(np.float64, copy=False)
+            rewards_64 = one_each("reward", rewards, self.num_envs).astype(np.float64, copy=False)
             self._columns.put("reward", self._now.row, rewards_64)
             values = [convert(observations) for convert in self._converters]
-            over = self._one_each("end flag", np.logical_or(terminated, truncated))
+            over = one_each("end flag", np.logical_or(terminated, truncated), self.num_envs)
             ended = self._running & over
             if self._infos:
                 infos = as_arrays(infos)
@@ -281,22 +286,6 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             if not self._recording.closed:
                 self._interrupt(self._every)
                 self._recording.close()
-
-    def _one_each(self, what: str, values: NDArray[Any]) -> NDArray[Any]:
-        """Return one value for each environment, (N,).
-
-        Raises:
-            SpaceError: There is another number of values.
-        """
-        if values.shape == self._running.shape:
-            return values
-        if values.size != self.num_envs:
-            cure = "; combine several rewards with a wrapper" if what == "reward" else ""
-            raise SpaceError(
-                f"each environment must have one {what}, but those of {self.num_envs} environments"
-                f" have shape {values.shape}{cure}"
-            )
-        return values.reshape(self.num_envs)
 
     def _act(self, actions: Any) -> None:
         """Store the actions before the environments can change them."""
@@ -360,7 +349,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         same_step = self._autoreset is AutoresetMode.SAME_STEP
         for number in np.flatnonzero(self._running).tolist():
             is_final = same_step and ended[number]
-            source = _final_info(infos) if is_final else infos
+            source = final_info(infos) if is_final else infos
             step = self._now.row + 1 - int(self._first[number])
             self._infos[number].add(step, info_of(source, number, self.num_envs))
 
@@ -389,7 +378,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         In same-step mode, also begin their next episodes.
         """
         same_step = self._autoreset is AutoresetMode.SAME_STEP
-        infos_of_ended = _final_info(infos) if same_step else infos
+        infos_of_ended = final_info(infos) if same_step else infos
         ended: list[_Ended] = []
         try:
             for number in numbers.tolist():
@@ -397,7 +386,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
                     final = self._final_observation(infos, number)
                     self._put(self._now.row, final, number)
                 is_terminal = bool(terminated[number])
-                reason = reason_of(_reason(infos_of_ended, number), is_terminal)
+                reason = reason_of(info_reason(infos_of_ended, number), is_terminal)
                 ended.append(_Ended(number, is_terminal, bool(truncated[number]), reason))
         finally:
             self._end(ended)
@@ -497,30 +486,3 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
 
 # Reprs and pickles contain this public import path.
 RecordVecMcap.__module__ = "mcaprl"
-
-
-def _autoreset_mode(env: gym.vector.VectorEnv[Any, Any, Any]) -> AutoresetMode:
-    declared = env.metadata.get("autoreset_mode")
-    try:
-        return AutoresetMode(declared)
-    except ValueError:
-        known = ", ".join(mode.value for mode in AutoresetMode)
-        raise UsageError(
-            f"metadata['autoreset_mode'] of {env} is {declared!r}, expected one of {known}:"
-            " set it to the way in which the environment resets itself"
-        ) from None
-
-
-def _final_info(infos: dict[str, Any]) -> Any:
-    """Return the infos of the episodes that ended in same-step mode."""
-    return infos.get("final_info", {})
-
-
-def _reason(infos: Any, number: int) -> Any:
-    """Return the reason in the infos of one environment; None if there is none."""
-    if not isinstance(infos, Mapping):
-        # Some vector environments return one dict for each environment.
-        one = infos[number] if isinstance(infos, np.ndarray | list | tuple) else None
-        return one.get("reason") if isinstance(one, Mapping) else None
-    found = infos.get("reason")
-    return found[number] if isinstance(found, np.ndarray | list | tuple) else None

@@ -283,6 +283,18 @@ def test_other_numbers_of_rewards_are_refused(
         recorder.step(np.array([0, 1]))
 
 
+def test_the_last_infos_may_be_missing(log_path: Path) -> None:
+    envs = SyncVectorEnv(
+        [lambda: Wanderer(VECTOR, [99], 1)] * 2, autoreset_mode=AutoresetMode.SAME_STEP
+    )
+    last = {"final_obs": np.ones((2, 3), np.float32), "final_info": None}
+    flagged = Flags(envs, np.ones(2), np.array([True, True]), last)
+    with closing(mcaprl.RecordVecMcap(flagged, log_path, infos=True)) as recorder:
+        recorder.reset(seed=0)
+        recorder.step(np.array([0, 1]))
+    assert [one.reason for one in mcaprl.open(log_path).episodes] == ["terminated"] * 2
+
+
 def test_infos_may_be_tensors_or_one_dict_for_each_environment(log_path: Path) -> None:
     infos = {"speed": torch.tensor([1.5, 2.5]).as_subclass(Gpu), "_speed": torch.tensor([1, 0])}
     with closing(two(log_path, np.ones(2), np.array([True, True]), infos, infos=True)) as recorder:
