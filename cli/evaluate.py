@@ -15,9 +15,12 @@ from mcaprl.cli.help import Command
 from mcaprl.cli.options import (
     integer_option,
     json_option,
+    keys_option,
     mapping_options,
+    max_steps_option,
     ray_options,
     sim_options,
+    trust_run_option,
 )
 from mcaprl.cli.progress import keeping, working
 from mcaprl.cli.show import echo, print_json, print_table
@@ -59,6 +62,7 @@ _OF_DATA = (
     type=click.IntRange(1),
     help="Number of episodes for each policy and training seed.  [default: 30]",
 )
+@max_steps_option
 @integer_option(
     "--seed",
     "Seed of the episodes; with --data, seed of the model and of the resampling.",
@@ -66,6 +70,7 @@ _OF_DATA = (
     default=1_000_000,
 )
 @sim_options
+@trust_run_option
 @click.option("--gamma", type=click.FloatRange(0, 1), help="With --data: discount. [default: 0.97]")
 @click.option(
     "--epsilon",
@@ -91,6 +96,7 @@ _OF_DATA = (
 @mapping_options
 @click.option("--behavior", metavar="DATA", help="Logs whose returns are shown for comparison.")
 @click.option("--record", type=click.Path(path_type=Path), help="Log to write.")
+@keys_option
 @click.option("--report", type=click.Path(path_type=Path), help="Output folder of the HTML report.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing log.")
 @ray_options
@@ -138,7 +144,8 @@ def evaluate(
 def _refuse_unused(given: dict[str, Any], names: Sequence[str], needed: str) -> None:
     for name in names:
         if name in given:
-            raise UsageError(f"{flag(name)} requires --{needed}")
+            shown = "--env-arg" if name == "sim_options" else flag(name)
+            raise UsageError(f"{shown} requires --{needed}")
 
 
 def _print_scores(found: Evaluation) -> None:

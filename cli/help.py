@@ -77,15 +77,23 @@ _BAGS: Final[dict[str, tuple[str, ...]]] = {
 _RAY: Final[dict[str, tuple[str, ...]]] = {"Ray cluster": ("ray", "workers", "address")}
 OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "record": {
-        "Policy and length": ("policy", "epsilon", "episodes", "steps", "seed", "envs"),
-        "Sim": ("observation", "rules"),
-        "Log": ("out", "no_scene", "camera", "infos", "compression"),
+        "Policy and length": (
+            "policy",
+            "epsilon",
+            "episodes",
+            "steps",
+            "max_steps",
+            "seed",
+            "envs",
+        ),
+        "Sim": ("observation", "rules", "sim_options", "trust_env"),
+        "Log": ("out", "no_scene", "camera", "infos", "keys", "compression"),
         "Files": ("overwrite", "append", "rotate_mb", "upload"),
         "Ray cluster": ("ray", "workers", "address", "shards"),
     },
     "train-online": {
         "Run": ("out", "algo", "preset", "seeds", "seed", "threads", "device", "sources", "resume"),
-        "Sim": ("observation", "rules"),
+        "Sim": ("observation", "rules", "sim_options", "max_steps"),
         "Log": ("record", "upload"),
         "Live view": ("live", "live_speed", "port", "allow_origin"),
     },
@@ -96,7 +104,17 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         **_BAGS,
     },
     "evaluate": {
-        "Episodes in a sim": ("sim", "episodes", "seed", "observation", "rules", "behavior"),
+        "Episodes in a sim": (
+            "sim",
+            "episodes",
+            "max_steps",
+            "seed",
+            "observation",
+            "rules",
+            "sim_options",
+            "trust_env",
+            "behavior",
+        ),
         "Estimates from logs": (
             "data",
             "gamma",
@@ -105,7 +123,7 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
             "estimate_behavior",
             "threads",
         ),
-        "Output with --sim": ("record", "report", "overwrite"),
+        "Output with --sim": ("record", "keys", "report", "overwrite"),
         "Output": ("as_json",),
         **_BAGS,
         **_RAY,
@@ -114,13 +132,13 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "check": _BAGS,
     "annotate": {
         "Values": ("policy", "gamma"),
-        "Scene": ("scene", "camera", "sim", "trust_env"),
+        "Scene": ("scene", "camera", "sim", "sim_options", "trust_env"),
         "Output": ("out", "overwrite"),
         **_BAGS,
     },
     "replay": {
         "Playback": ("browser", "episode", "speed", "loop", "port", "allow_origin"),
-        "Comparison with the sim": ("verifies", "sim", "trust_env"),
+        "Comparison with the sim": ("verifies", "sim", "sim_options", "trust_env"),
         "Page, video and image": ("save", "video", "contact_sheet", "height", "overwrite"),
     },
     "convert": {

@@ -13,7 +13,15 @@ from mcaprl.api.bags import RECORDING_COLUMNS, TOPIC_COLUMNS, BagInfo
 from mcaprl.cli.completion import Name, sims
 from mcaprl.cli.exit_codes import WITH_LOSSES
 from mcaprl.cli.help import Command
-from mcaprl.cli.options import PATH, integer_option, json_option, mapping_options, trust_option
+from mcaprl.cli.options import (
+    PATH,
+    env_arg_option,
+    integer_option,
+    json_option,
+    keys_option,
+    mapping_options,
+    trust_option,
+)
 from mcaprl.cli.progress import hint, working
 from mcaprl.cli.show import echo, print_facts, print_json, print_problems, print_table
 from mcaprl.page import PAGE_NAME
@@ -123,11 +131,14 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
     type=click.Path(path_type=Path),
     help="JSON file to write; - for the standard output.",
 )
+@env_arg_option
+@keys_option
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-def layout(source: str, out: Path, overwrite: bool) -> None:
+def layout(source: str, out: Path, **request: Any) -> None:
     """Write the Foxglove layout of a log, or of the logs of a sim."""
     with working("reading the topics"):
-        found = mcaprl.layout(source, None if str(out) == "-" else out, overwrite=overwrite)
+        target = None if str(out) == "-" else out
+        found = mcaprl.layout(source, target, **request)
     if str(out) == "-":
         print_json(found)
         return
@@ -142,6 +153,7 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
 @click.option("--scene", is_flag=True, help="Step the sim again and add its scene.")
 @click.option("--camera", is_flag=True, help="With --scene: add metric depth images.")
 @click.option("--sim", type=Name(sims), help="With --scene: sim to step instead of the logged one.")
+@env_arg_option
 @trust_option
 @mapping_options
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="File to write.")

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
 import click
 
 from mcaprl.cli.completion import Name
+from mcaprl.errors import UsageError
+from mcaprl.files import parse_json
 
 PATH: Final = Name(tuple, is_path=True)
 """Type of a path, a glob or a URL."""
+_CONSTANTS: Final = {"True": True, "False": False, "None": None}
 F = TypeVar("F", bound=Callable[..., Any])
 
 trust_option = click.option(
@@ -72,7 +75,72 @@ def sim_options(command: F) -> F:
     """Add the options that select the variant of a sim."""
     text = "Observation that the sim returns: state, depth, ..."
     rules = click.option("--rules", help="Rules of the sim: default, classic, ...")
-    return click.option("--observation", help=text)(rules(command))
+    return click.option("--observation", help=text)(rules(env_arg_option(command)))
+
+
+def env_arguments(texts: Iterable[str]) -> dict[str, Any] | None:
+    """Parse KEY=VALUE texts; VALUE is JSON, or else a text. Return None if there are no texts.
+
+    >>> env_arguments(["continuous=false", "map_name=8x8", 'config={"lanes": 2}'])
+    {'continuous': False, 'map_name': '8x8', 'config': {'lanes': 2}}
+
+    Raises:
+        UsageError: A text has another form, or a key is given twice.
+    """
+    found: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not (equals and key.isidentifier()):
+            raise UsageError(f"--env-arg {text}: expected KEY=VALUE, such as continuous=false")
+        if key in found:
+            raise UsageError(f"--env-arg {key} is given twice: pass it once")
+        try:
+            # Python's names of constants would be true texts.
+            found[key] = _CONSTANTS[value] if value in _CONSTANTS else parse_json(value)
+        except ValueError as error:
+            if value.startswith(("{", "[", '"')):
+                raise UsageError(f"--env-arg {key}: {value!r:.60} is not JSON: {error}") from error
+            found[key] = value
+    return found or None
+
+
+def _parsed(_: click.Context, __: click.Parameter, texts: Iterable[str]) -> dict[str, Any] | None:
+    return env_arguments(texts)
+
+
+env_arg_option = click.option(
+    "--env-arg",
+    "sim_options",
+    multiple=True,
+    metavar="KEY=VALUE",
+    callback=_parsed,
+    help="Argument of the environment, such as continuous=false; VALUE is JSON or a text. May be"
+    " repeated.",
+)
+trust_run_option = click.option(
+    "--trust-env",
+    is_flag=True,
+    help="Trust the run: use the arguments of its training in environments other than the sims.",
+)
+
+
+def _keys(_: click.Context, __: click.Parameter, text: str | None) -> list[str] | None:
+    return None if text is None else text.split(",")
+
+
+keys_option = click.option(
+    "--keys",
+    metavar="KEY,...",
+    callback=_keys,
+    help="Keys of a Dict or Tuple observation to record, such as image,direction.  [default: all]",
+)
+
+
+max_steps_option = click.option(
+    "--max-steps",
+    type=click.IntRange(1),
+    help="Steps after which an episode is truncated.  [default: 27000 if SIM has no time limit]",
+)
 
 
 def integer_option(

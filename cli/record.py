@@ -11,7 +11,14 @@ import click
 import mcaprl
 from mcaprl.cli.completion import Name, policies, sims
 from mcaprl.cli.help import Command
-from mcaprl.cli.options import integer_option, ray_options, sim_options
+from mcaprl.cli.options import (
+    integer_option,
+    keys_option,
+    max_steps_option,
+    ray_options,
+    sim_options,
+    trust_run_option,
+)
 from mcaprl.cli.progress import keeping, working
 from mcaprl.cli.show import echo
 from mcaprl.texts import counted, size
@@ -46,6 +53,7 @@ def _compressions() -> Iterable[str]:
     type=click.IntRange(1),
     help="Number of steps to record, instead of a number of episodes.",
 )
+@max_steps_option
 @integer_option("--seed", "Seed of the recording.", least=0)
 @integer_option(
     "--envs",
@@ -53,9 +61,11 @@ def _compressions() -> Iterable[str]:
     least=1,
 )
 @sim_options
+@trust_run_option
 @click.option("--no-scene", is_flag=True, help="Omit the topics that only viewers use.")
 @click.option("--camera", is_flag=True, help="Record metric depth images on /camera/depth.")
 @click.option("--infos", is_flag=True, help="Record the info dicts that the environment returns.")
+@keys_option
 @click.option(
     "--compression",
     default="zstd",

@@ -12,7 +12,7 @@ import click
 import mcaprl
 from mcaprl.cli.completion import Name, sims
 from mcaprl.cli.help import Command
-from mcaprl.cli.options import PATH, origin_option, trust_option
+from mcaprl.cli.options import PATH, env_arg_option, origin_option, trust_option
 from mcaprl.cli.progress import hint, working
 from mcaprl.cli.show import echo, print_address, print_problems
 from mcaprl.errors import UsageError
@@ -56,6 +56,7 @@ if TYPE_CHECKING:
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing page, video or image.")
 @click.option("--sim", type=Name(sims), help="Sim to step instead of the logged one.")
+@env_arg_option
 @trust_option
 def replay(
     files: tuple[str, ...],
@@ -68,6 +69,7 @@ def replay(
     save: Path | None,
     verifies: bool,
     sim: str | None,
+    sim_options: dict[str, Any] | None,
     trust_env: bool,
     video: Path | None,
     contact_sheet: Path | None,
@@ -89,8 +91,9 @@ def replay(
         from mcaprl.recorder.dataset.open import find_logs
 
         paths = find_logs(files)
+    stepped: dict[str, Any] = {"sim": sim, "trust_env": trust_env, "sim_options": sim_options}
     if verifies:
-        same = [_verify(path, episode, sim, trust_env) for path in paths]
+        same = [_verify(path, episode, stepped) for path in paths]
         return int(not all(same))
     if (browser or save or draws) and len(paths) > 1:
         raise UsageError("a page or video shows one log: run replay once for each log")
@@ -100,8 +103,7 @@ def replay(
             length = mcaprl.save_page(paths[0], save, loop=loop, **chosen)
         echo(f"{save}: episode {chosen['episode']}, {size(length)}")
     if draws:
-        chosen |= {"height": height, "sim": sim, "trust_env": trust_env}
-        _render(paths[0], video, contact_sheet, **chosen)
+        _render(paths[0], video, contact_sheet, height=height, **chosen, **stepped)
     if save is not None or draws:
         return 0
     served: dict[str, Any] = {"speed": speed, "loop": loop}
@@ -154,10 +156,10 @@ def _print_open(address: LiveAddress) -> None:
     hint("press Ctrl-C to stop")
 
 
-def _verify(path: Path, episode: int | None, sim: str | None, trust_env: bool) -> bool:
+def _verify(path: Path, episode: int | None, stepped: dict[str, Any]) -> bool:
     """Compare one file with the sim, print the result, and return whether all steps match."""
     with working("reading the log") as bar:
-        found = mcaprl.verify(path, episode=episode, sim=sim, trust_env=trust_env, progress=bar)
+        found = mcaprl.verify(path, episode=episode, progress=bar, **stepped)
     print_problems(found.problems(str(path)))
     if found.difference is None and found.episodes:
         echo(

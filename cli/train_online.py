@@ -89,6 +89,12 @@ def _tuned() -> dict[str, dict[str, Any]]:
     " cpu. For double-dqn in lane and racer, with other default settings; the last policy is saved."
     " Without it, Stable-Baselines3 trains one seed after the other.",
 )
+@click.option(
+    "--max-steps",
+    type=click.IntRange(1),
+    help="Steps after which an episode is truncated.  [default: no limit; in evaluations, 27000 if"
+    " SIM has no time limit]",
+)
 @sim_options
 def train_online(sim: str | None, out: Path, **request: Any) -> None:
     """Train a policy in SIM: lane, powerline, racer, highway-lane, or any Gymnasium id.

@@ -98,7 +98,9 @@ class Agent:
             self._watched = live.watch(recorder or batch) if live is not None else None
             recorded_env = self._watched or recorder or batch
             env = stack.enter_context(closing(BatchedVecEnv(recorded_env)))
-            self._evaluated = FirstEpisodes(task.batch(task.config.eval_episodes), env_id)
+            self._evaluated = FirstEpisodes(
+                task.evaluation_batch(task.config.eval_episodes), env_id
+            )
             eval_env = stack.enter_context(closing(BatchedVecEnv(self._evaluated)))
             self._eval_env = _stacked(eval_env, task.config.frame_stack)
             stacked = _stacked(env, task.config.frame_stack)

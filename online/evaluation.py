@@ -6,6 +6,7 @@ Scores are scaled so that random actions have the score 0 and the sim's pilot ha
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import ConvertCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from mcaprl.ends import STEP_LIMIT
 from mcaprl.online.curves import CurvePoint
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.vector_wrapper import VectorWrapper
@@ -82,6 +84,8 @@ class Evaluation(EvalCallback):
         self._returns: list[float] = []
         self._lengths: list[int] = []
         self._progress_m: list[float] = []
+        self._cuts = 0
+        self._has_warned = False
 
     def resume(self, calls: int, best_mean_return: float) -> None:
         """Resume after `calls` steps of the training batch, with the best mean return so far."""
@@ -92,6 +96,7 @@ class Evaluation(EvalCallback):
             return True
         self.eval_env.seed(SELECTION_SEED)
         self._returns, self._lengths, self._progress_m = [], [], []
+        self._cuts = 0
         best_before = self.best_mean_reward
         going_on = super()._on_step()
         point = CurvePoint(
@@ -105,6 +110,14 @@ class Evaluation(EvalCallback):
             best=self.best_mean_reward > best_before,
         )
         self._on_point(point)
+        if self._cuts and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                f"{self._cuts} of {len(self._lengths)} episodes of the evaluation at step"
+                f" {self.num_timesteps} reached the limit of {max(self._lengths)} steps and were"
+                " truncated; set another limit with --max-steps (max_steps in Python)",
+                stacklevel=2,
+            )
         return going_on
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
@@ -115,6 +128,7 @@ class Evaluation(EvalCallback):
             self._returns.append(episode["r"])
             self._lengths.append(episode["l"])
             self._progress_m.append(locals_["info"].get("progress_m", math.nan))
+            self._cuts += locals_["info"].get("reason") == STEP_LIMIT
 
 
 class _Step(NamedTuple):

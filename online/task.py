@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from gymnasium import Env
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from mcaprl.errors import TrainingError, UsageError
@@ -16,8 +17,10 @@ from mcaprl.online.presets import find_preset, settings_for
 from mcaprl.runs import CONFIG_NAME, RunIdentity, check_kind, read_config, run_to_resume
 from mcaprl.settings import check_settings, settings_from_json
 from mcaprl.sims import make_sims
+from mcaprl.sims.evaluation.limits import make_limited, make_limited_sims
 
 DEFAULT_ALGO = "double-dqn"
+_MODE = AutoresetMode.SAME_STEP.value
 
 
 @dataclass(frozen=True)
@@ -29,12 +32,16 @@ class Task:
         config: Settings of the algorithm.
         sim: Short name or Gymnasium id.
         sim_options: Arguments of the environment.
+        max_steps: Steps after which an episode is truncated, in training and evaluation. None
+            selects the environment's own limit; evaluations of environments without one then have
+            the limit of `mcaprl.sims.evaluation.limits`.
     """
 
     algo: str
     config: OnlineConfig
     sim: str
     sim_options: dict[str, Any]
+    max_steps: int | None = None
 
     @classmethod
     def for_sim(
@@ -93,9 +100,10 @@ class Task:
             )
         try:
             earlier = settings_from_json(found["config"])
-            return cls._checked(
+            task = cls._checked(
                 found["algo"], found["sim"], dict(found["sim_options"]), earlier, settings
             )
+            return replace(task, max_steps=found.get("max_steps"))
         except (KeyError, TypeError) as error:
             raise TrainingError(
                 f"{folder / CONFIG_NAME} does not belong to an online run: {error}"
@@ -116,14 +124,26 @@ class Task:
 
     def batch(self, count: int) -> VectorEnv[Any, Any, Any]:
         """Create a batch of environments, each reset in the step that ends its episode."""
-        mode = AutoresetMode.SAME_STEP.value
-        return make_sims(self.sim, count, autoreset_mode=mode, **self.sim_options)
+        if self.max_steps is not None:
+            return self.evaluation_batch(count)
+        return make_sims(self.sim, count, autoreset_mode=_MODE, **self.sim_options)
+
+    def evaluation_batch(self, count: int) -> VectorEnv[Any, Any, Any]:
+        """Create a batch like `batch`, in which each episode ends."""
+        options = {"autoreset_mode": _MODE, **self.sim_options}
+        return make_limited_sims(self.sim, count, self.max_steps, **options)
+
+    def evaluation_env(self) -> Env[Any, Any]:
+        """Create an environment in which each episode ends."""
+        return make_limited(self.sim, self.max_steps, **self.sim_options)
 
     @property
     def identity(self) -> RunIdentity:
         """Settings of this task that must not change when a run is resumed."""
         parts = {"algo": self.algo, "sim": self.sim, "sim_options": self.sim_options}
-        return RunIdentity({**parts, "config": self.config.to_json()})
+        # Runs of earlier versions have no limit in their files.
+        limit = {} if self.max_steps is None else {"max_steps": self.max_steps}
+        return RunIdentity({**parts, **limit, "config": self.config.to_json()})
 
 
 def choose_task(
@@ -133,6 +153,7 @@ def choose_task(
     given: Mapping[str, Any],
     *,
     preset: str | None = None,
+    max_steps: int | None = None,
     resumed: Path | None = None,
 ) -> Task:
     """Return the task that the arguments of a command line describe.
@@ -144,6 +165,7 @@ def choose_task(
         sim_options: Arguments of the environment.
         given: Settings of the algorithm.
         preset: Name of published settings.
+        max_steps: Limit on the steps of an episode; None selects that of the run, else no limit.
         resumed: Folder of a run to resume; None for a new run.
 
     Raises:
@@ -154,7 +176,8 @@ def choose_task(
     if resumed is not None and run_to_resume(resumed):
         task = Task.of_run(resumed, **given)
         options = {**task.sim_options, **sim_options}
-        task = Task(algo or task.algo, task.config, sim or task.sim, options)
+        limit = max_steps or task.max_steps
+        task = Task(algo or task.algo, task.config, sim or task.sim, options, limit)
         task.identity.check_same(read_config(resumed), resumed / CONFIG_NAME)
         return task
     if preset is not None:
@@ -162,7 +185,7 @@ def choose_task(
         for name, value, own in (("SIM", sim, task.sim), ("--algo", algo, task.algo)):
             if value not in (None, own):
                 raise UsageError(f"preset {preset} sets {name} to {own}: omit {name} {value}")
-        return task
+        return replace(task, max_steps=max_steps)
     if sim is None:
         raise UsageError("train-online needs a SIM, such as lane, or a --preset")
-    return Task.for_sim(sim, algo, sim_options, **given)
+    return replace(Task.for_sim(sim, algo, sim_options, **given), max_steps=max_steps)

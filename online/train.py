@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
 from contextlib import closing, nullcontext
@@ -43,8 +44,8 @@ from mcaprl.runs import (
     seed_folder,
     writing,
 )
-from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.evaluate import Scale, evaluate
+from mcaprl.sims.evaluation.limits import warn_of_cuts
 
 _SEEDS = 2**32
 """Number of seeds that Stable-Baselines3 accepts."""
@@ -120,7 +121,7 @@ def train(
         check_log_name(record)
     logs = log_paths(Path(record), numbers, resume) if record is not None else {}
     config = task.config
-    with locked_run(folder, resume), closing(make_sim(task.sim, **task.sim_options)) as env:
+    with locked_run(folder, resume), closing(task.evaluation_env()) as env:
         check_spaces(task.algo, env.observation_space, env.action_space)
         run = _Run(folder, task, env, logs, data, policy, live, numbers)
         run.open(resume)
@@ -184,6 +185,7 @@ class _Run:
             episodes=self.task.config.final_episodes,
             seed=FRESH_SEED,
         )
+        warn_of_cuts(itertools.chain(*score.results), str(folder), self.task.sim)
         return OnlineSummary(
             folder=folder,
             algo=self.task.algo,

@@ -13,12 +13,12 @@ import contextlib
 import importlib
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
 
-from mcaprl.errors import UnknownNameError, UsageError, import_extra
+from mcaprl.errors import McaprlError, UnknownNameError, UsageError, import_extra
 from mcaprl.lazy import lazy_attributes
 from mcaprl.sims import highway, lane, powerline, racer
 from mcaprl.sims.spec import SimCatalog, SimSpec
@@ -61,7 +61,12 @@ def make_sim(name: str, /, **kwargs: Any) -> gym.Env[Any, Any]:
 
 
 def make_sims(
-    name: str, num_envs: int, *, autoreset_mode: str = "NextStep", **kwargs: Any
+    name: str,
+    num_envs: int,
+    *,
+    autoreset_mode: str = "NextStep",
+    wrappers: Sequence[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]] = (),
+    **kwargs: Any,
 ) -> gym.vector.VectorEnv[Any, Any, Any]:
     """Make environments that are stepped together in this process.
 
@@ -73,6 +78,8 @@ def make_sims(
         num_envs: Number of environments.
         autoreset_mode: `NextStep`, `SameStep` or `Disabled`; see
             `gymnasium.vector.AutoresetMode`.
+        wrappers: Wrappers of each environment, the innermost first. With wrappers, environments are
+            stepped one after the other.
         **kwargs: As in `make_sim`.
 
     Raises:
@@ -83,10 +90,13 @@ def make_sims(
         raise UnknownNameError("autoreset_mode", autoreset_mode, modes)
     env_id, spec = _resolve(name)
     with _clear_errors(name, spec, kwargs):
-        if spec is not None and spec.vector_entry_point:
+        if spec is not None and spec.vector_entry_point and not wrappers:
             return gym.make_vec(env_id, num_envs, autoreset_mode=autoreset_mode, **kwargs)
         options = {"autoreset_mode": autoreset_mode}
-        envs = gym.make_vec(env_id, num_envs, "sync", vector_kwargs=options, **kwargs)
+        wraps: Any = list(wrappers)
+        envs = gym.make_vec(
+            env_id, num_envs, "sync", vector_kwargs=options, wrappers=wraps, **kwargs
+        )
     _set_module(getattr(envs.unwrapped, "envs", ()), env_id)
     return envs
 
@@ -155,12 +165,17 @@ def _clear_errors(name: str, spec: SimSpec | None, kwargs: dict[str, Any]) -> It
     except gym.error.UnregisteredEnv as error:
         known = [*SIMS, "any Gymnasium id"]
         raise UnknownNameError("sim", name, known, gym.registry) from error
-    except (TypeError, ValueError, gym.error.Error, ModuleNotFoundError) as error:
+    except (McaprlError, OSError):
+        raise
+    # An environment may raise any exception, for example for an argument with a wrong type.
+    except Exception as error:
         given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
         reason = str(error).split(" was raised from the environment creator")[0]
         unknown = re.search(r"unexpected keyword argument '(\w+)'", reason)
         if unknown and unknown[1] in kwargs:
             raise UsageError(f"sim '{name}' has no argument {unknown[1]}: omit it") from error
+        if not isinstance(error, TypeError | ValueError | gym.error.Error | ModuleNotFoundError):
+            reason = f"{type(error).__name__}: {reason}"
         raise UsageError(f"cannot make sim '{name}' with {given}: {reason}") from error
 
 

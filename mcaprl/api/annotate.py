@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,6 +51,7 @@ def annotate(
     camera: bool = False,
     sim: str | None = None,
     trust_env: bool = False,
+    sim_options: Mapping[str, Any] | None = None,
     overwrite: bool = False,
     mapping: MappingFile | None = None,
     trust_code: bool = False,
@@ -70,6 +72,7 @@ def annotate(
         sim: Short name or Gymnasium id to use instead of the logged one.
         trust_env: Whether to import the module that the logged id names, and to pass the logged
             arguments to environments other than the sims of `SIMS`.
+        sim_options: With `scene`, arguments of the environment that replace the logged ones.
         overwrite: Whether an existing file is replaced.
         mapping: Mapping that describes a bag; see `open`.
         trust_code: Whether the mapping may name a Python function.
@@ -107,7 +110,8 @@ def annotate(
         for name, topic in topics.items():
             copy.add_values(topic, _values(dataset, name, gamma, progress))
         if scene:
-            with closing(sim_of(dataset, path, sim, trust_env=trust_env)) as env:
+            trust: Any = {"trust_env": trust_env, "sim_options": sim_options}
+            with closing(sim_of(dataset, path, sim, **trust)) as env:
                 added = copy.add_scene(dataset, env, camera=camera)
     return Annotation(Path(out), len(dataset), topics, added)
 

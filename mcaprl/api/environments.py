@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 
+from mcaprl.api.policies import SCRIPTED, load_policies
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.format.metadata import as_json, same_env
 from mcaprl.sims import SIMS, make_sim
+from mcaprl.sims.evaluation.rollout import as_options
 from mcaprl.texts import shortened
 
 _MAX_SHOWN = 200
@@ -21,11 +26,59 @@ def all_options(
 ) -> dict[str, Any]:
     """Return the arguments of a sim, except arguments that are None.
 
+    Raises:
+        UsageError: An argument is given twice.
+
     >>> all_options("depth", None, {"road": "racetrack-v0"})
     {'observation': 'depth', 'road': 'racetrack-v0'}
     """
     named = {"observation": observation, "rules": rules}
-    return {name: value for name, value in named.items() if value is not None} | dict(others or {})
+    given = {name: value for name, value in named.items() if value is not None}
+    for name in given.keys() & (others or {}).keys():
+        raise UsageError(f"the argument {name} is given twice: pass it once")
+    return given | dict(others or {})
+
+
+def trained_options(
+    names: Iterable[str], sim: str, options: dict[str, Any], *, trust_env: bool
+) -> dict[str, Any]:
+    """Return the arguments of an environment in which policies act.
+
+    If no arguments are given, these are the arguments with which the policies were trained in the
+    same environment.
+
+    Args:
+        names: Names or paths of policies.
+        sim: Short name or Gymnasium id.
+        options: Given arguments.
+        trust_env: Whether the arguments in the files of policies may be passed to environments
+            other than the sims of `SIMS`. If not, a warning names the arguments.
+    """
+    paths = [Path(name) for name in names if name not in SCRIPTED and Path(name).exists()]
+    if options or not paths:
+        return options
+    found: dict[str, dict[str, Any]] = {}
+    for path in paths:
+        policy = load_policies(path)[0]
+        if policy.env_id and same_env(policy.env_id, SIMS.get(sim, sim)):
+            found[str(path)] = _special(policy.env_kwargs, sim, imports=True)
+    first = next(iter(found.values()), {})
+    if any(other != first for other in found.values()):
+        _warn(found, sim, "the policies were trained with different arguments: pass them")
+        return {}
+    if first and not trust_env and _needs_trust(sim):
+        _warn(found, sim, "to use the arguments of the run, pass --trust-env or the arguments")
+        return {}
+    return first
+
+
+def _warn(found: Mapping[str, dict[str, Any]], sim: str, advice: str) -> None:
+    name, arguments = next((name, one) for name, one in found.items() if one)
+    warnings.warn(
+        f"{name} was trained with {_shown(arguments)}, but {sim} is used with its defaults;"
+        f" {advice}, as {shortened(as_options(arguments), _MAX_SHOWN)}",
+        stacklevel=3,
+    )
 
 
 def sim_of(
@@ -34,7 +87,8 @@ def sim_of(
     sim: str | None = None,
     *,
     trust_env: bool = False,
-    **others: Any,
+    sim_options: Mapping[str, Any] | None = None,
+    render_mode: str | None = None,
 ) -> gym.Env[Any, Any]:
     """Make the environment in which a log was recorded.
 
@@ -44,36 +98,70 @@ def sim_of(
         sim: Short name or Gymnasium id to use instead of the logged one.
         trust_env: Whether to import the module that the logged id names, and to pass the logged
             arguments to environments other than sims of `SIMS`.
-        **others: Additional arguments of the environment.
+        sim_options: Arguments of the environment that replace the logged ones.
+        render_mode: Render mode of the environment.
 
     Raises:
-        UsageError: The log has no environment id, its environment needs `trust_env`, or the
-            environment cannot be made.
+        UsageError: The log has no environment id, its environment needs `trust_env`, an argument
+            was not stored, or the environment cannot be made.
     """
-    name = sim or dataset.env_id
+    name, given = sim or dataset.env_id, dict(sim_options or {})
     if not name:
         raise UsageError(f"{path} has no environment id: pass --sim")
-    if not trust_env:
-        _check_needs_no_trust(dataset, path, sim)
-    return make_sim(name, **{**dataset.env_kwargs, **others})
+    if sim is None and ":" in name and not trust_env:
+        module = name.partition(":")[0]
+        raise UsageError(
+            f"{path} names the environment {name}, so the module {module} would be imported: if you"
+            f" trust the log, pass --trust-env (trust_env=True in Python) or --sim {name}"
+        )
+    missing = [argument for argument in dataset.unstored_kwargs if argument not in given]
+    if missing:
+        raise UsageError(
+            f"{path} was recorded with arguments of {name} that are not stored, because they are"
+            f" not JSON: {', '.join(missing)}; pass them as sim_options in Python, or with"
+            " --env-arg"
+        )
+    logged = {key: value for key, value in dataset.env_kwargs.items() if key not in given}
+    logged = _special(logged, name, imports=trust_env or sim is not None)
+    if logged and not trust_env and _needs_trust(name):
+        raise UsageError(
+            f"{path} names arguments of {name}: {_shown(logged)}; if you trust the log, pass"
+            " --trust-env (trust_env=True in Python)"
+        )
+    others = {} if render_mode is None else {"render_mode": render_mode}
+    return make_sim(name, **{**logged, **given, **others})
 
 
-def _check_needs_no_trust(dataset: Dataset, path: Path, sim: str | None) -> None:
-    """Raise an error if making the environment of the log would need `trust_env`."""
-    if sim is None and ":" in dataset.env_id:
-        module = dataset.env_id.partition(":")[0]
-        raise UsageError(
-            f"{path} names the environment {dataset.env_id}, so the module {module} would be"
-            f" imported: if you trust the log, pass --trust-env (trust_env=True in Python) or --sim"
-            f" {dataset.env_id}"
-        )
-    name = sim or dataset.env_id
-    if dataset.env_kwargs and SIMS.find(SIMS.get(name, name), loads=":" not in name) is None:
-        arguments = ", ".join(f"{key}={value!r}" for key, value in dataset.env_kwargs.items())
-        raise UsageError(
-            f"{path} names arguments of {name}: {shortened(arguments, _MAX_SHOWN)}; if you trust"
-            " the log, pass --trust-env (trust_env=True in Python)"
-        )
+def _needs_trust(name: str) -> bool:
+    """Return whether arguments from a file may be passed to this environment only with trust."""
+    return SIMS.find(SIMS.get(name, name), loads=":" not in name) is None
+
+
+def _special(arguments: Mapping[str, Any], name: str, *, imports: bool) -> dict[str, Any]:
+    """Return the arguments that differ from the defaults with which an environment is registered.
+
+    Args:
+        arguments: Arguments of JSON types.
+        name: Short name or Gymnasium id.
+        imports: Whether to import the module in the id.
+    """
+    env_id = SIMS.get(name, name)
+    spec = gym.registry.get(env_id.rpartition(":")[2])
+    if spec is None and ":" in env_id and imports:
+        # `make_sim` reports an id that cannot be used.
+        with suppress(Exception):
+            spec = gym.spec(env_id)
+    found = dict(arguments)
+    for key, default in (spec.kwargs if spec else {}).items():
+        with suppress(ValueError):
+            if key in found and as_json(default) == found[key]:
+                del found[key]
+    return found
+
+
+def _shown(arguments: Mapping[str, Any]) -> str:
+    texts = (f"{key}={value!r}" for key, value in arguments.items())
+    return shortened(", ".join(texts), _MAX_SHOWN)
 
 
 def check_episode(dataset: Dataset, episode: int | None, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -13,7 +14,7 @@ from typing import Any
 import gymnasium as gym
 
 from mcaprl.api.cluster import ClusterOptions
-from mcaprl.api.environments import all_options
+from mcaprl.api.environments import all_options, trained_options
 from mcaprl.api.evaluate_parts import Part, results_on_ray
 from mcaprl.api.policies import SCRIPTED, Names, as_names, policies_of, policy_names
 from mcaprl.api.ranges import check_least
@@ -24,7 +25,7 @@ from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.open import find_logs, open_logs
 from mcaprl.recorder.format.metadata import same_env
 from mcaprl.recorder.record.wrapper import RecordMcap
-from mcaprl.sims import make_sim, make_sims
+from mcaprl.sims import make_sims
 from mcaprl.sims.evaluation.evaluate import (
     Improvement,
     PolicyScore,
@@ -34,6 +35,7 @@ from mcaprl.sims.evaluation.evaluate import (
     score_of,
 )
 from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
+from mcaprl.sims.evaluation.limits import StepLimit, make_limited, warn_of_cuts
 from mcaprl.sims.evaluation.pilots import has_pilot
 from mcaprl.sims.evaluation.rollout import Policy
 from mcaprl.sims.evaluation.statistics import mean_interval
@@ -95,12 +97,15 @@ def evaluate(
     sim: str,
     *,
     episodes: int = 30,
+    max_steps: int | None = None,
     seed: int = 1_000_000,
     observation: str | None = None,
     rules: str | None = None,
     sim_options: Mapping[str, Any] | None = None,
+    trust_env: bool = False,
     behavior: str | None = None,
     record: str | Path | None = None,
+    keys: Sequence[str] | None = None,
     report: str | Path | None = None,
     overwrite: bool = False,
     ray: bool = False,
@@ -117,12 +122,18 @@ def evaluate(
             a run is evaluated.
         sim: Short name of a sim, or a Gymnasium id.
         episodes: Number of episodes for each policy and training seed.
+        max_steps: Steps after which an episode is truncated, with the reason `step_limit`. None
+            selects 27,000 if the environment has no time limit.
         seed: Seed of the episodes.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
-        sim_options: Other arguments of the environment.
+        sim_options: Other arguments of the environment. Without any argument, the environment has
+            the arguments with which `policies` were trained in it.
+        trust_env: Whether the arguments of the training may be passed to environments other than
+            the sims of `SIMS`.
         behavior: Logs of the sim that the policies are compared with.
         record: Output log of the episodes of `policies`.
+        keys: Keys of the parts of a Dict or Tuple observation that `record` contains; default: all.
         report: Output folder of the HTML report, images and JSON.
         overwrite: Whether an existing log is replaced.
         ray: Whether the episodes run on Ray workers. The results are the same. All workers must be
@@ -143,17 +154,20 @@ def evaluate(
         ReportError: The report cannot be written.
         ClusterError: The Ray cluster cannot be used, or its workers died repeatedly.
     """
-    check_least(1, episodes=episodes)
+    check_least(1, episodes=episodes, max_steps=max_steps)
     check_least(0, seed=seed)
     on_cluster = ClusterOptions(ray, workers, address)
     on_cluster.check()
     if ray and record is not None:
         raise UsageError("--record needs one process: omit --ray")
+    if keys is not None and record is None:
+        raise UsageError("--keys selects what --record writes: omit it, or pass --record")
     names, options = as_names(policies), all_options(observation, rules, sim_options)
+    options = trained_options(names, sim, options, trust_env=trust_env)
     log, folder = (None if path is None else Path(path) for path in (record, report))
     if log is not None:
         check_log_name(log)
-    env = make_sim(sim, **options)
+    env = make_limited(sim, max_steps, **options)
     with closing(env):
         # Arguments are checked first, because the episodes may take minutes.
         logged = None if behavior is None else _behavior(behavior, env, log)
@@ -164,21 +178,25 @@ def evaluate(
         if log is not None:
             check_target(log, overwrite=overwrite)
         world = list(getattr(env.unwrapped, "static_scene", list)())
-        is_batched = env.spec is not None and bool(env.spec.vector_entry_point) and log is None
+        # Batched sims have no other limit than their own, and no recorder of single episodes.
+        is_plain = log is None and not isinstance(env, StepLimit)
+        is_batched = is_plain and env.spec is not None and bool(env.spec.vector_entry_point)
         found = _policies(names, env)
         shown, scores = policy_names(list(found)), {}
         with ExitStack() as stack:
             total = sum(map(len, found.values())) * episodes
             advance = stack.enter_context(progress("evaluating", total))
             if ray:
-                request = Part(sim, options, seed, is_batched)
+                request = Part(sim, options, seed, is_batched, max_steps)
                 results = results_on_ray(request, found, episodes, on_cluster, advance)
                 scores = {name: score_of(shown[name], results[name], env) for name in found}
                 found = {}
             envs = make_sims(sim, episodes, **options) if is_batched and found else None
             recorder = None
             if log is not None:
-                recorder = RecordMcap(env, log, seed=seed, overwrite=overwrite, epsilon=0.0)
+                recorder = RecordMcap(
+                    env, log, seed=seed, overwrite=overwrite, epsilon=0.0, keys=keys
+                )
                 stack.enter_context(closing(recorder))
             for name, candidates in found.items():
                 recorded = recorder if name in names else None
@@ -192,11 +210,13 @@ def evaluate(
                     on_policy=partial(_set_policy, recorded),
                     on_episode=lambda result: advance(1),
                 )
+        for score in scores.values():
+            warn_of_cuts(itertools.chain(*score.results), score.policy, sim)
     random, pilot = scores["random"], scores.get("pilot")
     normalized = [normalize(score, random, pilot) for score in scores.values()]
     if logged is not None:
-        score = Scale.of(random, pilot).score(logged.mean_return)
-        logged = replace(logged, normalized_score=None if math.isnan(score) else score)
+        value = Scale.of(random, pilot).score(logged.mean_return)
+        logged = replace(logged, normalized_score=None if math.isnan(value) else value)
     result = Evaluation(sim, seed, logged, tuple(normalized), tuple(improvements(normalized)))
     if folder is not None:
         _write_report(folder, result, world, log, names)

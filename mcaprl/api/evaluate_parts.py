@@ -12,8 +12,9 @@ from mcaprl.api.cluster import ClusterOptions
 from mcaprl.api.policies import SCRIPTED, policies_of
 from mcaprl.errors import ClusterError
 from mcaprl.progress import Advance
-from mcaprl.sims import make_sim, make_sims
+from mcaprl.sims import make_sims
 from mcaprl.sims.evaluation.evaluate import greedy_episodes
+from mcaprl.sims.evaluation.limits import make_limited
 from mcaprl.sims.evaluation.rollout import EpisodeResult
 
 # Number of episodes that a worker runs as one task.
@@ -29,6 +30,7 @@ class Part:
         options: Arguments of the environment.
         seed: Seed of the evaluation.
         is_batched: Whether the sim steps several environments at once.
+        max_steps: Limit on the steps of an episode; see `make_limited`.
         policy: Name or path of the policy.
         index: Index of the policy's training seed.
         first: Number of the first episode.
@@ -39,6 +41,7 @@ class Part:
     options: Mapping[str, Any]
     seed: int
     is_batched: bool
+    max_steps: int | None = None
     policy: str = ""
     index: int = 0
     first: int = 0
@@ -110,7 +113,7 @@ def _run_part(part: Part, report: Callable[[int], None]) -> list[EpisodeResult]:
         done += 1
         report(done)
 
-    with closing(make_sim(part.sim, **part.options)) as env:
+    with closing(make_limited(part.sim, part.max_steps, **part.options)) as env:
         is_batched = part.is_batched and part.policy not in SCRIPTED
         return greedy_episodes(
             env,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -18,17 +19,24 @@ from mcaprl.sims import SIMS, make_sim
 
 
 def layout(
-    source: str | Path, out: str | Path | None = None, *, overwrite: bool = False
+    source: str | Path,
+    out: str | Path | None = None,
+    *,
+    sim_options: Mapping[str, Any] | None = None,
+    keys: Sequence[str] | None = None,
+    overwrite: bool = False,
 ) -> dict[str, Any]:
     """Return the Foxglove layout of a log, or of the logs of a sim.
 
     Args:
         source: Path or URL of a log, short name of a sim, or Gymnasium id.
         out: JSON file to write; None to write nothing.
+        sim_options: Arguments of the environment.
+        keys: Keys of the parts of a Dict or Tuple observation that the logs contain; default: all.
         overwrite: Whether an existing file is replaced.
 
     Raises:
-        UsageError: `out` has the suffix of a log.
+        UsageError: `out` has the suffix of a log, or arguments or keys are given for a log.
         UnknownNameError: There is no such sim.
         OutputExistsError: `out` exists.
         LogError: The log cannot be read.
@@ -42,17 +50,21 @@ def layout(
     name = str(source)
     is_file = is_url(name) or Path(name).is_file() or name.endswith(".mcap")
     is_log = name not in SIMS and is_file
-    found = attached_layout(McapReader(name)) if is_log else _layout_of_sim(name)
+    options = dict(sim_options or {})
+    if is_log and (options or keys is not None):
+        raise UsageError(f"{name} is a log, but --env-arg and --keys are for a sim: omit them")
+    found = attached_layout(McapReader(name)) if is_log else _layout_of_sim(name, options, keys)
     if path is not None:
         write_json(path, found, ReportError)
     return found
 
 
-def _layout_of_sim(sim: str) -> dict[str, Any]:
+def _layout_of_sim(sim: str, options: dict[str, Any], keys: Sequence[str] | None) -> dict[str, Any]:
     """Return the layout of a temporary recording of a sim."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "reset.mcap"
-        env = make_sim(sim)
-        with closing(RecordMcap(env, path, camera=isinstance(env.unwrapped, DepthSource))) as log:
+        env = make_sim(sim, **options)
+        camera = isinstance(env.unwrapped, DepthSource)
+        with closing(RecordMcap(env, path, camera=camera, keys=keys)) as log:
             log.reset(seed=0)
         return attached_layout(McapReader(path))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,10 +13,11 @@ import gymnasium as gym
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import PolicyError, UnknownNameError, UsageError
+from mcaprl.errors import McaprlError, PolicyError, UnknownNameError, UsageError
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.format.action_commands import ActionCommands
+from mcaprl.recorder.record.recorded_space import RecordedSpace, recorded_like
 from mcaprl.runs import BEST_NAME, CONFIG_NAME, POLICY_NAME, policy_files
 from mcaprl.sims.evaluation.rollout import Policy, check_fit, same_form
 
@@ -153,9 +156,43 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
             raise UsageError(f"{sim} has no pilot: use random, or the path of a trained run")
         return [make_pilot(env)]
     policies = load_policies(_existing(name, SCRIPTED))
-    for policy in policies:
-        check_fit(policy, env)
-    return list(policies)
+    return [_fitted(policy, env) for policy in policies]
+
+
+@dataclass(frozen=True)
+class _PartPolicy:
+    """A policy that receives observations in the form of the log that it was trained on."""
+
+    policy: TrainedPolicy
+    recorded: RecordedSpace
+
+    @property
+    def name(self) -> str:
+        return self.policy.name
+
+    def begin(self) -> None:
+        self.policy.begin()
+
+    def act(self, observations: Any) -> NDArray[Any]:
+        return self.policy.act(self.recorded.of(observations))
+
+
+def _fitted(policy: TrainedPolicy, env: gym.Env[Any, Any]) -> Policy:
+    """Return a policy that acts in an environment.
+
+    The environment may have more observations than the policy needs, or a Tuple instead of a Dict.
+
+    Raises:
+        PolicyError: The policy's spaces differ from those of `env`.
+    """
+    space = policy.observation_space
+    if isinstance(space, spaces.Dict) and not same_form(space, env.observation_space):
+        with suppress(McaprlError):
+            recorded = recorded_like(env.observation_space, space)
+            check_fit(policy, env, recorded.space)
+            return _PartPolicy(policy, recorded)
+    check_fit(policy, env)
+    return policy
 
 
 def trained_policies(name: str, dataset: Dataset) -> list[TrainedPolicy]:

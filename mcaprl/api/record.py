@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mcaprl.api.cluster import ClusterOptions
-from mcaprl.api.environments import all_options
+from mcaprl.api.environments import all_options, trained_options
 from mcaprl.api.ranges import check_fraction, check_least, check_positive
 from mcaprl.api.record_file import FileRequest, record_file
 from mcaprl.api.shards import record_on_ray, record_shards
@@ -21,6 +21,7 @@ from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.manifest import MANIFEST_NAME
 from mcaprl.remote import check_upload, upload_all
 from mcaprl.settings import flag
+from mcaprl.sims.evaluation.limits import warn_of_cuts
 from mcaprl.sims.evaluation.rollout import EpisodeResult
 
 
@@ -58,14 +59,17 @@ def record(
     epsilon: float = 0.0,
     episodes: int | None = None,
     steps: int | None = None,
+    max_steps: int | None = None,
     seed: int = 0,
     envs: int = 1,
     observation: str | None = None,
     rules: str | None = None,
     sim_options: Mapping[str, Any] | None = None,
+    trust_env: bool = False,
     scene: bool = True,
     camera: bool = False,
     infos: bool | Sequence[str] = False,
+    keys: Sequence[str] | None = None,
     compression: str = "zstd",
     overwrite: bool = False,
     append: bool = False,
@@ -86,15 +90,21 @@ def record(
         epsilon: Probability of a random action instead of the policy's.
         episodes: Number of episodes; exclusive with `steps`.
         steps: Number of steps; exclusive with `episodes`.
+        max_steps: Steps after which an episode is truncated, with the reason `step_limit`. None
+            selects 27,000 if the environment has no time limit and `episodes` is given.
         seed: Seed of the recording.
         envs: Number of processes. With more than one, a script needs
             `if __name__ == "__main__"`, because each process imports the script.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
-        sim_options: Other arguments of the environment.
+        sim_options: Other arguments of the environment. Without any argument, a trained policy acts
+            with the arguments of its training if that was in the same environment.
+        trust_env: Whether the arguments of the training may be passed to environments other than
+            the sims of `SIMS`.
         scene: Whether topics that only viewers use are recorded.
         camera: Whether metric depth images are recorded.
         infos: Whether the infos of the environment are recorded, or the names of infos to record.
+        keys: Keys of the parts of a Dict or Tuple observation that are recorded; default: all.
         compression: Compression of chunks: `zstd`, `lz4` or `none`.
         overwrite: Whether existing logs are replaced.
         append: Whether the episodes are added to an existing file.
@@ -119,6 +129,7 @@ def record(
         ClusterError: The Ray cluster cannot be used.
         MissingExtraError: Ray is not installed.
     """
+    options = all_options(observation, rules, sim_options)
     request = FileRequest(
         sim=sim,
         out=Path(out),
@@ -127,14 +138,16 @@ def record(
         episodes=episodes,
         steps=steps,
         seed=seed,
-        sim_options=all_options(observation, rules, sim_options),
+        sim_options=trained_options([str(policy)], sim, options, trust_env=trust_env),
         scene=scene,
         camera=camera,
         infos=infos,
+        keys=keys,
         compression=compression,
         overwrite=overwrite,
         append=append,
         rotate_mb=rotate_mb,
+        max_steps=max_steps,
     )
     _check_request(request, envs)
     on_cluster = ClusterOptions(ray, workers, address)
@@ -156,6 +169,7 @@ def record(
             results = record_file(request, on_episode)
         else:
             results = record_shards(request, envs, on_episode)
+    warn_of_cuts(results, request.policy, sim)
     files = _files(request.out, rotated=request.rotate_mb is not None)
     if upload is not None:
         upload_all([*files, request.out / MANIFEST_NAME] if ray else files, upload)
@@ -178,7 +192,13 @@ def _check_request(request: FileRequest, envs: int) -> None:
     check_fraction(epsilon=request.epsilon)
     if request.rotate_mb is not None:
         check_positive(rotate_mb=request.rotate_mb)
-    check_least(1, episodes=request.episodes, steps=request.steps, envs=envs)
+    check_least(
+        1,
+        episodes=request.episodes,
+        steps=request.steps,
+        max_steps=request.max_steps,
+        envs=envs,
+    )
     check_least(0, seed=request.seed)
     if envs > 1 and request.append:
         raise UsageError("--append needs one file, but --envs writes several: omit one option")

@@ -15,6 +15,7 @@ from mcaprl.api.policies import policies_of, policy_names
 from mcaprl.files import work_folder
 from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.sims import make_sim
+from mcaprl.sims.evaluation.limits import make_limited
 from mcaprl.sims.evaluation.rollout import EpisodeResult, EpsilonGreedy, rollout
 
 
@@ -37,10 +38,12 @@ class FileRequest:
     scene: bool
     camera: bool
     infos: bool | Sequence[str]
+    keys: Sequence[str] | None
     compression: str
     overwrite: bool
     append: bool
     rotate_mb: float | None
+    max_steps: int | None
     first_episode: int = 0
 
 
@@ -48,7 +51,7 @@ def record_file(
     request: FileRequest, on_episode: Callable[[EpisodeResult], None] | None = None
 ) -> list[EpisodeResult]:
     """Record one file in this process."""
-    with closing(make_sim(request.sim, **request.sim_options)) as env:
+    with closing(_env(request)) as env:
         behavior = _behavior(request, env)
         recorder = _recorder(request, env, behavior)
 
@@ -77,10 +80,17 @@ def try_request(request: FileRequest) -> None:
     """
     with (
         work_folder(request.out) as trial,
-        closing(make_sim(request.sim, **request.sim_options)) as env,
+        closing(_env(request)) as env,
     ):
         behavior = _behavior(request, env)
         _recorder(replace(request, out=trial / "trial.mcap"), env, behavior).close()
+
+
+def _env(request: FileRequest) -> gym.Env[Any, Any]:
+    # A number of steps ends the recording, so it needs no default limit.
+    if request.steps is not None and request.max_steps is None:
+        return make_sim(request.sim, **request.sim_options)
+    return make_limited(request.sim, request.max_steps, **request.sim_options)
 
 
 def _behavior(request: FileRequest, env: gym.Env[Any, Any]) -> EpsilonGreedy:
@@ -102,4 +112,5 @@ def _recorder(request: FileRequest, env: gym.Env[Any, Any], behavior: EpsilonGre
         scene=request.scene,
         camera=request.camera,
         infos=request.infos,
+        keys=request.keys,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -135,6 +135,7 @@ def verify(
     episode: int | None = None,
     sim: str | None = None,
     trust_env: bool = False,
+    sim_options: Mapping[str, Any] | None = None,
     progress: ProgressBar = no_progress,
 ) -> Verification:
     """Repeat the logged actions in the sim, and compare each step until one differs.
@@ -144,7 +145,9 @@ def verify(
         episode: Index of the only episode to compare; None for all.
         sim: Short name or Gymnasium id to use instead of the logged one.
         trust_env: Whether to import the module that the logged id names, and to pass the logged
-            arguments to environments other than the sims of `SIMS`.
+            arguments to environments other than the sims of `SIMS`. Arguments with which the
+            environment is registered need no trust.
+        sim_options: Arguments of the environment that replace the logged ones.
         progress: Function that opens a progress bar.
 
     Raises:
@@ -156,7 +159,7 @@ def verify(
     dataset = open_logs(path)
     check_episode(dataset, episode, path)
     with (
-        closing(sim_of(dataset, path, sim, trust_env=trust_env)) as env,
+        closing(sim_of(dataset, path, sim, trust_env=trust_env, sim_options=sim_options)) as env,
         progress("stepping", len(dataset)) as advance,
     ):
         return verify_dataset(
@@ -190,6 +193,7 @@ def render(
     overwrite: bool = False,
     sim: str | None = None,
     trust_env: bool = False,
+    sim_options: Mapping[str, Any] | None = None,
     progress: ProgressBar = no_progress,
 ) -> Rendering:
     """Render one episode of a log.
@@ -209,6 +213,7 @@ def render(
         sim: Short name or Gymnasium id to use instead of the logged one.
         trust_env: Whether to import the module that the logged id names, and to pass the logged
             arguments to any environment.
+        sim_options: Arguments of the environment that replace the logged ones.
         progress: Function that opens a progress bar.
 
     Raises:
@@ -243,7 +248,8 @@ def render(
             f"{path} has no scene, so the sim chooses the height of its images: omit the height"
         )
     else:
-        make = partial(sim_of, dataset, path, sim, trust_env=trust_env, render_mode="rgb_array")
+        trust: dict[str, Any] = {"trust_env": trust_env, "sim_options": sim_options}
+        make = partial(sim_of, dataset, path, sim, render_mode="rgb_array", **trust)
         draw = partial(_of_sim, path, dataset, one, make)
     frames, stills = 0, list[int]()
     if movie is not None:

@@ -250,6 +250,7 @@ def train_online(
     port: int = DEFAULT_PORT,
     allow_origin: str | Sequence[str] = (),
     device: str | None = None,
+    max_steps: int | None = None,
     observation: str | None = None,
     rules: str | None = None,
     sim_options: Mapping[str, Any] | None = None,
@@ -286,6 +287,9 @@ def train_online(
             all seeds are trained at once; only for `double-dqn` in the sims `lane` and `racer`,
             without a recording. The settings have other defaults (`mcaprl.device.training`), and
             the last policy is saved instead of the best checkpoint. None trains with SB3.
+        max_steps: Steps after which an episode is truncated, in training and evaluation. None
+            selects that of the resumed run, else no limit in training, and 27,000 in evaluations of
+            environments without a time limit.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
         sim_options: Other arguments of the environment.
@@ -311,7 +315,7 @@ def train_online(
     from mcaprl.online.task import choose_task
     from mcaprl.online.train import train as train_agents
 
-    check_least(1, seeds=seeds, threads=threads)
+    check_least(1, seeds=seeds, threads=threads, max_steps=max_steps)
     check_least(0, seed=seed)
     check_positive(live_speed=live_speed)
     check_port(port)
@@ -330,10 +334,14 @@ def train_online(
             sources=bool(as_names(sources)),
             resume=resume,
             live=live,
+            max_steps=max_steps is not None,
         )
         numbers = choose_seeds(out, seeds, seed, resume)
         return _train_on_device(sim, out, device, numbers, threads, options, settings, progress)
-    task = choose_task(sim, algo, options, settings, preset=preset, resumed=out if resume else None)
+    resumed = out if resume else None
+    task = choose_task(
+        sim, algo, options, settings, preset=preset, max_steps=max_steps, resumed=resumed
+    )
     data, policy = _experience(as_names(sources))
     with ExitStack() as stack:
         stack.enter_context(torch_threads(threads))

@@ -32,7 +32,7 @@ from mcaprl.online.train import OnlineSummary, write_scores
 from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
 from mcaprl.runs import locked_run, open_run, seed_folder
 from mcaprl.settings import flag
-from mcaprl.sims import DeviceSims, make_device_sims, make_sim
+from mcaprl.sims import DeviceSims, make_device_sims
 from mcaprl.sims.evaluation.evaluate import Scale, evaluate
 from mcaprl.sims.vehicle.device import Batch
 
@@ -118,7 +118,7 @@ def train(
     sims = make_device_sims(
         task.sim, seeds * config.envs, device=device, seed=seed, **task.sim_options
     )
-    with locked_run(folder, False), closing(make_sim(task.sim, **task.sim_options)) as env:
+    with locked_run(folder, False), closing(task.evaluation_env()) as env:
         numbers = range(seed, seed + seeds)
         open_run(folder, task.identity, False, numbers, device=device)
         agents = Agents(sims, config, numbers, place)

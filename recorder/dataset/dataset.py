@@ -215,6 +215,11 @@ class Dataset(Conversions):
         return dict(self._description.env_kwargs)
 
     @property
+    def unstored_kwargs(self) -> tuple[str, ...]:
+        """Names of arguments of the environment that the log does not store: they are not JSON."""
+        return self._description.unstored_kwargs
+
+    @property
     def observation_space(self) -> spaces.Space[Any]:
         """Observation space of the environment."""
         return self._description.observation_space

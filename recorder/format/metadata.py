@@ -7,6 +7,8 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
     env_id              Gymnasium id; `module:Name-v0` if the import of a module registers it;
                         empty if unknown
     env_kwargs          JSON object: keyword arguments of gymnasium.make
+    unstored_kwargs     JSON list: names of the arguments whose values are not JSON; absent if there
+                        are none
     observation_space   JSON, see `spaces.space_to_json`
     action_space        JSON
     observation_fields  JSON list of {"path": keys in a Dict space, "field" or "topic": name};
@@ -33,6 +35,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
@@ -40,6 +43,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium import spaces
 
 from mcaprl._version import __version__
@@ -96,6 +100,8 @@ class LogMetadata:
         action_space: Action space of the environment.
         env_id: Gymnasium id of the environment; empty if unknown.
         env_kwargs: Keyword arguments of `gymnasium.make`; JSON types only.
+        unstored_kwargs: Names of the arguments that differ from the environment's defaults, but
+            cannot be stored because they are not JSON.
         observation_names: Names of a vector observation's elements; empty if unknown.
         action_meanings: Names of the discrete actions; empty if unknown.
         action_commands: Commands that the discrete actions stand for; None if unknown.
@@ -134,6 +140,7 @@ class LogMetadata:
     about: Mapping[str, Any] = field(default_factory=dict)
     times: str = ""
     action_commands: ActionCommands | None = None
+    unstored_kwargs: tuple[str, ...] = ()
 
     @cached_property
     def leaves(self) -> tuple[Leaf, ...]:
@@ -193,6 +200,11 @@ class LogMetadata:
             "epsilon": self.epsilon,
             "seed": self.seed,
             "versions": json.dumps(dict(self.versions)),
+            **(
+                {"unstored_kwargs": json.dumps(self.unstored_kwargs)}
+                if self.unstored_kwargs
+                else {}
+            ),
             **({"behavior_prob": self.behavior_prob} if self.behavior_prob else {}),
             **({"about": json.dumps(dict(self.about))} if self.about else {}),
             **({"times": self.times} if self.times else {}),
@@ -235,6 +247,7 @@ class LogMetadata:
                 about=_object(strings, "about"),
                 times=strings.get("times", ""),
                 action_commands=_commands(strings, action_space),
+                unstored_kwargs=_texts(strings, "unstored_kwargs"),
             )
         except (KeyError, ValueError, TypeError, MemoryError) as error:
             raise LogError(
@@ -282,7 +295,8 @@ class LogMetadata:
 
         A vector environment is described by one of its sub-environments. The step duration is the
         first available value of: the argument, the environment's `step_duration_s`,
-        1 / `metadata["render_fps"]`, 0.1 s.
+        1 / `metadata["render_fps"]`, 0.1 s. Arguments of the environment that are not JSON are left
+        out with a warning.
         """
         one = _one_of(env)
         inner = one.unwrapped
@@ -295,14 +309,19 @@ class LogMetadata:
                 f"step_duration_s is {step_duration_s}: it must be a number of seconds"
             )
         is_vector = isinstance(one, gym.vector.VectorEnv)
-        kwargs = dict(one.spec.kwargs) if one.spec else {}
-        for name in _NOT_OF_ONE_ENV:
-            kwargs.pop(name, None)
+        kwargs, unstored = _split_kwargs(one.spec)
+        if unstored:
+            warnings.warn(
+                f"the log does not store {', '.join(unstored)} of {one.spec.id}, because the values"
+                " are not JSON: pass the arguments again to repeat the episodes",
+                stacklevel=3,
+            )
         return cls(
             observation_space=one.single_observation_space if is_vector else one.observation_space,
             action_space=one.single_action_space if is_vector else one.action_space,
             env_id=_env_id(one),
             env_kwargs=kwargs,
+            unstored_kwargs=unstored,
             observation_names=_names(inner, "observation_names"),
             action_meanings=_names(inner, "action_meanings"),
             success_reasons=_names(inner, "success_reasons"),
@@ -313,6 +332,60 @@ class LogMetadata:
             seed=seed,
             versions=installed_versions(),
         )
+
+
+def _split_kwargs(spec: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return the arguments of an environment that are JSON, and the names of the others.
+
+    Other arguments that have the environment's default are omitted, because the default is used
+    anyway.
+    """
+    kept: dict[str, Any] = {}
+    others = []
+    for name, value in (spec.kwargs if spec else {}).items():
+        if name in _NOT_OF_ONE_ENV:
+            continue
+        try:
+            kept[name] = as_json(value)
+        except ValueError:
+            registered = gym.registry.get(spec.id)
+            if registered is None or not _is_default(value, registered.kwargs.get(name)):
+                others.append(name)
+    return kept, tuple(others)
+
+
+def _is_default(value: Any, default: Any) -> bool:
+    try:
+        return value is default or np.array_equal(value, default)
+    # Foreign objects may raise any exception.
+    except Exception:
+        return False
+
+
+def as_json(value: Any) -> Any:
+    """Return a value as JSON types: tuples become lists, and NumPy numbers become numbers.
+
+    Raises:
+        ValueError: The value has other types, or is nested too deeply.
+    """
+    try:
+        found = _plain(value)
+        parse_json(json.dumps(found))
+    except RecursionError as error:
+        raise ValueError("the value is nested too deeply for JSON") from error
+    return found
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, str | int | float):
+        return value
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
+        return {key: _plain(part) for key, part in value.items()}
+    raise ValueError(f"{type(value).__name__} is not a type of JSON")
 
 
 def _env_id(env: Any) -> str:

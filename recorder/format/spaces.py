@@ -113,9 +113,27 @@ def select(leaves: Sequence[Leaf], keys: Sequence[str] | None) -> list[Leaf]:
         return list(leaves)
     names = {leaf: "/".join(leaf.path) for leaf in leaves}
     for key in keys:
-        if not any(_is_below(name, key) for name in names.values()):
+        if not any(is_below(name, key) for name in names.values()):
             raise UnknownNameError("column", key, filter(None, names.values()))
-    return [leaf for leaf, name in names.items() if any(_is_below(name, key) for key in keys)]
+    return [leaf for leaf, name in names.items() if any(is_below(name, key) for key in keys)]
+
+
+def is_below(name: str, key: str) -> bool:
+    """Return whether the leaf `name`, such as `joints/q`, is `key` or below it."""
+    return name == key or name.startswith(f"{key}/")
+
+
+def check_key(key: object, role: str, path: tuple[str | int, ...] = ()) -> None:
+    """Check that a key of a Dict space is a text, because a log stores the keys as texts.
+
+    Raises:
+        SpaceError: The key is not a text.
+    """
+    if not isinstance(key, str):
+        raise SpaceError(
+            f"keys of a Dict must be texts: {_place(role, path)} has the key {key!r:.60}; rename"
+            " them, e.g. with a TransformObservation wrapper"
+        )
 
 
 def outside(space: spaces.Space[Any], values: NDArray[Any]) -> NDArray[np.bool_]:
@@ -239,29 +257,33 @@ def space_from_json(text: str) -> spaces.Space[Any]:
         raise SpaceError(f"not a description of a space: {text[:80]!r}") from error
 
 
-def _is_below(name: str, key: str) -> bool:
-    return name == key or name.startswith(f"{key}/")
-
-
 def _walk(
     space: spaces.Space[Any], path: tuple[str, ...]
 ) -> Iterator[tuple[tuple[str, ...], spaces.Space[Any]]]:
     if isinstance(space, spaces.Dict):
         for key, part in space.spaces.items():
+            check_key(key, "observation", path)
             yield from _walk(part, (*path, key))
     else:
         yield path, space
 
 
+def _place(role: str, path: tuple[str | int, ...]) -> str:
+    return role + "".join(f"[{key!r}]" for key in path)
+
+
 def _shape_and_dtype(
     space: spaces.Space[Any], role: str, path: tuple[str, ...]
 ) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    where = role + "".join(f"['{key}']" for key in path)
+    where = _place(role, path)
     if not isinstance(
         space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
     ):
         allowed = "Box, Discrete, MultiDiscrete, MultiBinary"
-        allowed += ", or a Dict of these" if role == "observation" else ""
+        if role == "observation":
+            allowed += ", or a Dict of these"
+        else:
+            allowed += ": convert it, e.g. with a TransformAction wrapper"
         raise SpaceError(f"{where} is a {type(space).__name__} space; a log can store {allowed}")
     shape = tuple(space.shape or ())
     if math.prod(shape) == 0:
@@ -341,9 +363,19 @@ def _from_plain(plain: dict[str, Any]) -> spaces.Space[Any]:
         case "MultiBinary":
             return spaces.MultiBinary(plain["n"])
         case "Dict":
-            return spaces.Dict([(key, _from_plain(part)) for key, part in plain["spaces"]])
+            parts = [(_key_text(key), _from_plain(part)) for key, part in plain["spaces"]]
+            if len(dict(parts)) < len(parts):
+                raise ValueError("two keys of a Dict are the same text")
+            return spaces.Dict(parts)
         case other:
             raise ValueError(other)
+
+
+def _key_text(key: Any) -> str:
+    """Return a key of a Dict space as text. In old logs, keys may be numbers or lists."""
+    if isinstance(key, list):
+        key = tuple(key)
+    return key if isinstance(key, str) else str(key)
 
 
 def _dtype(plain: dict[str, Any]) -> np.dtype[Any]:

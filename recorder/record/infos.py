@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mcaprl.recorder.format.info_topics import InfoTopics, flat_infos, info_array
+from mcaprl.recorder.record.array_types import as_array, is_other_array
 
 
 class EpisodeInfos:
@@ -81,22 +82,29 @@ class EpisodeInfos:
 
 def _copied(value: Any) -> Any:
     """Copy arrays and lists, because the environment may change them later."""
+    if is_other_array(value):
+        value = as_array(value)
+        return value.copy() if value.ndim else value[()]
     if isinstance(value, np.ndarray):
         return value.copy()
     return [_copied(each) for each in value] if isinstance(value, list | tuple) else value
 
 
-def info_of(infos: Mapping[str, Any], number: int, count: int) -> dict[str, Any]:
+def info_of(infos: Any, number: int, count: int) -> dict[str, Any]:
     """Return the info of one of `count` environments from the infos of a vector environment.
 
     Gymnasium stores the values of all environments in one array per info. The mask `_name` selects
     the environments that returned the info `name`. A value with another length is the info of
-    each environment.
+    each environment. Some vector environments return a sequence with one dict for each
+    environment.
     """
+    if not isinstance(infos, Mapping):
+        one = infos[number] if len(infos) == count else None
+        return dict(one) if isinstance(one, Mapping) else {}
     found: dict[str, Any] = {}
     for name, value in infos.items():
         mask = infos.get(f"_{name}")
-        is_own = name in ("final_obs", "final_info") or name.startswith("_")
+        is_own = name in ("final_obs", "final_observation", "final_info") or name.startswith("_")
         if is_own or (mask is not None and not mask[number]):
             continue
         if isinstance(value, Mapping):
@@ -106,3 +114,19 @@ def info_of(infos: Mapping[str, Any], number: int, count: int) -> dict[str, Any]
         elif isinstance(value, np.ndarray | list | tuple):
             found[name] = value[number] if np.shape(value)[:1] == (count,) else value
     return found
+
+
+def final_info(infos: dict[str, Any]) -> Any:
+    """Return the infos of the episodes that ended in same-step mode."""
+    found = infos.get("final_info")
+    return {} if found is None else found
+
+
+def info_reason(infos: Any, number: int) -> Any:
+    """Return the reason in the infos of one environment; None if there is none."""
+    if not isinstance(infos, Mapping):
+        # Some vector environments return one dict for each environment.
+        one = infos[number] if isinstance(infos, np.ndarray | list | tuple) else None
+        return one.get("reason") if isinstance(one, Mapping) else None
+    found = infos.get("reason")
+    return found[number] if isinstance(found, np.ndarray | list | tuple) else None

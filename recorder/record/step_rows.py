@@ -12,17 +12,19 @@ import math
 import warnings
 from array import array
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from io import BytesIO
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.format.episode_summary import add_up
 from mcaprl.recorder.format.log_writer import LogTopics
-from mcaprl.recorder.format.spaces import Leaf, observation_leaves
+from mcaprl.recorder.format.spaces import Leaf
+from mcaprl.recorder.record.array_types import as_array
+from mcaprl.recorder.record.recorded_space import RecordedSpace
 
 Store = Callable[[Any], None]
 """Function that stores a copy of a value.
@@ -257,16 +259,19 @@ class ImageColumn:
 
 
 def observation_store(
-    space: spaces.Space[Any], columns: StepColumns, images: Mapping[Leaf, ImageColumn]
+    recorded: RecordedSpace, columns: StepColumns, images: Mapping[Leaf, ImageColumn]
 ) -> Store:
-    """Return a function that stores observations of a space."""
-    leaves = observation_leaves(space)
+    """Return a function that stores the recorded part of observations."""
+    leaves = recorded.leaves
     stores = [
         images[leaf].store(leaf) if leaf in images else columns.store(leaf) for leaf in leaves
     ]
     if not leaves[0].path:
         return stores[0]
-    parts = [(_part(leaf), store) for leaf, store in zip(leaves, stores, strict=True)]
+    parts = [
+        (_part(leaf, path), store)
+        for leaf, path, store in zip(leaves, recorded.paths, stores, strict=True)
+    ]
 
     def store_all(observation: Any) -> None:
         for part, store in parts:
@@ -275,14 +280,21 @@ def observation_store(
     return store_all
 
 
-def converters(space: spaces.Space[Any]) -> list[Converter]:
-    """Return one function per leaf, which reads the leaf's value from an observation."""
-    return [converter(leaf) for leaf in observation_leaves(space)]
+def converters(recorded: RecordedSpace, count: int | None = None) -> list[Converter]:
+    """Return one function per leaf, which reads the leaf's value from an observation.
+
+    If a `count` of environments is given, it reads their values from a batch of observations.
+    """
+    batch = () if count is None else (count,)
+    return [
+        converter(replace(leaf, shape=(*batch, *leaf.shape)), path)
+        for leaf, path in zip(recorded.leaves, recorded.paths, strict=True)
+    ]
 
 
-def converter(leaf: Leaf) -> Converter:
-    """Return the function that reads a leaf's value from an observation, or from an action."""
-    shape, dtype, part = leaf.shape, leaf.dtype, _part(leaf)
+def converter(leaf: Leaf, path: tuple[str | int, ...] = ()) -> Converter:
+    """Return the function that reads a leaf's value at a path in an observation, or an action."""
+    shape, dtype, part = leaf.shape, leaf.dtype, _part(leaf, path)
 
     def convert(observation: Any) -> NDArray[Any]:
         value = part(observation)
@@ -303,10 +315,10 @@ def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
     """
     where = _where(leaf)
     try:
-        array = np.asarray(value)
+        array = as_array(value)
         with np.errstate(all="ignore"):
             cast = array.astype(leaf.dtype)
-    except (TypeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise SpaceError(f"{where} is {value!r:.60}; its space declares {leaf.dtype}") from error
     if not leaf.shape and array.size == 1:
         cast, array = cast.reshape(()), array.reshape(())
@@ -316,7 +328,7 @@ def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
         return cast
     if array.dtype.kind == leaf.dtype.kind == "f":
         # Lists have no dtype, so their conversion causes no warning.
-        if array.ndim and isinstance(value, np.ndarray):
+        if array.ndim and hasattr(value, "dtype"):
             warnings.warn(
                 f"{where} is {array.dtype}; it is converted to {leaf.dtype}, as its space declares",
                 stacklevel=2,
@@ -332,18 +344,23 @@ def reward_number(reward: Any) -> float:
     Raises:
         SpaceError: The reward is not one number.
     """
-    array = np.asarray(reward)
+    array = as_array(reward)
     if array.size != 1 or array.dtype.kind not in "biuf":
-        raise SpaceError(f"the reward is {reward!r:.60}: it must be a single number")
+        raise SpaceError(
+            f"the reward is {reward!r:.60}: it must be a single number; combine several rewards"
+            " with a wrapper, such as LinearReward of mo-gymnasium"
+        )
     return float(array.item())
 
 
-def _part(leaf: Leaf) -> Callable[[Any], Any]:
+def _part(leaf: Leaf, path: tuple[str | int, ...]) -> Callable[[Any], Any]:
     """Return a function that reads a leaf's value from an observation without converting it."""
 
     def part(observation: Any) -> Any:
         try:
-            return leaf.of(observation)
+            for key in path:
+                observation = observation[key]
+            return observation
         except (KeyError, IndexError, TypeError) as error:
             raise SpaceError(f"{_where(leaf)} is missing") from error
 

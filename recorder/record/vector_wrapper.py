@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,16 +20,24 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from mcaprl.errors import SpaceError, UsageError
+from mcaprl.errors import SpaceError
 from mcaprl.recorder.format.episode_summary import INTERRUPTED, EpisodeSummary
 from mcaprl.recorder.format.info_topics import InfoTopics
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.probability import check_probability, is_impossible
 from mcaprl.recorder.format.rows import TopicRows
-from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
+from mcaprl.recorder.format.spaces import action_leaf
 from mcaprl.recorder.format.writing import HoldSignals
+from mcaprl.recorder.record.array_types import (
+    as_array,
+    as_arrays,
+    final_observation,
+    one_each,
+)
 from mcaprl.recorder.record.display import Display
-from mcaprl.recorder.record.infos import EpisodeInfos, info_of
+from mcaprl.recorder.record.env_types import autoreset_mode, check_vector
+from mcaprl.recorder.record.infos import EpisodeInfos, final_info, info_of, info_reason
+from mcaprl.recorder.record.recorded_space import recorded_space
 from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
 from mcaprl.recorder.record.step_rows import converter, converters
 from mcaprl.recorder.record.unclosed import FinishesAtExit
@@ -96,27 +105,32 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         append: bool = False,
         max_file_bytes: int | None = None,
         infos: bool | Sequence[str] = False,
+        keys: Sequence[str] | None = None,
         step_duration_s: float | None = None,
         start_time_ns: int | None = None,
     ) -> None:
         """Wrap `env` and create the file; for the other arguments, see `RecordMcap`.
 
-        `env` must have spaces that `RecordMcap` supports and declare its autoreset mode. If
+        `env` must have spaces that `RecordMcap` supports and declare its autoreset mode. It may
+        return arrays of NumPy, PyTorch, JAX and others; `step` and `reset` return them unchanged.
+        The observations of episodes that end in same-step mode are read from `infos["final_obs"]`
+        or `infos["final_observation"]`: one item for each environment, or a Dict of such arrays. If
         `policy_version` is None, the log has no `/rl/learner`. Episodes that end in the same step
         share chunks. With `max_file_bytes`, episodes that end in the same step are in the same file
         as long as their uncompressed rows have at most this size.
 
         Raises:
             SpaceError: The log format does not support the environments' spaces.
-            UsageError: Timestamps would not increase, or the autoreset mode is unknown.
+            UnknownNameError: The observation has no such key.
+            UsageError: Timestamps would not increase, the autoreset mode is unknown, or `env` is
+                not a vector environment of Gymnasium.
             OutputExistsError, LogError: The file cannot be created or appended to.
         """
-        if not isinstance(env, gym.vector.VectorEnv):
-            raise UsageError(
-                "RecordVecMcap wraps vector environments; RecordMcap wraps single ones"
-            )
+        check_vector(env)
+        recorded = recorded_space(env.single_observation_space, keys)
+        action_leaf(env.single_action_space)
         super().__init__(env)
-        self._autoreset = _autoreset_mode(env)
+        self._autoreset = autoreset_mode(env)
         self.policy, self.epsilon, self.policy_version = policy, epsilon, policy_version
         self.behavior_probs: Any = math.nan
         description = LogMetadata.of_env(
@@ -128,7 +142,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         )
         self._recording = EpisodeLog(
             path,
-            description,
+            replace(description, observation_space=recorded.space),
             compression=compression,
             overwrite=overwrite,
             append=append,
@@ -137,8 +151,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         )
         log, count = self._recording.log, self.num_envs
         self._display = Display(log, None, scene=False, camera=False)
-        leaves = observation_leaves(self.single_observation_space)
-        fields = [leaf.name for leaf in leaves if not leaf.encoding]
+        fields = [leaf.name for leaf in recorded.leaves if not leaf.encoding]
         self._columns = OpenSteps(
             log.step_rows(), count, ["action", "reward", "behavior_prob", *fields]
         )
@@ -153,10 +166,10 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         self._infos = [EpisodeInfos(topics, infos) for _ in range(count)] if infos else []
         self._places = [
             (self._images[leaf], "data") if leaf in self._images else (self._columns, leaf.name)
-            for leaf in leaves
+            for leaf in recorded.leaves
         ]
-        self._converters = converters(self.observation_space)
-        self._converters_of_one = converters(self.single_observation_space)
+        self._converters = converters(recorded, count)
+        self._converters_of_one = converters(recorded)
         self._action_of = converter(action_leaf(self.action_space))
         self._every = np.arange(count)
         self._open = [OpenEpisode("", math.nan) for _ in range(count)]
@@ -197,7 +210,8 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         self._recording.check_can_begin(seeds)
         # The options are read before the reset, because environments remove the mask from them.
         given = {key: value for key, value in (options or {}).items() if key != "reset_mask"}
-        numbers = np.flatnonzero((options or {}).get("reset_mask", np.ones(count, np.bool_)))
+        mask = (options or {}).get("reset_mask", np.ones(count, np.bool_))
+        numbers = np.flatnonzero(as_array(mask))
         self._interrupt(numbers)
         observations, infos = self.env.reset(seed=seed, options=options)
         values = [convert(observations) for convert in self._converters]
@@ -229,12 +243,17 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             )
         self._act(actions)
         try:
-            observations, rewards, terminated, truncated, infos = self.env.step(actions)
-            rewards_64 = np.asarray(rewards, np.float64).reshape(self.num_envs)
+            transition = self.env.step(actions)
+            observations, rewards, terminated, truncated, infos = transition
+            if not (type(rewards) is type(terminated) is type(truncated) is np.ndarray):
+                rewards, terminated, truncated = map(as_array, (rewards, terminated, truncated))
+            rewards_64 = one_each("reward", rewards, self.num_envs).astype(np.float64, copy=False)
             self._columns.put("reward", self._now.row, rewards_64)
             values = [convert(observations) for convert in self._converters]
-            ended = self._running & np.logical_or(terminated, truncated)
+            over = one_each("end flag", np.logical_or(terminated, truncated), self.num_envs)
+            ended = self._running & over
             if self._infos:
+                infos = as_arrays(infos)
                 self._add_infos(infos, ended)
             any_ended = np.count_nonzero(ended)
             if any_ended or self._any_due or self._now.row + 1 >= self._full_at:
@@ -253,7 +272,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             # The environments may have made a step that the log lacks, so all episodes end here.
             self._interrupt(self._every)
             raise
-        return observations, rewards, terminated, truncated, infos
+        return transition
 
     def close(self, **kwargs: Any) -> None:
         """Finish the log and close the environments; a second call has no effect."""
@@ -288,13 +307,14 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             SpaceError: The shape is wrong.
             UsageError: A probability is not in (0, 1].
         """
-        probs, shape = np.asarray(self.behavior_probs, np.float32), (self.num_envs,)
+        given, shape = as_array(self.behavior_probs), (self.num_envs,)
+        probs = given.astype(np.float32)
         if probs.shape not in ((), shape):
             raise SpaceError(f"behavior_probs has shape {probs.shape}, expected {shape}")
         # An environment that is reset in this step ignores its action, so its probability is not
         # checked.
         for number in np.flatnonzero(is_impossible(probs) & self._running):
-            prob = float(np.broadcast_to(self.behavior_probs, shape)[number])
+            prob = float(np.broadcast_to(given, shape)[number])
             check_probability(prob, f"behavior_probs[{number}]")
         return probs
 
@@ -329,7 +349,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         same_step = self._autoreset is AutoresetMode.SAME_STEP
         for number in np.flatnonzero(self._running).tolist():
             is_final = same_step and ended[number]
-            source = infos.get("final_info", {}) if is_final else infos
+            source = final_info(infos) if is_final else infos
             step = self._now.row + 1 - int(self._first[number])
             self._infos[number].add(step, info_of(source, number, self.num_envs))
 
@@ -358,7 +378,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         In same-step mode, also begin their next episodes.
         """
         same_step = self._autoreset is AutoresetMode.SAME_STEP
-        infos_of_ended = infos.get("final_info", {}) if same_step else infos
+        infos_of_ended = final_info(infos) if same_step else infos
         ended: list[_Ended] = []
         try:
             for number in numbers.tolist():
@@ -366,7 +386,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
                     final = self._final_observation(infos, number)
                     self._put(self._now.row, final, number)
                 is_terminal = bool(terminated[number])
-                reason = reason_of(_of_env(infos_of_ended, "reason", number), is_terminal)
+                reason = reason_of(info_reason(infos_of_ended, number), is_terminal)
                 ended.append(_Ended(number, is_terminal, bool(truncated[number]), reason))
         finally:
             self._end(ended)
@@ -377,7 +397,8 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
 
     def _final_observation(self, infos: dict[str, Any], number: int) -> list[NDArray[Any]]:
         """Return an episode's last observation from the infos of same-step mode."""
-        final = _of_env(infos, "final_obs", number)
+        space = self.single_observation_space
+        final = final_observation(infos, number, self.num_envs, space)
         if final is None:
             raise SpaceError(
                 f"environment {number} was reset in its episode's last step, but infos['final_obs']"
@@ -465,20 +486,3 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
 
 # Reprs and pickles contain this public import path.
 RecordVecMcap.__module__ = "mcaprl"
-
-
-def _autoreset_mode(env: gym.vector.VectorEnv[Any, Any, Any]) -> AutoresetMode:
-    declared = env.metadata.get("autoreset_mode")
-    try:
-        return AutoresetMode(declared)
-    except ValueError:
-        known = ", ".join(mode.value for mode in AutoresetMode)
-        raise UsageError(
-            f"metadata['autoreset_mode'] of {env} is {declared!r}; expected one of {known}"
-        ) from None
-
-
-def _of_env(infos: dict[str, Any], key: str, number: int) -> Any:
-    """Return the value of `infos[key]` for one environment; None if the key is missing."""
-    found = infos.get(key)
-    return found[number] if isinstance(found, np.ndarray | list | tuple) else None

@@ -10,19 +10,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
 
-from mcaprl.errors import SpaceError, UsageError
+from mcaprl.errors import SpaceError
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.info_topics import InfoTopics
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.probability import SMALLEST, check_probability
+from mcaprl.recorder.format.spaces import action_leaf
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
+from mcaprl.recorder.record.env_types import check_single
 from mcaprl.recorder.record.infos import EpisodeInfos
+from mcaprl.recorder.record.recorded_space import recorded_space
 from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
 from mcaprl.recorder.record.step_rows import (
     ImageColumn,
@@ -65,6 +69,7 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
         scene: bool = True,
         camera: bool = False,
         infos: bool | Sequence[str] = False,
+        keys: Sequence[str] | None = None,
         step_duration_s: float | None = None,
         start_time_ns: int | None = None,
     ) -> None:
@@ -72,7 +77,8 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
 
         Args:
             env: Environment with a Box, Discrete, MultiDiscrete or MultiBinary action space. Its
-                observation space is one of these, or a Dict of them.
+                observation space is one of these, or a Dict or Tuple of them. A Tuple is recorded
+                as a Dict with the keys `0`, `1`, ...
             path: File to write.
             policy: Name of the policy.
             epsilon: Probability of a random action; NaN if unknown.
@@ -90,6 +96,8 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
             infos: Whether to record the infos that the environment returns, or the names of the
                 infos to record; `episode` includes `episode.r`. Values other than numbers, flags,
                 strings and arrays are not recorded and cause a warning.
+            keys: Keys of the parts of a Dict or Tuple observation to record, such as `joints`, or
+                `joints/q` for a part of a part; default: all. The agent still receives all parts.
             step_duration_s: Simulated seconds between two observations; default: the environment's
                 `step_duration_s`, else 1 / `render_fps`, else 0.1.
             start_time_ns: log_time of the first message, in nanoseconds since the Unix epoch;
@@ -97,13 +105,14 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
 
         Raises:
             SpaceError: The log format does not support the environment's spaces.
-            UsageError: Timestamps would not increase.
+            UnknownNameError: The observation has no such key.
+            UsageError: Timestamps would not increase, the observation has no keys, or `env` is not
+                an environment of Gymnasium.
             OutputExistsError, LogError: The file cannot be created or appended to.
         """
-        if isinstance(env, gym.vector.VectorEnv):
-            raise UsageError(
-                "RecordMcap wraps single environments; RecordVecMcap wraps vector ones"
-            )
+        check_single(env)
+        recorded = recorded_space(env.observation_space, keys)
+        action_leaf(env.action_space)
         super().__init__(env)
         self.policy, self.epsilon, self.behavior_prob = policy, epsilon, math.nan
         description = LogMetadata.of_env(
@@ -115,7 +124,7 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
         )
         self._recording = EpisodeLog(
             path,
-            description,
+            replace(description, observation_space=recorded.space),
             compression=compression,
             overwrite=overwrite,
             append=append,
@@ -133,7 +142,7 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
             for leaf in log.image_leaves
         }
         self._images = list(images.values())
-        self._store_observation = observation_store(env.observation_space, self._columns, images)
+        self._store_observation = observation_store(recorded, columns, images)
         self._full_at = 0
         self._open: OpenEpisode | None = None
         self._watch()

@@ -17,18 +17,22 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, SpaceError
+from mcaprl.ends import STEP_LIMIT
+from mcaprl.errors import LogError, McaprlError, SpaceError
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
+from mcaprl.recorder.record.recorded_space import recorded_like, value_at
 from mcaprl.recorder.record.step_rows import as_declared
 from mcaprl.texts import counted
 
 _MOST_FIELDS = 8
 _MOST_EPISODES = 10
 _Result = TypeVar("_Result")
+Paths = dict[Leaf, tuple[str | int, ...]]
+"""Path of each logged leaf in an observation of the environment."""
 
 
 @dataclass(frozen=True)
@@ -155,14 +159,16 @@ _Frames = Generator[tuple[Episode, int], None, _Result]
 def _compare_all(
     dataset: Dataset, env: gym.Env[Any, Any], only: int | None
 ) -> _Frames[Verification]:
-    _check_spaces(dataset, env)
+    paths = _checked_paths(dataset, env)
     compared = steps = 0
     unseeded: list[int] = []
     is_start_known = False
     for episode in _needed(dataset.episodes, only):
         continues = is_start_known and _follows(dataset.episodes, episode.index)
         is_start_known = episode.seed is not None or continues
-        difference = (yield from _compare(dataset, env, episode)) if is_start_known else None
+        difference = None
+        if is_start_known:
+            difference = yield from _compare(dataset, env, episode, paths)
         if difference is not None and episode.seed is None and difference.step == 0:
             # The episode started from an unknown state, so a difference is expected.
             is_start_known, difference = False, None
@@ -196,17 +202,17 @@ def _follows(episodes: tuple[Episode, ...], index: int) -> bool:
 
 
 def _compare(
-    dataset: Dataset, env: gym.Env[Any, Any], episode: Episode
+    dataset: Dataset, env: gym.Env[Any, Any], episode: Episode, paths: Paths
 ) -> _Frames[Difference | None]:
     """Replay one episode; yield the equal frames, and return the first difference."""
-    leaves = observation_leaves(dataset.observation_space)
     for step, now in enumerate(_stepped(env, episode, dataset.action_space)):
         fields = []
         if step > 0:
             fields += _transition_differences(episode, step - 1, now)
         logged = _at(episode, step)
-        for leaf in leaves:
-            fields += _leaf_differences(leaf, logged, now[0], dataset.observation_names)
+        for leaf, path in paths.items():
+            value = value_at(now[0], path)
+            fields += _leaf_differences(leaf, logged, value, dataset.observation_names)
         if fields:
             time_ns = int(episode.log_time_ns[step])
             since_s = (time_ns - int(episode.log_time_ns[0])) / 1e9
@@ -249,7 +255,7 @@ def _transition_differences(episode: Episode, step: int, now: _Frame) -> list[Fi
         ("reward", episode.rewards[step], np.float64(reward)),
         ("terminated", episode.terminated[step], np.bool_(terminated)),
     ]
-    broken_off = episode.reason == INTERRUPTED and step == episode.length - 1
+    broken_off = episode.reason in (INTERRUPTED, STEP_LIMIT) and step == episode.length - 1
     if not broken_off:
         pairs.append(("truncated", episode.truncated[step], np.bool_(truncated)))
     return [
@@ -263,7 +269,7 @@ def _leaf_differences(
     leaf: Leaf, logged: Any, now: Any, names: tuple[str, ...]
 ) -> list[FieldDifference]:
     old = np.asarray(leaf.of(logged))
-    new = as_declared(leaf.of(now), leaf)
+    new = as_declared(now, leaf)
     if old.tobytes() == new.tobytes():
         return []
     places = np.argwhere(_bits(old) != _bits(new)).tolist()
@@ -295,9 +301,27 @@ def _row(arrays: Any, row: int) -> Any:
     return arrays[row]
 
 
-def _check_spaces(dataset: Dataset, env: gym.Env[Any, Any]) -> None:
-    for role in ("observation_space", "action_space"):
-        logged, actual = getattr(dataset, role), getattr(env, role)
-        if logged != actual:
+def _checked_paths(dataset: Dataset, env: gym.Env[Any, Any]) -> Paths:
+    """Return the path of each logged leaf in an observation of the environment.
+
+    Raises:
+        SpaceError: The environment has other spaces than the log.
+    """
+    logged, actual = dataset.observation_space, env.observation_space
+    own: dict[tuple[str, ...], tuple[str | int, ...]] = {}
+    try:
+        recorded = recorded_like(actual, logged)
+        actual = recorded.space
+        own = {tuple(map(str, path)): path for path in recorded.paths}
+    except McaprlError:
+        # The environment lacks a logged part, so the spaces differ.
+        pass
+    pairs = {
+        "observation_space": (logged, actual),
+        "action_space": (dataset.action_space, env.action_space),
+    }
+    for role, (ours, theirs) in pairs.items():
+        if ours != theirs:
             name = env.spec.id if env.spec else "the environment"
-            raise SpaceError(f"the log has {role} {logged}, but {name} has {actual}")
+            raise SpaceError(f"the log has {role} {ours}, but {name} has {theirs}")
+    return {leaf: own[leaf.path] for leaf in observation_leaves(logged)}

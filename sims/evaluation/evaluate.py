@@ -107,6 +107,9 @@ def evaluate(
 ) -> PolicyScore:
     """Evaluate greedy actions of a policy; all training seeds get the same episodes.
 
+    In an environment without a time limit, an episode may never end: add one with
+    `gymnasium.wrappers.TimeLimit`.
+
     Args:
         env: Environment.
         policies: Policies of the training seeds; [None] for random actions.

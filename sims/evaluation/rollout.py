@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Sequence
+import shlex
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -156,6 +158,9 @@ def rollout(
 ) -> list[EpisodeResult]:
     """Run a number of episodes, or a number of steps.
 
+    In an environment without a time limit, an episode may never end: add one with
+    `gymnasium.wrappers.TimeLimit`.
+
     Args:
         env: Environment.
         behavior: Exploration policy.
@@ -233,21 +238,56 @@ def batch_rollout(
     return [result for result in results if result is not None]
 
 
-def check_fit(policy: Any, env: gym.Env[Any, Any]) -> None:
+def check_fit(
+    policy: Any, env: gym.Env[Any, Any], observation_space: spaces.Space[Any] | None = None
+) -> None:
     """Validate that the spaces of a trained policy and of an environment match; see `same_form`.
+
+    Args:
+        policy: Trained policy.
+        env: Environment.
+        observation_space: Space of the observations that the policy receives; default: that of the
+            environment.
 
     Raises:
         PolicyError: The policy was trained on spaces that do not match.
     """
-    for role in ("observation_space", "action_space"):
-        trained, actual = getattr(policy, role, None), getattr(env, role)
+    pairs = {
+        "observation_space": observation_space or env.observation_space,
+        "action_space": env.action_space,
+    }
+    for role, actual in pairs.items():
+        trained = getattr(policy, role, None)
         if trained is not None and not same_form(trained, actual):
             name = env.spec.id if env.spec else "the environment"
-            kind = getattr(policy, "env_kwargs", {}).get("observation")
-            hint = f"; try --observation {kind}" if kind and role == "observation_space" else ""
+            options = as_options(_other_arguments(policy, env))
+            hint = f"; the policy was trained with other arguments: pass {options}"
             raise PolicyError(
-                f"{policy.name} was trained on {role} {trained}; {name} has {actual}{hint}"
+                f"{policy.name} was trained on {role} {trained}; {name} has"
+                f" {actual}{hint if options else ''}"
             )
+
+
+def _other_arguments(policy: Any, env: gym.Env[Any, Any]) -> dict[str, Any]:
+    """Return the arguments of the training environment that differ from those of `env`."""
+    own = env.spec.kwargs if env.spec else {}
+    arguments = getattr(policy, "env_kwargs", {})
+    return {key: value for key, value in arguments.items() if own.get(key) != value}
+
+
+def as_options(arguments: Mapping[str, Any]) -> str:
+    """Return the options of the command line for arguments of an environment.
+
+    >>> as_options({"observation": "depth", "continuous": False})
+    '--observation depth --env-arg continuous=false'
+    """
+    options = []
+    for key, value in arguments.items():
+        if key in ("observation", "rules") and isinstance(value, str):
+            options.append(f"--{key} {shlex.quote(value)}")
+        else:
+            options.append(f"--env-arg {shlex.quote(f'{key}={json.dumps(value, default=repr)}')}")
+    return " ".join(options)
 
 
 def same_form(space: spaces.Space[Any], other: spaces.Space[Any]) -> bool:
@@ -266,6 +306,8 @@ def same_form(space: spaces.Space[Any], other: spaces.Space[Any]) -> bool:
 
 
 def _batch(observation: Any) -> Any:
+    if isinstance(observation, tuple):
+        return tuple(map(_batch, observation))
     if isinstance(observation, dict):
         return {key: _batch(part) for key, part in observation.items()}
     return np.asarray(observation)[None]

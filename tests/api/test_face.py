@@ -37,6 +37,7 @@ ONLY_OPTIONS = {
     "help": "click adds it",
     "quiet": "a function prints nothing unless the caller passes `progress`",
     "json": "a function returns a dataclass, whose to_json the command prints",
+    "env-arg": "an entry of sim_options",
     "convert --dry-run": "out=None",
     "convert --from": "`from` is a keyword of Python: source_format",
     "convert --suggest": "it selects the function suggest_mapping",

@@ -66,3 +66,13 @@ def test_a_sim_that_kills_each_worker_is_one_line(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("mcaprl.ray.workers.MOST_DEATHS", 1)
     with pytest.raises(ClusterError, match="died repeatedly while they evaluated random"):
         mcaprl.evaluate("random", SEEDED, episodes=1, ray=True, sim_options={"dies": True})
+
+
+def test_episodes_are_truncated_like_those_of_one_process() -> None:
+    options: dict[str, Any] = {"episodes": 3, "max_steps": 50}
+    with pytest.warns(UserWarning, match="3 of 3 episodes in CliffWalking-v1"):
+        local = mcaprl.evaluate("random", "CliffWalking-v1", **options)
+    with pytest.warns(UserWarning, match="3 of 3 episodes in CliffWalking-v1"):
+        found = mcaprl.evaluate("random", "CliffWalking-v1", ray=True, workers=1, **options)
+    assert found.to_json() == local.to_json()
+    assert found.policies[0].ends == {"step_limit": 3}

@@ -1,0 +1,155 @@
+"""The space of the observations in a log, which may differ from that of the environment.
+
+A log stores a Tuple as a Dict with the keys `0`, `1`, ..., and may omit parts of a Dict or Tuple.
+The agent still receives the observation of the environment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+from gymnasium import spaces
+
+from mcaprl.errors import SpaceError, UnknownNameError, UsageError
+from mcaprl.recorder.format.spaces import (
+    Leaf,
+    check_key,
+    is_below,
+    leaves_of,
+    nest,
+    observation_leaves,
+)
+
+
+class RecordedSpace(NamedTuple):
+    """The part of an observation space that a log stores.
+
+    Attributes:
+        space: Observation space of the log.
+        leaves: Leaves of this space.
+        paths: Path of each leaf in an observation of the environment. Keys of a Dict are strings,
+            indexes of a Tuple are integers.
+    """
+
+    space: spaces.Space[Any]
+    leaves: tuple[Leaf, ...]
+    paths: tuple[tuple[str | int, ...], ...]
+
+    def of(self, observation: Any) -> Any:
+        """Return an observation of the environment, or a batch of them, in the form of the log."""
+        return nest(self.leaves, [value_at(observation, path) for path in self.paths])
+
+
+def recorded_space(space: spaces.Space[Any], keys: Sequence[str] | None = None) -> RecordedSpace:
+    """Return the form in which a log stores the observations of an environment.
+
+    Args:
+        space: Observation space of the environment.
+        keys: Keys of the recorded parts of a Dict or Tuple, such as `joints`, or `joints/q` for a
+            part of a part; None for all.
+
+    Raises:
+        SpaceError: A log cannot store a recorded part.
+        UnknownNameError: A key matches no part.
+        UsageError: The observation has no keys.
+    """
+    parts = dict(_parts(space, ()))
+    paths = list(parts)
+    if keys is not None:
+        paths = _selected(paths, keys, space)
+    changes = len(paths) < len(parts) or any(isinstance(key, int) for path in paths for key in path)
+    logged = space
+    if changes:
+        logged = _dict_of([(tuple(map(str, path)), parts[path]) for path in paths])
+    try:
+        return RecordedSpace(logged, observation_leaves(logged), tuple(paths))
+    except SpaceError as error:
+        cure = "convert it with a TransformObservation wrapper"
+        if any(paths):
+            cure = f"{_keys_cure(parts)}, or {cure}"
+        raise SpaceError(f"{error}; {cure}") from error
+
+
+def recorded_like(space: spaces.Space[Any], logged: spaces.Space[Any]) -> RecordedSpace:
+    """Return the form in which a log with the space `logged` stores an environment's observations.
+
+    Raises:
+        SpaceError: A log cannot store a part that `logged` has.
+        UnknownNameError: The environment lacks a part.
+        UsageError: Only `logged` has keys.
+    """
+    keys = None
+    if isinstance(logged, spaces.Dict):
+        keys = ["/".join(leaf.path) for leaf in leaves_of(logged)]
+    return recorded_space(space, keys)
+
+
+def _parts(
+    space: spaces.Space[Any], path: tuple[str | int, ...]
+) -> Iterator[tuple[tuple[str | int, ...], spaces.Space[Any]]]:
+    """Yield the path and the space of each part that is neither a Dict nor a Tuple."""
+    if isinstance(space, spaces.Dict):
+        for key, part in space.spaces.items():
+            check_key(key, "observation", path)
+            yield from _parts(part, (*path, key))
+    elif isinstance(space, spaces.Tuple):
+        for index, part in enumerate(space.spaces):
+            yield from _parts(part, (*path, index))
+    else:
+        yield path, space
+
+
+def _selected(
+    paths: Sequence[tuple[str | int, ...]], keys: Sequence[str], space: spaces.Space[Any]
+) -> list[tuple[str | int, ...]]:
+    """Return the paths that the keys select.
+
+    Raises:
+        UnknownNameError: A key selects no path.
+        UsageError: There are no keys, or the space is not a Dict or Tuple.
+    """
+    if isinstance(keys, str):
+        keys = [keys]
+    if not isinstance(space, spaces.Dict | spaces.Tuple):
+        raise UsageError(
+            f"keys select parts of a Dict or Tuple, but the observation space is {space}: omit keys"
+        )
+    if not keys:
+        raise UsageError("keys is empty, so no observation would be recorded: pass some keys")
+    names = {path: "/".join(map(str, path)) for path in paths}
+    for key in keys:
+        if not any(is_below(name, key) for name in names.values()):
+            raise UnknownNameError("key of the observation", str(key), names.values())
+    return [path for path, name in names.items() if any(is_below(name, key) for key in keys)]
+
+
+def _dict_of(parts: Sequence[tuple[tuple[str, ...], spaces.Space[Any]]]) -> spaces.Dict:
+    """Return the Dict space with these paths, in order."""
+    groups: dict[str, list[tuple[tuple[str, ...], spaces.Space[Any]]]] = {}
+    for (key, *rest), part in parts:
+        groups.setdefault(key, []).append((tuple(rest), part))
+    return spaces.Dict(
+        [(key, _dict_of(inner) if inner[0][0] else inner[0][1]) for key, inner in groups.items()]
+    )
+
+
+def _keys_cure(parts: dict[tuple[str | int, ...], spaces.Space[Any]]) -> str:
+    """Return an advice to leave out the parts that a log cannot store."""
+    good = []
+    for path, part in parts.items():
+        try:
+            leaves_of(part)
+        except SpaceError:
+            continue
+        good.append("/".join(map(str, path)))
+    if not good:
+        return "no part of the observation can be recorded"
+    return f"leave it out with keys={good} (--keys {','.join(good)})"
+
+
+def value_at(observation: Any, path: Sequence[str | int]) -> Any:
+    """Return the part of an observation at a path of keys and indexes."""
+    for key in path:
+        observation = observation[key]
+    return observation
