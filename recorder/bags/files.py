@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import zstandard
 
 from mcaprl.errors import LogError, import_extra
+from mcaprl.files import temporary_folder
 from mcaprl.recorder.bags.mcap_file import McapFile
 from mcaprl.recorder.bags.rosbag_file import RosbagFile
 
@@ -117,8 +117,7 @@ def _metadata(folder: Path) -> dict[str, Any]:
 def _open(path: Path, distribution: str, opened: ExitStack) -> McapFile | RosbagFile:
     plain = path
     if path.name.endswith(_COMPRESSED):
-        folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="mcaprl-"))
-        plain = Path(folder) / _plain_name(path)
+        plain = opened.enter_context(temporary_folder()) / _plain_name(path)
         try:
             with path.open("rb") as packed, plain.open("wb") as file:
                 zstandard.ZstdDecompressor().copy_stream(packed, file)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import mmap
 import os
-import stat
 import struct
 from array import array
 from collections.abc import Iterator, Mapping
@@ -73,8 +72,6 @@ def map_unchanged(path: Path) -> tuple[memoryview, os.stat_result]:
         descriptor = open_at_once(path)
         try:
             state = os.fstat(descriptor)
-            if not stat.S_ISREG(state.st_mode):
-                raise LogError(f"cannot read {path}: it is not a regular file")
             if not state.st_size:
                 raise NotMcapError(f"{path} is not an MCAP file: it is empty")
             found = mmap.mmap(descriptor, state.st_size, access=mmap.ACCESS_READ)
