@@ -24,12 +24,14 @@ from typing import Any
 from mcaprl.errors import LogError, McaprlError, OutputExistsError, UsageError
 from mcaprl.locks import (
     OpenFolder,
+    check_plain,
     check_regular,
     hold,
     is_at,
     lock,
     locked_file,
     open_at_once,
+    read_file,
     taken,
     try_lock,
     waiting_lock,
@@ -49,6 +51,7 @@ from mcaprl.work_folders import (
 __all__ = [
     "TemporaryFolder",
     "check_log_name",
+    "check_plain",
     "check_regular",
     "check_target",
     "check_writable",
@@ -62,6 +65,7 @@ __all__ = [
     "open_at_once",
     "open_own",
     "parse_json",
+    "read_file",
     "remove_leftover",
     "replacing",
     "replacing_folder",

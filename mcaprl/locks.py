@@ -208,6 +208,35 @@ def check_regular(path: str | Path) -> None:
         raise OSError(_NOT_REGULAR)
 
 
+def read_file(path: str | Path) -> bytes:
+    """Read a regular file.
+
+    Raises:
+        OSError: The file cannot be read, or is a folder, device, socket or FIFO.
+    """
+    with FileIO(open_at_once(path)) as file:
+        return file.readall()
+
+
+def check_plain(path: str | Path) -> None:
+    """Check that a path is a regular file, or a folder of nothing but regular files and folders.
+
+    Libraries that open the files by their names would wait for the writer of a FIFO.
+
+    Raises:
+        OSError: There is something else; the error's file name is its path.
+    """
+    if not os.path.isdir(path):
+        check_regular(path)
+        return
+    for folder, _, names in os.walk(path):
+        for name in names:
+            place = os.path.join(folder, name)
+            # A link to a missing file is an error of the reader that needs it.
+            if os.path.exists(place) and not os.path.isfile(place):
+                raise OSError(f"{place} is not a regular file")
+
+
 def is_at(descriptor: int, path: str | Path) -> bool:
     """Return whether a descriptor and a path refer to the same file or folder."""
     try:

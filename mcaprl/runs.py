@@ -26,6 +26,7 @@ from mcaprl.files import (
     is_leftover,
     locked_folder,
     parse_json,
+    read_file,
     remove_leftover,
     subfolder,
     target_of,
@@ -236,8 +237,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     path = folder / CONFIG_NAME
     try:
-        check_regular(path)
-        found = parse_json(path.read_bytes())
+        found = parse_json(read_file(path))
     except (OSError, ValueError) as error:
         raise TrainingError(f"cannot resume: {path} cannot be read: {error}") from error
     if not isinstance(found, dict):
@@ -301,7 +301,7 @@ def saved_updates(run: Path, seeds: int) -> int:
     files = policy_files(run)
     if len(files) < seeds:
         return 0
-    return min(int(parse_json(file.read_bytes())["updates"]) for file in files)
+    return min(int(parse_json(read_file(file))["updates"]) for file in files)
 
 
 def read_curve(path: Path) -> Curve:
@@ -311,6 +311,7 @@ def read_curve(path: Path) -> Curve:
         TrainingError: The file cannot be read, or has no rows.
     """
     try:
+        check_regular(path)
         with path.open(newline="") as file:
             rows = list(csv.DictReader(file))
         return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}

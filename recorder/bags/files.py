@@ -11,7 +11,7 @@ from typing import Any
 import zstandard
 
 from mcaprl.errors import LogError, import_extra
-from mcaprl.files import temporary_folder
+from mcaprl.files import check_plain, read_file, temporary_folder
 from mcaprl.recorder.bags.mcap_file import McapFile
 from mcaprl.recorder.bags.rosbag_file import RosbagFile
 
@@ -51,6 +51,7 @@ def open_files(path: Path, opened: ExitStack) -> list[McapFile | RosbagFile]:
     if str(metadata.get("compression_mode") or "").lower() == "message":
         # Each message of this bag is compressed separately. `RosbagFile` decompresses the messages
         # only if it opens the folder instead of a file.
+        _check_plain(path)
         folder = RosbagFile(path)
         opened.callback(folder.close)
         return [folder]
@@ -108,14 +109,23 @@ def _metadata(folder: Path) -> dict[str, Any]:
         return {}
     yaml = import_extra("ruamel.yaml", "bags")
     try:
-        found = yaml.YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+        found = yaml.YAML(typ="safe").load(read_file(path).decode())
         return dict(found["rosbag2_bagfile_information"])
     except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
         raise LogError(f"{path} is not the metadata of a rosbag2 bag: {error}") from error
 
 
+def _check_plain(path: Path) -> None:
+    """Raise LogError if a file, or a file in a folder, is a device, socket or FIFO."""
+    try:
+        check_plain(path)
+    except OSError as error:
+        raise LogError(f"cannot read {path}: {error.strerror or error}") from error
+
+
 def _open(path: Path, distribution: str, opened: ExitStack) -> McapFile | RosbagFile:
     plain = path
+    _check_plain(path)
     if path.name.endswith(_COMPRESSED):
         plain = opened.enter_context(temporary_folder()) / _plain_name(path)
         try:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mcaprl.errors import LogError, UnknownNameError, UsageError
-from mcaprl.files import replacing, replacing_folder
+from mcaprl.files import check_plain, replacing, replacing_folder
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.remote import is_url
 
@@ -141,6 +141,10 @@ def read_format(path: str | Path, form: Format) -> Dataset:
     source = target_path(path, form)
     if not source.exists():
         raise LogError(f"{path}: no such file or folder")
+    try:
+        check_plain(source)
+    except OSError as error:
+        raise LogError(f"cannot read {path}: {error}") from error
     dataset: Dataset = form.module.read(source)
     dataset.sources = dataset.sources or (source,)
     return dataset
