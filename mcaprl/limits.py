@@ -20,7 +20,7 @@ SLOW_AFTER_S: Final = 12.0
 """Time after which the rate of an answer is checked, because the first bytes may take long."""
 MIN_BYTES_PER_S: Final = 500.0
 """Mean rate of an HTTP answer, because a dripping server would be awaited for ever."""
-MAX_OPEN_LOGS: Final = 128
-"""Logs that are open at the same time; each takes two descriptors of the usual 1024."""
+MAX_OPEN_LOGS: Final = 1000
+"""Logs that a stream keeps open, because each takes memory and one of the system's 65,530 maps."""
 CLIENT_TIMEOUT_S: Final = 10.0
 """Time that a viewer may take for its request or for the next part of an answer."""

@@ -9,8 +9,10 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import tempfile
 import threading
 from collections.abc import Iterable, Iterator, Sequence
+from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any, TypeGuard
 from weakref import WeakValueDictionary
@@ -73,6 +75,10 @@ class RemoteFile:
         self._version = _version_of(facts)
         folder, self._temporary = _folder_of(url, self._version, self.size)
         self._is_kept = self._temporary is None
+        if not self._is_kept:
+            # Unlike `weakref.finalize`, this also works at the end of a process of
+            # `multiprocessing`, and does nothing in a forked process, which shares the folder.
+            Finalize(self, shutil.rmtree, (folder, True), exitpriority=0)
         self.local = folder / _last_part(url)
         self._blocks_path = folder / "blocks"
         self._lock = threading.Lock()
@@ -81,7 +87,8 @@ class RemoteFile:
             if self._is_kept and self.local.exists():
                 self._merge_blocks()
             else:
-                self._blocks_path.unlink(missing_ok=True)
+                with open_own(self._blocks_path, "r+") as file:
+                    file.truncate(0)
             # Another process may be filling the same file, so an existing file is not emptied.
             with open_own(self.local, "a") as file:
                 file.truncate(self.size)
@@ -207,6 +214,8 @@ class RemoteFile:
 # Files by process and URL. A forked process opens its own files, because its parent removes the
 # local files when it no longer uses them.
 _in_use: WeakValueDictionary[tuple[int, str], RemoteFile] = WeakValueDictionary()
+# Folder of their local files by process and place.
+_temporary: WeakValueDictionary[tuple[int, str], TemporaryFolder] = WeakValueDictionary()
 
 
 class RemotePath(type(Path())):  # type: ignore[misc]
@@ -441,8 +450,11 @@ def _folder_of(url: str, version: str, size: int) -> tuple[Path, TemporaryFolder
         with _Errors(f"cannot write {folder}"):
             return subfolder(folder, own=True), None
     with _Errors("cannot write to the folder for temporary files"):
-        temporary = TemporaryFolder()
-    return temporary.path, temporary
+        # All files of a process share one locked folder, because a lock takes a descriptor.
+        key = os.getpid(), tempfile.gettempdir()
+        temporary = _temporary.get(key) or TemporaryFolder()
+        _temporary[key] = temporary
+        return Path(tempfile.mkdtemp(dir=temporary.path)), temporary
 
 
 def _last_part(url: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import mmap
 import os
 import struct
 from array import array
@@ -30,6 +29,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
 from mcaprl.files import open_at_once
 from mcaprl.recorder.columns.checksum import crc32
+from mcaprl.recorder.columns.file_map import mapped
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -74,7 +74,7 @@ def map_unchanged(path: Path) -> tuple[memoryview, os.stat_result]:
             state = os.fstat(descriptor)
             if not state.st_size:
                 raise NotMcapError(f"{path} is not an MCAP file: it is empty")
-            found = mmap.mmap(descriptor, state.st_size, access=mmap.ACCESS_READ)
+            found = mapped(descriptor, state.st_size)
         finally:
             os.close(descriptor)
     # `mmap` raises ValueError if the file was truncated after `fstat`.
@@ -82,7 +82,7 @@ def map_unchanged(path: Path) -> tuple[memoryview, os.stat_result]:
         raise LogError(
             f"cannot read {path}: {getattr(error, 'strerror', None) or error}"
         ) from error
-    return memoryview(found), state
+    return found, state
 
 
 def records_of(

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Windows has no `madvise`.
-_WILL_NEED = getattr(mmap, "MADV_WILLNEED", None)
+from mcaprl.recorder.format.reading import prefetch
+
 _PREFETCHED_BYTES = 1 << 30
 """Size of the images from which on they are prefetched. Fewer are soon in the system's cache."""
 
@@ -48,14 +48,13 @@ class ImageFile:
             (len(bytes_) - image_bytes + 1,),
             (1,),
         )
-        self._map = view.obj if isinstance(view.obj, mmap.mmap) else None
+        self._view = view
         self._checks = checks
         self._is_checked = np.zeros(len(checks), bool)
 
     def prefetch(self, start: int, stop: int) -> None:
         """Let the system start to load the pages of a range of bytes from the disk."""
-        if self._map is not None and _WILL_NEED is not None:
-            self._map.madvise(_WILL_NEED, start, stop - start)
+        prefetch(self._view, start, stop)
 
     def read(self, offsets: NDArray[np.int64], chunks: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Copy K images, given their byte offsets (K,) and the indexes (K,) of their chunks.

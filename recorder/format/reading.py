@@ -7,6 +7,7 @@ from mcaprl.recorder.columns.chunks import Scratch, chunk_header
 from mcaprl.recorder.columns.decoder import Columns, Decoder
 from mcaprl.recorder.columns.definitions import ROS1, definitions_of, full_name, leaf_kinds
 from mcaprl.recorder.columns.file_check import check_chunk, check_file, check_statistics, place
+from mcaprl.recorder.columns.file_map import prefetch
 from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, MessageRange
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.salvage import Damage
@@ -32,4 +33,5 @@ __all__ = [
     "full_name",
     "leaf_kinds",
     "place",
+    "prefetch",
 ]
