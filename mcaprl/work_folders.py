@@ -333,7 +333,7 @@ def _empty(folder: Path, opened: OpenFolder) -> None:
 
 
 def _remove(folder: Path, opened: OpenFolder) -> None:
-    """Remove a folder and end its lock; do nothing in a process forked from the one that made it."""
+    """Remove a folder and end its lock; do nothing in a process forked from its own."""
     if opened.closed:
         return
     try:
