@@ -132,12 +132,13 @@ def taken(path: Path, descriptor: int | None = None) -> LogError:
         path: Path that the message names.
         descriptor: Descriptor of the locked file; None if another process has locked it.
     """
-    mine = [file for file, records in list(_held.items()) if records]
-    for file in mine if descriptor is not None else ():
-        # Another thread may close the file.
-        with suppress(OSError, ValueError):
-            if os.path.samestat(os.fstat(file.fileno()), os.fstat(descriptor)):
-                return LogError(_OWN.format(path))
+    if descriptor is not None:
+        state = os.fstat(descriptor)
+        for file in [file for file, records in list(_held.items()) if records]:
+            # Another thread may close the file.
+            with suppress(OSError, ValueError):
+                if os.path.samestat(os.fstat(file.fileno()), state):
+                    return LogError(_OWN.format(path))
     return LogError(_TAKEN.format(path))
 
 

@@ -365,7 +365,8 @@ def system_of(url: str) -> tuple[Any, str]:
         LogError: The URL is not valid, or its server cannot be reached.
         MissingExtraError: The package for the protocol is not installed.
     """
-    core, options = import_extra("fsspec.core", "remote"), {}
+    core = import_extra("fsspec.core", "remote")
+    options: dict[str, Any] = {}
     if "http" in url.partition("://")[0]:
         http = import_extra("mcaprl.http_answers", "remote").options()
         is_chain = not url.startswith("http")

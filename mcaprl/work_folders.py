@@ -327,7 +327,7 @@ def _empty(folder: Path, opened: OpenFolder) -> None:
     for name, mode in _entries(folder, opened).items():
         place = name if options else folder / name
         if stat.S_ISDIR(mode):
-            shutil.rmtree(place, **options)
+            shutil.rmtree(place, dir_fd=options.get("dir_fd"))
         elif name != _MARK:
             os.unlink(place, **options)
 

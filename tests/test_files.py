@@ -165,14 +165,13 @@ def test_a_folder_that_was_being_replaced_is_restored(tmp_path: Path) -> None:
     (path / "1.txt").write_text("old")
 
     def replace() -> None:
-        moves, rename = [], os.rename
+        rename = os.rename
 
         def rename_once(*names: Any) -> None:
             rename(*names)
-            moves.append(names)
             os.kill(os.getpid(), signal.SIGKILL)
 
-        os.rename = rename_once
+        os.rename = rename_once  # type: ignore[assignment]
         with replacing_folder(path, overwrite=True) as folder:
             (folder / "1.txt").write_text("new")
 

@@ -26,7 +26,7 @@ def mapped(descriptor: int, size: int) -> memoryview:
     """
     if _LIBC is None:
         return memoryview(mmap.mmap(descriptor, size, access=mmap.ACCESS_READ))
-    return memoryview(np.asarray(_Map(descriptor, size)))
+    return np.asarray(_Map(descriptor, size)).data
 
 
 def prefetch(view: memoryview, start: int, stop: int) -> None:

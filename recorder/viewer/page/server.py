@@ -103,8 +103,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def setup(self) -> None:
         """Limit the time for the request and for each block of the answer."""
-        self.timeout = limits.CLIENT_TIMEOUT_S
         super().setup()
+        self.connection.settimeout(limits.CLIENT_TIMEOUT_S)
         # A client that sends one byte after the other would never reach the time-out of a byte.
         self._hang_up = threading.Timer(limits.CLIENT_TIMEOUT_S, self._close_connection)
         self._hang_up.daemon = True

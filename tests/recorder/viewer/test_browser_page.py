@@ -598,7 +598,12 @@ def test_a_client_that_reads_nothing_is_disconnected(
     monkeypatch.setattr(limits, "CLIENT_TIMEOUT_S", 0.3)
     monkeypatch.setattr(LogPage, "episode", lambda *_: bytes(2**26))
     left, finish = threading.Event(), server._Handler.finish
-    monkeypatch.setattr(server._Handler, "finish", lambda one: (finish(one), left.set()))
+
+    def note(handler: server._Handler) -> None:
+        finish(handler)
+        left.set()
+
+    monkeypatch.setattr(server._Handler, "finish", note)
     with served(log) as url:
         with socket.create_connection(("127.0.0.1", urlsplit(url).port), timeout=2) as connection:
             connection.sendall(b"GET /episode/1 HTTP/1.0\r\nHost: 127.0.0.1\r\n\r\n")
