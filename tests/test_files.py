@@ -87,11 +87,11 @@ needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @contextmanager
 def forked(body: Callable[[], object]) -> Iterator[Callable[[], None]]:
     """Run a function in a forked process, which then waits; yield a function that kills it."""
-    told, tell = os.pipe()
+    receiver, sender = os.pipe()
     pid = os.fork()
     if pid == 0:
         body()
-        os.write(tell, b".")
+        os.write(sender, b".")
         signal.pause()
     killed = []
 
@@ -101,7 +101,7 @@ def forked(body: Callable[[], object]) -> Iterator[Callable[[], None]]:
         killed.append(True)
 
     try:
-        assert os.read(told, 1) == b"."
+        assert os.read(receiver, 1) == b"."
         yield kill
     finally:
         if not killed:
