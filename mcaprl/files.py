@@ -1,74 +1,88 @@
-"""Locks on files and folders, and atomic replacement of files.
+"""Atomic replacement of files and folders.
 
 A file is written in a hidden work folder beside its target. This folder, `.NAME.part`, is locked
 while its writer runs. When the file is complete and synced to disk, it replaces the target
 atomically. If the writer is killed, the target has either its old or its new content. The next
-writer removes the work folder.
+writer in the same folder removes the work folder. `mcaprl.locks` has the locks, and
+`mcaprl.work_folders` the work folders; other modules import both from here.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
 import re
-import shutil
 import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from mcaprl.errors import LogError, McaprlError, OutputExistsError, UsageError
+from mcaprl.locks import (
+    OpenFolder,
+    check_plain,
+    check_regular,
+    hold,
+    is_at,
+    lock,
+    locked_file,
+    open_at_once,
+    read_file,
+    taken,
+    try_lock,
+    waiting_lock,
+)
+from mcaprl.work_folders import (
+    TemporaryFolder,
+    check_local,
+    fresh_folder,
+    is_leftover,
+    moved_aside,
+    remove_leftover,
+    target_of,
+    temporary_folder,
+    work_folder,
+)
 
-if sys.platform != "win32":
-    import fcntl
+__all__ = [
+    "TemporaryFolder",
+    "check_log_name",
+    "check_plain",
+    "check_regular",
+    "check_target",
+    "check_writable",
+    "fresh_folder",
+    "hold",
+    "is_at",
+    "is_leftover",
+    "json_text",
+    "locked_file",
+    "locked_folder",
+    "open_at_once",
+    "open_own",
+    "parse_json",
+    "read_file",
+    "remove_leftover",
+    "replacing",
+    "replacing_folder",
+    "size_of",
+    "subfolder",
+    "taken",
+    "target_of",
+    "temporary_folder",
+    "try_lock",
+    "waiting_lock",
+    "work_folder",
+    "write_atomically",
+    "write_json",
+]
 
-_MAX_NAME_BYTES = 255
 _MAX_JSON_DEPTH = 100
 _DIGITS = re.compile(r"\d+")
-# `Path` turns the two slashes of a URL into one.
-_URL = re.compile(r"[a-z][a-z0-9+.-]+:/")
-_TAKEN = "{} is being written by another process; wait until it ends, or choose another path"
-
-
-def try_lock(descriptor: int) -> bool:
-    """Lock an open file or folder; return False if another process has locked it.
-
-    The lock is advisory and ends when the file is closed. On systems without `flock`, such as
-    Windows and some network file systems, nothing is locked, and the result is True.
-    """
-    if sys.platform != "win32":
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        except OSError:
-            pass
-    return True
-
-
-@contextmanager
-def waiting_lock(file: BinaryIO) -> Iterator[None]:
-    """Lock an open file; if another process has locked it, wait. Unlock it at the end.
-
-    On systems without `flock`, nothing is locked; see `try_lock`.
-    """
-    if sys.platform == "win32":
-        yield
-        return
-    with suppress(OSError):
-        fcntl.flock(file, fcntl.LOCK_EX)
-    try:
-        yield
-    finally:
-        file.flush()
-        # A forked process may still have the file open, so closing it does not end the lock.
-        with suppress(OSError):
-            fcntl.flock(file, fcntl.LOCK_UN)
 
 
 @contextmanager
@@ -81,16 +95,16 @@ def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Ite
         UsageError: The path is a URL.
         McaprlError: Another process is writing to the folder, or it cannot be created.
     """
-    _check_local(folder)
-    descriptor, is_new = -1, not folder.exists()
+    check_local(folder)
+    is_new, opened = not folder.exists(), None
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if sys.platform != "win32":
-            descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+            opened = OpenFolder(os.open(folder, os.O_RDONLY | os.O_DIRECTORY))
     except OSError as error:
         raise error_type(f"cannot write {folder}: {_reason(folder, error)}") from error
     try:
-        if descriptor >= 0 and not try_lock(descriptor):
+        if opened is not None and not lock(opened):
             raise error_type(
                 f"{folder} is in use by another recording or training: wait until it ends, or"
                 " choose another folder"
@@ -98,12 +112,55 @@ def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Ite
         try:
             yield
         finally:
-            if is_new:
+            # A forked process has closed its copy, and must not remove its parent's folder.
+            if is_new and not (opened is not None and opened.closed):
                 with suppress(OSError):
                     folder.rmdir()
     finally:
-        if descriptor >= 0:
-            os.close(descriptor)
+        if opened is not None:
+            opened.close()
+
+
+def subfolder(path: Path, *, own: bool = False) -> Path:
+    """Create a folder in the folder of an output, if it is missing; return its path.
+
+    Args:
+        path: Path of the folder.
+        own: Whether the folder must belong to this user.
+
+    Raises:
+        OutputExistsError: A symbolic link, a file or the folder of another user is at the path.
+        OSError: The folder cannot be created.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with suppress(FileExistsError):
+        path.mkdir()
+    state, problem = path.lstat(), ""
+    if not stat.S_ISDIR(state.st_mode):
+        problem = "is a symbolic link" if path.is_symlink() else "is not a folder"
+    elif own and sys.platform != "win32" and state.st_uid != os.geteuid():
+        problem = "belongs to another user"
+    if problem:
+        raise OutputExistsError(f"{path} {problem}: move or delete it, or choose another output")
+    return path
+
+
+def open_own(path: Path, mode: str) -> FileIO:
+    """Open a file of a cache, or create it; follow no symbolic link.
+
+    Args:
+        path: Path of the file.
+        mode: `a` to write at the end, `r+` to read and write; both create the file.
+
+    Raises:
+        OutputExistsError: A symbolic link, or what is not a regular file, is at the path.
+        OSError: The file cannot be opened.
+    """
+    flags = {"a": os.O_WRONLY | os.O_APPEND, "r+": os.O_RDWR}[mode]
+    flags |= os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    if os.path.lexists(path) and not stat.S_ISREG(path.lstat().st_mode):
+        raise OutputExistsError(f"{path} is not a regular file: move or delete it")
+    return FileIO(path, mode, opener=lambda name, _: os.open(name, flags, 0o666))
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:
@@ -113,9 +170,9 @@ def check_target(path: Path, *, overwrite: bool) -> None:
         OutputExistsError: The file exists and `overwrite` is not set, or the path belongs to a
             symbolic link, folder, device or FIFO.
         UsageError: The path is a URL.
-        LogError: Another writer has locked the file.
+        LogError: Another writer has locked the file, or this program has an open recorder of it.
     """
-    _check_local(path)
+    check_local(path)
     try:
         mode = path.lstat().st_mode
     except OSError:
@@ -126,21 +183,11 @@ def check_target(path: Path, *, overwrite: bool) -> None:
         raise OutputExistsError(f"{path} is a symbolic link: choose the path of a regular file")
     if not stat.S_ISREG(mode):
         raise OutputExistsError(f"{path} is not a regular file: choose another path")
+    with locked_file(path):
+        pass
     if not overwrite:
         raise OutputExistsError(
             f"{path} exists: choose another path, or pass --overwrite (overwrite=True in Python)"
-        )
-    with locked_file(path):
-        pass
-
-
-def _check_local(path: Path) -> None:
-    """Raise UsageError if the path of an output is a URL."""
-    if _URL.match(str(path)):
-        url = str(path).replace(":/", "://", 1)
-        raise UsageError(
-            f"{url} is a URL, but outputs are local: choose a local path; record, convert and"
-            " train-online copy their logs with --upload URL"
         )
 
 
@@ -168,116 +215,6 @@ def check_log_name(path: str | Path) -> Path:
     if path.suffix != ".mcap":
         raise UsageError(f"{path}: the name of a log must end in .mcap")
     return path
-
-
-@contextmanager
-def locked_file(path: Path) -> Iterator[None]:
-    """Lock a file against other writers. Do nothing if it does not exist or cannot be read.
-
-    Raises:
-        LogError: Another writer has locked the file.
-    """
-    while True:
-        try:
-            file = FileIO(open_at_once(path))
-        except OSError:
-            yield
-            return
-        with file:
-            if not try_lock(file.fileno()):
-                raise LogError(_TAKEN.format(path))
-            # A writer may have replaced the file before this lock was acquired: try again.
-            if is_at(file.fileno(), path):
-                yield
-                return
-
-
-def open_at_once(path: Path) -> int:
-    """Open a file for reading; if it is a FIFO, do not wait for its writer."""
-    return os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-
-
-def is_at(descriptor: int, path: str | Path) -> bool:
-    """Return whether a descriptor and a path refer to the same file or folder."""
-    try:
-        return os.path.samestat(os.fstat(descriptor), os.stat(path))
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-
-
-@contextmanager
-def work_folder(path: Path, *, concurrent: bool = False) -> Iterator[Path]:
-    """Create and lock the work folder of a target; remove it at the end.
-
-    Files that a killed writer left there are removed first.
-
-    Args:
-        path: Target, which this function neither reads nor writes.
-        concurrent: Whether several processes may write files for the target at the same time.
-
-    Raises:
-        LogError: Another process is writing the target, or a log in the folder cannot be written.
-        OSError: The folder cannot be created.
-    """
-    _check_local(path)
-    folder = _work_path(path, f".{os.getpid()}.part" if concurrent else ".part")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if concurrent:
-        _remove_unlocked(path.parent, f".{path.name}.")
-    while True:
-        folder.mkdir(exist_ok=True)
-        descriptor = -1 if sys.platform == "win32" else os.open(folder, os.O_RDONLY)
-        try:
-            if descriptor >= 0 and not try_lock(descriptor):
-                raise LogError(_TAKEN.format(path))
-            # A writer may have removed the folder before this lock was acquired: try again.
-            if descriptor >= 0 and not is_at(descriptor, folder):
-                continue
-            _empty(folder)
-            try:
-                yield folder
-            except LogError as error:
-                # The message names the target, because the user does not know the work folder.
-                cause = error.__cause__
-                if isinstance(cause, OSError) and str(folder) in str(error):
-                    raise LogError(f"cannot write {path}: {cause.strerror or cause}") from error
-                raise
-            finally:
-                shutil.rmtree(folder, ignore_errors=True)
-            return
-        finally:
-            if descriptor >= 0:
-                os.close(descriptor)
-
-
-def remove_leftover(path: Path) -> None:
-    """Remove the work folder of a target if a process was killed while writing it."""
-    if _work_path(path).is_dir():
-        with suppress(OSError, LogError), work_folder(path):
-            pass
-
-
-def _remove_unlocked(parent: Path, prefix: str) -> None:
-    """Remove the work folders of concurrent writers that were killed."""
-    for folder in parent.iterdir():
-        if folder.name.startswith(prefix) and folder.name.endswith(".part"):
-            with suppress(OSError, LogError), locked_folder(folder):
-                shutil.rmtree(folder)
-
-
-def _work_path(path: Path, suffix: str = ".part") -> Path:
-    name = f".{path.name}{suffix}"
-    if len(os.fsencode(name)) > _MAX_NAME_BYTES:
-        name = f".{hashlib.sha256(os.fsencode(name)).hexdigest()[:32]}{suffix}"
-    return path.with_name(name)
-
-
-def _empty(folder: Path) -> None:
-    for leftover in folder.iterdir():
-        if leftover.is_dir() and not leftover.is_symlink():
-            shutil.rmtree(leftover)
-        else:
-            leftover.unlink()
 
 
 @contextmanager
@@ -351,8 +288,9 @@ def replacing_folder(
             _check_folder(path, overwrite=overwrite)
             if path.exists():
                 _check_contents(path, unfinished)
-                # Between these two moves, nothing is at `path`, but both folders are complete.
-                os.rename(path, work / f"{path.name}.old")
+                # Between these two moves, nothing is at `path`. If the process is killed there,
+                # the next run moves the old folder back.
+                os.rename(path, moved_aside(work, path.name))
             os.rename(unfinished, path)
     except OSError as error:
         raise error_type(f"cannot write {path}: {_reason(path, error)}") from error
@@ -362,13 +300,16 @@ def _reason(path: Path, error: OSError) -> str:
     """Return why a file or folder cannot be created."""
     if isinstance(error, FileExistsError | NotADirectoryError):
         for folder in (path, *path.parents):
+            if folder.is_symlink() and not folder.exists():
+                return f"{folder} is a symbolic link to a missing file"
             if folder.exists() and not folder.is_dir():
                 return f"{folder} is not a folder"
-    return error.strerror or str(error)
+    # Some libraries put a sentence of theirs in the place of the system's text.
+    return os.strerror(error.errno) if error.errno else str(error)
 
 
 def _check_folder(path: Path, *, overwrite: bool) -> None:
-    _check_local(path)
+    check_local(path)
     if path.is_symlink() or (path.exists() and not path.is_dir()):
         raise OutputExistsError(f"{path} is not a folder: choose another path")
     if path.name in ("", ".."):

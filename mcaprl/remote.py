@@ -20,8 +20,9 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl import limits
 from mcaprl.errors import LogError, OutputExistsError, UsageError, import_extra
-from mcaprl.files import waiting_lock
+from mcaprl.files import TemporaryFolder, open_own, replacing, subfolder, waiting_lock
 
 CACHE_VARIABLE = "MCAPRL_CACHE"
 """Name of the environment variable for the folder that keeps fetched parts for later commands."""
@@ -66,8 +67,14 @@ class RemoteFile:
         if facts.get("size") is None:
             raise LogError(f"cannot read {url}: its size is unknown; download it first")
         self.size = int(facts["size"])
+        if not 0 <= self.size <= limits.MAX_REMOTE_BYTES:
+            raise LogError(
+                f"cannot read {url}: its server declares {self.size} bytes, but a file has at most"
+                f" {limits.MAX_REMOTE_BYTES}"
+            )
         self._version = _version_of(facts)
-        folder, self._is_kept = _folder_of(url, self._version, self.size)
+        folder, self._temporary = _folder_of(url, self._version, self.size)
+        self._is_kept = self._temporary is None
         if not self._is_kept:
             # Unlike `weakref.finalize`, this also works at the end of a process of
             # `multiprocessing`, and does nothing in a forked process, which shares the folder.
@@ -80,9 +87,10 @@ class RemoteFile:
             if self._is_kept and self.local.exists():
                 self._merge_blocks()
             else:
-                self._blocks_path.unlink(missing_ok=True)
+                with open_own(self._blocks_path, "r+") as file:
+                    file.truncate(0)
             # Another process may be filling the same file, so an existing file is not emptied.
-            with self.local.open("ab") as file:
+            with open_own(self.local, "a") as file:
                 file.truncate(self.size)
 
     @classmethod
@@ -110,33 +118,39 @@ class RemoteFile:
                 last = -(-min(stop, self.size) // BLOCK_BYTES)
                 wanted[max(start, 0) // BLOCK_BYTES : last] = True
             pieces = [one for run in self._runs(wanted & ~self._has) for one in _divided(*run)]
-            if not pieces:
-                return
-            starts, stops = (list(each) for each in zip(*pieces, strict=True))
-            system, path = self._system()
-            with _Errors(f"cannot read {self.url}"):
-                parts = system.cat_ranges([path] * len(pieces), starts, stops, on_error="raise")
-                # Older versions of fsspec return some errors.
-                for part in parts:
-                    if isinstance(part, BaseException):
-                        raise part
-            for (start, stop), part in zip(pieces, parts, strict=True):
-                if len(part) != stop - start:
-                    raise LogError(
-                        f"cannot read {self.url}: bytes {start} to {stop} were requested, but"
-                        f" {len(part)} bytes arrived: the file has changed, or its server ignores"
-                        " ranges; download it first"
-                    )
-            with _Errors(f"cannot write {self.local}"):
-                self._write(pieces, parts)
+            for group in _grouped(pieces):
+                parts = self._request(group)
+                with _Errors(f"cannot write {self.local}"):
+                    self._write(group, parts)
+
+    def _request(self, pieces: list[Range]) -> list[bytes]:
+        """Request byte ranges at the same time."""
+        starts, stops = (list(each) for each in zip(*pieces, strict=True))
+        system, path = self._system()
+        with _Errors(f"cannot read {self.url}"):
+            found = system.cat_ranges([path] * len(pieces), starts, stops, on_error="raise")
+            # Older versions of fsspec return some errors.
+            for part in found:
+                if isinstance(part, BaseException):
+                    raise part
+        parts: list[bytes] = list(found)
+        for (start, stop), part in zip(pieces, parts, strict=True):
+            if len(part) != stop - start:
+                raise LogError(
+                    f"cannot read {self.url}: bytes {start} to {stop} were requested, but"
+                    f" {len(part)} bytes arrived: the file has changed, or its server ignores"
+                    " ranges; download it first"
+                )
+        return parts
 
     def _write(self, pieces: Iterable[Range], parts: Iterable[bytes]) -> None:
         """Write fetched parts to the local file, and then mark their blocks."""
-        with self.local.open("rb+") as file:
+        with open_own(self.local, "r+") as file:
             for (start, _), part in zip(pieces, parts, strict=True):
                 file.seek(start)
-                file.write(part)
-            file.flush()
+                rest = memoryview(part)
+                while rest:
+                    rest = rest[file.write(rest) :]
             if self._is_kept:
                 # Otherwise, a block could be marked after a crash of the system, but empty.
                 os.fsync(file.fileno())
@@ -147,8 +161,7 @@ class RemoteFile:
 
     def _merge_blocks(self) -> None:
         """Exchange the marks of fetched blocks with the processes that share the cache."""
-        self._blocks_path.touch()
-        with self._blocks_path.open("rb+") as file, waiting_lock(file):
+        with open_own(self._blocks_path, "r+") as file, waiting_lock(file):
             bits = np.zeros(-(-len(self._has) // 8), np.uint8)
             kept = np.frombuffer(file.read(len(bits)), np.uint8)
             bits[: len(kept)] = kept
@@ -201,6 +214,8 @@ class RemoteFile:
 # Files by process and URL. A forked process opens its own files, because its parent removes the
 # local files when it no longer uses them.
 _in_use: WeakValueDictionary[tuple[int, str], RemoteFile] = WeakValueDictionary()
+# Folder of their local files by process and place.
+_temporary: WeakValueDictionary[tuple[int, str], TemporaryFolder] = WeakValueDictionary()
 
 
 class RemotePath(type(Path())):  # type: ignore[misc]
@@ -282,8 +297,15 @@ def upload(path: str | Path, url: str) -> None:
         MissingExtraError: The package for the URL's protocol is not installed.
     """
     system, target = system_of(url)
+    local = import_extra("fsspec.implementations.local", "remote").LocalFileSystem
     unfinished = f"{target}.part"
     with _Errors(f"cannot upload {path} to {url}"):
+        if isinstance(system, local):
+            with replacing(Path(target)) as copy:
+                shutil.copyfile(path, copy)
+            return
+        if system.exists(unfinished) and system.info(unfinished).get("type") != "file":
+            raise OutputExistsError(f"{url}.part is not a file: delete it, or choose another URL")
         try:
             parent = system._parent(target)
             if parent:
@@ -344,8 +366,13 @@ def system_of(url: str) -> tuple[Any, str]:
         MissingExtraError: The package for the protocol is not installed.
     """
     core = import_extra("fsspec.core", "remote")
+    options: dict[str, Any] = {}
+    if "http" in url.partition("://")[0]:
+        http = import_extra("mcaprl.http_answers", "remote").options()
+        is_chain = not url.startswith("http")
+        options = {"http": http, "https": http} if is_chain else http
     with _Errors(f"cannot open {url}"):
-        system, path = core.url_to_fs(url)
+        system, path = core.url_to_fs(url, **options)
     return system, str(path)
 
 
@@ -365,6 +392,10 @@ class _Errors:
             if not _is_failed_request(error.__cause__):
                 raise LogError(f"{self._text}: no such file") from error
             error = error.__cause__
+        if isinstance(error, TimeoutError):
+            # Its own text is empty, or names no time.
+            seconds = limits.SILENCE_TIMEOUT_S
+            raise LogError(f"{self._text}: no answer within {seconds:.0f} s") from error
         what = str(error).strip().splitlines()
         raise LogError(f"{self._text}: {what[0] if what else type(error).__name__}") from error
 
@@ -378,6 +409,20 @@ def _is_failed_request(cause: BaseException | None) -> TypeGuard[Exception]:
     if isinstance(cause, OSError):
         return not isinstance(cause, FileNotFoundError)
     return getattr(cause, "status", 404) != 404
+
+
+def _grouped(pieces: list[Range]) -> Iterator[list[Range]]:
+    """Divide the ranges of a request into groups that fit in memory."""
+    group, size = list[Range](), 0
+    for start, stop in pieces:
+        is_full = size + stop - start > limits.MAX_FETCHED_BYTES
+        if group and (is_full or len(group) == limits.MAX_REQUESTS):
+            yield group
+            group, size = [], 0
+        group.append((start, stop))
+        size += stop - start
+    if group:
+        yield group
 
 
 def _divided(start: int, stop: int) -> list[Range]:
@@ -394,8 +439,8 @@ def _version_of(facts: dict[str, Any]) -> str:
     return " ".join(str(facts[name]) for name in names if facts.get(name) is not None)
 
 
-def _folder_of(url: str, version: str, size: int) -> tuple[Path, bool]:
-    """Return the local folder for a remote file, and whether it is kept for later processes.
+def _folder_of(url: str, version: str, size: int) -> tuple[Path, TemporaryFolder | None]:
+    """Return the local folder for a remote file; the second value is None if it is kept.
 
     Without a version, a later process could not notice that the remote file has changed.
     """
@@ -404,9 +449,13 @@ def _folder_of(url: str, version: str, size: int) -> tuple[Path, bool]:
     if kept and version:
         folder = Path(kept) / name
         with _Errors(f"cannot write {folder}"):
-            folder.mkdir(parents=True, exist_ok=True)
-        return folder, True
-    return Path(tempfile.mkdtemp(prefix="mcaprl-remote-")), False
+            return subfolder(folder, own=True), None
+    with _Errors("cannot write to the folder for temporary files"):
+        # All files of a process share one locked folder, because a lock takes a descriptor.
+        key = os.getpid(), tempfile.gettempdir()
+        temporary = _temporary.get(key) or TemporaryFolder()
+        _temporary[key] = temporary
+        return Path(tempfile.mkdtemp(dir=temporary.path)), temporary
 
 
 def _last_part(url: str) -> str:

@@ -11,7 +11,6 @@ RUN/seed-K/best_model.zip               policy of an online run, as Stable-Basel
 from __future__ import annotations
 
 import csv
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,7 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import OutputExistsError, TrainingError, UsageError
-from mcaprl.files import locked_folder, parse_json, write_json
+from mcaprl.files import (
+    check_regular,
+    is_leftover,
+    locked_folder,
+    parse_json,
+    read_file,
+    remove_leftover,
+    subfolder,
+    target_of,
+    write_json,
+)
 from mcaprl.texts import counted
 
 CONFIG_NAME = "config.json"
@@ -153,7 +162,7 @@ def open_run(
         identity.check_same(found, folder / CONFIG_NAME)
     with writing(folder):
         for path in leftovers or ():
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+            remove_leftover(path.with_name(target_of(path))) if path.is_dir() else path.unlink()
         folder.mkdir(parents=True, exist_ok=True)
     trained = {"seeds": len(seeds), "seed": seeds.start}
     write_json(folder / CONFIG_NAME, {**identity.parts, **trained, **source}, TrainingError)
@@ -202,8 +211,7 @@ def seed_folder(run: Path, seed: int) -> Path:
     """Return the folder of a seed; create it if it is missing."""
     folder = run / f"seed-{seed}"
     with writing(folder):
-        folder.mkdir(exist_ok=True)
-    return folder
+        return subfolder(folder)
 
 
 def run_to_resume(folder: Path) -> dict[str, Any]:
@@ -229,7 +237,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     path = folder / CONFIG_NAME
     try:
-        found = parse_json(path.read_bytes())
+        found = parse_json(read_file(path))
     except (OSError, ValueError) as error:
         raise TrainingError(f"cannot resume: {path} cannot be read: {error}") from error
     if not isinstance(found, dict):
@@ -293,7 +301,7 @@ def saved_updates(run: Path, seeds: int) -> int:
     files = policy_files(run)
     if len(files) < seeds:
         return 0
-    return min(int(parse_json(file.read_bytes())["updates"]) for file in files)
+    return min(int(parse_json(read_file(file))["updates"]) for file in files)
 
 
 def read_curve(path: Path) -> Curve:
@@ -303,6 +311,7 @@ def read_curve(path: Path) -> Curve:
         TrainingError: The file cannot be read, or has no rows.
     """
     try:
+        check_regular(path)
         with path.open(newline="") as file:
             rows = list(csv.DictReader(file))
         return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
@@ -326,13 +335,19 @@ def _leftovers(folder: Path) -> list[Path] | None:
         return None
     found: list[Path] = []
     for path in folder.iterdir():
-        is_seed = path.is_dir() and path.name.startswith("seed-")
+        is_seed = _is_real_folder(path) and path.name.startswith("seed-")
         found += path.iterdir() if is_seed else [path]
     return found if all(map(_is_leftover, found)) else None
 
 
+def _is_real_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
+
+
 def _is_leftover(path: Path) -> bool:
+    if path.is_symlink():
+        return False
     if path.is_dir():
         # Some files are first written in such a temporary folder. A killed run leaves it.
-        return path.name.startswith(".") and path.name.endswith(".part")
+        return is_leftover(path)
     return path.name in (CONFIG_NAME, METRICS_NAME) or path.name.startswith("events.out.tfevents")

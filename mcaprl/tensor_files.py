@@ -14,7 +14,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from mcaprl.errors import TrainingError
-from mcaprl.files import parse_json, write_atomically
+from mcaprl.files import check_regular, parse_json, write_atomically
 
 _DESCRIPTION = "description"
 
@@ -42,6 +42,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         SafetensorError: The file is not a safetensors file.
         ValueError: The header has no description.
     """
+    check_regular(path)
     with safe_open(path, framework="pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         description = parse_json((file.metadata() or {}).get(_DESCRIPTION, "null"))

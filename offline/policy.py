@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from mcaprl.architecture import architecture_of
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
-from mcaprl.files import parse_json, write_json
+from mcaprl.files import parse_json, read_file, write_json
 from mcaprl.networks import ImageInput, Network, check_size
 from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import allowed_only, likely_actions, mean_values
@@ -254,7 +254,7 @@ def read_policy(folder: Path) -> Policy:
         PolicyError: A file is missing or broken.
     """
     try:
-        description = parse_json((folder / POLICY_NAME).read_bytes())
+        description = parse_json(read_file(folder / POLICY_NAME))
         if description["format_version"] != FORMAT_VERSION:
             raise ValueError(f"format_version {description['format_version']} is not supported")
         return _build(folder, description, read_tensors(folder / _WEIGHTS_NAME)[0])

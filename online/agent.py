@@ -21,7 +21,7 @@ from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.errors import TrainingError
-from mcaprl.files import write_atomically
+from mcaprl.files import subfolder, write_atomically
 from mcaprl.online.algorithms import make_model, own_architecture
 from mcaprl.online.checkpoint import load_checkpoint, save_checkpoint
 from mcaprl.online.config import DQNConfig
@@ -250,7 +250,7 @@ class Agent:
             self._describer.reset()
             folder = self._folder / EVALUATIONS_NAME
             with writing(folder):
-                folder.mkdir(exist_ok=True)
+                subfolder(folder)
             path = folder / f"step-{point.step:09d}.mcap"
             self._evaluated.dataset().save(path, overwrite=True)
 

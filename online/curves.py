@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import TrainingError
 from mcaprl.figures import BACKGROUND, COLORS, INK, PALE, new_figure, save_png
-from mcaprl.files import write_atomically
+from mcaprl.files import read_file, write_atomically
 from mcaprl.runs import CURVE_NAME, Curve, read_curves
 
 IMAGE_NAME = "curve.png"
@@ -132,7 +132,7 @@ def _final_scores(path: Path) -> tuple[float, ...]:
     if not path.exists():
         return ()
     try:
-        seeds = json.loads(path.read_text())["seeds"].values()
+        seeds = json.loads(read_file(path))["seeds"].values()
         return tuple(seed["score"] for seed in seeds if seed["score"] is not None)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise TrainingError(f"cannot read the scores in {path}: {error}") from error

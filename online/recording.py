@@ -20,6 +20,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
 from mcaprl.errors import LogError, NoStepsError, NotMcapError, OutputExistsError, UsageError
+from mcaprl.files import check_target
 from mcaprl.online.double_dqn import WarmDQN
 from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
 from mcaprl.recorder.repair.recover import recover_log
@@ -78,6 +79,7 @@ def recorded(
             with path.open("rb") as file:
                 if not MCAP0_MAGIC.startswith(file.read(len(MCAP0_MAGIC))):
                     raise
+            check_target(damaged, overwrite=True)
             os.replace(path, damaged)
             return wrap(append=False)
         _keep(path, damaged)
@@ -87,6 +89,7 @@ def recorded(
 
 def _keep(path: Path, kept: Path) -> None:
     """Link or copy a file to a second path, so that the first path can be replaced atomically."""
+    check_target(kept, overwrite=True)
     kept.unlink(missing_ok=True)
     try:
         os.link(path, kept)

@@ -23,7 +23,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import Tensor
 
 from mcaprl.errors import PolicyError, TrainingError
-from mcaprl.files import parse_json, write_atomically
+from mcaprl.files import check_regular, parse_json, write_atomically
 
 OWN_NAME = "mcaprl.json"
 _DATA_NAME = "data"
@@ -68,6 +68,7 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any], dict[str, Te
         PolicyError: The file is not a model of SB3, or is broken.
     """
     try:
+        check_regular(path)
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
             own = parse_json(_read(archive, OWN_NAME, _MAX_JSON_BYTES)) if OWN_NAME in names else {}

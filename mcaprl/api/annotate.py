@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from mcaprl.api.environments import sim_of
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
 from mcaprl.api.ranges import check_fraction
 from mcaprl.errors import UsageError
-from mcaprl.files import check_log_name, check_target
+from mcaprl.files import check_log_name, check_target, temporary_folder
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import open_logs
@@ -98,8 +97,8 @@ def annotate(
             raise UsageError("the scene of a bag cannot be added: there is no sim to step")
         dataset = open_data(path, mapping=mapping, trust_code=trust_code, definitions=definitions)
         check_target(Path(out), overwrite=overwrite)
-        with tempfile.TemporaryDirectory(prefix="mcaprl-") as folder:
-            log = Path(folder) / "converted.mcap"
+        with temporary_folder() as folder:
+            log = folder / "converted.mcap"
             dataset.save(log)
             options: Any = {"gamma": gamma, "overwrite": overwrite, "progress": progress}
             return annotate(log, out, policy=policy, **options)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from mcaprl.errors import OutputExistsError, ReportError, UsageError
-from mcaprl.files import write_json
+from mcaprl.files import temporary_folder, write_json
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.scene import DepthSource
 from mcaprl.recorder.record.wrapper import RecordMcap
@@ -61,8 +60,8 @@ def layout(
 
 def _layout_of_sim(sim: str, options: dict[str, Any], keys: Sequence[str] | None) -> dict[str, Any]:
     """Return the layout of a temporary recording of a sim."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "reset.mcap"
+    with temporary_folder() as folder:
+        path = folder / "reset.mcap"
         env = make_sim(sim, **options)
         camera = isinstance(env.unwrapped, DepthSource)
         with closing(RecordMcap(env, path, camera=camera, keys=keys)) as log:

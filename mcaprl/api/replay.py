@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
@@ -20,7 +19,7 @@ from mcaprl.api.environments import check_episode, sim_of
 from mcaprl.api.policies import as_names
 from mcaprl.api.ranges import check_port, check_positive
 from mcaprl.errors import LogError, UsageError
-from mcaprl.files import write_json
+from mcaprl.files import temporary_folder, write_json
 from mcaprl.progress import Advance, ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
@@ -121,8 +120,8 @@ def replay(
         port=port,
         origins=as_names(allow_origin),
     )
-    with tempfile.TemporaryDirectory(prefix="mcaprl-") as folder, closing(server):
-        layout_path = Path(folder) / LAYOUT_NAME
+    with temporary_folder() as folder, closing(server):
+        layout_path = folder / LAYOUT_NAME
         write_json(layout_path, layout)
         on_open(LiveAddress(server.app_url, server.url, layout_path))
         with suppress(KeyboardInterrupt):

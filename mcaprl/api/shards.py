@@ -87,6 +87,7 @@ def _new_folder(whole: FileRequest, first: FileRequest) -> Iterator[None]:
             with locked_file(path):
                 path.unlink()
         # Also remove the manifest of an earlier recording, because it lists other files.
+        check_target(whole.out / MANIFEST_NAME, overwrite=True)
         (whole.out / MANIFEST_NAME).unlink(missing_ok=True)
         yield
 

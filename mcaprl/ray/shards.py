@@ -6,13 +6,12 @@ The log is moved to its final path when it is complete.
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
 
 from mcaprl.errors import LogError, NoStepsError
-from mcaprl.files import locked_file
+from mcaprl.files import fresh_folder, locked_file
 from mcaprl.recorder.dataset.log_reader import LogReader
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.repair.recover import recover_log
@@ -73,11 +72,12 @@ class Shard:
 
 
 def unfinished_folder(folder: Path) -> Path:
-    """Create a new hidden folder for the unfinished logs of a recording, and return its path."""
-    hidden = folder / _UNFINISHED
-    shutil.rmtree(hidden, ignore_errors=True)
-    hidden.mkdir(parents=True)
-    return hidden
+    """Create a hidden folder for the unfinished logs of a recording, and return its path.
+
+    Raises:
+        OutputExistsError: Another program's folder, a file or a link is at this path.
+    """
+    return fresh_folder(folder / _UNFINISHED)
 
 
 def episodes_of(path: Path) -> list[EpisodeResult]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from ray.data import Datasink
 from ray.data.block import BlockAccessor
 
 from mcaprl.errors import OutputExistsError, UsageError
-from mcaprl.files import parse_json
+from mcaprl.files import parse_json, temporary_folder
 from mcaprl.ray.blocks import Columns, dataset_of
 from mcaprl.ray.shards import unfinished_folder
 from mcaprl.ray.workers import check_machine
@@ -65,9 +64,9 @@ class LogSink(Datasink[LogFile | None]):  # type: ignore[misc]
         if self._url is None:
             check_machine(self._versions, [self._hidden])
             return self._save(data, self._hidden / name)
-        with tempfile.TemporaryDirectory() as folder:
-            found = self._save(data, Path(folder) / name)
-            upload(Path(folder) / name, f"{self._url}/{name}")
+        with temporary_folder() as folder:
+            found = self._save(data, folder / name)
+            upload(folder / name, f"{self._url}/{name}")
         return found
 
     def on_write_complete(self, write_result: Any) -> None:
@@ -77,8 +76,8 @@ class LogSink(Datasink[LogFile | None]):  # type: ignore[misc]
         """
         files = sorted(filter(None, write_result.write_returns), key=lambda file: file.name)
         if self._url is not None:
-            with tempfile.TemporaryDirectory() as folder:
-                path = write_manifest(Path(folder), files)
+            with temporary_folder() as folder:
+                path = write_manifest(folder, files)
                 upload(path, f"{self._url}/{path.name}")
             return
         for file in files:

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from mcaprl.errors import UsageError, import_extra
+from mcaprl.files import read_file
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.settings import check_settings
@@ -102,7 +103,8 @@ def _load(path: Path) -> tuple[str, object]:
     yaml = import_extra("ruamel.yaml", "ray")
     try:
         # YAML 1.2 reads JSON, too.
-        return str(path), yaml.YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+        text = read_file(path).decode()
+        return str(path), yaml.YAML(typ="safe", pure=True).load(text)
     except (OSError, UnicodeError) as error:
         raise UsageError(f"{path}: cannot be read: {error}") from error
     except yaml.YAMLError as error:

@@ -11,6 +11,7 @@ import torch.distributed
 import torch.utils.data
 from numpy.typing import NDArray
 
+from mcaprl import limits
 from mcaprl.errors import LogError, UsageError
 from mcaprl.offline.batches.items import Arrays, ItemOptions, Items
 from mcaprl.offline.batches.loading import (
@@ -259,9 +260,12 @@ class _Source:
         )
 
     def _log(self, number: int) -> LogReader:
-        if number not in self._logs:
-            self._logs[number] = LogReader(self._paths[number], Selection())
-        return self._logs[number]
+        log = self._logs.pop(number, None) or LogReader(self._paths[number], Selection())
+        self._logs[number] = log
+        if len(self._logs) > limits.MAX_OPEN_LOGS:
+            # The first one was not used for the longest time.
+            del self._logs[next(iter(self._logs))]
+        return log
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without open files; each process opens its own."""

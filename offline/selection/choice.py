@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcaprl.errors import TrainingError
-from mcaprl.files import parse_json, write_json
+from mcaprl.files import parse_json, read_file, write_json
 from mcaprl.offline.estimate.off_policy import LEAST_SAMPLE_SIZE
 from mcaprl.offline.selection.portfolio import LogTraits
 from mcaprl.offline.selection.rule import Rating
@@ -152,7 +152,7 @@ def read_choice(run: Path) -> Choice:
     """
     path = run / CHOICE_NAME
     try:
-        found = parse_json(path.read_bytes())
+        found = parse_json(read_file(path))
         traits = LogTraits(**{**found["traits"], "problems": tuple(found["traits"]["problems"])})
         tried = {name: Tried.from_json(one) for name, one in found["tried"].items()}
         return Choice(

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import TrainingError, UsageError
-from mcaprl.files import parse_json, replacing_folder, write_json
+from mcaprl.files import parse_json, read_file, replacing_folder, subfolder, write_json
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.estimate.evidence import (
     FOLDS,
@@ -340,7 +340,7 @@ class _Race:
         self, folder: Path, config: TrainingConfig, seeds: range, progress: ProgressCallback
     ) -> None:
         """Start or resume a run. Return when it ends, or when the callback pauses it."""
-        folder.parent.mkdir(exist_ok=True)
+        subfolder(folder.parent)
         with suppress(_Pause), warnings.catch_warnings():
             # `_warn_about_short_horizons` names the candidates, once for both stages.
             warnings.filterwarnings("ignore", SHORT_HORIZON)
@@ -526,7 +526,7 @@ class _Race:
         if not path.exists():
             return {}
         try:
-            found = parse_json(path.read_bytes())
+            found = parse_json(read_file(path))
             return {kind: Stage.from_json(stage) for kind, stage in found.items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise TrainingError(f"cannot resume: {path} cannot be read: {error}") from error

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import os
-import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mcaprl.errors import LogError
+from mcaprl.files import check_plain, temporary_folder
 from mcaprl.recorder.bags.bag_metadata import read_metadata
 from mcaprl.recorder.bags.compressed import CompressedTopic, decompress_file
 from mcaprl.recorder.bags.mcap_file import McapFile
@@ -213,16 +213,22 @@ def _metadata(folder: Path, *, is_optional: bool = False) -> dict[str, Any]:
         raise
 
 
+def _check_plain(path: Path) -> None:
+    """Raise LogError if a file, or a file in a folder, is a device, socket or FIFO."""
+    try:
+        check_plain(path)
+    except OSError as error:
+        raise LogError(f"cannot read {path}: {error.strerror or error}") from error
+
+
 def _open(
     path: Path, distribution: str, opened: ExitStack, *, are_compressed: bool = False
 ) -> McapFile | RosbagFile:
     """Open a file; `are_compressed` tells whether its messages are compressed one by one."""
-    if not path.is_file():
-        raise LogError(f"{path} is not a regular file")
     plain = path
+    _check_plain(path)
     if path.name.endswith(_COMPRESSED):
-        folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="mcaprl-"))
-        plain = Path(folder) / _plain_name(path)
+        plain = opened.enter_context(temporary_folder()) / _plain_name(path)
         decompress_file(path, plain)
     kind = RosbagFile if plain.suffix in (".db3", ".bag") else McapFile
     found = kind(plain, distribution=distribution)

@@ -15,7 +15,7 @@ from io import FileIO
 from pathlib import Path
 
 from mcaprl.errors import LogError
-from mcaprl.files import check_target, is_at, try_lock, work_folder
+from mcaprl.files import check_regular, check_target, hold, is_at, taken, try_lock, work_folder
 
 if sys.platform != "win32":
     import fcntl
@@ -46,7 +46,7 @@ def create(path: Path, *, overwrite: bool) -> FileIO:
     except OSError as error:
         raise LogError(f"cannot write {path}: {error.strerror or error}") from error
     # Another process has created or replaced the file in the meantime.
-    raise _taken(path)
+    raise taken(path)
 
 
 def reopen(path: Path) -> FileIO:
@@ -57,16 +57,13 @@ def reopen(path: Path) -> FileIO:
     """
     try:
         while True:
-            file = FileIO(path, "r+")
-            if not try_lock(file.fileno()):
-                file.close()
-                break
+            check_regular(path)
+            file = _locked(FileIO(path, "r+"), path)
             if is_at(file.fileno(), path):
                 return file
             release(file)
     except OSError as error:
         raise LogError(f"cannot write {path}: {error.strerror or error}") from error
-    raise _taken(path)
 
 
 def release(file: FileIO) -> None:
@@ -124,12 +121,8 @@ def copy_start(source: FileIO, target: FileIO, length: int) -> None:
 
 def _locked(file: FileIO, path: Path) -> FileIO:
     if not try_lock(file.fileno()):
+        error = taken(path, file.fileno())
         file.close()
-        raise _taken(path)
+        raise error
+    hold(file, records=True)
     return file
-
-
-def _taken(path: Path) -> LogError:
-    return LogError(
-        f"{path} is being written by another recording; wait for its end, or choose another path"
-    )

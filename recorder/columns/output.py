@@ -139,6 +139,11 @@ class OutputFile:
                 self.position += sum(map(len, parts))
         except OSError as error:
             self._give_up(error)
+        except ValueError as error:
+            # A process that was forked from the writer's has closed its copy of the file.
+            raise LogError(
+                f"{self.path} is closed, or was opened by another process: open it in this process"
+            ) from error
 
     def _give_up(self, error: OSError) -> NoReturn:
         """Truncate the file after its last complete record, close it, and raise LogError."""

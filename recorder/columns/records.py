@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import mmap
 import os
-import stat
 import struct
 from array import array
 from collections.abc import Iterator, Mapping
@@ -31,6 +29,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
 from mcaprl.files import open_at_once
 from mcaprl.recorder.columns.checksum import crc32
+from mcaprl.recorder.columns.file_map import mapped
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -73,11 +72,9 @@ def map_unchanged(path: Path) -> tuple[memoryview, os.stat_result]:
         descriptor = open_at_once(path)
         try:
             state = os.fstat(descriptor)
-            if not stat.S_ISREG(state.st_mode):
-                raise LogError(f"cannot read {path}: it is not a regular file")
             if not state.st_size:
                 raise NotMcapError(f"{path} is not an MCAP file: it is empty")
-            found = mmap.mmap(descriptor, state.st_size, access=mmap.ACCESS_READ)
+            found = mapped(descriptor, state.st_size)
         finally:
             os.close(descriptor)
     # `mmap` raises ValueError if the file was truncated after `fstat`.
@@ -85,7 +82,7 @@ def map_unchanged(path: Path) -> tuple[memoryview, os.stat_result]:
         raise LogError(
             f"cannot read {path}: {getattr(error, 'strerror', None) or error}"
         ) from error
-    return memoryview(found), state
+    return found, state
 
 
 def records_of(

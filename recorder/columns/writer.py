@@ -253,6 +253,8 @@ class McapWriter(OutputFile):
             release(self._file)
 
     def _begin(self, path: Path, overwrite: bool) -> None:
+        # `compact` needs the work folder at the end, so a foreign file at its path is an error now.
+        remove_leftover(path)
         self._file, self.untouched = create(path, overwrite=overwrite), False
         self.path, self.position, self._crc, self._summary = path, 0, 0, Summary()
         self._write(MAGIC)

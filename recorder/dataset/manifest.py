@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from mcaprl.errors import LogError
-from mcaprl.files import parse_json, write_json
+from mcaprl.files import parse_json, read_file, write_json
 from mcaprl.remote import RemotePath, as_path, is_url
 
 MANIFEST_NAME = "manifest.json"
@@ -71,7 +71,7 @@ def listed_logs(name: str | Path) -> list[Path]:
 
 def _content(name: str | Path) -> bytes:
     try:
-        return as_path(name, whole=True).read_bytes()
+        return read_file(as_path(name, whole=True))
     except OSError as error:
         raise LogError(f"cannot read {name}: {error.strerror or error}") from error
 

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Windows has no `madvise`.
-_WILL_NEED = getattr(mmap, "MADV_WILLNEED", None)
-_DONT_NEED = getattr(mmap, "MADV_DONTNEED", None)
+from mcaprl.recorder.format.reading import prefetch, release
+
 _UINT8 = np.dtype(np.uint8)
 _BLOCK_BYTES = 1 << 24
 _PREFETCHED_BYTES = 1 << 30
@@ -51,19 +50,17 @@ class ImageFile:
             (len(bytes_) - image_bytes + 1,),
             (1,),
         )
-        self._map = view.obj if isinstance(view.obj, mmap.mmap) else None
+        self._view = view
         self._checks = checks
         self._is_checked = np.zeros(len(checks), bool)
 
     def prefetch(self, start: int, stop: int) -> None:
         """Let the system start to load the pages of a range of bytes from the disk."""
-        if self._map is not None and _WILL_NEED is not None:
-            self._map.madvise(_WILL_NEED, start, stop - start)
+        prefetch(self._view, start, stop)
 
     def release(self) -> None:
         """Let the system take back the memory of the file; it is read again when it is needed."""
-        if self._map is not None and _DONT_NEED is not None:
-            self._map.madvise(_DONT_NEED)
+        release(self._view)
 
     def read(self, offsets: NDArray[np.int64], chunks: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Copy K images, given their byte offsets (K,) and the indexes (K,) of their chunks.

@@ -8,6 +8,7 @@ from mcaprl.recorder.columns.decoder import Columns, Decoder
 from mcaprl.recorder.columns.definition_text import full_name, parsed_types
 from mcaprl.recorder.columns.definitions import ROS1, TypeSource, definitions_of, leaf_kinds
 from mcaprl.recorder.columns.file_check import check_chunk, check_file, check_statistics, place
+from mcaprl.recorder.columns.file_map import prefetch, release
 from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, MessageRange
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.salvage import Damage
@@ -35,4 +36,6 @@ __all__ = [
     "leaf_kinds",
     "parsed_types",
     "place",
+    "prefetch",
+    "release",
 ]

@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 from mcaprl.errors import UsageError, import_extra
+from mcaprl.files import read_file
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.format.spaces import MAX_ACTIONS
 
@@ -564,9 +565,9 @@ def load_mapping(source: str | Path | MappingOf[str, Any]) -> tuple[Mapping, Pla
         return parse_mapping(source), Place()
     path, yaml = source, import_extra("ruamel.yaml", "bags")
     try:
-        tree = yaml.YAML(typ="rt").load(Path(path).read_text(encoding="utf-8"))
+        tree = yaml.YAML(typ="rt").load(read_file(path).decode())
     except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from error
+        raise UsageError(f"{path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise UsageError(f"{path} is not UTF-8 text: {error.reason}") from error
     except yaml.YAMLError as error:

@@ -16,6 +16,8 @@ import threading
 from collections.abc import Collection
 from urllib.parse import urlsplit
 
+from mcaprl import limits
+
 VIEWER_ORIGINS = (
     "https://app.foxglove.dev",
     "https://lichtblick-suite.github.io",
@@ -25,7 +27,6 @@ VIEWER_ORIGINS = (
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _END = b"\r\n\r\n"
 _MAX_HEAD_BYTES = 2**14
-_HEAD_TIMEOUT_S = 10.0
 _CLOSE_TIMEOUT_S = 1.0
 _BLOCK_BYTES = 2**16
 
@@ -131,7 +132,7 @@ class OriginFilter:
 
     async def _connect(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Read the head of a request, and reject the request or forward the connection."""
-        head = await asyncio.wait_for(reader.readuntil(_END), _HEAD_TIMEOUT_S)
+        head = await asyncio.wait_for(reader.readuntil(_END), limits.CLIENT_TIMEOUT_S)
         if not is_allowed(head, self._origins):
             text = b"this page may not connect; see --allow-origin of mcaprl\n"
             writer.write(b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\n")

@@ -152,6 +152,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
                     is_image = isinstance(array, np.ndarray) and array.ndim == 4
                     compression = "lzf" if is_image else None
                     file.create_dataset(place, data=array, compression=compression)
+            nodes.stop_if_full(file)
         file["columns"] = list(_KEYS)
         file["num_episodes"] = len(dataset.episode_lengths)
         file["version"] = VERSION

@@ -241,3 +241,4 @@ def _put(file: Any, name: str, column: Any, rows: NDArray[np.int64], is_image: b
     for start in range(0, len(rows), _BLOCK_ROWS):
         block = slice(start, start + _BLOCK_ROWS)
         stored[block] = np.asarray(column[rows[block]])
+        nodes.stop_if_full(file)

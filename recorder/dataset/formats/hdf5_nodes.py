@@ -23,6 +23,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, McaprlError, import_extra
+from mcaprl.files import open_at_once
 from mcaprl.limits import MAX_NESTED_GROUPS, MAX_READ_RATIO, UNPACKED_ALLOWANCE_BYTES
 from mcaprl.recorder.dataset.formats.budget import Budget
 from mcaprl.texts import printable
@@ -57,10 +58,7 @@ _budget: ContextVar[Budget] = ContextVar("budget")
 def is_hdf5(path: Path) -> bool:
     """Return whether a path is a file that starts with the HDF5 signature."""
     try:
-        # Opening a named pipe would wait for its writer.
-        if not path.is_file():
-            return False
-        with path.open("rb") as file:
+        with FileIO(open_at_once(path)) as file:
             return file.read(len(SIGNATURE)) == SIGNATURE
     except OSError:
         return False
@@ -104,9 +102,9 @@ def created(path: Path, **options: Any) -> Iterator[Any]:
     with _Output(path) as output:
         try:
             with h5py.File(output, "w", **options) as file:
+                file.output = output
                 yield file
         finally:
-            # HDF5 continues after an error, and then raises others.
             if output.error is not None:
                 raise output.error
 
@@ -188,10 +186,23 @@ class _Input(FileIO):
             offset += step
 
 
-class _Output(FileIO):
-    """File that raises the first error of writing, and ignores what is written afterwards.
+def stop_if_full(file: Any) -> None:
+    """Raise the first error of writing a file that `created` yielded.
 
-    If HDF5 cannot write its metadata at the end, because the disk is full, the process crashes.
+    Writers call this after each part of the data, because HDF5 does not notice such an error.
+
+    Raises:
+        OSError: The file cannot be written, for example because the disk is full.
+    """
+    if file.output.error is not None:
+        raise file.output.error
+
+
+class _Output(FileIO):
+    """File that holds in memory what it cannot write.
+
+    HDF5 must not notice that the disk is full: it would continue with objects that it could not
+    write, and the process would crash when they are freed.
 
     Attributes:
         error: First error.
@@ -202,18 +213,42 @@ class _Output(FileIO):
     def __init__(self, path: Path) -> None:
         """Create or replace the file."""
         super().__init__(path, "w+")
+        # Offsets and bytes of what could not be written, in the order of the writes.
+        self._held: list[tuple[int, bytes]] = []
 
     def write(self, data: Any) -> int:
-        """Write all bytes and return their number."""
-        rest = memoryview(data).cast("B")
-        count = len(rest)
+        """Write or hold all bytes; return their number."""
+        whole = memoryview(data).cast("B")
+        rest, start = whole, self.tell()
         try:
             while rest and self.error is None:
                 rest = rest[super().write(rest) :]
         except OSError as error:
             self.error = error
-            raise
+        if self.error is not None:
+            self._held.append((start, bytes(whole)))
+            self.seek(start + len(whole))
+        return len(whole)
+
+    def readinto(self, buffer: Any) -> int:
+        """Read bytes of the file, or those that are held in memory."""
+        target, start = memoryview(buffer).cast("B"), self.tell()
+        count = super().readinto(target)
+        for offset, data in self._held:
+            first, stop = max(offset, start), min(offset + len(data), start + len(target))
+            if first < stop:
+                target[first - start : stop - start] = data[first - offset : stop - offset]
+                count = max(count, stop - start)
+        self.seek(start + count)
         return count
+
+    def truncate(self, size: int | None = None) -> int:
+        """Change the size of the file; HDF5 does this when it closes the file."""
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return self.tell() if size is None else size
 
 
 def image_settings(shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mcaprl.errors import LogError, UnknownNameError, UsageError
-from mcaprl.files import replacing, replacing_folder
+from mcaprl.files import check_plain, replacing, replacing_folder
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.remote import is_url
 
@@ -176,8 +176,10 @@ def read_format(path: str | Path, form: Format, **options: Any) -> Dataset:
         del given[name]
     if not source.exists():
         raise LogError(f"{path}: no such file or folder")
-    if not (source.is_file() or source.is_dir()):
-        raise LogError(f"{path} is neither a file nor a folder")
+    try:
+        check_plain(source)
+    except OSError as error:
+        raise LogError(f"cannot read {path}: {error}") from error
     dataset: Dataset = form.module.read(source, **given)
     dataset.sources = dataset.sources or (source,)
     return dataset

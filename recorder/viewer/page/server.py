@@ -8,12 +8,15 @@ server checks the origin and the host name that browsers send with a request.
 from __future__ import annotations
 
 import re
+import socket
 import sys
 import threading
+from contextlib import suppress
 from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
+from mcaprl import limits
 from mcaprl.errors import McaprlError, UsageError
 from mcaprl.recorder.viewer.origin_filter import is_loopback
 from mcaprl.recorder.viewer.page.episode_data import LogPage
@@ -21,6 +24,7 @@ from mcaprl.recorder.viewer.page.html import page_html
 
 _EPISODE = re.compile(r"/episode/(\d{1,9})")
 _EPISODES_KEPT = 4
+_BLOCK_BYTES = 2**20
 _HEADERS = {
     "Cache-Control": "no-store",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -89,16 +93,35 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def handle_error(self, *_: Any) -> None:
-        """Ignore errors of connections that a browser closed early, and print all others."""
-        if not isinstance(sys.exception(), ConnectionError):
+        """Ignore errors of connections that are closed early or too slow; print all others."""
+        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
             super().handle_error(*_)
 
 
 class _Handler(BaseHTTPRequestHandler):
     respond: Any
 
+    def setup(self) -> None:
+        """Limit the time for the request and for each block of the answer."""
+        super().setup()
+        self.connection.settimeout(limits.CLIENT_TIMEOUT_S)
+        # A client that sends one byte after the other would never reach the time-out of a byte.
+        self._hang_up = threading.Timer(limits.CLIENT_TIMEOUT_S, self._close_connection)
+        self._hang_up.daemon = True
+        self._hang_up.start()
+
+    def _close_connection(self) -> None:
+        with suppress(OSError):
+            self.connection.shutdown(socket.SHUT_RDWR)
+
+    def finish(self) -> None:
+        """Close the connection."""
+        self._hang_up.cancel()
+        super().finish()
+
     def do_GET(self) -> None:
         """Answer a request of the page, or of a program on this machine."""
+        self._hang_up.cancel()
         if self._is_allowed():
             status, kind, body = self.respond(self.path)
         else:
@@ -108,7 +131,8 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
-        self.wfile.write(body)
+        for start in range(0, len(body), _BLOCK_BYTES):
+            self.wfile.write(body[start : start + _BLOCK_BYTES])
 
     def _is_allowed(self) -> bool:
         hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))

@@ -210,10 +210,10 @@ def test_readers_keep_the_old_file(log_path: Path, monkeypatch: pytest.MonkeyPat
 
     def look(*paths: Any) -> None:
         opened.append(McapReader(log_path))
-        with pytest.raises(LogError, match="being written by another"):
+        with pytest.raises(LogError, match="has an open recorder"):
             file_lock.reopen(log_path)
         replace(*paths)
-        with pytest.raises(LogError, match="being written by another"):
+        with pytest.raises(LogError, match="has an open recorder"):
             file_lock.reopen(log_path)
 
     monkeypatch.setattr(os, "replace", look)

@@ -355,6 +355,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["merge", *names, str(tmp_path / "out.mcap")]) == 0
     assert "out.mcap: 2 episodes, 4 steps, " in capsys.readouterr().out
     assert run(["merge", names[0], names[0], str(tmp_path / "out2.mcap")]) == 2
-    assert capsys.readouterr().err == "mcaprl: merge needs two or more logs, not 1\n"
+    message = f"merge needs two or more logs, not 1: {names[0]} was given twice"
+    assert capsys.readouterr().err == f"mcaprl: {message}\n"
     assert run(["merge", *names, str(tmp_path / "out.mcap")]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

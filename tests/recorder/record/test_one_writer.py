@@ -5,6 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
+import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from contextlib import closing
@@ -23,6 +26,7 @@ from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import recover_log
 from tests.support.damage.faults import KnownEpisodes, assert_is_known, play, write_log
+from tests.support.paths import ROOT
 
 
 @pytest.fixture
@@ -99,7 +103,7 @@ def test_a_log_that_is_being_recorded_is_not_replaced(
     with closing(mcaprl.RecordMcap(KnownEpisodes(), target, **options)) as env:
         play(env)
         inode = recorded.stat().st_ino
-        with pytest.raises(LogError, match="is being written by another"):
+        with pytest.raises(LogError, match="this program has an open recorder of"):
             write(target)
         assert recorded.stat().st_ino == inode
         play(env)
@@ -199,7 +203,7 @@ def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path: Path) -> None:
         _write_beside(out, lambda: out.write_bytes(b"other"), overwrite=False)
     assert out.read_bytes() == b"other"
     recorders = []
-    with pytest.raises(LogError, match="is being written by another"):
+    with pytest.raises(LogError, match="this program has an open recorder of"):
         _write_beside(out, lambda: recorders.append(_recorder_of(out)), overwrite=True)
     recorders[0].close()
     assert check_log(out) == []
@@ -234,6 +238,52 @@ def test_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
             unfinished.write_bytes(b"whole")
         assert [path.name for path in tmp_path.iterdir()] == [out.name]
     assert out.read_bytes() == b"whole"
+
+
+_RECORD_AND_DIE = """
+import os, signal, sys
+from pathlib import Path
+import mcaprl
+from mcaprl.errors import McaprlError
+from tests.support.damage.faults import KnownEpisodes, play
+env = mcaprl.RecordMcap(KnownEpisodes(), Path(sys.argv[1]))
+play(env)
+play(env)
+pid = os.fork()
+if pid == 0:
+    print(os.getpid(), flush=True)
+    try:
+        play(env)
+    except McaprlError as error:
+        print(error, flush=True)
+    signal.pause()
+os.read(0, 1)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_killed_recorder_whose_child_lives_locks_nothing(log_path: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", _RECORD_AND_DIE, str(log_path)]
+    with subprocess.Popen(
+        command, cwd=ROOT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        child, refusal = int(process.stdout.readline()), process.stdout.readline()
+        try:
+            with pytest.raises(LogError, match="is being written by another"):
+                mcaprl.RecordMcap(KnownEpisodes(), log_path, append=True)
+            process.stdin.write(".")
+            process.stdin.flush()
+            process.wait(60)
+            assert "is closed; record to another file" in refusal
+            assert recover_log(log_path, tmp_path / "out.mcap").episodes == 2
+            with pytest.warns(UserWarning, match="cut off|still being written"):
+                assert len(mcaprl.open(log_path).episodes) == 2
+            mcaprl.RecordMcap(KnownEpisodes(), tmp_path / "out.mcap", append=True).close()
+            mcaprl.RecordMcap(KnownEpisodes(), log_path, overwrite=True).close()
+        finally:
+            os.kill(child, signal.SIGKILL)
 
 
 def test_appending_keeps_what_readers_have_mapped(log_path: Path) -> None:

@@ -6,9 +6,13 @@ import json
 import multiprocessing
 import os
 import pickle
+import shutil
 import socket
 import tempfile
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing.queues import Queue
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
@@ -17,6 +21,7 @@ import numpy as np
 import pytest
 
 import mcaprl
+from mcaprl import limits
 from mcaprl.cli import run
 from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.recorder.columns.reader import McapReader
@@ -338,3 +343,178 @@ def test_online_training_uploads_its_log(tmp_path: Path) -> None:
     request = ["--out", str(tmp_path / "run"), "--record", str(log), "--upload", url]
     assert run([*train, *request]) == 0
     assert (tmp_path / "there" / "online.mcap").read_bytes() == log.read_bytes()
+
+
+Answer = Callable[[socket.socket, bytes], None]
+
+
+@contextmanager
+def raw_server(answer: Answer) -> Iterator[str]:
+    """Answer each request with bytes of the test; yield the URL of a log."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    ended = threading.Event()
+
+    def talk(connection: socket.socket) -> None:
+        with connection, suppress(OSError):
+            while head := connection.recv(2**16):
+                answer(connection, head)
+
+    def listen() -> None:
+        with suppress(OSError):
+            while not ended.is_set():
+                threading.Thread(target=talk, args=listener.accept()[:1], daemon=True).start()
+
+    threading.Thread(target=listen, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}/a.mcap"
+    finally:
+        ended.set()
+        listener.close()
+
+
+def head_of(size: int, *lines: str, status: str = "200 OK") -> bytes:
+    every = [f"HTTP/1.1 {status}", f"Content-Length: {size}", "Accept-Ranges: bytes", *lines]
+    return "\r\n".join([*every, "", ""]).encode()
+
+
+def test_a_range_answer_that_does_not_end_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent = [0]
+
+    def answer(connection: socket.socket, head: bytes) -> None:
+        if head.startswith(b"HEAD"):
+            connection.sendall(head_of(10**6))
+            return
+        connection.sendall(b"HTTP/1.1 206 Partial Content\r\nConnection: close\r\n\r\n")
+        while True:
+            connection.sendall(bytes(2**16))
+            sent[0] += 2**16
+
+    with raw_server(answer) as url, pytest.raises(LogError, match=r"more than the \d+ bytes"):
+        mcaprl.open(url)
+    # What is on its way when the client closes the connection is in the buffers of the sockets.
+    assert sent[0] < 100 * 2**20
+
+
+@pytest.mark.parametrize("size", [2**43, 10**18, 10**40, -1])
+def test_an_absurd_size_is_refused(size: int) -> None:
+    def answer(connection: socket.socket, head: bytes) -> None:
+        connection.sendall(head_of(size))
+
+    with raw_server(answer) as url, pytest.raises(LogError, match=f"cannot read {url}") as caught:
+        mcaprl.open(url)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("status", "lines", "message"),
+    [
+        ("200 OK", (), r"status 200\) is not the requested range"),
+        ("206 Partial", ("Content-Range: bytes 7-100/9",), "is not the requested range"),
+        ("206 Partial", ("Content-Encoding: gzip",), "is not the requested range"),
+        ("404 Not Found", (), "no such file"),
+        ("503 Busy", (), "503"),
+        ("416 Range", (), "416"),
+    ],
+)
+def test_an_answer_of_another_kind_is_refused(
+    status: str, lines: tuple[str, ...], message: str
+) -> None:
+    def answer(connection: socket.socket, head: bytes) -> None:
+        if head.startswith(b"HEAD"):
+            connection.sendall(head_of(10**7))
+        elif b"bytes=0-" in head and status.startswith("200"):
+            connection.sendall(head_of(BLOCK_BYTES, status="206 Partial") + bytes(BLOCK_BYTES))
+        else:
+            connection.sendall(head_of(BLOCK_BYTES, *lines, status=status) + bytes(BLOCK_BYTES))
+
+    with raw_server(answer) as url, pytest.raises(LogError, match=message):
+        mcaprl.open(url)
+
+
+def silent(connection: socket.socket, head: bytes) -> None:
+    """Answer nothing."""
+
+
+def silent_after_the_head(connection: socket.socket, head: bytes) -> None:
+    connection.sendall(head_of(10**6))
+
+
+def dripping_head(connection: socket.socket, head: bytes) -> None:
+    connection.sendall(b"HTTP/1.1 200 OK\r\nX: ")
+    while True:
+        connection.sendall(b"x")
+        time.sleep(0.01)
+
+
+def dripping(connection: socket.socket, head: bytes) -> None:
+    if head.startswith(b"HEAD"):
+        connection.sendall(head_of(10**6))
+        return
+    connection.sendall(head_of(BLOCK_BYTES, status="206 Partial Content"))
+    while True:
+        connection.sendall(b"x")
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("answer", [silent, silent_after_the_head, dripping_head, dripping])
+def test_a_server_that_is_silent_or_slow_is_left(
+    answer: Answer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("SILENCE_TIMEOUT_S", "SLOW_AFTER_S", "CONNECT_TIMEOUT_S"):
+        monkeypatch.setattr(limits, name, 0.2)
+    began_s = time.monotonic()
+    with raw_server(answer) as url, pytest.raises(LogError, match=r"no answer within|arrived in"):
+        mcaprl.open(url)
+    assert time.monotonic() - began_s < 5
+
+
+def test_many_ranges_are_requested_in_groups(
+    server: RangeServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "MAX_REQUESTS", 2)
+    monkeypatch.setattr(limits, "MAX_FETCHED_BYTES", BLOCK_BYTES)
+    remote = RemoteFile(f"{server.url}/images.mcap")
+    remote.fetch([(4 * k * BLOCK_BYTES, 4 * k * BLOCK_BYTES + 1) for k in range(7)])
+    content = (server.folder / "images.mcap").read_bytes()
+    for k in range(7):
+        part = slice(4 * k * BLOCK_BYTES, (4 * k + 1) * BLOCK_BYTES)
+        assert remote.local.read_bytes()[part] == content[part]
+
+
+def test_a_link_in_the_cache_is_refused(
+    server: RangeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    precious, cache = tmp_path / "precious", tmp_path / "cache"
+    precious.write_text("text")
+    monkeypatch.setenv(CACHE_VARIABLE, str(cache))
+    url = f"{server.url}/lane.mcap"
+    local = RemoteFile(url).local
+    for path in (local, local.with_name("blocks")):
+        path.unlink()
+        path.symlink_to(precious)
+        with pytest.raises(UsageError, match=f"{path} is not a regular file"):
+            mcaprl.open(url)
+        path.unlink()
+    folder = local.parent
+    shutil.rmtree(folder)
+    folder.symlink_to(tmp_path)
+    with pytest.raises(UsageError, match=f"{folder} is a symbolic link"):
+        mcaprl.open(url)
+    assert precious.read_text() == "text"
+
+
+def test_a_link_at_the_copy_of_an_upload_is_refused(folder: Path, tmp_path: Path) -> None:
+    there, precious = tmp_path / "there", tmp_path / "precious"
+    there.mkdir()
+    precious.write_text("text")
+    for name in ("x.mcap.part", "x.mcap", ".x.mcap.part"):
+        (there / name).symlink_to(precious)
+        if name == "x.mcap.part":
+            upload(folder / "lane.mcap", f"file://{there}/x.mcap")
+            (there / "x.mcap").unlink()
+        else:
+            with pytest.raises(UsageError, match="is a symbolic link"):
+                upload(folder / "lane.mcap", f"file://{there}/x.mcap")
+        assert (there / name).is_symlink()
+        assert precious.read_text() == "text"
+        (there / name).unlink()

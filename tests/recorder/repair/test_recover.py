@@ -303,7 +303,7 @@ def test_paths_that_are_refused(log_path: Path, good: bytes) -> None:
     assert out.read_text() == "precious"
     with (
         closing(mcaprl.RecordMcap(gym.make("CartPole-v1"), log_path, overwrite=True)),
-        pytest.raises(LogError, match="being written by another"),
+        pytest.raises(LogError, match="has an open recorder"),
     ):
         recover_log(log_path, out, overwrite=True)
     assert out.read_text() == "precious"

@@ -6,14 +6,17 @@ import gzip
 import json
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import gymnasium as gym
 import numpy as np
@@ -24,10 +27,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 import mcaprl
+from mcaprl import limits
 from mcaprl.cli import run
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.display import SCENE
 from mcaprl.recorder.viewer.annotate import annotated_copy
+from mcaprl.recorder.viewer.page import server
 from mcaprl.recorder.viewer.page.episode_data import LogPage
 from mcaprl.recorder.viewer.page.packed import pack
 from mcaprl.recorder.viewer.scene_reader import moments_of_episode
@@ -559,6 +564,55 @@ def answer(url: str, path: str = "/", **headers: str) -> tuple[int, dict[str, st
         connection.endheaders()
         found = connection.getresponse()
         return found.status, dict(found.getheaders()), found.read()
+
+
+@pytest.mark.parametrize("start", [b"", b"GET / HTTP/1.0\r\nHost: 127.0.0.1\r\n", b"drip"])
+def test_slow_clients_are_disconnected(
+    log: Path, start: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A client must send its whole request in time, even if it sends a byte now and then."""
+    monkeypatch.setattr(limits, "CLIENT_TIMEOUT_S", 0.3)
+    with served(log) as url:
+        port = urlsplit(url).port
+        with socket.create_connection(("127.0.0.1", port), timeout=2) as connection:
+            connection.sendall(start)
+            if start == b"drip":
+                connection.settimeout(0.05)
+                began_s = time.monotonic()
+                while time.monotonic() - began_s < 2:
+                    with suppress(TimeoutError):
+                        with suppress(ConnectionError):
+                            connection.sendall(b"x")
+                            assert connection.recv(1) == b""
+                        break
+                else:
+                    pytest.fail("the client is still connected")
+            else:
+                assert connection.recv(1) == b""
+        assert answer(url)[0] == 200
+
+
+def test_a_client_that_reads_nothing_is_disconnected(
+    log: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(limits, "CLIENT_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(LogPage, "episode", lambda *_: bytes(2**26))
+    left, finish = threading.Event(), server._Handler.finish
+
+    def note(handler: server._Handler) -> None:
+        finish(handler)
+        left.set()
+
+    monkeypatch.setattr(server._Handler, "finish", note)
+    with served(log) as url:
+        with socket.create_connection(("127.0.0.1", urlsplit(url).port), timeout=2) as connection:
+            connection.sendall(b"GET /episode/1 HTTP/1.0\r\nHost: 127.0.0.1\r\n\r\n")
+            assert left.wait(2)
+            received = 0
+            while part := connection.recv(2**20):
+                received += len(part)
+        assert received < 2**26
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_the_server_answers_this_machine_alone(log: Path) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from gymnasium import spaces
 
+from mcaprl import limits
 from mcaprl.errors import UsageError
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.viewer.foxglove_server import HOST, _hidden_host
@@ -113,6 +114,18 @@ def test_junk_and_half_requests_do_not_stop_the_server(server: LiveServer) -> No
             junk.sendall(b"x" * 10**6)
             assert junk.recv(1) == b""
         assert answer(server, head()).startswith(b"HTTP/1.1 101 ")
+
+
+@pytest.mark.parametrize("start", [b"", b"GET / HTTP/1.1\r\nHost:"])
+def test_silent_clients_are_disconnected(
+    server: LiveServer, start: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "CLIENT_TIMEOUT_S", 0.2)
+    port = int(server.url.rpartition(":")[2])
+    with socket.create_connection((HOST, port), timeout=2) as connection:
+        connection.sendall(start)
+        assert connection.recv(1) == b""
+    assert answer(server, head()).startswith(b"HTTP/1.1 101 ")
 
 
 def test_messages_pass_through_the_filter(server: LiveServer) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mcaprl.files import parse_json
+from mcaprl.files import parse_json, read_file
 from mcaprl.recorder.dataset.formats.lerobot.reader import read
 from mcaprl.recorder.dataset.formats.lerobot.writer import write
 
@@ -14,7 +14,7 @@ __all__ = ["matches", "read", "write"]
 def matches(path: Path) -> bool:
     """Return whether a folder is a LeRobot dataset of any version."""
     try:
-        info = parse_json((path / "meta/info.json").read_bytes())
+        info = parse_json(read_file(path / "meta/info.json"))
     except (OSError, ValueError):
         return False
     return isinstance(info, dict) and "codebase_version" in info

@@ -16,7 +16,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from mcaprl.errors import LogError, SpaceError, UsageError
-from mcaprl.files import parse_json
+from mcaprl.files import parse_json, read_file
 from mcaprl.recorder.dataset.formats.minari.spaces import (
     StoredSpace,
     space_from_text,
@@ -128,7 +128,7 @@ def raw_metadata(path: Path) -> dict[str, Any]:
     """
     file = data_folder(path) / FILE
     try:
-        found = parse_json(file.read_bytes())
+        found = parse_json(read_file(file))
     except (OSError, ValueError) as error:
         raise LogError(f"{file} cannot be read: {error}") from error
     if not isinstance(found, dict) or not isinstance(found.get("total_episodes"), int):

@@ -23,6 +23,7 @@ from mcaprl.recorder.dataset.formats.hdf5_nodes import (
     EXTRA,
     created,
     image_settings,
+    stop_if_full,
     with_names_for_hdf5,
 )
 from mcaprl.recorder.dataset.formats.infos import (
@@ -98,6 +99,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
             own["log_time_ns"] = episode.log_time_ns
             if not np.isnan(episode.behavior_probs).all():
                 own["behavior_probs"] = episode.behavior_probs
+            stop_if_full(file)
     counts = {
         "total_episodes": len(dataset.episode_lengths),
         "total_steps": len(dataset),

@@ -1,0 +1,246 @@
+"""Locks on files and folders, which end with the process that took them.
+
+A forked process inherits the open files of its parent, and with them the locks. A child that
+outlives a killed recorder would keep the log locked. A forked process therefore closes its copies
+of all locked files; the locks of the parent remain.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from io import FileIO
+from pathlib import Path
+from typing import BinaryIO, Protocol
+from weakref import WeakKeyDictionary
+
+from mcaprl.errors import LogError
+
+if sys.platform != "win32":
+    import fcntl
+
+_TAKEN = "{} is being written by another process; wait until it ends, or choose another path"
+_NOT_REGULAR = "it is not a regular file"
+_OWN = "this program has an open recorder of {0}: call close() on it"
+
+
+class Lockable(Protocol):
+    """Open file or folder."""
+
+    @property
+    def closed(self) -> bool:
+        """Whether the file is closed."""
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+
+    def close(self) -> None:
+        """Close the file, which ends its lock."""
+
+
+class OpenFolder:
+    """Descriptor of a folder, which is closed once."""
+
+    def __init__(self, descriptor: int) -> None:
+        """Take over a descriptor."""
+        self._descriptor: int | None = descriptor
+
+    @property
+    def closed(self) -> bool:
+        """Whether the descriptor is closed."""
+        return self._descriptor is None
+
+    def fileno(self) -> int:
+        """Return the descriptor.
+
+        Raises:
+            ValueError: It is closed.
+        """
+        if self._descriptor is None:
+            raise ValueError("the folder is closed")
+        return self._descriptor
+
+    def close(self) -> None:
+        """Close the descriptor, which ends its lock."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+
+# Locked files of this process, and whether a recorder writes them.
+_held: WeakKeyDictionary[Lockable, bool] = WeakKeyDictionary()
+
+
+def _close_inherited() -> None:
+    for file in list(_held):
+        with suppress(OSError):
+            file.close()
+    _held.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_close_inherited)
+
+
+def lock(file: Lockable) -> bool:
+    """Lock an open file or folder until it is closed; return False if it is locked already."""
+    if not try_lock(file.fileno()):
+        return False
+    hold(file)
+    return True
+
+
+def hold(file: Lockable, *, records: bool = False) -> None:
+    """Close a locked file in processes that are forked from this one.
+
+    Args:
+        file: File or folder.
+        records: Whether a recorder writes the file.
+    """
+    _held[file] = records
+
+
+def try_lock(descriptor: int) -> bool:
+    """Lock an open file or folder; return False if it is locked already.
+
+    The lock is advisory and ends when the file is closed. On systems without `flock`, such as
+    Windows and some network file systems, nothing is locked, and the result is True.
+    """
+    return surely_locked(descriptor) is not False
+
+
+def surely_locked(descriptor: int) -> bool | None:
+    """Lock an open file or folder as `try_lock` does; return None on systems without `flock`."""
+    if sys.platform == "win32":
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+def taken(path: Path, descriptor: int | None = None) -> LogError:
+    """Return the error for a file that is locked already.
+
+    Args:
+        path: Path that the message names.
+        descriptor: Descriptor of the locked file; None if another process has locked it.
+    """
+    if descriptor is not None:
+        state = os.fstat(descriptor)
+        for file in [file for file, records in list(_held.items()) if records]:
+            # Another thread may close the file.
+            with suppress(OSError, ValueError):
+                if os.path.samestat(os.fstat(file.fileno()), state):
+                    return LogError(_OWN.format(path))
+    return LogError(_TAKEN.format(path))
+
+
+@contextmanager
+def waiting_lock(file: BinaryIO | FileIO) -> Iterator[None]:
+    """Lock an open file; if another process has locked it, wait. Unlock it at the end.
+
+    On systems without `flock`, nothing is locked; see `try_lock`.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    with suppress(OSError):
+        fcntl.flock(file, fcntl.LOCK_EX)
+    try:
+        yield
+    finally:
+        file.flush()
+        # A forked process may still have the file open, so closing it does not end the lock.
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_UN)
+
+
+@contextmanager
+def locked_file(path: Path) -> Iterator[None]:
+    """Lock a file against other writers. Do nothing if it does not exist or cannot be read.
+
+    Raises:
+        LogError: Another writer has locked the file, or this program has an open recorder of it.
+    """
+    while True:
+        try:
+            file = FileIO(open_at_once(path))
+        except OSError:
+            yield
+            return
+        with file:
+            if not lock(file):
+                raise taken(path, file.fileno())
+            # A writer may have replaced the file before this lock was acquired: try again.
+            if is_at(file.fileno(), path):
+                yield
+                return
+
+
+def open_at_once(path: str | Path) -> int:
+    """Open a regular file for reading, without waiting for the writer of a FIFO.
+
+    Raises:
+        OSError: The file cannot be opened, or is a folder, device, socket or FIFO. Opening a device
+            can have effects, so the type is checked before and after.
+    """
+    check_regular(path)
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(_NOT_REGULAR)
+    return descriptor
+
+
+def check_regular(path: str | Path) -> None:
+    """Check that a path belongs to a regular file, so that opening it does not wait.
+
+    Raises:
+        OSError: There is no such file, or it is a folder, device, socket or FIFO.
+    """
+    if not stat.S_ISREG(os.stat(path).st_mode):
+        raise OSError(_NOT_REGULAR)
+
+
+def read_file(path: str | Path) -> bytes:
+    """Read a regular file.
+
+    Raises:
+        OSError: The file cannot be read, or is a folder, device, socket or FIFO.
+    """
+    with FileIO(open_at_once(path)) as file:
+        return file.readall()
+
+
+def check_plain(path: str | Path) -> None:
+    """Check that a path is a regular file, or a folder of nothing but regular files and folders.
+
+    Libraries that open the files by their names would wait for the writer of a FIFO.
+
+    Raises:
+        OSError: There is something else; the error's file name is its path.
+    """
+    if not os.path.isdir(path):
+        check_regular(path)
+        return
+    for folder, _, names in os.walk(path):
+        for name in names:
+            place = os.path.join(folder, name)
+            # A link to a missing file is an error of the reader that needs it.
+            if os.path.exists(place) and not os.path.isfile(place):
+                raise OSError(f"{place} is not a regular file")
+
+
+def is_at(descriptor: int, path: str | Path) -> bool:
+    """Return whether a descriptor and a path refer to the same file or folder."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.stat(path))
+    except (FileNotFoundError, NotADirectoryError):
+        return False
