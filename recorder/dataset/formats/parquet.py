@@ -283,14 +283,19 @@ def _summary(index: int, row: Mapping[str, Any]) -> EpisodeSummary:
     seed = row["seed"]
     if seed is not None and not 0 <= int(seed) <= MAX_SEED:
         raise ValueError(f"seed {seed}")
-    counts = ("length", "start_time_ns", "end_time_ns")
     return EpisodeSummary(
         episode=index,
+        length=int(row["length"]),
+        total_reward=float(row["total_reward"]),
+        terminated=bool(row["terminated"]),
+        truncated=bool(row["truncated"]),
+        start_time_ns=int(row["start_time_ns"]),
+        end_time_ns=int(row["end_time_ns"]),
+        reason=str(row["reason"]),
+        policy=str(row["policy"]),
+        epsilon=float(row["epsilon"]),
         seed=seed,
-        **{name: int(row[name]) for name in counts},
-        **{name: float(row[name]) for name in ("total_reward", "epsilon")},
-        **{name: bool(row[name]) for name in ("terminated", "truncated")},
-        **{name: str(row[name]) for name in ("reason", "policy", "options")},
+        options=str(row["options"]),
     )
 
 

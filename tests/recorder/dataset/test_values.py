@@ -38,7 +38,11 @@ IMPOSSIBLE: list[tuple[str, Any, str]] = [
     ("rewards", np.zeros(3, complex), "rewards has dtype complex128"),
     ("rewards", np.zeros(3, "V4"), r"rewards has dtype \|V4"),
     ("rewards", np.array([1, "x", 2], object), "rewards has dtype object, .*: row 1 is 'x'"),
-    ("rewards", np.ma.MaskedArray([1.0, 2, 3], [0, 0, 1]), "rewards has no value in row 2"),
+    (
+        "rewards",
+        np.ma.MaskedArray([1.0, 2, 3], [False, False, True]),
+        "rewards has no value in row 2",
+    ),
     ("rewards", np.array([0, 2**53 + 1, 0]), "rewards is int64 and .*: row 1 is 9007199254740993"),
     ("behavior_probs", [0.5, 0, 1], r"behavior_probs: row 1 is 0.0, expected a number in \(0, 1\]"),
     ("behavior_probs", [0.5, 1, np.inf], "behavior_probs: row 2 is inf"),

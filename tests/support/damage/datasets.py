@@ -34,7 +34,21 @@ _MEMORY_BYTES = 4 << 30
 _GROWTH_BYTES = 512 << 20
 """Memory that a damaged file of a few kB may take."""
 _SIZES = (0, 1, 2**15, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
-_JSON = (None, True, -1, 0, 0.5, 1e300, 10**400, 2**63, "x", [], {}, [[[0]]], {"a": {}})
+_JSON: tuple[Any, ...] = (
+    None,
+    True,
+    -1,
+    0,
+    0.5,
+    1e300,
+    10**400,
+    2**63,
+    "x",
+    [],
+    {},
+    [[[0]]],
+    {"a": {}},
+)
 
 
 def dataset() -> Dataset:

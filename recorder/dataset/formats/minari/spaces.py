@@ -201,7 +201,7 @@ def _joined(space: spaces.Space[Any]) -> tuple[spaces.Space[Any], str]:
         )
         joined: spaces.Space[Any] = spaces.Box(low, high, dtype=low.dtype.type)
     elif parts and all(isinstance(part, spaces.Discrete | spaces.MultiDiscrete) for part in parts):
-        counts = [getattr(part, "nvec", getattr(part, "n", None)) for part in parts]
+        counts: list[Any] = [getattr(part, "nvec", getattr(part, "n", 0)) for part in parts]
         joined = spaces.MultiDiscrete(
             np.concatenate([np.ravel(count) for count in counts]),
             start=np.concatenate([np.ravel(part.start) for part in parts]),

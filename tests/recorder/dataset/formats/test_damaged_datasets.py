@@ -28,7 +28,8 @@ def test_damaged_files_are_read_or_refused_in_bounded_memory(tmp_path: Path) -> 
     command = [sys.executable, "-m", "tests.support.damage.datasets", str(tmp_path), "300", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stdout[-200:] + done.stderr[-3000:]
-    cases, refused = (int(word) for word in done.stdout.split() if word.isdecimal())
+    last = done.stdout.splitlines()[-1]
+    cases, refused = (int(word) for word in last.split() if word.isdecimal())
     assert cases == 300
     assert refused > 100
 

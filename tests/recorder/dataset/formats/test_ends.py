@@ -61,7 +61,7 @@ def _is_expected(found: Dataset) -> bool:
     assert found.rewards.tolist() == [0, 1, 2, 3, 5]
     assert found.terminated.tolist() == [False, False, True, False, False]
     assert found.truncated.tolist() == [False, False, False, True, True]
-    return found.episode_lengths.tolist() == [3, 1, 1]
+    return bool(found.episode_lengths.tolist() == [3, 1, 1])
 
 
 DIVISIONS: dict[str, Any] = {
