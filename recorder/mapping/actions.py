@@ -97,21 +97,23 @@ def actions_of(action: Action, commands: Sequence[CommandPart]) -> Actions:
             np.broadcast_to(np.array(each, np.float32), numbers.shape[1])
             for each in (action.box.low, action.box.high)
         )
-        far = ((numbers < low) | (numbers > high)).any(axis=1) & ~missing
-        kept = np.clip(numbers, low, high).astype(np.float32)
-        space = spaces.Box(low.copy(), high.copy())
-        return Actions(space, kept, missing, far, (), numbers, fields)
+        # The limits are float32, so a command that equals its limit may be beyond it in float64.
+        with np.errstate(over="ignore"):
+            rounded = numbers.astype(np.float32)
+        far = ((rounded < low) | (rounded > high)).any(axis=1) & ~missing
+        kept = np.clip(rounded, low, high)
+        box = spaces.Box(low.copy(), high.copy())
+        return Actions(box, kept, missing, far, (), numbers, fields)
     if action.actions:
         values, distance = _nearest(numbers, np.array(list(action.actions.values()), np.float64))
         far = (distance > action.far) & ~missing
-        space: spaces.Space[Any] = spaces.Discrete(len(action.actions))
         names = tuple(action.actions)
-        return Actions(space, values, missing, far, names, numbers, fields)
+        return Actions(spaces.Discrete(len(names)), values, missing, far, names, numbers, fields)
     values, meanings = _binned(
         action, numbers, [each for part in commands for each in part.elements]
     )
-    space = spaces.Discrete(len(meanings))
-    return Actions(space, values, missing, none, meanings, numbers, fields)
+    count = len(meanings)
+    return Actions(spaces.Discrete(count), values, missing, none, meanings, numbers, fields)
 
 
 def _discrete(

@@ -149,7 +149,11 @@ def test_results_are_copies() -> None:
 
 def test_a_reset_in_the_step_that_ends_an_episode_clears_the_commands() -> None:
     # The second car leaves the lane; the first drives on.
-    options = {"observation": "depth-commands", "start": "line", "autoreset_mode": "SameStep"}
+    options: dict[str, Any] = {
+        "observation": "depth-commands",
+        "start": "line",
+        "autoreset_mode": "SameStep",
+    }
     env = make_sims("lane", 2, **options)
     env.reset(seed=0)
     for step in range(1, 33):

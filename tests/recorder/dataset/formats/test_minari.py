@@ -405,6 +405,7 @@ def test_texts_are_refused_or_left_out(minari: Any, form: str, tmp_path: Path) -
         with pytest.warns(UserWarning, match=r"\['mission'\] is a Text space, which is left out"):
             found = read(path, lossy=True)
         assert found.frames["x"].tolist() == [[1], [2], [3]]
+        assert isinstance(found.observation_space, spaces.Dict)
         assert list(found.observation_space) == ["x"]
     with pytest.warns(UserWarning, match="left out"):
         mcaprl.convert(path, tmp_path / "log.mcap", lossy=True)
