@@ -36,7 +36,7 @@ class MemoryBag:
         """
         self._times: dict[str, NDArray[np.int64]] = {}
         self._columns: dict[str, dict[str, NDArray[Any]]] = {}
-        self._files: dict[str, NDArray[np.int64]] = {}
+        self._places: dict[str, NDArray[np.int64]] = {}
         self.topics: dict[str, TopicInfo] = {}
         for name, (times_s, columns) in topics.items():
             times_ns = np.rint(np.array(times_s, np.float64) * SECOND_NS).astype(np.int64)
@@ -60,7 +60,13 @@ class MemoryBag:
                 key: np.concatenate([bag._columns[name][key] for bag in bags])
                 for key in bags[0]._columns[name]
             }
-            found._files[name] = np.repeat(np.arange(len(bags)), [len(part) for part in parts])
+            found._places[name] = np.concatenate(
+                [
+                    [(k, row) for row in range(len(part))]
+                    for k, part in enumerate(parts)
+                    if len(part)
+                ]
+            )
             found.topics[name] = dataclasses.replace(info, count=len(found._times[name]))
         return found
 
@@ -69,7 +75,7 @@ class MemoryBag:
 
     def places(self, topic: str) -> NDArray[np.int64]:
         rows = np.arange(len(self._times[topic]))
-        return np.column_stack([self._files.get(topic, np.zeros_like(rows)), rows])
+        return self._places.get(topic, np.column_stack([np.zeros_like(rows), rows]))
 
     def read(
         self, topic: str, fields: Sequence[str], rows: NDArray[np.int64] | None = None

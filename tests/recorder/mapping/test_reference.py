@@ -139,3 +139,54 @@ def test_columns_equal_a_reading_message_by_message(
     assert found == expected
     if clock == "rate":
         assert all(np.diff(e.log_time_ns).min() == 1e9 / RATE_HZ for e in data.episodes)
+
+
+@st.composite
+def drives(draw: Any) -> Messages:
+    """Return messages of a topic: a random rate, jitter in the order of recording, and pauses."""
+    period_s = draw(st.sampled_from([0.02, 0.1, 0.5]))
+    jitter = st.floats(-1.4, 1.4).map(lambda share: share * period_s)
+    time, found = draw(st.sampled_from([0.0, 10.0, 900_000.0])), list[tuple[float, float]]()
+    for count in draw(st.lists(st.integers(1, 12), min_size=1, max_size=3)):
+        found += [(time + k * period_s + draw(jitter), len(found) + float(k)) for k in range(count)]
+        time += count * period_s + draw(st.sampled_from([0.4, 3.0, 80_000.0]))
+    return [(max(each, 0.0), value) for each, value in found]
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(st.tuples(drives(), drives()), min_size=2, max_size=4),
+    st.sampled_from(["last", "nearest", "linear"]),
+    st.sampled_from([{"rate_hz": 20}, {"rate_hz": 3}, {"topic": "/odom"}, {"topic": "/mode"}]),
+    st.sampled_from([1.0, 2.0]),
+)
+def test_recordings_have_the_same_transitions_together_as_apart(
+    recordings: list[Recording], align: str, clock: dict[str, Any], gap_s: float
+) -> None:
+    mapping = parse_mapping(
+        {
+            "clock": clock,
+            "observation": {"speed": {"field": "/odom.speed", "align": align}},
+            "action": {"fields": ["/mode.data"], "box": {"low": -1, "high": 99}},
+            "episodes": {"gap_s": gap_s, "min_steps": 1},
+        }
+    )
+
+    def episodes(bag: MemoryBag) -> list[Any]:
+        try:
+            data = read_open_bag(bag, mapping).dataset
+        except LogError:
+            return []
+        return [
+            (e.observations.tolist(), e.next_observations[-1].tolist(), e.actions.tolist())
+            for e in data.episodes
+        ]
+
+    apart = sorted(recordings, key=lambda each: min(time for part in each for time, _ in part))
+    together = episodes(MemoryBag.together(*(bag_of(*each) for each in apart)))
+    assert together == [e for each in apart for e in episodes(bag_of(*each))]
+    # Nothing is observed twice, but for a rate above that of the messages.
+    if clock == {"topic": "/odom"}:
+        for observations, last, _ in together:
+            values = [value for (value,) in observations] + last
+            assert len(set(values)) == len(values) or align == "linear"
