@@ -82,15 +82,14 @@ def remove_leftover(path: Path) -> None:
         OutputExistsError: As for `work_folder`.
     """
     remove_leftovers(path.parent)
-    if os.path.lexists(_work_path(path)):
-        with suppress(OSError, LogError), work_folder(path):
-            pass
+    with suppress(OSError):
+        _remove_left(_work_path(path))
 
 
 def is_leftover(folder: Path) -> bool:
     """Return whether a folder is the work folder of a target, made by this package."""
     try:
-        opened = _opened(folder)
+        opened = _opened(folder, create=False)
     except (OSError, OutputExistsError):
         return False
     opened.close()
@@ -109,7 +108,8 @@ def remove_leftovers(parent: Path) -> None:
     with suppress(OSError), os.scandir(parent) as entries:
         for entry in entries:
             if _LEFTOVER.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False):
-                _remove_left(Path(entry.path))
+                with suppress(OSError, OutputExistsError):
+                    _remove_left(Path(entry.path), marked=True)
 
 
 class TemporaryFolder:
@@ -236,18 +236,18 @@ def _locked(folder: Path, path: Path) -> OpenFolder:
         opened.close()
 
 
-def _opened(folder: Path) -> OpenFolder:
-    """Open a folder of this package, or create it.
+def _opened(folder: Path, *, create: bool = True) -> OpenFolder:
+    """Open a folder of this package; create it if it is missing and `create` is set.
 
     Raises:
         OutputExistsError: Something else is at this path.
         OSError: The folder cannot be created or opened.
     """
-    is_new = True
-    try:
-        folder.mkdir(_PRIVATE)
-    except FileExistsError:
-        is_new = False
+    is_new = False
+    if create:
+        with suppress(FileExistsError):
+            folder.mkdir(_PRIVATE)
+            is_new = True
     try:
         mode = folder.lstat().st_mode
         if not stat.S_ISDIR(mode):
@@ -255,6 +255,8 @@ def _opened(folder: Path) -> OpenFolder:
             raise _foreign(folder, f"is {kind}")
         opened = OpenFolder(_descriptor_of(folder))
     except FileNotFoundError:
+        if not create:
+            raise
         # Its process has removed it in the meantime.
         return _opened(folder)
     try:
@@ -347,12 +349,22 @@ def _remove(folder: Path, opened: OpenFolder) -> None:
         opened.close()
 
 
-def _remove_left(folder: Path) -> None:
-    """Remove a marked folder of this user if no process has locked it."""
-    with suppress(OSError, OutputExistsError):
-        opened = _opened(folder)
-        is_dead = surely_locked(opened.fileno()) and _is_at(opened, folder)
-        if is_dead and _MARK in _entries(folder, opened):
+def _remove_left(folder: Path, *, marked: bool = False) -> None:
+    """Remove a folder of this package if no process has locked it.
+
+    Its process locks a new folder before it writes the mark. An empty folder is therefore left
+    alone: locking it here could refuse its process.
+
+    Raises:
+        OutputExistsError: The folder is not one of this package.
+        OSError: There is no such folder, or it cannot be opened.
+    """
+    opened = _opened(folder, create=False)
+    try:
+        entries = _entries(folder, opened)
+        is_left = _MARK in entries if marked else bool(entries)
+        if is_left and surely_locked(opened.fileno()) and _is_at(opened, folder):
             _restore(folder)
             _remove(folder, opened)
+    finally:
         opened.close()
