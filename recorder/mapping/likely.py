@@ -15,6 +15,7 @@ from mcaprl.recorder.bags.bag import Bag, TopicInfo
 from mcaprl.recorder.bags.overview import TopicOverview, instants_of, is_fresh
 from mcaprl.recorder.format.reading import full_name
 from mcaprl.recorder.mapping.config import Quantity
+from mcaprl.recorder.mapping.precision import needed_offset
 
 _SAMPLES = 200
 _SIZES = (8, 16, 32, 64)
@@ -243,8 +244,8 @@ def _spec(info: TopicInfo, name: str, columns: dict[str, NDArray[Any]]) -> dict[
     finite = np.isfinite(numbers)
     if "clip" not in spec and finite.mean() < _ARE_FINITE:
         return None
-    if column.ndim == 1 and _loses_digits(numbers[finite]):
-        spec["offset"] = -float(round(float(np.median(numbers[finite])), 3))
+    if column.ndim == 1 and (offset := needed_offset(numbers)) is not None:
+        spec["offset"] = offset
     return spec
 
 
@@ -281,12 +282,6 @@ def _add_joints(spec: dict[str, Any], names: NDArray[Any]) -> bool:
         spec["names"] = every
         return True
     return all(each == lists[0] for each in lists)
-
-
-def _loses_digits(numbers: NDArray[np.float64]) -> bool:
-    """Return whether different numbers become equal as float32."""
-    distinct = np.unique(numbers)
-    return len(np.unique(distinct.astype(np.float32))) < len(distinct)
 
 
 def _penalty(name: str, column: NDArray[Any], share: float, *, is_known: bool) -> tuple[int, str]:
