@@ -34,6 +34,7 @@ from mcaprl.offline.training.watch import (
     divergence_warning,
     horizon_warning,
     largest_return,
+    schedule_warning,
 )
 from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
 from mcaprl.runs import (
@@ -43,6 +44,7 @@ from mcaprl.runs import (
     locked_run,
     open_run,
     policy_files,
+    read_updates,
     seed_folder,
 )
 
@@ -76,7 +78,7 @@ def train(
             that of the run.
         weights: (E,) relative sampling weight of each transition of an episode; default: all equal.
         resume: Whether to resume from the checkpoints in `out`. Seeds without a checkpoint
-            start from update 0.
+            start from update 0. With more updates than the run has, it is continued to this number.
         other_data: Whether to accept checkpoints trained on other data when resuming.
         follow: Growing logs from which `dataset` was read; episodes finished during training
             are added.
@@ -102,8 +104,10 @@ def train(
     weights = np.ones(len(dataset.episodes)) if weights is None else weights
     check_weights(weights, len(dataset.episodes))
     data = fingerprint(dataset, weights)
-    identity = RunIdentity(identity_parts(config, data), other_data)
+    identity = RunIdentity(identity_parts(config, data), other_data, longer=True)
     with locked_run(folder, resume):
+        if resume and (message := schedule_warning(read_updates(folder), config)):
+            warnings.warn(message, stacklevel=2)
         held_out = choose_held_out(len(weights), config.held_out)
         encoder, reward_scale = earlier_scales(folder) if resume and other_data else (None, None)
         buffer = TransitionBuffer.from_dataset(
