@@ -95,7 +95,7 @@ class RunIdentity:
             if old == new or (name == "data" and self.other_data):
                 continue
             if name == "updates" and self.longer and isinstance(old, int):
-                if old < new:
+                if old < int(self.parts["config"]["updates"]):
                     continue
                 raise TrainingError(
                     f"cannot resume: {where} has {old} updates, more than {new}; resume with at"
@@ -163,7 +163,7 @@ def open_run(
         raise OutputExistsError(
             f"{folder} exists: choose another folder, or resume its run (--resume)"
         )
-    versions = _numerical_versions()
+    versions: Any = _numerical_versions()
     if leftovers is None:
         identity.check_same(found, folder / CONFIG_NAME)
         versions = found.get("versions")

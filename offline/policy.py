@@ -15,6 +15,7 @@ import json
 import math
 from collections import deque
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -28,6 +29,7 @@ from torch import Tensor, nn
 from mcaprl.architecture import architecture_of
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
 from mcaprl.files import parse_json, write_json
+from mcaprl.joint_actions import JointActions
 from mcaprl.networks import ImageInput, Network, check_size
 from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import allowed_only, likely_actions, mean_values
@@ -84,7 +86,8 @@ class Policy:
         name: Folder names of the run and the seed.
         algo: Name of the training algorithm.
         observation_space: Space of one observation.
-        action_space: Space of one action.
+        action_space: Space of one action. Its values are numbered as 0 to A - 1; each combination
+            of the elements of a MultiDiscrete or MultiBinary space is one action.
         env_id: ID of the environment in the training log; empty if unknown.
         env_kwargs: Keyword arguments of that environment.
         frame_stack: Number of successive observations in one input; see `act`.
@@ -97,7 +100,7 @@ class Policy:
     name: str
     algo: str
     observation_space: spaces.Space[Any]
-    action_space: spaces.Discrete
+    action_space: spaces.Space[Any]
     env_id: str
     env_kwargs: dict[str, Any]
     frame_stack: int
@@ -110,8 +113,13 @@ class Policy:
         """Drop the stored frames. The next observations start new episodes."""
         self._seen.clear()
 
-    def act(self, observations: Any) -> NDArray[np.int64]:
-        """Return the best actions (B,) in `action_space`; a tie selects the lowest action.
+    @cached_property
+    def joint(self) -> JointActions:
+        """Numbering of the actions: the order of the axis A."""
+        return discrete_actions(self.action_space)
+
+    def act(self, observations: Any) -> NDArray[Any]:
+        """Return the best actions (B, *shape) in `action_space`; a tie selects the first action.
 
         A policy with `frame_stack` k > 1 stores the observations of the last k calls since `begin`.
         It also accepts stacks (B, k, *shape), oldest first; it stores nothing in this case.
@@ -125,7 +133,7 @@ class Policy:
             inputs = self._inputs(observations)
         with torch.inference_mode():
             best = cast(NDArray[np.int64], self.scores(inputs).argmax(1).numpy())
-        return best + self.action_space.start
+        return self.joint.values(best)
 
     def q_values(self, observations: Any) -> NDArray[np.float32]:
         """Return the values (B, A) of all actions; minus infinity for masked actions.
@@ -263,8 +271,8 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
     if description["acts_by"] not in get_args(ActsBy):
         raise ValueError(f"acts_by {description['acts_by']!r} is not supported")
     observation_space = space_from_json(json.dumps(description["observation_space"]))
-    action_space = discrete_actions(space_from_json(json.dumps(description["action_space"])))
-    encoder = ObservationEncoder(observation_space, int(action_space.n))
+    action_space = space_from_json(json.dumps(description["action_space"]))
+    encoder = ObservationEncoder(observation_space, discrete_actions(action_space).count)
     encoder.shift = weights.pop("observation.shift").numpy()
     encoder.scale = weights.pop("observation.scale").numpy()
     stack, shape = int(description["frame_stack"]), description["architecture"]

@@ -14,7 +14,11 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from mcaprl.errors import PolicyError
+from mcaprl.joint_actions import joint_actions
 from mcaprl.masks import allowed_actions
+
+MOST_NUMBERED = 1 << 62
+"""Largest number of actions that a policy chooses among by their numbers."""
 
 
 class Policy(Protocol):
@@ -68,7 +72,7 @@ class EpsilonGreedy:
         self.epsilon = 1.0 if policy is None else epsilon
         self.name = "random" if policy is None else policy.name
         self._space = action_space
-        self._count = int(action_space.n) if isinstance(action_space, spaces.Discrete) else 0
+        self._joint = joint_actions(action_space)
         self.begin(0)
 
     def begin(self, seed: int) -> None:
@@ -83,22 +87,29 @@ class EpsilonGreedy:
         """Return the action for one observation, and the probability of that action.
 
         Each of the A allowed actions has the probability epsilon / A; the policy's greedy action
-        has an additional 1 - epsilon. Without an action mask, all actions are allowed. If actions
-        are not discrete, the returned probability is NaN.
+        has an additional 1 - epsilon. Without an action mask, all actions are allowed. Each
+        combination of the elements of a MultiDiscrete or MultiBinary space is one action; with more
+        than `MOST_NUMBERED` actions, and for other spaces, the returned probability is NaN.
         """
         greedy = None if self.policy is None else self.policy.act(_batch(observation))[0]
         explores = self.epsilon > 0 and self._random.random() < self.epsilon
-        if not self._count:
+        joint = self._joint
+        if joint is None or joint.count > MOST_NUMBERED:
             return (self._space.sample() if explores else greedy), math.nan
-        start, mask = int(getattr(self._space, "start", 0)), allowed_actions(observation)
-        allowed = range(self._count) if mask is None else np.flatnonzero(mask).tolist()
-        if explores or greedy is None:
-            action = allowed[int(self._random.integers(len(allowed)))] + start
+        mask = allowed_actions(observation)
+        # For MultiDiscrete spaces, there are also masks with one flag for each value of an element.
+        if joint.shape and mask is not None and mask.shape != (joint.count,):
+            mask = None
+        allowed = range(joint.count) if mask is None else np.flatnonzero(mask).tolist()
+        own = None if greedy is None else int(joint.indexes(np.asarray(greedy)[None])[0])
+        if explores or own is None:
+            number = allowed[int(self._random.integers(len(allowed)))]
+            action = joint.values(np.array([number]))[0]
         else:
-            action = int(greedy)
-        own = greedy is not None and action == int(greedy)
-        by_chance = self.epsilon / len(allowed) if action - start in allowed else 0.0
-        return action, by_chance + (1 - self.epsilon) * own
+            number, action = own, greedy
+        by_chance = self.epsilon / len(allowed) if number in allowed else 0.0
+        chance = by_chance + (1 - self.epsilon) * (number == own)
+        return (action if joint.shape else int(action)), chance
 
 
 def episode_seed(seed: int, episode: int) -> int:
