@@ -19,6 +19,7 @@ from mcaprl.recorder.dataset.episode import Episode, shapes
 from mcaprl.recorder.dataset.mapped import MappedImages, rows_of
 from mcaprl.recorder.dataset.statistics import Statistics, describe_columns
 from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, TransitionBatch, Transitions
+from mcaprl.recorder.format.episode_summary import add_up_each
 from mcaprl.recorder.format.metadata import ESTIMATED, LogMetadata
 from mcaprl.recorder.format.spaces import nest, space_to_json
 
@@ -305,6 +306,38 @@ class Dataset(Conversions):
         return Dataset(
             dataclasses.replace(self._transitions, behavior_probs=column),
             dataclasses.replace(self._description, behavior_prob=mark),
+            sources=self.sources,
+        )
+
+    def with_rewards(self, rewards: Any) -> Dataset:
+        """Return the same transitions with other rewards; the returns of the episodes are theirs.
+
+        Args:
+            rewards: (N,) reward of each transition, in the order of `rewards`; finite numbers.
+
+        Raises:
+            SpaceError: The length of `rewards` is not the number of transitions, or a reward is not
+                a finite number.
+        """
+        given = np.asarray(rewards)
+        if given.shape != (len(self),):
+            raise SpaceError(f"rewards has shape {given.shape}, expected {(len(self),)}")
+        if given.dtype.kind not in "biuf":
+            raise SpaceError(f"rewards has dtype {given.dtype}, expected numbers")
+        column = given.astype(np.float64)
+        if not np.isfinite(column).all():
+            row = int(np.isfinite(column).argmin())
+            raise SpaceError(f"rewards has {column[row]} in row {row}, expected finite numbers")
+        columns = self._transitions
+        stops = np.cumsum(columns.lengths)
+        totals = add_up_each(column, columns.first_steps.tolist(), stops.tolist())
+        episodes = tuple(
+            one._replace(total_reward=total)
+            for one, total in zip(columns.episodes, totals, strict=True)
+        )
+        return Dataset(
+            dataclasses.replace(columns, rewards=column, episodes=episodes),
+            self._description,
             sources=self.sources,
         )
 
