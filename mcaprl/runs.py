@@ -94,6 +94,9 @@ class RunIdentity:
             old, new = theirs.get(name), mine.get(name)
             if old == new or (name == "data" and self.other_data):
                 continue
+            if old is None and new == "":
+                # Earlier versions did not have this setting.
+                continue
             if name == "updates" and self.longer and isinstance(old, int):
                 if old < int(self.parts["config"]["updates"]):
                     continue

@@ -30,6 +30,7 @@ from mcaprl.architecture import architecture_of
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
 from mcaprl.files import parse_json, write_json
 from mcaprl.joint_actions import JointActions
+from mcaprl.masks import OBSERVATION_KEY, has_source
 from mcaprl.networks import ImageInput, Network, check_size
 from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import allowed_only, likely_actions, mean_values
@@ -95,6 +96,9 @@ class Policy:
         scores: Networks that score actions.
         reward_scale: Divisor of the rewards in the training. `q_values` returns values in units of
             the logged rewards, without this divisor.
+        mask_from: Source of the action mask, `info:NAME` or a key of the observation; empty if
+            the environment's observations have the mask, or there is none. With a source, the
+            observations of `act` are `{"observation": ..., "action_mask": ...}`.
     """
 
     name: str
@@ -107,11 +111,21 @@ class Policy:
     encoder: ObservationEncoder = field(repr=False)
     scores: Scores = field(repr=False)
     reward_scale: float = 1.0
+    mask_from: str = ""
     _seen: deque[Observations] = field(default_factory=deque, init=False, repr=False)
 
     def begin(self) -> None:
         """Drop the stored frames. The next observations start new episodes."""
         self._seen.clear()
+
+    @property
+    def env_observation_space(self) -> spaces.Space[Any]:
+        """Observation space of the environment, without a mask from `mask_from`."""
+        space = self.observation_space
+        if not self.mask_from:
+            return space
+        assert isinstance(space, spaces.Dict)
+        return space[OBSERVATION_KEY]
 
     @cached_property
     def joint(self) -> JointActions:
@@ -240,6 +254,7 @@ def save_policy(
         "frame_stack": buffer.packing.frame_stack,
         "env_id": env_id,
         "env_kwargs": env_kwargs,
+        "mask_from": learner.config.mask_from,
         "observation_space": json.loads(space_to_json(buffer.encoder.space)),
         "action_space": json.loads(space_to_json(buffer.action_space)),
     }
@@ -272,6 +287,9 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
         raise ValueError(f"acts_by {description['acts_by']!r} is not supported")
     observation_space = space_from_json(json.dumps(description["observation_space"]))
     action_space = space_from_json(json.dumps(description["action_space"]))
+    mask_from = str(description.get("mask_from", ""))
+    if mask_from and not has_source(observation_space):
+        raise ValueError(f"mask_from {mask_from!r} does not fit {observation_space}")
     encoder = ObservationEncoder(observation_space, discrete_actions(action_space).count)
     encoder.shift = weights.pop("observation.shift").numpy()
     encoder.scale = weights.pop("observation.scale").numpy()
@@ -301,6 +319,7 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
         encoder=encoder,
         scores=scores.eval(),
         reward_scale=float(description.get("reward_scale", 1.0)),
+        mask_from=mask_from,
     )
 
 

@@ -32,6 +32,7 @@ from mcaprl.offline.training.train import (
     earlier_scales,
     identity_parts,
     train_share,
+    with_source,
     without,
 )
 from mcaprl.offline.training.watch import choose_held_out, horizon_warning, schedule_warning
@@ -287,7 +288,7 @@ def _read_logs(job: _Job, first: int, stop: int) -> Dataset:
         if len(mine):
             check_machine(job.versions, [path])
             parts.append(LogReader(path).read(mine))
-    return Dataset.concatenate(parts)
+    return with_source(Dataset.concatenate(parts), job.request.config.mask_from)
 
 
 def _read_summaries(data: Sequence[str]) -> _Logs:

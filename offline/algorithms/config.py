@@ -37,6 +37,9 @@ class TrainingConfig(NetworkSettings):
     """fraction of the episodes held out for validation"""
     log_interval: int = 100
     """updates between two rows of metrics"""
+    mask_from: str = ""
+    """source of the flags of the allowed actions: info:NAME, or a key of the observation; by
+    default, the key action_mask, if there is one"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""

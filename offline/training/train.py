@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.errors import TrainingError, UsageError
+from mcaprl.masks import has_source
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import choose_algorithm
@@ -101,6 +102,7 @@ def train(
     numbers = choose_seeds(folder, seeds, seed, resume)
     place = choose_device(device)
     learner_type, config = choose_algorithm(algo)
+    dataset = with_source(dataset, config.mask_from)
     weights = np.ones(len(dataset.episodes)) if weights is None else weights
     check_weights(weights, len(dataset.episodes))
     data = fingerprint(dataset, weights)
@@ -165,6 +167,13 @@ def train_share(
     ).to(choose_device(device))
     run = _run(out, identity, dataset, buffer, held_out, None)
     return run.train(choose_algorithm(config)[0], config, seeds, report)
+
+
+def with_source(dataset: Dataset, source: str) -> Dataset:
+    """Return a dataset with the masks of `mask_from`, unless it has them or there is no source."""
+    if not source or has_source(dataset.observation_space):
+        return dataset
+    return dataset.with_action_mask(source)
 
 
 def identity_parts(config: TrainingConfig, data: str) -> dict[str, Any]:
@@ -310,7 +319,8 @@ class _Run:
         """
         if self.follow is None or learner.step % CHECK_INTERVAL or not self.follow.grow():
             return learner
-        return with_more_data(learner, self.follow.dataset, self.held_out_episodes)
+        grown = with_source(self.follow.dataset, learner.config.mask_from)
+        return with_more_data(learner, grown, self.held_out_episodes)
 
     def _save(self, learner: Learner) -> None:
         """Write each seed's policy and then its checkpoint.

@@ -14,6 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError, UnknownNameError, UsageError
+from mcaprl.recorder.dataset.action_mask import with_mask
 from mcaprl.recorder.dataset.conversions import Conversions
 from mcaprl.recorder.dataset.episode import Episode, shapes
 from mcaprl.recorder.dataset.mapped import MappedImages, rows_of
@@ -340,6 +341,24 @@ class Dataset(Conversions):
             self._description,
             sources=self.sources,
         )
+
+    def with_action_mask(self, source: str) -> Dataset:
+        """Return the same transitions with the flags of the allowed actions in the observations.
+
+        The observations become `{"observation": ..., "action_mask": ...}`; learning and estimates
+        use only allowed actions. `mask_from` of `mcaprl.train` does the same.
+
+        Args:
+            source: `info:NAME` for a recorded info, or the key of a part of a Dict observation,
+                such as `robot/legal`; an array with a flag for each action, in each observation.
+
+        Raises:
+            SpaceError: The observations have an `action_mask` already, the values are no flags, or
+                a frame in which an action was chosen has none.
+            UnknownNameError: There is no such info or part.
+        """
+        columns, description = with_mask(self._transitions, self._description, source)
+        return Dataset(columns, description, sources=self.sources)
 
     def batch(self, steps: NDArray[np.integer[Any]]) -> TransitionBatch:
         """Copy the transitions with indexes (B,), reading images from disk if needed.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import PolicyError
 from mcaprl.joint_actions import joint_actions
-from mcaprl.masks import allowed_actions
+from mcaprl.masks import allowed_actions, masked
 
 MOST_NUMBERED = 1 << 62
 """Largest number of actions that a policy chooses among by their numbers."""
@@ -59,7 +60,11 @@ class EpsilonGreedy:
     """Epsilon-greedy exploration around a policy, with the probabilities of its actions."""
 
     def __init__(
-        self, policy: Policy | None, epsilon: float, action_space: spaces.Space[Any]
+        self,
+        policy: Policy | None,
+        epsilon: float,
+        action_space: spaces.Space[Any],
+        mask_from: str = "",
     ) -> None:
         """Follow `policy`, but take a random action with probability `epsilon`.
 
@@ -67,12 +72,15 @@ class EpsilonGreedy:
             policy: Policy, or None for random actions.
             epsilon: Probability of a random action, 0 to 1; ignored if there is no policy.
             action_space: Space of the random actions.
+            mask_from: Source of the mask of random actions if there is no policy; see
+                `mcaprl.masks`. A policy has its own source.
         """
         self.policy = policy
         self.epsilon = 1.0 if policy is None else epsilon
         self.name = "random" if policy is None else policy.name
         self._space = action_space
         self._joint = joint_actions(action_space)
+        self.mask_from = mask_from if policy is None else getattr(policy, "mask_from", "")
         self.begin(0)
 
     def begin(self, seed: int) -> None:
@@ -83,14 +91,18 @@ class EpsilonGreedy:
         self._random = np.random.default_rng([seed, 1])
         self._space.seed(seed)
 
-    def choose(self, observation: Any) -> tuple[Any, float]:
-        """Return the action for one observation, and the probability of that action.
+    def choose(
+        self, observation: Any, info: Mapping[str, Any] = MappingProxyType({})
+    ) -> tuple[Any, float]:
+        """Return the action for one observation and its info, and the probability of that action.
 
         Each of the A allowed actions has the probability epsilon / A; the policy's greedy action
         has an additional 1 - epsilon. Without an action mask, all actions are allowed. Each
         combination of the elements of a MultiDiscrete or MultiBinary space is one action; with more
         than `MOST_NUMBERED` actions, and for other spaces, the returned probability is NaN.
         """
+        if self.mask_from:
+            observation = masked(observation, info, self.mask_from)
         greedy = None if self.policy is None else self.policy.act(_batch(observation))[0]
         explores = self.epsilon > 0 and self._random.random() < self.epsilon
         joint = self._joint
@@ -140,7 +152,7 @@ def run_episode(
     positions = [_position(telemetry)]
     total, length, reason = 0.0, 0, "interrupted"
     while max_steps is None or length < max_steps:
-        action, probability = behavior.choose(observation)
+        action, probability = behavior.choose(observation, info)
         if on_action is not None:
             on_action(probability)
         observation, reward, terminated, truncated, info = env.step(action)
@@ -251,7 +263,8 @@ def check_fit(policy: Any, env: gym.Env[Any, Any]) -> None:
         PolicyError: The policy was trained on spaces that do not match.
     """
     for role in ("observation_space", "action_space"):
-        trained, actual = getattr(policy, role, None), getattr(env, role)
+        trained = getattr(policy, f"env_{role}", None) or getattr(policy, role, None)
+        actual = getattr(env, role)
         if trained is not None and not same_form(trained, actual):
             name = env.spec.id if env.spec else "the environment"
             kind = getattr(policy, "env_kwargs", {}).get("observation")
