@@ -38,8 +38,7 @@ class TrainingConfig(NetworkSettings):
     log_interval: int = 100
     """updates between two rows of metrics"""
     mask_from: str = ""
-    """source of the flags of the allowed actions: info:NAME, or a key of the observation; by
-    default, the key action_mask, if there is one"""
+    """source of the flags of allowed actions: info:NAME, or a key of the observation"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
