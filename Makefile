@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BENCH ?= .venv-bench
+NEWEST ?= .venv-newest
 BIN := $(VENV)/bin
 # Without the cache of compiled modules, every process that is started compiles what it imports.
 unexport PYTHONDONTWRITEBYTECODE
@@ -9,14 +10,18 @@ unexport PYTHONDONTWRITEBYTECODE
 PIP := PYTHONWARNINGS=ignore:::setuptools.command.editable_wheel $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 # CI also runs the tests that take minutes.
 QUICK := $(if $(filter true,$(CI)),,-m "not slow and not long")
+EXTRAS := sims,offline,online,report,tables,video,export,foxglove,bags,remote,ray,fast
+# What works with new versions of the dependencies: reading, recording, sims, learning and the API.
+CORE := tests/recorder tests/sims tests/offline tests/online tests/api
 # A change of these files reinstalls the environments.
 SETTINGS := pyproject.toml constraints.txt setup.py recorder/columns/_native.c
 
-.PHONY: help demo test faults fuzz sanitize check bench bench-learning sim-grid docs docs-test vendor wheel clean
+.PHONY: help demo test newest faults fuzz sanitize check bench bench-learning sim-grid docs docs-test vendor wheel clean
 
 help:
 	@echo "make demo             record a car, train on its log offline, evaluate, and write the replay"
 	@echo "make test             run the tests; with CI=true, also those that take minutes"
+	@echo "make newest           run the core tests with the newest version of every dependency (for a schedule)"
 	@echo "make faults           run the fault tests at full size: kills, damaged files, failed writes"
 	@echo "make fuzz             fuzz the reader for ten minutes"
 	@echo "make sanitize         test the C code with AddressSanitizer and UndefinedBehaviorSanitizer (needs gcc)"
@@ -40,6 +45,15 @@ demo: $(VENV)/.demo
 
 test: $(VENV)/.dev $(VENV)/.lerobot $(VENV)/.s3 $(VENV)/.rivals tests/node/node_modules
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder $(QUICK)
+
+# The environment is new each time, and constraints.txt does not apply.
+newest:
+	$(PYTHON) -m venv --clear $(NEWEST)
+	$(NEWEST)/bin/python -m pip install -qq --disable-pip-version-check --upgrade 'pip>=25.1'
+	$(NEWEST)/bin/python -m pip install -qq --disable-pip-version-check -e '.[$(EXTRAS)]' --group dev
+	$(NEWEST)/bin/python -m pip freeze --exclude-editable > $(NEWEST)/versions.txt
+	OMP_NUM_THREADS=1 $(NEWEST)/bin/python -m pytest -q -m "not slow and not long" $(CORE) \
+	  || { echo "the versions are in $(NEWEST)/versions.txt; compare them with constraints.txt"; exit 1; }
 
 faults: $(VENV)/.dev
 	rm -f $(VENV)/fault-figures
@@ -89,7 +103,7 @@ wheel: $(VENV)/.dev tests/node/node_modules
 	PYTHON="$(BIN)/python" sh .ci/check-wheel
 
 clean:
-	rm -rf $(VENV) $(BENCH) build dist demo *.egg-info tests/node/node_modules recorder/viewer/page/vendor/node_modules
+	rm -rf $(VENV) $(BENCH) $(NEWEST) build dist demo *.egg-info tests/node/node_modules recorder/viewer/page/vendor/node_modules
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
@@ -108,7 +122,7 @@ $(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
 
 $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
 	@echo "installing into $(VENV)"
-	$(PIP) -e '.[sims,offline,online,report,tables,video,export,foxglove,bags,remote,ray,fast]' --group dev
+	$(PIP) -e '.[$(EXTRAS)]' --group dev
 	@touch $@
 
 # The libraries that the benchmarks compare with.

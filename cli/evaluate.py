@@ -99,6 +99,12 @@ _OF_DATA = (
 @keys_option
 @click.option("--report", type=click.Path(path_type=Path), help="Output folder of the HTML report.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing log.")
+@click.option(
+    "--mask-from",
+    metavar="SOURCE",
+    help="With --sim: flags of the allowed actions, for random actions: info:NAME, or a key of the"
+    " observation.  [default: that of the trained policies]",
+)
 @ray_options
 @json_option
 def evaluate(

@@ -109,7 +109,7 @@ def _all_defaults(
 def _shown(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return ",".join(map(str, value)) or "none" if isinstance(value, tuple) else f"{value}"
+    return (",".join(map(str, value)) if isinstance(value, tuple) else f"{value}") or "none"
 
 
 class _Widths(click.ParamType[tuple[int, ...]]):

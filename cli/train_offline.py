@@ -75,7 +75,8 @@ def train_offline(data: tuple[str, ...], out: Path, sweep: Path | None, **reques
     A number after a name is a weight: with good.mcap:2 rest/, transitions of good.mcap are drawn
     twice as often as others. With --follow, another process may still write DATA, and training
     uses each episode after it has ended. All seeds are trained in parallel and independently.
-    Omitted settings have the algorithm's defaults. With --resume, they have the values of the run.
+    Omitted settings have the algorithm's defaults. With --resume, they have the values of the run;
+    a larger number of --updates continues a finished run.
     """
     given = {name: value for name, value in request.items() if value is not None}
     if sweep is not None:

@@ -1,6 +1,6 @@
 """Run folders and summaries of offline and online training.
 
-RUN/config.json                         algorithm, settings, seeds, and the data or sim
+RUN/config.json                         algorithm, settings, seeds, the data or sim, and versions
 RUN/seed-K/checkpoint.safetensors       state to resume from
 RUN/seed-K/metrics.csv                  loss terms of an offline run
 RUN/seed-K/policy.json, .safetensors    policy of an offline run
@@ -11,9 +11,11 @@ RUN/seed-K/best_model.zip               policy of an online run, as Stable-Basel
 from __future__ import annotations
 
 import csv
+import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +42,8 @@ METRICS_NAME = "metrics.csv"
 CURVE_NAME = "curve.csv"
 POLICY_NAME = "policy.json"
 BEST_NAME = "best_model.zip"
+_NUMERICAL = ("torch", "numpy", "stable-baselines3")
+"""Packages whose version may change the numbers of a training."""
 Curve = dict[str, NDArray[np.float64]]
 """Columns of a `metrics.csv` or `curve.csv` by name."""
 
@@ -74,10 +78,12 @@ class RunIdentity:
     Attributes:
         parts: Algorithm (`algo`), settings (`config`), and the data or sim, as plain JSON types.
         other_data: Whether `parts["data"]`, the fingerprint of the data, may differ.
+        longer: Whether the run may be continued to a larger number of `updates`.
     """
 
     parts: dict[str, Any]
     other_data: bool = False
+    longer: bool = False
 
     def check_same(self, found: Mapping[str, Any], where: Path) -> None:
         """Check that the identity in a file is equal to this identity.
@@ -97,6 +103,16 @@ class RunIdentity:
             old, new = theirs.get(name), mine.get(name)
             if old == new or (name == "data" and self.other_data):
                 continue
+            if old is None and new == "":
+                # Earlier versions did not have this setting.
+                continue
+            if name == "updates" and self.longer and isinstance(old, int):
+                if old < int(self.parts["config"]["updates"]):
+                    continue
+                raise TrainingError(
+                    f"cannot resume: {where} has {old} updates, more than {new}; resume with at"
+                    f" least {old}, or train into another folder"
+                )
             if name == "data":
                 raise TrainingError(
                     f"cannot resume: {where} was trained on other data; resume with the same data"
@@ -139,7 +155,8 @@ def open_run(
 ) -> None:
     """Create a run folder, or check that it belongs to this run, and write `config.json`.
 
-    Files of a run that ended before its first checkpoint are removed.
+    Files of a run that ended before its first checkpoint are removed. A run that is resumed with
+    other versions of PyTorch, NumPy or SB3 than it was started with causes a warning.
 
     Args:
         folder: Folder of the run.
@@ -158,14 +175,46 @@ def open_run(
         raise OutputExistsError(
             f"{folder} exists: choose another folder, or resume its run (--resume)"
         )
+    versions: Any = _numerical_versions()
     if leftovers is None:
         identity.check_same(found, folder / CONFIG_NAME)
+        versions = found.get("versions")
+        _warn_of_versions(folder, versions)
     with writing(folder):
         for path in leftovers or ():
             remove_leftover(path.with_name(target_of(path))) if path.is_dir() else path.unlink()
         folder.mkdir(parents=True, exist_ok=True)
-    trained = {"seeds": len(seeds), "seed": seeds.start}
-    write_json(folder / CONFIG_NAME, {**identity.parts, **trained, **source}, TrainingError)
+    written = {**identity.parts, "seeds": len(seeds), "seed": seeds.start, **source}
+    if versions is not None:
+        written["versions"] = versions
+    write_json(folder / CONFIG_NAME, written, TrainingError)
+
+
+def _numerical_versions() -> dict[str, str]:
+    """Return the installed versions of `_NUMERICAL`."""
+    found = {}
+    for package in _NUMERICAL:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
+
+
+def _warn_of_versions(folder: Path, started_with: object) -> None:
+    """Warn if a run was started with other versions; earlier runs do not contain versions."""
+    if not isinstance(started_with, dict):
+        return
+    now = _numerical_versions()
+    changed = [
+        f"{package} {started_with[package]}, not {now[package]}"
+        for package in _NUMERICAL
+        if package in now and started_with.get(package, now[package]) != now[package]
+    ]
+    if changed:
+        warnings.warn(
+            f"{folder} was started with {' and '.join(changed)}: the resumed run may end in other"
+            " bits than an uninterrupted one",
+            stacklevel=2,
+        )
 
 
 def choose_seeds(folder: Path, seeds: int | None, seed: int | None, resume: bool) -> range:
@@ -243,6 +292,20 @@ def read_config(folder: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise TrainingError(f"cannot resume: {path} is not a JSON object")
     return found
+
+
+def read_updates(folder: Path) -> int | None:
+    """Return the number of updates with which an offline run was started or last continued.
+
+    The result is None if the run ended before writing its config.
+
+    Raises:
+        TrainingError: There is no run in the folder, or its config cannot be read.
+    """
+    match run_to_resume(folder):
+        case {"config": {"updates": int(updates)}}:
+            return updates
+    return None
 
 
 def check_kind(folder: Path, config: Mapping[str, Any], kind: str) -> None:

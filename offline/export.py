@@ -2,9 +2,13 @@
 
 The inputs are the parts of an observation as the environment returns them, with a leading batch
 axis. They have the same names as in `/rl/step` (`observation`, `camera`, ...). A policy with frame
-stacks of k expects inputs (B, k, *shape), oldest frame first. The outputs are `action` (B,) int64,
+stacks of k expects inputs (B, k, *shape), oldest frame first. The outputs are `action` (B, *shape),
 a value of the action space, and `scores` (B, A); the action has the largest score. The file
 includes the normalization.
+
+A Discrete action is an int64. An action of a MultiDiscrete or MultiBinary space has the dtype of
+the space; score k is that of the k-th combination of its elements, where the last element changes
+fastest (`numpy.unravel_index(k, sizes)`). The metadata of the file contain this description.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ from mcaprl.errors import PolicyError, import_extra
 from mcaprl.files import replacing
 from mcaprl.offline.batches.observations import Observations, discrete_sizes
 from mcaprl.offline.policy import Policy
+from mcaprl.recorder.format.spaces import space_to_json
 
 
 class ExportedPolicy(nn.Module):
@@ -36,7 +41,7 @@ class ExportedPolicy(nn.Module):
         self.scores = policy.scores
         self.encoder = policy.encoder
         self.frame_stack = policy.frame_stack
-        self.first_action = int(policy.action_space.start)
+        self.joint = policy.joint
         self.shift = torch.from_numpy(policy.encoder.shift)
         self.scale = torch.from_numpy(policy.encoder.scale)
 
@@ -67,7 +72,19 @@ class ExportedPolicy(nn.Module):
             inputs = tuple(part.flatten(0, 1) for part in inputs)
         observations = self._encode(inputs).stacked(self.frame_stack)
         scores = self.scores(observations)
-        return scores.argmax(1) + self.first_action, scores
+        return self._actions(scores.argmax(1)), scores
+
+    def _actions(self, best: Tensor) -> Tensor:
+        """Return the actions with these numbers (B,), as `JointActions.values` does in NumPy."""
+        joint = self.joint
+        if isinstance(joint.space, spaces.Discrete):
+            return best + joint.first
+        elements = [
+            best // stride % size + int(start)
+            for stride, size, start in zip(joint.strides, joint.sizes, joint.starts, strict=True)
+        ]
+        dtype = torch.from_numpy(np.empty(0, joint.space.dtype)).dtype
+        return torch.stack(elements, 1).reshape(-1, *joint.shape).to(dtype)
 
     def _encode(self, inputs: tuple[Tensor, ...]) -> Observations:
         """Encode observations in torch as `ObservationEncoder.encode` does in NumPy."""
@@ -111,8 +128,22 @@ def export_onnx(policy: object, path: Path, *, overwrite: bool = True) -> None:
             verbose=False,
         )
     assert program is not None
+    program.model.metadata_props.update(_metadata(policy))
     with replacing(path, PolicyError, overwrite=overwrite) as unfinished:
         program.save(str(unfinished))
+
+
+def _metadata(policy: Policy) -> dict[str, str]:
+    """Return the properties of the ONNX file that describe its outputs."""
+    joint = policy.joint
+    if isinstance(joint.space, spaces.Discrete):
+        order = f"scores[:, k] is the score of action k + {joint.first}"
+    else:
+        elements = f"numpy.unravel_index(k, {joint.sizes})"
+        if joint.starts.any():
+            elements += f" + {joint.starts.tolist()}"
+        order = f"scores[:, k] is the score of the action {elements}, in C order"
+    return {"action_space": space_to_json(policy.action_space), "scores": order}
 
 
 @contextmanager

@@ -15,6 +15,7 @@ import json
 import math
 from collections import deque
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -28,6 +29,8 @@ from torch import Tensor, nn
 from mcaprl.architecture import architecture_of
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
 from mcaprl.files import parse_json, read_file, write_json
+from mcaprl.joint_actions import JointActions
+from mcaprl.masks import OBSERVATION_KEY, has_source
 from mcaprl.networks import ImageInput, Network, check_size
 from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import allowed_only, likely_actions, mean_values
@@ -85,7 +88,8 @@ class Policy:
         name: Folder names of the run and the seed.
         algo: Name of the training algorithm.
         observation_space: Space of one observation.
-        action_space: Space of one action.
+        action_space: Space of one action. Its values are numbered as 0 to A - 1; each combination
+            of the elements of a MultiDiscrete or MultiBinary space is one action.
         env_id: ID of the environment in the training log; empty if unknown.
         env_kwargs: Keyword arguments of that environment.
         frame_stack: Number of successive observations in one input; see `act`.
@@ -94,12 +98,15 @@ class Policy:
         reward_scale: Divisor of the rewards in the training. `q_values` returns values in units of
             the logged rewards, without this divisor.
         action_commands: Commands of a robot that the actions stand for; None if unknown.
+        mask_from: Source of the action mask, `info:NAME` or a key of the observation; empty if
+            the environment's observations have the mask, or there is none. With a source, the
+            observations of `act` are `{"observation": ..., "action_mask": ...}`.
     """
 
     name: str
     algo: str
     observation_space: spaces.Space[Any]
-    action_space: spaces.Discrete
+    action_space: spaces.Space[Any]
     env_id: str
     env_kwargs: dict[str, Any]
     frame_stack: int
@@ -107,14 +114,29 @@ class Policy:
     scores: Scores = field(repr=False)
     reward_scale: float = 1.0
     action_commands: ActionCommands | None = None
+    mask_from: str = ""
     _seen: deque[Observations] = field(default_factory=deque, init=False, repr=False)
 
     def begin(self) -> None:
         """Drop the stored frames. The next observations start new episodes."""
         self._seen.clear()
 
-    def act(self, observations: Any) -> NDArray[np.int64]:
-        """Return the best actions (B,) in `action_space`; a tie selects the lowest action.
+    @property
+    def env_observation_space(self) -> spaces.Space[Any]:
+        """Observation space of the environment, without a mask from `mask_from`."""
+        space = self.observation_space
+        if not self.mask_from:
+            return space
+        assert isinstance(space, spaces.Dict)
+        return space[OBSERVATION_KEY]
+
+    @cached_property
+    def joint(self) -> JointActions:
+        """Numbering of the actions: the order of the axis A."""
+        return discrete_actions(self.action_space)
+
+    def act(self, observations: Any) -> NDArray[Any]:
+        """Return the best actions (B, *shape) in `action_space`; a tie selects the first action.
 
         A policy with `frame_stack` k > 1 stores the observations of the last k calls since `begin`.
         It also accepts stacks (B, k, *shape), oldest first; it stores nothing in this case.
@@ -128,7 +150,7 @@ class Policy:
             inputs = self._inputs(observations)
         with torch.inference_mode():
             best = cast(NDArray[np.int64], self.scores(inputs).argmax(1).numpy())
-        return best + self.action_space.start
+        return self.joint.values(best)
 
     def q_values(self, observations: Any) -> NDArray[np.float32]:
         """Return the values (B, A) of all actions; minus infinity for masked actions.
@@ -240,6 +262,7 @@ def save_policy(
         "frame_stack": buffer.packing.frame_stack,
         "env_id": env_id,
         "env_kwargs": env_kwargs,
+        "mask_from": learner.config.mask_from,
         "observation_space": json.loads(space_to_json(buffer.encoder.space)),
         "action_space": json.loads(space_to_json(buffer.action_space)),
         **({"action_commands": action_commands.to_json()} if action_commands else {}),
@@ -272,8 +295,11 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
     if description["acts_by"] not in get_args(ActsBy):
         raise ValueError(f"acts_by {description['acts_by']!r} is not supported")
     observation_space = space_from_json(json.dumps(description["observation_space"]))
-    action_space = discrete_actions(space_from_json(json.dumps(description["action_space"])))
-    encoder = ObservationEncoder(observation_space, int(action_space.n))
+    action_space = space_from_json(json.dumps(description["action_space"]))
+    mask_from = str(description.get("mask_from", ""))
+    if mask_from and not has_source(observation_space):
+        raise ValueError(f"mask_from {mask_from!r} does not fit {observation_space}")
+    encoder = ObservationEncoder(observation_space, discrete_actions(action_space).count)
     encoder.shift = weights.pop("observation.shift").numpy()
     encoder.scale = weights.pop("observation.scale").numpy()
     stack, shape = int(description["frame_stack"]), description["architecture"]
@@ -306,6 +332,7 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
         action_commands=None
         if commands is None
         else ActionCommands.from_json(commands, int(action_space.n)),
+        mask_from=mask_from,
     )
 
 

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.architecture import Architecture
 from mcaprl.errors import SpaceError, UnknownNameError, UsageError
+from mcaprl.joint_actions import joint_actions
 from mcaprl.online.config import (
     CONFIGS,
     DoubleDQNConfig,
@@ -73,7 +74,11 @@ def check_spaces(
     """
     find_algorithm(algo)
     if not isinstance(action_space, spaces.Discrete):
-        raise SpaceError(f"{algo} needs discrete actions, got {action_space}")
+        hint = ""
+        if joint_actions(action_space) is not None:
+            hint = ": wrap the environment so that one Discrete action has all elements, or record"
+            hint += " and train offline (train-offline)"
+        raise SpaceError(f"{algo} needs discrete actions, got {action_space}{hint}")
     if action_space.start != 0:
         raise SpaceError(
             f"{algo} needs actions that start at 0, got {action_space}:"

@@ -108,6 +108,7 @@ def evaluate(
     keys: Sequence[str] | None = None,
     report: str | Path | None = None,
     overwrite: bool = False,
+    mask_from: str | None = None,
     ray: bool = False,
     workers: int | None = None,
     address: str | None = None,
@@ -136,6 +137,8 @@ def evaluate(
         keys: Keys of the parts of a Dict or Tuple observation that `record` contains; default: all.
         report: Output folder of the HTML report, images and JSON.
         overwrite: Whether an existing log is replaced.
+        mask_from: Source of the flags of the allowed actions, for random actions: `info:NAME`, or
+            a key of the observation. None selects that of the trained policies.
         ray: Whether the episodes run on Ray workers. The results are the same. All workers must be
             able to read the policies.
         workers: Number of Ray workers; default: number of CPUs of the cluster.
@@ -183,11 +186,13 @@ def evaluate(
         is_batched = is_plain and env.spec is not None and bool(env.spec.vector_entry_point)
         found = _policies(names, env)
         shown, scores = policy_names(list(found)), {}
+        sources = [getattr(one, "mask_from", "") for each in found.values() for one in each]
+        source = next(filter(None, sources), "") if mask_from is None else mask_from
         with ExitStack() as stack:
             total = sum(map(len, found.values())) * episodes
             advance = stack.enter_context(progress("evaluating", total))
             if ray:
-                request = Part(sim, options, seed, is_batched, max_steps)
+                request = Part(sim, options, seed, is_batched, max_steps, mask_from=source)
                 results = results_on_ray(request, found, episodes, on_cluster, advance)
                 scores = {name: score_of(shown[name], results[name], env) for name in found}
                 found = {}
@@ -207,6 +212,7 @@ def evaluate(
                     episodes=episodes,
                     seed=seed,
                     envs=None if name in SCRIPTED else envs,
+                    mask_from=source,
                     on_policy=partial(_set_policy, recorded),
                     on_episode=lambda result: advance(1),
                 )

@@ -35,6 +35,7 @@ class Part:
         index: Index of the policy's training seed.
         first: Number of the first episode.
         episodes: Number of episodes.
+        mask_from: Source of the mask of random actions.
     """
 
     sim: str
@@ -46,6 +47,7 @@ class Part:
     index: int = 0
     first: int = 0
     episodes: int = 0
+    mask_from: str = ""
 
 
 def results_on_ray(
@@ -122,5 +124,6 @@ def _run_part(part: Part, report: Callable[[int], None]) -> list[EpisodeResult]:
             seed=part.seed,
             first_episode=part.first,
             envs=make_sims(part.sim, part.episodes, **part.options) if is_batched else None,
+            mask_from=part.mask_from,
             on_episode=on_episode,
         )

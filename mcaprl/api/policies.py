@@ -212,7 +212,12 @@ def trained_policies(name: str, dataset: Dataset) -> list[TrainedPolicy]:
         for role in ("observation_space", "action_space"):
             trained, logged = getattr(policy, role), getattr(dataset, role)
             if trained is not None and not same_form(trained, logged):
-                raise PolicyError(f"{name} was trained on {role} {trained}; the log has {logged}")
+                hint = ""
+                if role == "observation_space" and (source := getattr(policy, "mask_from", "")):
+                    hint = f'; open it and pass with_action_mask("{source}")'
+                raise PolicyError(
+                    f"{name} was trained on {role} {trained}; the log has {logged}{hint}"
+                )
     return policies
 
 

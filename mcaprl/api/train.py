@@ -72,7 +72,8 @@ def train(
             that of the run.
         threads: Number of threads of PyTorch and of the reader.
         device: `cpu` or `cuda`.
-        resume: Whether training continues from the checkpoints in `out`.
+        resume: Whether training continues from the checkpoints in `out`. A number of `updates`
+            above that of the run continues the run to this number, also if it has finished.
         follow: Whether to also train on episodes that another process adds to the logs during the
             training.
         other_data: Whether `resume` accepts checkpoints trained on other data.

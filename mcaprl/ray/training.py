@@ -32,9 +32,10 @@ from mcaprl.offline.training.train import (
     earlier_scales,
     identity_parts,
     train_share,
+    with_source,
     without,
 )
-from mcaprl.offline.training.watch import choose_held_out, horizon_warning
+from mcaprl.offline.training.watch import choose_held_out, horizon_warning, schedule_warning
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.ray.board import Board
 from mcaprl.ray.cluster import cpus, restored_handlers
@@ -42,7 +43,7 @@ from mcaprl.ray.workers import MOST_DEATHS, check_machine, check_machines
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader
 from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
-from mcaprl.runs import RunIdentity, locked_run, open_run
+from mcaprl.runs import RunIdentity, locked_run, open_run, read_updates
 from mcaprl.texts import counted
 
 _POLL_S = 0.2
@@ -131,8 +132,10 @@ def train_on_ray(
     discrete_actions(logs.description.action_space)
     check_weights(logs.all_weights, len(logs.all_weights))
     count = _workers(workers, request.device, sum(map(len, logs.lengths)))
-    identity = RunIdentity(identity_parts(request.config, logs.fingerprint), request.other_data)
+    parts = identity_parts(request.config, logs.fingerprint)
+    identity = RunIdentity(parts, request.other_data, longer=True)
     with locked_run(request.out, request.resume):
+        earlier = read_updates(request.out) if request.resume else None
         check_machines([request.out, *logs.paths])
         transitions = int(logs.all_lengths.sum())
         open_run(
@@ -143,8 +146,12 @@ def train_on_ray(
             env_id=logs.description.env_id,
             transitions=transitions,
         )
-        if message := horizon_warning(request.config):
-            warnings.warn(message, stacklevel=2)
+        for message in (
+            horizon_warning(request.config),
+            schedule_warning(earlier, request.config),
+        ):
+            if message:
+                warnings.warn(message, stacklevel=2)
         board = ray.remote(Board).options(num_cpus=0).remote()
         job = _Job(request, logs, identity, installed_versions(), board)
         with _following(board, progress):
@@ -281,7 +288,7 @@ def _read_logs(job: _Job, first: int, stop: int) -> Dataset:
         if len(mine):
             check_machine(job.versions, [path])
             parts.append(LogReader(path).read(mine))
-    return Dataset.concatenate(parts)
+    return with_source(Dataset.concatenate(parts), job.request.config.mask_from)
 
 
 def _read_summaries(data: Sequence[str]) -> _Logs:

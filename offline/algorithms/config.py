@@ -37,6 +37,8 @@ class TrainingConfig(NetworkSettings):
     """fraction of the episodes held out for validation"""
     log_interval: int = 100
     """updates between two rows of metrics"""
+    mask_from: str = ""
+    """source of the flags of allowed actions: info:NAME, or a key of the observation"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""

@@ -74,7 +74,7 @@ class Learner(ABC):
         self.buffer = buffer
         self.seeds = tuple(seeds)
         self.step = 0
-        self.n_actions = int(buffer.action_space.n)
+        self.n_actions = buffer.joint.count
         channels = [image.shape[2] for image in buffer.encoder.image_inputs]
         self.architecture = config.architecture_for(channels)
         states = [np.random.SeedSequence(seed).generate_state(2, np.uint32) for seed in seeds]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
+from mcaprl.joint_actions import JointActions, joint_actions
 from mcaprl.networks import ImageInput
 from mcaprl.offline.batches.items import n_step_returns, returns_to_go
 from mcaprl.offline.batches.observations import FramesOnDisk, ObservationEncoder, Observations
@@ -25,12 +27,15 @@ from mcaprl.offline.batches.packing import Packing
 from mcaprl.offline.batches.share import ALONE, Share
 from mcaprl.recorder.dataset.values import is_beyond_float32
 from mcaprl.recorder.format.spaces import check_actions
+from mcaprl.texts import counted
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
 
 DEVICES = ("cpu", "cuda")
+MAX_JOINT_ACTIONS = 1_024
+"""Largest number of combinations of a MultiDiscrete or MultiBinary space."""
 _BLOCK_ROWS = 1 << 18
 """Rows that are checked at once."""
 _ON_DEVICE = ("frames", "starts", "places", "actions", "returns")
@@ -72,7 +77,7 @@ class TransitionBuffer:
 
     Attributes:
         encoder: Encoder that created the frames.
-        action_space: Action space of the log.
+        action_space: Action space of the log; all its values are numbered, see `joint`.
         packing: Settings with which the transitions were built.
         frames: All observations, each stored once; images of a mapped dataset stay on disk.
         starts: (F,) int64, first frame of each frame's episode; empty if frames are not stacked.
@@ -88,7 +93,7 @@ class TransitionBuffer:
     """
 
     encoder: ObservationEncoder
-    action_space: spaces.Discrete
+    action_space: spaces.Space[Any]
     packing: Packing
     frames: Observations | FramesOnDisk
     starts: Tensor
@@ -130,9 +135,9 @@ class TransitionBuffer:
                 was not allowed, or all weights are 0.
         """
         packing = packing or Packing()
-        action_space = discrete_actions(dataset.action_space)
+        joint = discrete_actions(dataset.action_space)
         if encoder is None:
-            encoder = ObservationEncoder(dataset.observation_space, int(action_space.n))
+            encoder = ObservationEncoder(dataset.observation_space, joint.count)
             if packing.normalize and len(dataset):
                 encoder.normalize_to(dataset.frames, share)
             elif packing.center_images and len(dataset):
@@ -147,17 +152,17 @@ class TransitionBuffer:
         places, returns = n_step_returns(dataset, packing.n_steps, packing.gamma)
         returns[0] /= reward_scale
         frames = encoder.encode_frames(dataset.frames)
-        actions = np.subtract(dataset.actions, action_space.start, dtype=np.int64)
-        if actions.min() < 0 or actions.max() >= action_space.n:
+        if not joint.contain(dataset.actions).all():
             raise SpaceError(
                 f"the dataset has actions from {dataset.actions.min()} to {dataset.actions.max()},"
-                f" but its action space is {action_space}"
+                f" but its action space is {dataset.action_space}"
             )
+        actions = joint.indexes(dataset.actions)
         _require_finite("sums of rewards", _is_finite(torch.from_numpy(returns[0])))
         _check_data(dataset, frames, actions)
         buffer = cls(
             encoder=encoder,
-            action_space=action_space,
+            action_space=dataset.action_space,
             packing=packing,
             frames=frames,
             starts=_first_frames(lengths + 1, packing.frame_stack),
@@ -172,6 +177,11 @@ class TransitionBuffer:
     def __len__(self) -> int:
         """Return the number of transitions."""
         return len(self.actions)
+
+    @cached_property
+    def joint(self) -> JointActions:
+        """Numbering of the actions: `actions` has the numbers."""
+        return discrete_actions(self.action_space)
 
     @property
     def device(self) -> torch.device:
@@ -279,16 +289,24 @@ def choose_device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def discrete_actions(space: spaces.Space[Any]) -> spaces.Discrete:
-    """Return the action space if it is discrete.
+def discrete_actions(space: spaces.Space[Any]) -> JointActions:
+    """Return the numbering of the actions of a space.
+
+    Each combination of the elements of a MultiDiscrete or MultiBinary space is one action.
 
     Raises:
-        SpaceError: The space is not discrete, or has too many actions.
+        SpaceError: The space is not finite, or has too many actions.
     """
-    if not isinstance(space, spaces.Discrete):
+    joint = joint_actions(space)
+    if joint is None:
         raise SpaceError(f"offline learning needs discrete actions, got {space}")
     check_actions(space)
-    return space
+    if not isinstance(space, spaces.Discrete) and joint.count > MAX_JOINT_ACTIONS:
+        raise SpaceError(
+            f"{space} has {counted(joint.count, 'combination')} of actions; offline learning uses"
+            f" at most {MAX_JOINT_ACTIONS:,}: record with fewer or coarser actions"
+        )
+    return joint
 
 
 def _first_frames(counts: NDArray[np.int64], frame_stack: int) -> Tensor:

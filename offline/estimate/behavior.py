@@ -156,7 +156,7 @@ def estimate_behavior(
     allowed = _allowed(buffer)
     random = np.random.default_rng(seed)
     fold_of = random.permutation(count) % folds
-    predicted = np.empty((len(buffer), int(buffer.action_space.n)))
+    predicted = np.empty((len(buffer), buffer.joint.count))
     scores = []
     for fold in range(folds):
         held_out = fold_of == fold
@@ -213,7 +213,7 @@ def _allowed(buffer: TransitionBuffer) -> NDArray[np.bool_]:
     """Return the allowed actions (N, A) of each step."""
     mask = buffer.observe(buffer.places[0]).mask
     if mask is None:
-        return np.ones((len(buffer), int(buffer.action_space.n)), bool)
+        return np.ones((len(buffer), buffer.joint.count), bool)
     return mask.numpy().astype(bool)
 
 

@@ -52,8 +52,8 @@ _SYNCS_PER_HORIZON: Final = 6.0
 class Actor(Protocol):
     """Trained policy that selects actions."""
 
-    def act(self, observations: Any) -> NDArray[np.int64]:
-        """Return the actions (B,) for B observations."""
+    def act(self, observations: Any) -> NDArray[Any]:
+        """Return the actions (B, *shape) for B observations."""
 
     def q_values(self, observations: Any) -> NDArray[np.floating[Any]]:
         """Return the values (B, A); raise PolicyError if the policy has none."""
@@ -174,8 +174,7 @@ class EvidenceCollector:
 
     def _actions(self, policy: Actor, observations: Any) -> NDArray[np.int64]:
         """Return the indexes (N,) of the policy's actions, from 0."""
-        indexes: NDArray[np.int64] = by_rows(policy.act, observations)
-        return indexes - int(self._buffer.action_space.start)
+        return self._buffer.joint.indexes(by_rows(policy.act, observations))
 
     def _values(
         self,
@@ -188,7 +187,7 @@ class EvidenceCollector:
         The values are those of the policy's action, of the logged action, and of the best action in
         the next state.
         """
-        pi_t = np.eye(int(self._buffer.action_space.n), dtype=np.float32)[next_actions]
+        pi_t = np.eye(self._buffer.joint.count, dtype=np.float32)[next_actions]
         rows = np.arange(actions.shape[1])
         fixed_v_t = None
         if self._pessimistic:

@@ -221,7 +221,7 @@ class OffPolicyEvaluator:
         """Return equal probabilities (N, A) of the allowed actions."""
         allowed = allowed_actions(observations)
         if allowed is None:
-            allowed = np.ones((len(self._buffer), int(self._buffer.action_space.n)), bool)
+            allowed = np.ones((len(self._buffer), self._buffer.joint.count), bool)
         uniform: Floats = allowed / allowed.sum(axis=1, keepdims=True)
         return uniform
 

@@ -17,6 +17,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import PolicyError, UsageError
+from mcaprl.joint_actions import joint_actions
 from mcaprl.offline.algorithms.config import DQNConfig
 from mcaprl.offline.algorithms.losses import q_learning_target
 from mcaprl.recorder.dataset.episode import Episode
@@ -52,13 +53,14 @@ def value_columns(
         gamma: Discount with which the policy was trained.
 
     Raises:
-        UsageError: The actions are not discrete.
+        UsageError: The action space is not finite.
         PolicyError: The observations do not fit the policy.
     """
-    if not isinstance(action_space, spaces.Discrete):
+    joint = joint_actions(action_space)
+    if joint is None:
         raise UsageError(f"values need discrete actions, got {action_space}")
     observations = policy_inputs(policy, episode)
-    taken = episode.actions - int(action_space.start)
+    taken = joint.indexes(episode.actions)
     preference = probabilities = policy.action_probabilities(observations)
     best = probabilities[:-1].argmax(1)
     try:
@@ -77,7 +79,7 @@ def value_columns(
         "advantage": q[np.arange(len(taken)), taken] - value,
         "td_error": td_errors(q, taken, episode.rewards, episode.terminated, gamma),
         "entropy": normalized_entropy(preference[:-1]),
-        "policy_action": best + int(action_space.start),
+        "policy_action": best + joint.first,
         "agrees": best == taken,
     }
 

@@ -58,7 +58,7 @@ from mcaprl.offline.selection.portfolio import (
 )
 from mcaprl.offline.selection.rule import Rating, ranked, rate
 from mcaprl.offline.training.metrics import OfflineSummary
-from mcaprl.offline.training.train import fingerprint, train
+from mcaprl.offline.training.train import fingerprint, train, with_source
 from mcaprl.offline.training.watch import SHORT_HORIZON, horizon_warning
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.runs import (
@@ -163,6 +163,7 @@ def select(
         UsageError: There are too few episodes, or the run to resume has other seeds.
     """
     check_finalists(config)
+    dataset = with_source(dataset, config.mask_from)
     if len(dataset.episodes) < FOLDS:
         raise UsageError(f"--algo {AUTO} needs {FOLDS} episodes or more in the log")
     weights = np.ones(len(dataset.episodes)) if weights is None else weights

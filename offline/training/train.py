@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.errors import TrainingError, UsageError
+from mcaprl.masks import has_source
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import choose_algorithm
@@ -34,6 +35,7 @@ from mcaprl.offline.training.watch import (
     divergence_warning,
     horizon_warning,
     largest_return,
+    schedule_warning,
 )
 from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
 from mcaprl.runs import (
@@ -43,6 +45,7 @@ from mcaprl.runs import (
     locked_run,
     open_run,
     policy_files,
+    read_updates,
     seed_folder,
 )
 
@@ -76,7 +79,7 @@ def train(
             that of the run.
         weights: (E,) relative sampling weight of each transition of an episode; default: all equal.
         resume: Whether to resume from the checkpoints in `out`. Seeds without a checkpoint
-            start from update 0.
+            start from update 0. With more updates than the run has, it is continued to this number.
         other_data: Whether to accept checkpoints trained on other data when resuming.
         follow: Growing logs from which `dataset` was read; episodes finished during training
             are added.
@@ -99,11 +102,14 @@ def train(
     numbers = choose_seeds(folder, seeds, seed, resume)
     place = choose_device(device)
     learner_type, config = choose_algorithm(algo)
+    dataset = with_source(dataset, config.mask_from)
     weights = np.ones(len(dataset.episodes)) if weights is None else weights
     check_weights(weights, len(dataset.episodes))
     data = fingerprint(dataset, weights)
-    identity = RunIdentity(identity_parts(config, data), other_data)
+    identity = RunIdentity(identity_parts(config, data), other_data, longer=True)
     with locked_run(folder, resume):
+        if resume and (message := schedule_warning(read_updates(folder), config)):
+            warnings.warn(message, stacklevel=2)
         held_out = choose_held_out(len(weights), config.held_out)
         encoder, reward_scale = earlier_scales(folder) if resume and other_data else (None, None)
         buffer = TransitionBuffer.from_dataset(
@@ -161,6 +167,13 @@ def train_share(
     ).to(choose_device(device))
     run = _run(out, identity, dataset, buffer, held_out, None)
     return run.train(choose_algorithm(config)[0], config, seeds, report)
+
+
+def with_source(dataset: Dataset, source: str) -> Dataset:
+    """Return a dataset with the masks of `mask_from`, unless it has them or there is no source."""
+    if not source or has_source(dataset.observation_space):
+        return dataset
+    return dataset.with_action_mask(source)
 
 
 def identity_parts(config: TrainingConfig, data: str) -> dict[str, Any]:
@@ -306,7 +319,8 @@ class _Run:
         """
         if self.follow is None or learner.step % CHECK_INTERVAL or not self.follow.grow():
             return learner
-        return with_more_data(learner, self.follow.dataset, self.held_out_episodes)
+        grown = with_source(self.follow.dataset, learner.config.mask_from)
+        return with_more_data(learner, grown, self.held_out_episodes)
 
     def _save(self, learner: Learner) -> None:
         """Write each seed's policy and then its checkpoint.

@@ -135,6 +135,22 @@ def horizon_warning(config: TrainingConfig) -> str | None:
     )
 
 
+def schedule_warning(earlier: int | None, config: TrainingConfig) -> str | None:
+    """Return a warning if a run is continued to more updates while its learning rate decays.
+
+    Args:
+        earlier: Number of updates that the run had; None if unknown.
+        config: Settings with the new number of updates.
+    """
+    if earlier is None or earlier >= config.updates or config.final_learning_rate_fraction == 1:
+        return None
+    return (
+        f"the learning rate decayed over {earlier} updates and continues as for {config.updates}:"
+        f" the result differs from a run that was started with {config.updates} updates; with"
+        " final_learning_rate_fraction 1, there is no decay"
+    )
+
+
 def divergence_warning(before: float, value: float, limit: float) -> str | None:
     """Return a warning if values grow beyond twice the largest possible return.
 

@@ -18,12 +18,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.joint_actions import joint_actions
 from mcaprl.recorder.format.probability import is_impossible
 
 EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 0.8, 1.0)
 """Edges of the probability ranges (low, high]."""
 _STANDARD_ERRORS = 4.0
 """The mean of 1 / p may exceed the number of actions by this many standard errors."""
+_MOST_ACTIONS = 1 << 62
 _LEAST_CHANCE = 1e-6
 """Lower limit for the chance that a log contains an action of its smallest probability.
 
@@ -100,10 +102,11 @@ def calibration(
     """Compare the logged action probabilities (N,) with the size of the action space.
 
     Returns:
-        The result of the comparison. It is None if the actions are not discrete, if a probability
-        is unknown or not in (0, 1], or if there are fewer than two steps.
+        The result of the comparison. It is None if the space is not finite, if a probability is
+        unknown or not in (0, 1], or if there are fewer than two steps.
     """
-    if not isinstance(action_space, spaces.Discrete) or len(behavior_probs) < 2:
+    joint = joint_actions(action_space)
+    if joint is None or joint.count > _MOST_ACTIONS or len(behavior_probs) < 2:
         return None
     if np.isnan(behavior_probs).any() or is_impossible(behavior_probs).any():
         return None
@@ -120,7 +123,7 @@ def calibration(
     ]
     actions, smallest = float(inverse.mean()), float(probs.min())
     error = float(inverse.std(ddof=1) / math.sqrt(len(inverse)))
-    return Calibration(int(action_space.n), actions, error, smallest, len(probs), tuple(ranges))
+    return Calibration(joint.count, actions, error, smallest, len(probs), tuple(ranges))
 
 
 def _number(value: float) -> str:

@@ -14,12 +14,14 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError, UnknownNameError, UsageError
+from mcaprl.recorder.dataset.action_mask import with_mask
 from mcaprl.recorder.dataset.conversions import Conversions
 from mcaprl.recorder.dataset.episode import Episode, shapes
 from mcaprl.recorder.dataset.mapped import MappedImages, blocks_of, rows_of
 from mcaprl.recorder.dataset.statistics import Statistics, describe_columns
 from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, TransitionBatch, Transitions
 from mcaprl.recorder.format.action_commands import ActionCommands
+from mcaprl.recorder.format.episode_summary import add_up_each
 from mcaprl.recorder.format.metadata import ESTIMATED, LogMetadata
 from mcaprl.recorder.format.spaces import nest, space_to_json
 
@@ -318,6 +320,56 @@ class Dataset(Conversions):
             dataclasses.replace(self._description, behavior_prob=mark),
             sources=self.sources,
         )
+
+    def with_rewards(self, rewards: Any) -> Dataset:
+        """Return the same transitions with other rewards; the returns of the episodes are theirs.
+
+        Args:
+            rewards: (N,) reward of each transition, in the order of `rewards`; finite numbers.
+
+        Raises:
+            SpaceError: The length of `rewards` is not the number of transitions, or a reward is not
+                a finite number.
+        """
+        given = np.asarray(rewards)
+        if given.shape != (len(self),):
+            raise SpaceError(f"rewards has shape {given.shape}, expected {(len(self),)}")
+        if given.dtype.kind not in "biuf":
+            raise SpaceError(f"rewards has dtype {given.dtype}, expected numbers")
+        column = given.astype(np.float64)
+        if not np.isfinite(column).all():
+            row = int(np.isfinite(column).argmin())
+            raise SpaceError(f"rewards has {column[row]} in row {row}, expected finite numbers")
+        columns = self._transitions
+        stops = np.cumsum(columns.lengths)
+        totals = add_up_each(column, columns.first_steps.tolist(), stops.tolist())
+        episodes = tuple(
+            one._replace(total_reward=total)
+            for one, total in zip(columns.episodes, totals, strict=True)
+        )
+        return Dataset(
+            dataclasses.replace(columns, rewards=column, episodes=episodes),
+            self._description,
+            sources=self.sources,
+        )
+
+    def with_action_mask(self, source: str) -> Dataset:
+        """Return the same transitions with the flags of the allowed actions in the observations.
+
+        The observations become `{"observation": ..., "action_mask": ...}`; learning and estimates
+        use only allowed actions. `mask_from` of `mcaprl.train` does the same.
+
+        Args:
+            source: `info:NAME` for a recorded info, or the key of a part of a Dict observation,
+                such as `robot/legal`; an array with a flag for each action, in each observation.
+
+        Raises:
+            SpaceError: The observations have an `action_mask` already, the values are no flags, or
+                a frame in which an action was chosen has none.
+            UnknownNameError: There is no such info or part.
+        """
+        columns, description = with_mask(self._transitions, self._description, source)
+        return Dataset(columns, description, sources=self.sources)
 
     def batch(self, steps: NDArray[np.integer[Any]]) -> TransitionBatch:
         """Copy the transitions with indexes (B,), reading images from disk if needed.

@@ -147,8 +147,11 @@ def values_schema(actions: int, action_names: Mapping[int, str] | None = None) -
     float32 advantage       q of the logged action minus `value`
     float32 td_error        r + gamma max q(next) - q of the logged action
     float32 entropy         normalized entropy of `preference`: 1 if uniform
-    int64 policy_action     action that the policy selects
+    int64 policy_action     action that the policy selects; number of the joint action, see below
     bool agrees             whether `policy_action` is the logged action
+
+    Values of a MultiDiscrete or MultiBinary space are numbered from 0, the last element changing
+    fastest, as by `numpy.ravel_multi_index`.
 
     Args:
         actions: Number of actions A.

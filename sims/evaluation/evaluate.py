@@ -102,6 +102,7 @@ def evaluate(
     episodes: int,
     seed: int,
     envs: gym.vector.VectorEnv[Any, Any, Any] | None = None,
+    mask_from: str = "",
     on_policy: Callable[[str], None] = lambda name: None,
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> PolicyScore:
@@ -118,6 +119,7 @@ def evaluate(
         seed: Seed of the episodes.
         envs: Vector environment of `episodes` copies to use instead of `env`; only for policies
             that act on batches.
+        mask_from: Source of the mask of random actions; see `mcaprl.masks`.
         on_policy: Function called with each policy's name before its first episode.
         on_episode: Function called after each episode.
     """
@@ -126,7 +128,13 @@ def evaluate(
         on_policy(name if policy is None or len(policies) == 1 else policy.name)
         results.append(
             greedy_episodes(
-                env, policy, episodes=episodes, seed=seed, envs=envs, on_episode=on_episode
+                env,
+                policy,
+                episodes=episodes,
+                seed=seed,
+                envs=envs,
+                mask_from=mask_from,
+                on_episode=on_episode,
             )
         )
     return score_of(name, results, env)
@@ -140,16 +148,17 @@ def greedy_episodes(
     seed: int,
     first_episode: int = 0,
     envs: gym.vector.VectorEnv[Any, Any, Any] | None = None,
+    mask_from: str = "",
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> list[EpisodeResult]:
     """Run episodes of one policy greedily; arguments as for `evaluate` and `rollout`."""
-    if envs is not None and policy is not None:
+    if envs is not None and policy is not None and not getattr(policy, "mask_from", ""):
         numbers = range(first_episode, first_episode + episodes)
         seeds = [episode_seed(seed, episode) for episode in numbers]
         return batch_rollout(envs, policy, seeds, on_episode)
     return rollout(
         env,
-        EpsilonGreedy(policy, 0.0, env.action_space),
+        EpsilonGreedy(policy, 0.0, env.action_space, mask_from),
         seed=seed,
         episodes=episodes,
         first_episode=first_episode,

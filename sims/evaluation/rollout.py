@@ -7,6 +7,7 @@ import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -16,7 +17,11 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from mcaprl.errors import PolicyError
-from mcaprl.masks import allowed_actions
+from mcaprl.joint_actions import joint_actions
+from mcaprl.masks import allowed_actions, masked
+
+MOST_NUMBERED = 1 << 62
+"""Largest number of actions that a policy chooses among by their numbers."""
 
 
 class Policy(Protocol):
@@ -57,7 +62,11 @@ class EpsilonGreedy:
     """Epsilon-greedy exploration around a policy, with the probabilities of its actions."""
 
     def __init__(
-        self, policy: Policy | None, epsilon: float, action_space: spaces.Space[Any]
+        self,
+        policy: Policy | None,
+        epsilon: float,
+        action_space: spaces.Space[Any],
+        mask_from: str = "",
     ) -> None:
         """Follow `policy`, but take a random action with probability `epsilon`.
 
@@ -65,12 +74,15 @@ class EpsilonGreedy:
             policy: Policy, or None for random actions.
             epsilon: Probability of a random action, 0 to 1; ignored if there is no policy.
             action_space: Space of the random actions.
+            mask_from: Source of the mask of random actions if there is no policy; see
+                `mcaprl.masks`. A policy has its own source.
         """
         self.policy = policy
         self.epsilon = 1.0 if policy is None else epsilon
         self.name = "random" if policy is None else policy.name
         self._space = action_space
-        self._count = int(action_space.n) if isinstance(action_space, spaces.Discrete) else 0
+        self._joint = joint_actions(action_space)
+        self.mask_from = mask_from if policy is None else getattr(policy, "mask_from", "")
         self.begin(0)
 
     def begin(self, seed: int) -> None:
@@ -81,26 +93,37 @@ class EpsilonGreedy:
         self._random = np.random.default_rng([seed, 1])
         self._space.seed(seed)
 
-    def choose(self, observation: Any) -> tuple[Any, float]:
-        """Return the action for one observation, and the probability of that action.
+    def choose(
+        self, observation: Any, info: Mapping[str, Any] = MappingProxyType({})
+    ) -> tuple[Any, float]:
+        """Return the action for one observation and its info, and the probability of that action.
 
         Each of the A allowed actions has the probability epsilon / A; the policy's greedy action
-        has an additional 1 - epsilon. Without an action mask, all actions are allowed. If actions
-        are not discrete, the returned probability is NaN.
+        has an additional 1 - epsilon. Without an action mask, all actions are allowed. Each
+        combination of the elements of a MultiDiscrete or MultiBinary space is one action; with more
+        than `MOST_NUMBERED` actions, and for other spaces, the returned probability is NaN.
         """
+        if self.mask_from:
+            observation = masked(observation, info, self.mask_from)
         greedy = None if self.policy is None else self.policy.act(_batch(observation))[0]
         explores = self.epsilon > 0 and self._random.random() < self.epsilon
-        if not self._count:
+        joint = self._joint
+        if joint is None or joint.count > MOST_NUMBERED:
             return (self._space.sample() if explores else greedy), math.nan
-        start, mask = int(getattr(self._space, "start", 0)), allowed_actions(observation)
-        allowed = range(self._count) if mask is None else np.flatnonzero(mask).tolist()
-        if explores or greedy is None:
-            action = allowed[int(self._random.integers(len(allowed)))] + start
+        mask = allowed_actions(observation)
+        # For MultiDiscrete spaces, there are also masks with one flag for each value of an element.
+        if joint.shape and mask is not None and mask.shape != (joint.count,):
+            mask = None
+        allowed = range(joint.count) if mask is None else np.flatnonzero(mask).tolist()
+        own = None if greedy is None else int(joint.indexes(np.asarray(greedy)[None])[0])
+        if explores or own is None:
+            number = allowed[int(self._random.integers(len(allowed)))]
+            action = joint.values(np.array([number]))[0]
         else:
-            action = int(greedy)
-        own = greedy is not None and action == int(greedy)
-        by_chance = self.epsilon / len(allowed) if action - start in allowed else 0.0
-        return action, by_chance + (1 - self.epsilon) * own
+            number, action = own, greedy
+        by_chance = self.epsilon / len(allowed) if number in allowed else 0.0
+        chance = by_chance + (1 - self.epsilon) * (number == own)
+        return (action if joint.shape else int(action)), chance
 
 
 def episode_seed(seed: int, episode: int) -> int:
@@ -131,7 +154,7 @@ def run_episode(
     positions = [_position(telemetry)]
     total, length, reason = 0.0, 0, "interrupted"
     while max_steps is None or length < max_steps:
-        action, probability = behavior.choose(observation)
+        action, probability = behavior.choose(observation, info)
         if on_action is not None:
             on_action(probability)
         observation, reward, terminated, truncated, info = env.step(action)
@@ -252,12 +275,11 @@ def check_fit(
     Raises:
         PolicyError: The policy was trained on spaces that do not match.
     """
-    pairs = {
-        "observation_space": observation_space or env.observation_space,
-        "action_space": env.action_space,
-    }
-    for role, actual in pairs.items():
-        trained = getattr(policy, role, None)
+    for role in ("observation_space", "action_space"):
+        trained = getattr(policy, f"env_{role}", None) or getattr(policy, role, None)
+        actual = getattr(env, role)
+        if role == "observation_space" and observation_space is not None:
+            actual = observation_space
         if trained is not None and not same_form(trained, actual):
             name = env.spec.id if env.spec else "the environment"
             options = as_options(_other_arguments(policy, env))

@@ -208,6 +208,8 @@ def test_mistakes_leave_no_folder(tmp_path: Path) -> None:
         Task.for_sim("lane", "double-dqm")
     with pytest.raises(SpaceError, match="dqn needs discrete actions"):
         train(Task.for_sim("Pendulum-v1", "dqn", **SHORT), out)
+    with pytest.raises(SpaceError, match=r"got MultiBinary\(2\): wrap the environment so that"):
+        check_spaces("ppo", spaces.Box(-1, 1, (2,)), spaces.MultiBinary(2))
     with pytest.raises(UsageError, match="seeds must be at least 1"):
         train(lane(), out, seeds=0)
     with pytest.raises(UsageError, match=r"Stable-Baselines3 needs seeds below 2\*\*32"):

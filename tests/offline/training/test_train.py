@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import sys
 import textwrap
 import time
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -326,13 +328,78 @@ def test_a_run_resumes_only_with_its_own_data(copied: Path) -> None:
     ("other", "says"),
     [
         (replace(SHORT_CQL, alpha=2.0), "has alpha 1.0, not 2.0"),
-        (replace(SHORT_CQL, updates=200), "has updates 100, not 200"),
+        (replace(SHORT_CQL, updates=99), "has 100 updates, more than 99; resume with at least 100"),
         (BCConfig(**SHORT), "has algo 'cql', not 'bc'"),
     ],
 )
 def test_a_run_resumes_only_with_its_own_settings(copied: Path, other: Any, says: str) -> None:
     with pytest.raises(TrainingError, match=says):
         train(corridor(), other, copied, resume=True, progress=silent)
+
+
+@pytest.mark.parametrize("config", RESUMABLE)
+def test_a_finished_run_continues_to_more_updates_bit_for_bit(config: Any, tmp_path: Path) -> None:
+    config = replace(config, final_learning_rate_fraction=1.0)
+    train(corridor(), config, tmp_path / "whole", seeds=2, progress=silent)
+    train(corridor(), replace(config, updates=70), tmp_path / "cut", seeds=2, progress=silent)
+    # A second continuation is killed after its first checkpoint, at update 80.
+    with pytest.raises(Stopped):
+        train(corridor(), config, tmp_path / "cut", resume=True, progress=StopAt(90))
+    found = train(corridor(), config, tmp_path / "cut", resume=True, progress=silent)
+    assert [(one.seed, one.resumed_at, one.steps) for one in found] == [(0, 80, 100), (1, 80, 100)]
+    for seed in (0, 1):
+        assert_same_result(tmp_path / "cut", tmp_path / "whole", seed)
+        assert [int(row["update"]) for row in rows(tmp_path / "cut", seed)] == [*range(10, 101, 10)]
+    assert json.loads((tmp_path / "cut" / "config.json").read_bytes())["config"]["updates"] == 100
+    assert read_policy(tmp_path / "cut" / "seed-0").algo == found[0].algo
+
+
+def test_a_run_continues_from_an_end_between_two_checkpoints(tmp_path: Path) -> None:
+    config = replace(SHORT_CQL, final_learning_rate_fraction=1.0)
+    (whole,) = train(corridor(), config, tmp_path / "whole", progress=silent)
+    train(corridor(), replace(config, updates=33), tmp_path / "run", progress=silent)
+    (found,) = train(corridor(), config, tmp_path / "run", resume=True, progress=silent)
+    assert (found.resumed_at, found.steps) == (33, 100)
+    for name in ("policy.safetensors", "checkpoint.safetensors"):
+        mine, theirs = (load_file(one.folder / name) for one in (found, whole))
+        assert all(torch.equal(mine[key], tensor) for key, tensor in theirs.items())
+    assert [int(row["update"]) for row in rows(tmp_path / "run")] == [
+        10, 20, 30, 33, *range(40, 101, 10)
+    ]  # fmt: skip
+
+
+def test_a_continued_run_with_a_decaying_learning_rate_warns(tmp_path: Path) -> None:
+    config = replace(SHORT_CQL, final_learning_rate_fraction=0.1, learning_rate=1e-3)
+    train(corridor(), replace(config, updates=50), tmp_path, progress=silent)
+    with pytest.warns(UserWarning, match="decayed over 50 updates and continues as for 100"):
+        train(corridor(), config, tmp_path, resume=True, progress=silent)
+    rates = [float(row["learning_rate"]) for row in rows(tmp_path)]
+    # After 49 of 50 updates, and after 59 of 100.
+    assert rates[4] == pytest.approx(1e-4)
+    assert rates[5] == pytest.approx(1e-3 * (1 - 0.9 * 59 / 99))
+
+
+def test_a_run_resumed_with_other_versions_warns(copied: Path) -> None:
+    config = json.loads((copied / "config.json").read_bytes())
+    installed = {name: version(name) for name in ("torch", "numpy")}
+    assert {name: config["versions"][name] for name in installed} == installed
+    config["versions"] |= {"torch": "1.13.1", "numpy": "1.26.0"}
+    (copied / "config.json").write_text(json.dumps(config))
+    message = (
+        rf"run was started with torch 1\.13\.1, not {re.escape(installed['torch'])} and numpy"
+        rf" 1\.26\.0, not {re.escape(installed['numpy'])}: the resumed run may end in other bits"
+    )
+    for _ in range(2):
+        with pytest.warns(UserWarning, match=message):
+            train(corridor(), SHORT_CQL, copied, resume=True, progress=silent)
+
+
+def test_a_run_without_versions_resumes(copied: Path) -> None:
+    config = json.loads((copied / "config.json").read_bytes())
+    del config["versions"]
+    (copied / "config.json").write_text(json.dumps(config))
+    train(corridor(), SHORT_CQL, copied, resume=True, progress=silent)
+    assert "versions" not in json.loads((copied / "config.json").read_bytes())
 
 
 @pytest.mark.parametrize("content", [b"", b"nonsense", b"\xff" * 64])

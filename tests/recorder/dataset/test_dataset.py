@@ -101,6 +101,53 @@ def test_split_is_a_partition(fraction: float, seed: int) -> None:
     assert min(len(first.episodes), len(second.episodes)) >= 1
 
 
+def test_other_rewards_change_the_returns_alone(tmp_path: Path) -> None:
+    data = mcaprl.Dataset.from_arrays(
+        observations=np.arange(4.0)[:, None],
+        actions=[0, 1, 1, 0],
+        rewards=[1.0, 2.0, 3.0, 4.0],
+        terminated=[False, True, False, True],
+        truncated=[False] * 4,
+        next_observations=np.arange(1.0, 5.0)[:, None],
+    )
+    other = data.with_rewards(data.rewards - 10 * (data.actions == 1))
+    assert other.rewards.tolist() == [1, -8, -7, 4]
+    assert [episode.total_reward for episode in other.episodes] == [-7, -3]
+    assert other.statistics.returns.tolist() == [-7, -3]
+    assert [episode.total_reward for episode in data.episodes] == [3, 7]
+    assert other.fingerprint != data.fingerprint
+    assert data.with_rewards([1, 2, 3, 4]).fingerprint == data.fingerprint
+    other.save(tmp_path / "other.mcap")
+    saved = mcaprl.open(tmp_path / "other.mcap")
+    assert saved.rewards.tolist() == [1, -8, -7, 4]
+    assert [episode.total_reward for episode in saved.episodes] == [-7, -3]
+    np.testing.assert_array_equal(saved.actions, data.actions)
+
+
+@pytest.mark.parametrize(
+    ("rewards", "says"),
+    [
+        ([1.0], r"rewards has shape \(1,\), expected \(2,\)"),
+        ([[1.0], [2.0]], r"rewards has shape \(2, 1\), expected \(2,\)"),
+        ([1.0, np.nan], "rewards has nan in row 1, expected finite numbers"),
+        ([np.inf, 1.0], "rewards has inf in row 0, expected finite numbers"),
+        (["a", "b"], "rewards has dtype <U1, expected numbers"),
+        ([1j, 2j], "rewards has dtype complex128, expected numbers"),
+    ],
+)
+def test_wrong_rewards_are_refused(rewards: Any, says: str) -> None:
+    data = mcaprl.Dataset.from_arrays(
+        observations=np.zeros((2, 1)),
+        actions=[0, 1],
+        rewards=[1.0, 2.0],
+        terminated=[False, True],
+        truncated=[False, False],
+        next_observations=np.zeros((2, 1)),
+    )
+    with pytest.raises(SpaceError, match=says):
+        data.with_rewards(rewards)
+
+
 def test_statistics_by_hand() -> None:
     statistics = small().statistics
     assert (statistics.episodes, statistics.steps) == (3, 5)

@@ -60,6 +60,43 @@ def test_random_actions_are_allowed_ones() -> None:
         assert drawn == pytest.approx(chances)
 
 
+class AlwaysOn:
+    name = "on"
+
+    def act(self, observations: Any) -> NDArray[Any]:
+        return np.ones((len(observations["x"]), 2), np.int8)
+
+
+def test_joint_actions_have_joint_probabilities() -> None:
+    behavior = EpsilonGreedy(AlwaysOn(), 0.4, spaces.MultiBinary(2))
+    behavior.begin(0)
+    seen: dict[str, Any] = {"x": np.zeros(1)}
+    drawn = [behavior.choose(seen) for _ in range(200)]
+    assert {(*action.tolist(), round(chance, 9)) for action, chance in drawn} == {
+        (0, 0, 0.1),
+        (0, 1, 0.1),
+        (1, 0, 0.1),
+        (1, 1, 0.7),
+    }
+    # A mask of the four joint actions forbids (0, 1) and (1, 0).
+    seen["action_mask"] = np.array([1, 0, 0, 1], np.int8)
+    masked = [behavior.choose(seen) for _ in range(200)]
+    assert {(*action.tolist(), round(chance, 9)) for action, chance in masked} == {
+        (0, 0, 0.2),
+        (1, 1, 0.8),
+    }
+    # A mask of another form, such as one flag for each value of an element, is left to the policy.
+    seen["action_mask"] = np.array([1, 0, 0, 1, 1], np.int8)
+    assert {round(behavior.choose(seen)[1], 9) for _ in range(200)} == {0.1, 0.7}
+
+
+def test_the_probability_in_a_very_large_space_is_unknown() -> None:
+    behavior = EpsilonGreedy(None, 1.0, spaces.MultiBinary(2000))
+    action, probability = behavior.choose(np.zeros(3))
+    assert action.shape == (2000,)
+    assert math.isnan(probability)
+
+
 def test_box_actions_have_no_known_probability() -> None:
     env = gym.make("Pendulum-v1")
     behavior = EpsilonGreedy(None, 0.0, env.action_space)
