@@ -9,7 +9,6 @@ from typing import Any
 import click
 
 import mcaprl
-from mcaprl.api.bags import RECORDING_COLUMNS, TOPIC_COLUMNS, BagInfo
 from mcaprl.cli.completion import Name, sims
 from mcaprl.cli.exit_codes import WITH_LOSSES
 from mcaprl.cli.help import Command
@@ -49,7 +48,7 @@ def info(
         found = mcaprl.info(data, report=report, **request)
     if as_json:
         print_json(found.to_json())
-    elif isinstance(found, BagInfo):
+    elif hasattr(found, "topic_rows"):
         _print_bag(found)
     else:
         rows = [*found.rows(), ("problems", "\n".join(found.problems) or "none")]
@@ -63,12 +62,12 @@ def info(
     return int(strict and bool(found.problems))
 
 
-def _print_bag(found: BagInfo) -> None:
+def _print_bag(found: Any) -> None:
     rows = [*found.rows(), ("problems", "\n".join(found.problems) or "none"), ("next", found.next)]
     print_facts(found.title, rows)
     if len(found.recordings) > 1:
-        print_table("", RECORDING_COLUMNS, found.recording_rows())
-    print_table("", TOPIC_COLUMNS, found.topic_rows())
+        print_table("", found.recording_columns, found.recording_rows())
+    print_table("", found.topic_columns, found.topic_rows())
 
 
 @click.command(cls=Command)

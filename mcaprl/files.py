@@ -3,8 +3,8 @@
 A file is written in a hidden work folder beside its target. This folder, `.NAME.part`, is locked
 while its writer runs. When the file is complete and synced to disk, it replaces the target
 atomically. If the writer is killed, the target has either its old or its new content. The next
-writer in the same folder removes the work folder. `mcaprl.locks` has the locks, and
-`mcaprl.work_folders` the work folders; other modules import both from here.
+writer in the same folder removes the work folder. `mcaprl.storage.locks` has the locks, and
+`mcaprl.storage.work_folders` the work folders; other modules import both from here.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from mcaprl.errors import LogError, McaprlError, OutputExistsError, UsageError
-from mcaprl.locks import (
+from mcaprl.storage.locks import (
     OpenFolder,
     check_plain,
     check_regular,
@@ -36,7 +36,7 @@ from mcaprl.locks import (
     try_lock,
     waiting_lock,
 )
-from mcaprl.work_folders import (
+from mcaprl.storage.work_folders import (
     TemporaryFolder,
     check_local,
     fresh_folder,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from mcaprl.architecture import ENCODERS, Architecture
-from mcaprl.tensor_files import check_widths
+from mcaprl.storage.tensor_files import check_widths
 
 _MAX_IMAGES = 10_000
 """Maximum number of images, evenly spaced, for computing a mean image."""

@@ -44,7 +44,7 @@ from mcaprl.recorder.format.spaces import (
     space_to_json,
 )
 from mcaprl.runs import POLICY_NAME
-from mcaprl.tensor_files import read_tensors, write_tensors
+from mcaprl.storage.tensor_files import read_tensors, write_tensors
 
 FORMAT_VERSION = 2
 _WEIGHTS_NAME = "policy.safetensors"
@@ -331,7 +331,7 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
         reward_scale=float(description.get("reward_scale", 1.0)),
         action_commands=None
         if commands is None
-        else ActionCommands.from_json(commands, int(action_space.n)),
+        else ActionCommands.from_json(commands, JointActions.of(action_space).count),
         mask_from=mask_from,
     )
 

@@ -25,7 +25,7 @@ from torch import Tensor
 from mcaprl.online.frame_buffer import FrameReplayBuffer
 from mcaprl.online.task import Task
 from mcaprl.runs import broken_checkpoint
-from mcaprl.tensor_files import read_tensors, write_tensors
+from mcaprl.storage.tensor_files import read_tensors, write_tensors
 
 # SB3 uses NumPy's global generator. NumPy's type stubs do not define `get_bit_generator`.
 _NUMPY_RANDOM: Any = np.random

@@ -43,7 +43,7 @@ from mcaprl.recorder.format.spaces import (
     space_to_json,
 )
 from mcaprl.runs import BEST_NAME
-from mcaprl.tensor_files import check_widths
+from mcaprl.storage.tensor_files import check_widths
 
 FORMAT_VERSION = 1
 _LEAST_IMAGE_FEATURES = 256

@@ -14,7 +14,6 @@ from typing import Any
 
 import pytest
 
-from mcaprl import work_folders
 from mcaprl.errors import LogError, ReportError, UsageError
 from mcaprl.files import (
     TemporaryFolder,
@@ -27,6 +26,7 @@ from mcaprl.files import (
     write_json,
 )
 from mcaprl.problem import Problem
+from mcaprl.storage import work_folders
 
 
 def fail_halfway(path: Path) -> None:

@@ -166,7 +166,7 @@ def tournament(sim: str, log: Path, out: Path, names: list[str]) -> list[Row]:
     (rewards, discounts), scale = buffer.returns.double().numpy(), buffer.reward_scale
     actions, half = buffer.actions.numpy(), np.arange(len(data.episodes)) % 2 == 0
     steps, first_half = np.arange(len(data)), np.repeat(half, data.episode_lengths)
-    first_action = int(buffer.action_space.start)
+    first_action = int(getattr(buffer.action_space, "start", 0))
     rows: list[Row] = []
     for name in names:
         policies = load_policies(out / name)

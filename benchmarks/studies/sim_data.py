@@ -25,9 +25,10 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple, cast
 
 import gymnasium as gym
@@ -133,8 +134,11 @@ class WeakPilot(EpsilonGreedy):
         meanings: tuple[str, ...] = env.get_wrapper_attr("action_meanings")
         self.name, self._wrong = "weak pilot", meanings.index(WRONG[sim])
         self._sim, self._timid_above_m_s = env.unwrapped, TIMID_ABOVE_M_S.get(sim)
+        self._count = len(meanings)
 
-    def choose(self, observation: Any) -> tuple[Any, float]:
+    def choose(
+        self, observation: Any, info: Mapping[str, Any] = MappingProxyType({})
+    ) -> tuple[Any, float]:
         """Return the action for one observation, and its probability."""
         assert self.policy is not None
         weak = self._probability if self._is_weak_here() else 0.0

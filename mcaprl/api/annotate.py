@@ -19,7 +19,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import open_logs
 from mcaprl.recorder.viewer.annotate import annotated_copy, values_topics
 from mcaprl.recorder.viewer.verify import Verification
-from mcaprl.remote import as_path
+from mcaprl.storage.remote import as_path
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from mcaprl.api.data import Definitions, Paths
 from mcaprl.errors import LogError, NotMcapError
@@ -15,7 +15,7 @@ from mcaprl.recorder.dataset.open import find_logs
 from mcaprl.recorder.format.metadata import METADATA_NAME
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.format.topics import STEP_TOPIC
-from mcaprl.remote import is_url
+from mcaprl.storage.remote import is_url
 from mcaprl.texts import counted, size
 
 if TYPE_CHECKING:
@@ -94,6 +94,19 @@ class BagInfo:
     problems: list[str]
     next: str
 
+    topic_columns: ClassVar = [
+        "topic",
+        "type",
+        "encoding",
+        "messages",
+        "rate",
+        "longest gap",
+        "from",
+        "to",
+        "readable",
+    ]
+    recording_columns: ClassVar = ["recording", "messages", "begins", "duration"]
+
     @property
     def title(self) -> str:
         """Path of the first file, and the number of other files."""
@@ -130,12 +143,12 @@ class BagInfo:
         return rows
 
     def topic_rows(self) -> list[list[str]]:
-        """Return the rows of the table of topics; `TOPIC_COLUMNS` are their columns."""
+        """Return the rows of the table of topics; `topic_columns` are their columns."""
         start_ns = min((each.first_ns for each in self.recordings if each.messages), default=0)
         return [_topic_row(topic, start_ns) for topic in self.topics.values()]
 
     def recording_rows(self) -> list[list[str]]:
-        """Return the rows of the table of recordings; `RECORDING_COLUMNS` are their columns."""
+        """Return the rows of the table of recordings; `recording_columns` are their columns."""
         return [
             [
                 ", ".join(path.name for path in each.paths),
@@ -145,20 +158,6 @@ class BagInfo:
             ]
             for each in self.recordings
         ]
-
-
-TOPIC_COLUMNS = [
-    "topic",
-    "type",
-    "encoding",
-    "messages",
-    "rate",
-    "longest gap",
-    "from",
-    "to",
-    "readable",
-]
-RECORDING_COLUMNS = ["recording", "messages", "begins", "duration"]
 
 
 def _topic_row(topic: BagTopic, start_ns: int) -> list[str]:

@@ -17,7 +17,7 @@ from mcaprl.files import check_target, replacing
 from mcaprl.recorder.viewer.page.episode_data import LogPage
 from mcaprl.recorder.viewer.page.html import page_html
 from mcaprl.recorder.viewer.page.server import PageServer
-from mcaprl.remote import as_path
+from mcaprl.storage.remote import as_path
 
 _KINDS = (".html", ".htm")
 

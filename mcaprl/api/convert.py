@@ -15,7 +15,7 @@ from mcaprl.errors import UsageError, import_extra
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.registry import target_format, write_format
-from mcaprl.remote import check_upload, upload_all
+from mcaprl.storage.remote import check_upload, upload_all
 
 if TYPE_CHECKING:
     from mcaprl.recorder.mapping.summary import MappingReport
@@ -210,7 +210,7 @@ def suggest_mapping(bag: Paths, *, bins: int | None = None, definitions: Definit
     from contextlib import closing
 
     from mcaprl.recorder.bags.bag import open_bag
-    from mcaprl.recorder.mapping.suggest import suggested
+    from mcaprl.recorder.mapping.suggest.draft import suggested
 
     if bins is not None:
         check_least(2, bins=bins)

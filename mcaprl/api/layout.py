@@ -13,8 +13,8 @@ from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.scene import DepthSource
 from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.recorder.viewer.log_layout import attached_layout
-from mcaprl.remote import is_url
 from mcaprl.sims import SIMS, make_sim
+from mcaprl.storage.remote import is_url
 
 
 def layout(

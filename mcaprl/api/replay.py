@@ -44,7 +44,7 @@ from mcaprl.recorder.viewer.video import (
     write_sheet,
     write_video,
 )
-from mcaprl.remote import as_path
+from mcaprl.storage.remote import as_path
 
 _Images = Iterator[NDArray[np.uint8]]
 _STILLS, _HEIGHTS_PX = 12, (16, 4320)

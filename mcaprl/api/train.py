@@ -21,9 +21,9 @@ from mcaprl.recorder.dataset.open import open_logs
 from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.live_stream import DEFAULT_SPEED
-from mcaprl.remote import check_upload, upload_all
 from mcaprl.runs import check_kind, choose_seeds, run_to_resume
 from mcaprl.settings import check_settings, flag, settings_from_json
+from mcaprl.storage.remote import check_upload, upload_all
 
 if TYPE_CHECKING:
     from mcaprl.offline.training.metrics import OfflineSummary

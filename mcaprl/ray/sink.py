@@ -20,7 +20,7 @@ from mcaprl.ray.shards import unfinished_folder
 from mcaprl.ray.workers import check_machine
 from mcaprl.recorder.dataset.manifest import MANIFEST_NAME, LogFile, write_manifest
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata, installed_versions
-from mcaprl.remote import check_upload, is_url, upload
+from mcaprl.storage.remote import check_upload, is_url, upload
 
 
 class LogSink(Datasink[LogFile | None]):  # type: ignore[misc]

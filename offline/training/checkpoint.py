@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.runs import CHECKPOINT_NAME, RunIdentity, broken_checkpoint
-from mcaprl.tensor_files import read_tensors, write_tensors
+from mcaprl.storage.tensor_files import read_tensors, write_tensors
 
 
 @dataclass(frozen=True)

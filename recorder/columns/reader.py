@@ -60,7 +60,7 @@ from mcaprl.recorder.columns.records import (
     records_of,
     start_of_summary,
 )
-from mcaprl.remote import RemotePath, as_path
+from mcaprl.storage.remote import RemotePath, as_path
 
 # Number of bytes at the start and at the end of a remote file that are fetched when it is opened.
 _HEAD_BYTES, _TAIL_BYTES = 2**16, 2**18

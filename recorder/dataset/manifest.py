@@ -14,7 +14,7 @@ from typing import Any
 
 from mcaprl.errors import LogError
 from mcaprl.files import parse_json, read_file, write_json
-from mcaprl.remote import RemotePath, as_path, is_url
+from mcaprl.storage.remote import RemotePath, as_path, is_url
 
 MANIFEST_NAME = "manifest.json"
 _VERSION = "1"

@@ -18,7 +18,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 from mcaprl.recorder.dataset.manifest import is_manifest, listed_logs
-from mcaprl.remote import RemotePath, as_path, find_remote, is_url
+from mcaprl.storage.remote import RemotePath, as_path, find_remote, is_url
 from mcaprl.texts import counted
 
 # Largest number of logs open at the same time; the system limits the open files of a process.

@@ -19,7 +19,7 @@ from mcaprl.recorder.format.selected_copy import Times, times_of
 from mcaprl.recorder.format.topics import PHASE_TOPIC, STEP_TOPIC
 from mcaprl.recorder.format.writing import finished_state
 from mcaprl.recorder.record.display import CAMERA_INFO, SCENE, SCENE_STATIC, TF, TF_STATIC
-from mcaprl.remote import as_path
+from mcaprl.storage.remote import as_path
 
 # On these topics, a message is valid until the next message of the same topic.
 _STATES = (SCENE, SCENE_STATIC, TF, TF_STATIC, CAMERA_INFO, PHASE_TOPIC)

@@ -27,10 +27,10 @@ from mcaprl.recorder.mapping.paths import (
     topic_of,
     unknown_field,
 )
-from mcaprl.recorder.mapping.rotations import yaw_of
+from mcaprl.recorder.mapping.poses.rotations import yaw_of
+from mcaprl.recorder.mapping.poses.transforms import Transforms, transform_topic
 from mcaprl.recorder.mapping.runs import Messages
 from mcaprl.recorder.mapping.streams import TopicStream
-from mcaprl.recorder.mapping.transforms import Transforms, transform_topic
 
 _QUATERNION = ("x", "y", "z", "w")
 _ANGLES = ("roll", "pitch", "yaw")

@@ -21,7 +21,7 @@ from mcaprl.recorder.mapping.config import (
     TimeSource,
 )
 from mcaprl.recorder.mapping.expression import Expression
-from mcaprl.recorder.mapping.images import ImageReader
+from mcaprl.recorder.mapping.images.reader import ImageReader
 from mcaprl.recorder.mapping.observe import Source, source_of
 from mcaprl.recorder.mapping.paths import topic_of
 from mcaprl.recorder.mapping.streams import TopicStream

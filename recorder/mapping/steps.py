@@ -24,6 +24,7 @@ from mcaprl.recorder.mapping.expression import Expression
 from mcaprl.recorder.mapping.observe import Values, pose_of, values_of
 from mcaprl.recorder.mapping.paths import as_numbers
 from mcaprl.recorder.mapping.plan import Plan, Wanted
+from mcaprl.recorder.mapping.poses.transforms import Transforms
 from mcaprl.recorder.mapping.runs import (
     Recorded,
     Run,
@@ -31,7 +32,6 @@ from mcaprl.recorder.mapping.runs import (
     runs_of,
 )
 from mcaprl.recorder.mapping.segments import Marks, Segment, segments
-from mcaprl.recorder.mapping.transforms import Transforms
 
 NS_PER_S = 10**9
 

@@ -34,7 +34,7 @@ from mcaprl.recorder.format.reading import (
 from mcaprl.recorder.format.topics import STEP_TOPIC
 from mcaprl.recorder.repair.bag_check import check_messages
 from mcaprl.recorder.repair.episode_check import EpisodeCheck
-from mcaprl.remote import RemotePath, as_path
+from mcaprl.storage.remote import RemotePath, as_path
 
 # Number of chunks that a thread decompresses before it hands them over. Handing over each one takes
 # more time.

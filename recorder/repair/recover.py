@@ -33,7 +33,7 @@ from mcaprl.recorder.repair.whole_episodes import (
     plan_episodes,
     write_planned,
 )
-from mcaprl.remote import as_path
+from mcaprl.storage.remote import as_path
 from mcaprl.texts import counted
 
 _LISTS = ("damages", "dropped")

@@ -42,6 +42,7 @@ ONLY_OPTIONS = {
     "convert --from": "`from` is a keyword of Python: source_format",
     "convert --suggest": "it selects the function suggest_mapping",
     "info --strict": "an exit code",
+    "strict": "a key of a mapping",
     "replay --browser": "it selects the function browse",
     "replay --save": "it selects the function save_page",
     "replay --verify": "it selects the function verify",

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.files import check_plain, replacing, replacing_folder
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.remote import is_url
+from mcaprl.storage.remote import is_url
 
 KINDS = ("terminated", "truncated")
 """Kinds of the end of an episode."""

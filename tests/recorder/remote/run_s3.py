@@ -34,7 +34,7 @@ def main(log: str) -> dict[str, Any]:
 
         import mcaprl
         from mcaprl.errors import LogError
-        from mcaprl.remote import upload
+        from mcaprl.storage.remote import upload
 
         system = s3fs.S3FileSystem()
         system.mkdir("logs")

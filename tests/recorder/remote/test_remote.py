@@ -25,7 +25,7 @@ from mcaprl import limits
 from mcaprl.cli import run
 from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.remote import BLOCK_BYTES, CACHE_VARIABLE, RemoteFile, RemotePath, upload
+from mcaprl.storage.remote import BLOCK_BYTES, CACHE_VARIABLE, RemoteFile, RemotePath, upload
 from tests.recorder.remote.range_server import RangeServer, range_server
 
 fsspec = pytest.importorskip("fsspec", reason="needs the extra remote")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import UsageError, import_extra
 from mcaprl.recorder.dataset.mapped import Frames
 from mcaprl.recorder.mapping.config import Quantity
-from mcaprl.recorder.mapping.pixels import Pixels, one_line
+from mcaprl.recorder.mapping.images.pixels import Pixels, one_line
 
 Image = NDArray[Any]
 

@@ -21,11 +21,11 @@ from mcaprl.recorder.bags.bag import Bag, Failure, TopicInfo
 from mcaprl.recorder.dataset.image_cache import Storage, is_mapped
 from mcaprl.recorder.dataset.mapped import Frames, as_pixels
 from mcaprl.recorder.format.spaces import MAX_ELEMENTS
-from mcaprl.recorder.mapping.compressed import compressed_pixels, is_video
 from mcaprl.recorder.mapping.config import Quantity
-from mcaprl.recorder.mapping.image_copy import copied_images
-from mcaprl.recorder.mapping.image_options import ImageOptions
-from mcaprl.recorder.mapping.pixels import Pixels, one_line, raw_pixels
+from mcaprl.recorder.mapping.images.compressed import compressed_pixels, is_video
+from mcaprl.recorder.mapping.images.copies import copied_images
+from mcaprl.recorder.mapping.images.options import ImageOptions
+from mcaprl.recorder.mapping.images.pixels import Pixels, one_line, raw_pixels
 from mcaprl.texts import counted, size
 
 Image = NDArray[Any]

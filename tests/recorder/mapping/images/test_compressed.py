@@ -19,8 +19,8 @@ from PIL import Image
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.image_files import FORMATS, decoded_file
-from mcaprl.recorder.mapping.compressed import compressed_pixels
-from mcaprl.recorder.mapping.rvl import rvl_decoded
+from mcaprl.recorder.mapping.images.compressed import compressed_pixels
+from mcaprl.recorder.mapping.images.rvl import rvl_decoded
 
 
 def rvl_encoded(pixels: list[int]) -> bytes:

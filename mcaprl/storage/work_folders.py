@@ -23,7 +23,7 @@ from multiprocessing.util import Finalize
 from pathlib import Path
 
 from mcaprl.errors import LogError, OutputExistsError, UsageError
-from mcaprl.locks import OpenFolder, lock, surely_locked, taken
+from mcaprl.storage.locks import OpenFolder, lock, surely_locked, taken
 
 _MARK, _FILES = ".mcaprl-work-folder", "files"
 _MAX_NAME_BYTES = 255

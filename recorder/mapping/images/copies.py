@@ -35,7 +35,7 @@ from mcaprl.recorder.format.topics import IMAGES_PER_CHUNK
 from mcaprl.texts import size
 
 if TYPE_CHECKING:
-    from mcaprl.recorder.mapping.images import ImageReader
+    from mcaprl.recorder.mapping.images.reader import ImageReader
 
 _VERSION = "1"
 """Version of the decoders. It changes if they decode the same message to other pixels."""

@@ -23,8 +23,10 @@ from mcaprl.recorder.bags.overview import TopicOverview, topics_of
 from mcaprl.recorder.format.topics import STEP_TOPIC
 from mcaprl.recorder.mapping.blame import Blame
 from mcaprl.recorder.mapping.config import Place, parse_mapping
-from mcaprl.recorder.mapping.images import ImageReader
-from mcaprl.recorder.mapping.likely import (
+from mcaprl.recorder.mapping.images.reader import ImageReader
+from mcaprl.recorder.mapping.plan import Plan
+from mcaprl.recorder.mapping.steps import StepReader
+from mcaprl.recorder.mapping.suggest.likely import (
     IMAGES,
     LIKELY,
     Candidate,
@@ -35,9 +37,7 @@ from mcaprl.recorder.mapping.likely import (
     shares_of_time,
     transforms,
 )
-from mcaprl.recorder.mapping.likely_action import action_spec, command_of, likelihood
-from mcaprl.recorder.mapping.plan import Plan
-from mcaprl.recorder.mapping.steps import StepReader
+from mcaprl.recorder.mapping.suggest.likely_action import action_spec, command_of, likelihood
 from mcaprl.texts import printable
 
 _MAX_RATE_HZ, _MIN_RATE_HZ, _GAP_S = 20.0, 1.0, 2.0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.bag import Bag, TopicInfo
 from mcaprl.recorder.bags.overview import TopicOverview
-from mcaprl.recorder.mapping.likely import (
+from mcaprl.recorder.mapping.suggest.likely import (
     ELEMENTS,
     IMAGES,
     NUMBERS,

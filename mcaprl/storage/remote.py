@@ -368,7 +368,7 @@ def system_of(url: str) -> tuple[Any, str]:
     core = import_extra("fsspec.core", "remote")
     options: dict[str, Any] = {}
     if "http" in url.partition("://")[0]:
-        http = import_extra("mcaprl.http_answers", "remote").options()
+        http = import_extra("mcaprl.storage.http_answers", "remote").options()
         is_chain = not url.startswith("http")
         options = {"http": http, "https": http} if is_chain else http
     with _Errors(f"cannot open {url}"):

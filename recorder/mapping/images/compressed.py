@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.image_files import FORMATS, decoded_file
-from mcaprl.recorder.mapping.pixels import CERTAIN_DEPTH, MM_PER_M, UNITS_PER_M, Pixels
-from mcaprl.recorder.mapping.rvl import rvl_decoded
+from mcaprl.recorder.mapping.images.pixels import CERTAIN_DEPTH, MM_PER_M, UNITS_PER_M, Pixels
+from mcaprl.recorder.mapping.images.rvl import rvl_decoded
 
 _VIDEO: Final = re.compile(r"h\.?26[45]|hevc|avc|vp[89]|av1|mpeg|theora", re.IGNORECASE)
 _PNG: Final = b"\x89PNG"

@@ -16,7 +16,8 @@ from mcaprl.recorder.bags.bag import Bag
 from mcaprl.recorder.mapping.align import NONE, NS_PER_S, last, nearest, time_order
 from mcaprl.recorder.mapping.config import TimeSource
 from mcaprl.recorder.mapping.paths import topic_of
-from mcaprl.recorder.mapping.rotations import (
+from mcaprl.recorder.mapping.poses.messages import STATIC, are_transforms, transforms_of
+from mcaprl.recorder.mapping.poses.rotations import (
     Floats,
     between,
     euler_of,
@@ -26,7 +27,6 @@ from mcaprl.recorder.mapping.rotations import (
     upper,
 )
 from mcaprl.recorder.mapping.runs import Recorded, Run
-from mcaprl.recorder.mapping.transform_messages import STATIC, are_transforms, transforms_of
 
 TF = "/tf"
 PLANAR = ("x", "y", "yaw")

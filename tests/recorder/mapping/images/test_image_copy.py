@@ -19,8 +19,8 @@ import mcaprl
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.dataset import image_cache
 from mcaprl.recorder.dataset.mapped import MappedImages
-from mcaprl.recorder.mapping import image_copy
-from mcaprl.recorder.mapping.images import ImageReader
+from mcaprl.recorder.mapping.images import copies as image_copy
+from mcaprl.recorder.mapping.images.reader import ImageReader
 from tests.support.bags import Channel, integers, write_channels, write_rosbag1, write_rosbag2
 from tests.support.recordings import assert_same_bits
 

@@ -1,0 +1,1 @@
+"""Files: locks, work folders, remote files, and files of tensors."""

@@ -1,0 +1,1 @@
+"""Poses of coordinate frames, from the transforms of a bag."""

@@ -1,0 +1,1 @@
+"""Suggestion of a mapping file, from the messages of a bag."""

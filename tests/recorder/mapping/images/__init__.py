@@ -1,0 +1,1 @@
+"""Tests of mappings, which convert bags to datasets."""
