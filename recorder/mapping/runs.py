@@ -33,7 +33,7 @@ _OUTLIERS = 3
 _SWITCHES = 8
 """Largest number of switches between two blocks of messages that were written out of order."""
 _JITTER = 20
-"""A stream in which more than one of so many messages goes back has jitter, not resets."""
+"""A stream has jitter, not resets, if more than one of this number of messages goes back."""
 
 
 class Recorded(Protocol):
