@@ -26,8 +26,12 @@ from rosbags.interfaces import Nodetype
 
 from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.recorder.columns.definition_text import full_name
-from mcaprl.recorder.columns.definitions import clear_definitions, definitions_of, leaf_kinds
-from mcaprl.recorder.columns.type_sizes import TIME_TYPES
+from mcaprl.recorder.columns.definitions import (
+    TIME_TYPES,
+    clear_definitions,
+    definitions_of,
+    leaf_kinds,
+)
 
 # The encapsulation header of little-endian plain CDR, bytes 00 01 00 00, as a uint32.
 ENCAPSULATION = 0x0100

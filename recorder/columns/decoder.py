@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.recorder.columns.cdr import Layout, message_type
 from mcaprl.recorder.columns.chunks import Scratch
+from mcaprl.recorder.columns.definitions import TIME_TYPES
 from mcaprl.recorder.columns.message_rows import (
     MESSAGE_HEADER,
     FieldCopy,
@@ -24,7 +25,6 @@ from mcaprl.recorder.columns.message_rows import (
 )
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import RECORD_HEADER
-from mcaprl.recorder.columns.type_sizes import TIME_TYPES
 
 # If the messages of a chunk have more different lengths than this, they are decoded one by one.
 _MAX_LENGTHS = 16

@@ -328,5 +328,5 @@ def test_damaged_definitions_are_read_or_refused(encoding: tuple[str, str]) -> N
 def test_pipes_are_refused(tmp_path: Path) -> None:
     for name in ("a.mcap", "a.db3", "a.bag", "a.mcap.zstd"):
         os.mkfifo(tmp_path / name)
-        with pytest.raises(LogError, match=f"{name} is not a regular file"):
+        with pytest.raises(LogError, match=f"{name}: it is not a regular file"):
             open_bag(tmp_path / name)

@@ -17,9 +17,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaprl.errors import LogError
 from mcaprl.recorder.columns.cdr import MessageType
+from mcaprl.recorder.columns.definitions import TIME_TYPES
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.topic import Topic
-from mcaprl.recorder.columns.type_sizes import TIME_TYPES
 
 pytestmark = pytest.mark.usefixtures("each_copy")
 NAME = "demo_msgs/msg/Outer"
