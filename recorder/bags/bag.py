@@ -20,7 +20,7 @@ from mcaprl.recorder.bags.files import find_bags, open_recordings
 from mcaprl.recorder.bags.mcap_file import McapFile
 from mcaprl.recorder.bags.path_steps import NAMES, general_path, kind_at, steps_of
 from mcaprl.recorder.bags.rosbag_file import RosbagFile
-from mcaprl.recorder.bags.source import Definition, TopicSource
+from mcaprl.recorder.bags.source import Definition, RawMessage, TopicSource
 from mcaprl.recorder.bags.values import ABSENT, NUMBERS, column_of, value_at
 from mcaprl.texts import counted, printable
 
@@ -311,7 +311,7 @@ class _Topic:
             mine = np.flatnonzero(chosen[:, 2] == k)
             for row, raw in zip(mine.tolist(), source.raw(chosen[mine, 3]), strict=True):
                 try:
-                    message = decoder.decode(raw.data)
+                    message = _decoded(decoder, raw)
                     for name, column in values.items():
                         is_time = name == _PUBLISH_TIME
                         column[row] = raw.publish_ns if is_time else value_at(message, name)
@@ -327,9 +327,20 @@ class _Topic:
             places = self._order[rows, 3]
             for row, raw in zip(rows.tolist(), source.raw(places), strict=True):
                 try:
-                    decoder.decode(raw.data)
+                    _decoded(decoder, raw)
                 except LogError as error:
                     yield Failure(row, int(self.times_ns[row]), str(error))
+
+
+def _decoded(decoder: MessageDecoder, raw: RawMessage) -> Any:
+    """Return a decoded message.
+
+    Raises:
+        LogError: The message is damaged.
+    """
+    if raw.problem:
+        raise LogError(raw.problem)
+    return decoder.decode(raw.data)
 
 
 class _Infos(Mapping[str, TopicInfo]):

@@ -80,7 +80,10 @@ class CompressedTopic:
     def raw(self, rows: NDArray[np.int64]) -> Iterator[RawMessage]:
         """Yield the messages at the positions `rows` (K,), which are distinct and ascending."""
         for message in self._source.raw(rows):
-            yield message._replace(data=_decompressed(message.data))
+            try:
+                yield message._replace(data=_decompressed(message.data))
+            except LogError as error:
+                yield message._replace(data=b"", problem=str(error))
 
     def columns(
         self, fields: Sequence[str], rows: NDArray[np.int64] | None

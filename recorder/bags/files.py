@@ -142,20 +142,18 @@ def _opened(path: Path, opened: ExitStack) -> Iterator[tuple[Path, McapFile | Ro
     """Open a file, or the files of a folder; yield each with the path of its recording."""
     if not path.is_dir():
         folder = path.parent
-        listed = _listed(folder, _metadata(folder, is_optional=True))
-        is_part = _plain_name(path) in map(_plain_name, listed)
-        yield (folder if is_part else path).resolve(), _open(path, "", opened)
+        metadata = _metadata(folder, is_optional=True)
+        is_part = _plain_name(path) in map(_plain_name, _listed(folder, metadata))
+        key = folder if is_part else path
+        yield key.resolve(), _open(path, metadata if is_part else {}, opened)
         return
     metadata = _metadata(path)
-    are_compressed = metadata.get("compression_mode", "").lower() == "message"
-    distribution = metadata.get("ros_distro", "")
     listed = [_existing(part) for part in _listed(path, metadata)]
     others = _unlisted(path, listed)
     if not listed and not others:
         raise LogError(f"{path} has no {', '.join(_KINDS)} files")
     for part in (*listed, *others):
-        file = _open(part, distribution, opened, are_compressed=are_compressed)
-        yield (path if part in listed else part).resolve(), file
+        yield (path if part in listed else part).resolve(), _open(part, metadata, opened)
 
 
 def _listed(folder: Path, metadata: dict[str, Any]) -> list[Path]:
@@ -221,20 +219,18 @@ def _check_plain(path: Path) -> None:
         raise LogError(f"cannot read {path}: {error.strerror or error}") from error
 
 
-def _open(
-    path: Path, distribution: str, opened: ExitStack, *, are_compressed: bool = False
-) -> McapFile | RosbagFile:
-    """Open a file; `are_compressed` tells whether its messages are compressed one by one."""
+def _open(path: Path, metadata: dict[str, Any], opened: ExitStack) -> McapFile | RosbagFile:
+    """Open a file of a bag with this metadata."""
     plain = path
     _check_plain(path)
     if path.name.endswith(_COMPRESSED):
         plain = opened.enter_context(temporary_folder()) / _plain_name(path)
         decompress_file(path, plain)
     kind = RosbagFile if plain.suffix in (".db3", ".bag") else McapFile
-    found = kind(plain, distribution=distribution)
+    found = kind(plain, distribution=metadata.get("ros_distro", ""))
     opened.callback(found.close)
     found.path = path
-    if are_compressed:
+    if metadata.get("compression_mode", "").lower() == "message":
         for sources in found.topics.values():
             sources[:] = [CompressedTopic(source) for source in sources]
     return found

@@ -36,10 +36,11 @@ class Definition:
 
 
 class RawMessage(NamedTuple):
-    """A message as the bytes that the file contains."""
+    """A message as the bytes that the file contains, or why they cannot be decompressed."""
 
     publish_ns: int
     data: bytes
+    problem: str = ""
 
 
 class TopicSource(Protocol):

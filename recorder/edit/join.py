@@ -46,13 +46,13 @@ def merge_logs(
 ) -> Edited:
     """Join the episodes and all other messages of logs; see `mcaprl.merge`."""
     found = find_logs(paths)
+    logs = [FinishedLog(path) for path in found]
     if len(found) < 2:
         # `find_logs` returns a file that is listed several times once.
         count = 1 if isinstance(paths, str | Path) else len(paths)
         times = {1: "", 2: f": {found[0]} was given twice"}
         same = times.get(count, f": {found[0]} was given {count} times")
         raise UsageError(f"merge needs two or more logs, not {len(found)}{same}")
-    logs = [FinishedLog(path) for path in found]
     metadata = _common_metadata([log for log in logs if log.has_steps])
     delays = _delays(logs, metadata, shift=shift)
     topics, sources = NewTopics(), []

@@ -143,7 +143,7 @@ def test_a_request_that_cannot_be_logged_leaves_old_shards(
     before = (tmp_path / "shard-00.mcap").read_bytes()
     text = spaces.Text(3)
     env = ScriptedEnv(text, spaces.Discrete(2), [])
-    monkeypatch.setattr(record_file, "make_sim", lambda sim: env)
+    monkeypatch.setattr(record_file, "make_limited", lambda sim, limit: env)
     with pytest.raises(SpaceError):
         mcaprl.record("Text-v0", tmp_path, policy="random", episodes=2, envs=2, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["shard-00.mcap"]

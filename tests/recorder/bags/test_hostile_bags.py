@@ -330,3 +330,23 @@ def test_pipes_are_refused(tmp_path: Path) -> None:
         os.mkfifo(tmp_path / name)
         with pytest.raises(LogError, match=f"{name}: it is not a regular file"):
             open_bag(tmp_path / name)
+
+
+def test_a_damaged_compressed_message_costs_one_message(tmp_path: Path) -> None:
+    bag = write_rosbag2(tmp_path / "bag", "sqlite3", "MESSAGE")
+    (path,) = bag.glob("*.db3")
+    with closing(sqlite3.connect(path)) as database:
+        database.execute(
+            "UPDATE messages SET data = x'28b52ffd00' WHERE id ="
+            " (SELECT id FROM messages WHERE topic_id ="
+            " (SELECT id FROM topics WHERE name = '/odom') ORDER BY id LIMIT 1 OFFSET 3)"
+        )
+        database.commit()
+    # A part that is given without its folder has the metadata of the folder, too.
+    for data in (bag, path):
+        with closing(open_bag(data)) as found:
+            stream = found.read("/odom", ["twist.twist.linear.x"])
+            assert stream.rows.tolist() == [0, 1, 2, *range(4, STEPS)]
+            assert [each.row for each in stream.failures] == [3]
+            assert [each.row for each in found.failures("/odom")] == [3]
+            assert "cannot be decompressed" in stream.failures[0].reason
