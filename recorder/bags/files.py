@@ -131,21 +131,21 @@ def open_recordings(paths: Sequence[Path], opened: ExitStack) -> list[list[McapF
     Raises:
         LogError: A path is not a bag, or a bag is damaged.
     """
-    parts: dict[Path, list[McapFile | RosbagFile]] = {}
+    parts: dict[str, list[McapFile | RosbagFile]] = {}
     for path in paths:
         for key, file in _opened(path, opened):
             parts.setdefault(key, []).append(file)
     return list(parts.values())
 
 
-def _opened(path: Path, opened: ExitStack) -> Iterator[tuple[Path, McapFile | RosbagFile]]:
+def _opened(path: Path, opened: ExitStack) -> Iterator[tuple[str, McapFile | RosbagFile]]:
     """Open a file, or the files of a folder; yield each with the path of its recording."""
     if not path.is_dir():
         folder = path.parent
         metadata = _metadata(folder, is_optional=True)
         is_part = _plain_name(path) in map(_plain_name, _listed(folder, metadata))
         key = folder if is_part else path
-        yield key.resolve(), _open(path, metadata if is_part else {}, opened)
+        yield os.path.realpath(key), _open(path, metadata if is_part else {}, opened)
         return
     metadata = _metadata(path)
     listed = [_existing(part) for part in _listed(path, metadata)]
@@ -153,7 +153,7 @@ def _opened(path: Path, opened: ExitStack) -> Iterator[tuple[Path, McapFile | Ro
     if not listed and not others:
         raise LogError(f"{path} has no {', '.join(_KINDS)} files")
     for part in (*listed, *others):
-        yield (path if part in listed else part).resolve(), _open(part, metadata, opened)
+        yield os.path.realpath(path if part in listed else part), _open(part, metadata, opened)
 
 
 def _listed(folder: Path, metadata: dict[str, Any]) -> list[Path]:

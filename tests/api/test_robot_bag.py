@@ -73,8 +73,8 @@ def test_the_suggested_mapping_uses_frequent_topics(native: Path, tmp_path: Path
     found = mcaprl.convert(bag, None, mapping=tmp_path / "suggested.yaml")
     assert found.report is not None
     observed = found.dataset.observation_names
-    # The messages contain the positions of two joints, and an empty array of velocities.
-    assert "joint_states_position" in observed
+    # The messages contain the position of a joint by its name, and an empty array of velocities.
+    assert "joint_states_position_steering" in observed
     assert "lane_data_10" in observed
     assert not any(name.startswith(("e_stop", "joint_states_velocity")) for name in observed)
     # The clock of the suggested mapping is not aligned with the messages of the lane detector.

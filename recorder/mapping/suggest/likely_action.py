@@ -217,8 +217,8 @@ def quantile_edges(values: NDArray[np.float64], bins: int) -> list[float]:
 
     Each edge is between two different values, so no bin is empty.
 
-    >>> quantile_edges(np.array([0.0, 0, 0, 1, 1, 2, 2, 2]), 3)
-    [0.5, 1.5]
+    >>> quantile_edges(np.array([0.0, 0, 0, 1, 1, 4, 4, 4]), 3)
+    [0.5, 2.0]
     """
     distinct, counts = np.unique(values, return_counts=True)
     shares = np.cumsum(counts)[:-1] / max(len(values), 1)

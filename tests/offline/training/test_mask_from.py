@@ -95,7 +95,7 @@ def test_masks_of_infos_forbid_actions_in_training_and_evaluation(tmp_path: Path
         [True, False, False],
     ]
     # The environment asserts that actions are allowed; random actions use the mask, too.
-    found = mcaprl.evaluate(str(out), SIM, episodes=6)
+    found = mcaprl.evaluate(str(out), SIM, episodes=6, trust_env=True)
     best = next(one for one in found.policies if one.policy == "run")
     expected = []
     for result in best.results[0]:
@@ -106,10 +106,10 @@ def test_masks_of_infos_forbid_actions_in_training_and_evaluation(tmp_path: Path
             total += env.step(5 + int(np.flatnonzero(env.legal).max()))[1]
         expected.append(total)
     assert [result.total_reward for result in best.results[0]] == expected
-    mcaprl.record(SIM, tmp_path / "again.mcap", policy=str(out), epsilon=0.5, episodes=10)
-    again = mcaprl.open(tmp_path / "again.mcap")
+    again, options = tmp_path / "again.mcap", {"as_info": True}
+    mcaprl.record(SIM, again, policy=str(out), epsilon=0.5, episodes=10, sim_options=options)
     # Two actions are allowed in each state: a random one has 0.5 / 2.
-    assert set(again.behavior_probs.tolist()) == {0.25, 0.75}
+    assert set(mcaprl.open(again).behavior_probs.tolist()) == {0.25, 0.75}
 
 
 def test_a_key_of_the_observation_is_a_source(tmp_path: Path) -> None:
