@@ -38,6 +38,7 @@ from mcaprl.recorder.columns.chunk_indexes import (
     parse_chunk_index,
 )
 from mcaprl.recorder.columns.chunks import Scratch, chunk_header, chunk_records
+from mcaprl.recorder.columns.file_map import release
 from mcaprl.recorder.columns.message_rows import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
@@ -62,6 +63,8 @@ from mcaprl.recorder.columns.records import (
 )
 from mcaprl.storage.remote import RemotePath, as_path
 
+_RELEASED_BYTES = 1 << 28
+"""Size of the chunks after which the memory of a file's pages is given back."""
 # Number of bytes at the start and at the end of a remote file that are fetched when it is opened.
 _HEAD_BYTES, _TAIL_BYTES = 2**16, 2**18
 _OTHER_FILES = {
@@ -118,6 +121,7 @@ class McapReader:
         # Offset and records of the latest chunk, kept because callers usually read all messages of
         # a chunk one after another.
         self._last_chunk = (-1, memoryview(b""))
+        self._touched_bytes = 0
         self._contents: dict[int, ChunkContents] = {}
         with self._named:
             footer = self._footer()
@@ -328,6 +332,11 @@ class McapReader:
             return kept
         self.check_unchanged()
         self.fetch([(start, end_of(chunk))])
+        # The pages of a mapped file count as memory of the process until they are given back.
+        self._touched_bytes += end_of(chunk) - start
+        if self._touched_bytes > _RELEASED_BYTES:
+            self._touched_bytes = 0
+            release(self._view)
         with self._named:
             records = chunk_records(self._view, start, scratch)
         if scratch is None:
