@@ -381,9 +381,12 @@ class OpenBag:
     ) -> None:
         """Join the topics of open files; `opened` closes them."""
         self._opened, self._strict = opened, strict
-        # The parts of a split bag cover successive time ranges.
-        ordered = [sorted(files, key=_first_ns) for files in recordings]
-        ordered.sort(key=lambda files: _first_ns(files[0]))
+        ordered = list(recordings)
+        # The first times are not needed, and not read, if there is one file.
+        if sum(map(len, ordered)) > 1:
+            # The parts of a split bag cover successive time ranges.
+            ordered = [sorted(files, key=_first_ns) for files in ordered]
+            ordered.sort(key=lambda files: _first_ns(files[0]))
         files = [file for each in ordered for file in each]
         self.paths = tuple(file.path for file in files)
         self.recordings = tuple(number for number, each in enumerate(ordered) for _ in each)
