@@ -30,6 +30,8 @@ _PERIODS = 3
 """Number of typical intervals between messages by which a clock goes back at least in a reset."""
 _OUTLIERS = 3
 """Largest number of successive messages that are outliers."""
+_MANY = 10
+"""A stream in which more than one of this number of messages goes back has no single clock."""
 _SWITCHES = 8
 """Largest number of switches between two blocks of messages that were written out of order."""
 _JITTER = 20
@@ -139,7 +141,9 @@ class _Part:
     def of(cls, stream: Recorded, part: slice, gap_ns: int) -> _Part:
         rows = np.arange(part.start, part.stop)
         found = cls(stream.times_ns[part], rows, stream.places[part])
-        found.drop(_outliers(found.times_ns, gap_ns))
+        outliers = _outliers(found.times_ns, gap_ns)
+        if len(outliers) * _MANY <= len(rows):
+            found.drop(outliers)
         return found
 
     def drop(self, rows: Iterable[int]) -> None:
@@ -229,8 +233,20 @@ class _Resets:
         self._mixed: list[str] = []
 
     def find(self) -> tuple[dict[str, list[int]], list[str]]:
-        """Return the first message of each run but the first by stream, and the mixed streams."""
+        """Return the first message of each run but the first by stream, and the mixed streams.
+
+        Raises:
+            UsageError: The clock of a stream was reset while that of another stream went on, or
+                goes back very often.
+        """
         jumps = self._jumps()
+        for name, rows in jumps.items():
+            count = len(self._parts[name].rows)
+            if len(rows) > _OUTLIERS and len(rows) * _MANY > count:
+                raise UsageError(
+                    f"{self._path}: the clock of {name} goes back {len(rows)} times in {count}"
+                    " messages, as if publishers had different clocks: use another `time`"
+                )
         while any(jumps.values()):
             first = min(
                 (name for name, rows in jumps.items() if rows),

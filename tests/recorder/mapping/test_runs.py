@@ -329,6 +329,17 @@ def test_single_messages_with_impossible_times_are_left_out(
     assert [each.what[:9] for each in count] == (["1 message"] if is_between else [])
 
 
+@pytest.mark.parametrize("other", [False, True])
+def test_publishers_with_different_clocks_are_refused(tmp_path: Path, other: bool) -> None:
+    # The clock of every second message of each topic, or only of /odom, is 5 s late.
+    rows = [
+        (topic, time_s + 10 - 5 * (k // 2 % 2 and (topic == "/odom" or not other)), value)
+        for k, (topic, time_s, value) in enumerate(drive(100, 0, 1))
+    ]
+    with pytest.raises(UsageError, match="goes back 50 times in 100 messages, as if publishers"):
+        read(recorded(tmp_path / "two.mcap", rows))
+
+
 def test_a_topic_that_was_written_out_of_order_is_sorted(tmp_path: Path) -> None:
     rows = drive(100, 0, 1)
     odom, cmd = rows[::2], rows[1::2]
