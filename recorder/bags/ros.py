@@ -6,8 +6,10 @@ from a ROS distribution.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
+from mcaprl.recorder.bags.wide_strings import WideForms
 from mcaprl.recorder.format.reading import (
     ROS1,
     TypeSource,
@@ -55,8 +57,16 @@ class RosDecoder:
         self._name = full_name(type_name)
         self._definitions = definitions_of(self._name, text, encoding, distribution, others)
         self.constants = self._definitions.constants
-        self.unreadable = self._definitions.unreadable
-        self.fields = leaf_kinds(self._definitions.types, self._name, inner=True)
+        self.unreadable, types = self._definitions.unreadable, self._definitions.types
+        self._wide: WideForms | None = None
+        if self.unreadable and not self._is_ros1:
+            with suppress(ValueError):
+                self._wide = WideForms(self._definitions.whole, self._name)
+        if self._wide is not None:
+            # The fields after wide strings can be found.
+            self.unreadable = {path: self.unreadable[path] for path in self._wide.paths}
+            types = self._wide.types
+        self.fields = leaf_kinds(types, self._name, inner=True)
 
     def decode(self, data: bytes) -> Any:
         """Decode a message to an object with an attribute for each field.
@@ -64,4 +74,5 @@ class RosDecoder:
         Raises:
             LogError: The bytes do not fit the type.
         """
-        return self._definitions.decode(data, is_ros1=self._is_ros1)
+        whole = None if self._wide is None else self._wide.decode(data)
+        return self._definitions.decode(data, is_ros1=self._is_ros1) if whole is None else whole

@@ -55,6 +55,7 @@ class Definitions:
             without the fields that cannot be read.
         unreadable: Reason by dotted path for each field that cannot be read: a wide string, and
             all fields after it.
+        whole: As `types`, with the fields that cannot be read.
         is_own: Whether the file defines all types.
     """
 
@@ -67,6 +68,7 @@ class Definitions:
         self.name, self.is_own = name, is_own
         check_size(types, name)
         self.unreadable: dict[str, str] = {}
+        self.whole = types
         self.types = _readable(types, name, self.unreadable)
 
     @property

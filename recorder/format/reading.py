@@ -6,7 +6,13 @@ from mcaprl.recorder.columns.cdr import ROS_TO_NUMPY
 from mcaprl.recorder.columns.chunks import Scratch, chunk_header
 from mcaprl.recorder.columns.decoder import Columns, Decoder
 from mcaprl.recorder.columns.definition_text import full_name, parsed_types
-from mcaprl.recorder.columns.definitions import ROS1, TypeSource, definitions_of, leaf_kinds
+from mcaprl.recorder.columns.definitions import (
+    ROS1,
+    UNREADABLE,
+    TypeSource,
+    definitions_of,
+    leaf_kinds,
+)
 from mcaprl.recorder.columns.file_check import check_chunk, check_file, check_statistics, place
 from mcaprl.recorder.columns.file_map import prefetch, release
 from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, MessageRange
@@ -19,6 +25,7 @@ __all__ = [
     "MESSAGE_HEADER",
     "ROS1",
     "ROS_TO_NUMPY",
+    "UNREADABLE",
     "Columns",
     "Damage",
     "Decoder",
