@@ -30,7 +30,7 @@ from mcaprl.texts import counted, size
 
 Image = NDArray[Any]
 
-_BLOCK_ROWS, _BLOCK_BYTES = 8, 1 << 22
+_BLOCK_ROWS, _BLOCK_BYTES = 32, 1 << 22
 """Largest number and size of the messages that are in memory at a time."""
 # foxglove.RawImage has no is_bigendian: its pixels are little-endian.
 _RAW_FIELDS, _BIG_ENDIAN = ("height", "width", "encoding", "step", "data"), "is_bigendian"
@@ -235,12 +235,13 @@ class ImageReader:
                     continue
                 largest = max(largest, _length(message["data"]))
                 try:
-                    pixels = self._decoded(message)
+                    # The full image is not kept: the next one is decoded into the same memory.
+                    image = self.options.applied(self._decoded(message))
                 except LogError as error:
                     time_ns = int(self.bag.times(self.topic)[row])
                     self.leave_out(Failure(row, time_ns, str(error)))
                     continue
-                yield row, self.options.applied(pixels)
+                yield row, image
             at, count = at + len(block), min(_BLOCK_ROWS, max(1, _BLOCK_BYTES // largest))
 
     def _messages(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, dict[str, Any] | Failure]]:
