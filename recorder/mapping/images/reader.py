@@ -210,7 +210,12 @@ class ImageReader:
         bounds = np.searchsorted(places.ravel()[order], np.arange(len(wanted) + 1))
         for rows, images in self.blocks(wanted, like.shape, like.dtype, 1):
             k = int(np.searchsorted(wanted, rows[0]))
-            frame, position = np.divmod(order[bounds[k] : bounds[k + 1]], stack)
+            frames = order[bounds[k] : bounds[k + 1]]
+            if stack == 1:
+                for frame in frames.tolist():
+                    found[frame, ..., 0] = as_pixels(images[0])
+                continue
+            frame, position = np.divmod(frames, stack)
             found[frame, :, :, position] = as_pixels(images[0])
         return found.view(like.dtype).reshape(len(places), *edges, stack * channels)
 
