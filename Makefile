@@ -25,7 +25,7 @@ help:
 	@echo "make faults           run the fault tests at full size: kills, damaged files, failed writes"
 	@echo "make fuzz             fuzz the reader for ten minutes"
 	@echo "make sanitize         test the C code with AddressSanitizer and UndefinedBehaviorSanitizer (needs gcc)"
-	@echo "make check            check format, lint, words, types and import contracts"
+	@echo "make check            check format, lint, words, types, import contracts and the size of the code"
 	@echo "make bench            measure speed relative to other libraries"
 	@echo "make bench-learning   measure training and off-policy estimates relative to d3rlpy, SB3 and SCOPE-RL"
 	@echo "make sim-grid         train offline on six logs of each sim, four seeds (hours; resumes if interrupted)"
@@ -76,6 +76,7 @@ check: $(VENV)/.dev
 	$(BIN)/codespell
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python .ci/ratchets.py
 
 bench: $(BENCH)/.ready
 	OMP_NUM_THREADS=1 $(BENCH)/bin/python -m benchmarks.run

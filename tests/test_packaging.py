@@ -134,15 +134,6 @@ def test_the_project_pins_what_it_was_tested_with() -> None:
         assert name in {*pinned, "mcaprl"}, f"{name} is not in constraints.txt"
 
 
-def test_pre_commit_runs_the_commands_of_make_check() -> None:
-    (recipe,) = re.findall(
-        r"^check:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), re.MULTILINE
-    )
-    hooks = (ROOT / ".pre-commit-config.yaml").read_text()
-    commands = [line.strip().replace("$(BIN)", ".venv/bin") for line in recipe.splitlines()]
-    assert re.findall(r"entry: (.*)", hooks) == commands
-
-
 def test_the_word_check_finds_each_entry_of_its_list() -> None:
     """The word check can only find phrases that its pattern matches as a whole."""
     pattern = re.compile(SETTINGS["tool"]["codespell"]["regex"])
