@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable
 from typing import Any, Final
 
@@ -203,6 +204,18 @@ class Program(click.Group):
         if lines:
             # A line with only \\b keeps the following lines as they are.
             cmd.epilog = "\n".join(["\b", "Examples:", *(f"  {line}" for line in lines)])
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command; if there is none, suggest those with similar names."""
+        if args and not args[0].startswith("-") and self.get_command(ctx, args[0]) is None:
+            names = self.list_commands(ctx)
+            near = [name for name in names if name.startswith(args[0])]
+            near = near or difflib.get_close_matches(args[0], names)
+            if near:
+                ctx.fail(f"No such command '{args[0]}': did you mean {' or '.join(near)}?")
+        return super().resolve_command(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of the commands in the order of `SECTIONS`."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from mcaprl._interrupt import is_program  # first, because the other imports take up to a second
 from mcaprl._version import __version__
-from mcaprl.errors import McaprlError
+from mcaprl.errors import LogError, McaprlError, PolicyError, UsageError
 from mcaprl.lazy import lazy_attributes
 
 # The program imports the environments with `mcaprl.api`, so that its help is fast.
@@ -49,10 +49,13 @@ if TYPE_CHECKING:
 __all__ = [
     "Dataset",
     "Episode",
+    "LogError",
     "McaprlError",
     "OpenBag",
+    "PolicyError",
     "RecordMcap",
     "RecordVecMcap",
+    "UsageError",
     "__version__",
     "annotate",
     "browse",
@@ -85,6 +88,10 @@ __all__ = [
     "train_online",
     "verify",
 ]
+_PUBLIC = __all__
+# `from mcaprl import *` must not replace functions of Python, or PyTorch and Ray.
+if not TYPE_CHECKING:
+    __all__ = [name for name in _PUBLIC if name not in {"filter", "open", "ray", "slice", "torch"}]
 
 # These names are imported on first use: their modules take long to import.
 __getattr__ = lazy_attributes(
@@ -117,4 +124,4 @@ __getattr__ = lazy_attributes(
 
 def __dir__() -> list[str]:
     """List the public names."""
-    return __all__
+    return _PUBLIC

@@ -66,7 +66,7 @@ def test_importing_loads_no_engine() -> None:
 
 
 def test_public_names_can_be_imported() -> None:
-    for name in mcaprl.__all__:
+    for name in dir(mcaprl):
         assert getattr(mcaprl, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = mcaprl.nothing

@@ -399,7 +399,9 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         (["layout", "nothing.mcap", "--out", "x.json"], 1, "cannot read nothing.mcap"),
         (["info", "x" * 300], 1, "name too long"),
         (["evaluate", "pilot", "--sim", "lane", "--behavior", "nothing"], 1, "no such file"),
-        (["recrod"], 2, "No such command 'recrod'"),
+        (["recrod"], 2, "No such command 'recrod': did you mean record or recover?"),
+        (["train"], 2, "did you mean train-online or train-offline?"),
+        (["xyz"], 2, "No such command 'xyz'"),
         (["info", "--jsn", str(LANE_LOG)], 2, "--json"),
     ],
 )  # fmt: skip
