@@ -8,7 +8,7 @@ import numpy as np
 
 from mcaprl.sims.highway.course import Course
 from mcaprl.sims.highway.env import STEERING_RAD, HighwayLaneEnv
-from mcaprl.sims.vehicle.pilot import ScriptedPilot
+from mcaprl.sims.vehicle.env import ScriptedPilot
 
 PURSUIT_M = 10.0
 ROOM_M = 30.0

@@ -20,7 +20,7 @@ from mcaprl.sims.lane.course import (
     buildings,
     rails,
 )
-from mcaprl.sims.lane.obstacles import NO_BARRIERS, world_at
+from mcaprl.sims.lane.rays import NO_BARRIERS, world_at
 from mcaprl.sims.lane.rules import Car
 
 LENS = lens(256, 144, math.pi / 2)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled
 from mcaprl.sims.lane.course import COURSE
-from mcaprl.sims.lane.obstacles import touches
+from mcaprl.sims.lane.rays import touches
 from mcaprl.sims.lane.rules import (
     BRAKE,
     COLLISION,

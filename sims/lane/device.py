@@ -9,9 +9,8 @@ import numpy as np
 
 from mcaprl.compiled import compiled
 from mcaprl.sims.lane.block import advance
-from mcaprl.sims.lane.fleet import LaneFleet
+from mcaprl.sims.lane.fleet import SHARES, LaneFleet, start_anywhere, start_on_line
 from mcaprl.sims.lane.rules import DRIVING, Car, observe, store_car
-from mcaprl.sims.lane.start import SHARES, start_anywhere, start_on_line
 from mcaprl.sims.vehicle.device import Batch, DeviceSims, begin_episode, finish_step
 
 

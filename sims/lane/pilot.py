@@ -25,7 +25,7 @@ from mcaprl.sims.lane.rules import (
     reward_of,
     wheel_angle,
 )
-from mcaprl.sims.vehicle.pilot import ScriptedPilot
+from mcaprl.sims.vehicle.env import ScriptedPilot
 
 PURSUIT_M = 8.0
 PURSUIT_S = 0.4

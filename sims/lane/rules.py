@@ -17,8 +17,8 @@ from mcaprl.sims.geometry.bicycle import (
     steering_of,
 )
 from mcaprl.sims.geometry.paths import Heading, heading_of, in_body_frame, wrap_angle
-from mcaprl.sims.lane.course import LANE_HALF_WIDTH_M
-from mcaprl.sims.lane.path import (
+from mcaprl.sims.lane.course import (
+    LANE_HALF_WIDTH_M,
     CourseSpot,
     course_point_ahead,
     course_project,

@@ -18,7 +18,7 @@ from mcaprl.sims.vehicle.batched import BatchedEnv
 from mcaprl.sims.vehicle.env import RENDER_MODES, RenderMode, VehicleEnv
 
 if TYPE_CHECKING:
-    from mcaprl.sims.powerline.view import PowerlineView
+    from mcaprl.sims.powerline.scene import PowerlineView
 
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / DECISION_S)}
 
@@ -200,7 +200,7 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
         return [powerline_scene.drone_frames(drone) for drone in self.fleet.drones_from(before)]
 
     def _open_view(self, render_mode: RenderMode) -> PowerlineView:
-        from mcaprl.sims.powerline.view import PowerlineView
+        from mcaprl.sims.powerline.scene import PowerlineView
 
         return PowerlineView(render_mode)
 

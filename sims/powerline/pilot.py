@@ -9,7 +9,7 @@ from mcaprl.sims.geometry.vectors import Vector, minus, norm, times
 from mcaprl.sims.powerline.course import ALONG_M, LEGS, TANGENTS, nearest_on_line, point_on_line
 from mcaprl.sims.powerline.env import PowerlineEnv
 from mcaprl.sims.powerline.rules import ACTION_MEANINGS, DIRECTIONS, Flight
-from mcaprl.sims.vehicle.pilot import ScriptedPilot
+from mcaprl.sims.vehicle.env import ScriptedPilot
 
 AIM_M = 6.0
 """Distance along the line to the target point."""

@@ -12,10 +12,9 @@ from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.paths import Path
 from mcaprl.sims.racer.car import Car, store_car
 from mcaprl.sims.racer.course import Track
-from mcaprl.sims.racer.fleet import RacerFleet
+from mcaprl.sims.racer.fleet import ANYWHERE, RacerFleet, start_anywhere, start_on_line
 from mcaprl.sims.racer.rays import BLOCK_SIZE
 from mcaprl.sims.racer.rules import CRASH, advance, observe_with
-from mcaprl.sims.racer.start import ANYWHERE, start_anywhere, start_on_line
 from mcaprl.sims.vehicle.device import Batch, DeviceSims, begin_episode, finish_step, to_gpu
 
 

@@ -19,7 +19,7 @@ from mcaprl.sims.vehicle.batched import BatchedEnv
 from mcaprl.sims.vehicle.env import RENDER_MODES, RenderMode, VehicleEnv
 
 if TYPE_CHECKING:
-    from mcaprl.sims.racer.view import RacerView
+    from mcaprl.sims.racer.scene import RacerView
 
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / STEP_S)}
 
@@ -191,7 +191,7 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
         return car_moments(start, end, self.step_duration_s)
 
     def _open_view(self, render_mode: RenderMode) -> RacerView:
-        from mcaprl.sims.racer.view import RacerView
+        from mcaprl.sims.racer.scene import RacerView
 
         return RacerView(render_mode, self.track)
 

@@ -13,7 +13,7 @@ from mcaprl.sims.racer.course import Track
 from mcaprl.sims.racer.env import RacerEnv
 from mcaprl.sims.racer.rays import BLOCK_SIZE, CENTER_RAYS, CENTER_RAYS_RAD, LENGTH, measure
 from mcaprl.sims.racer.rules import MAX_SPEED_PX, SPEED_CHANGE_PX, THROTTLE, TURN
-from mcaprl.sims.vehicle.pilot import ScriptedPilot
+from mcaprl.sims.vehicle.env import ScriptedPilot
 
 ROOM_EXPONENT = 1.17
 """Exponent of a ray's length in the weight of the ray."""

@@ -1,8 +1,8 @@
-"""Base class of environments with one vehicle: a fleet of one vehicle, and its rendering."""
+"""Base classes of environments with one vehicle (a fleet of one), and of their pilots."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from operator import index
@@ -224,3 +224,34 @@ def before_end(moments: Sequence[Frames], duration_s: float) -> list[tuple[float
     """
     count = len(moments)
     return [(duration_s * (count - 1 - k) / count, moments[k]) for k in range(count - 1)]
+
+
+AnySim = TypeVar("AnySim")
+
+
+class ScriptedPilot(ABC, Generic[AnySim]):
+    """Policy that reads the full state of one environment instead of its observations."""
+
+    name: ClassVar[str] = "pilot"
+
+    def __init__(self, sim: AnySim) -> None:
+        """Drive the vehicle of `sim`, an unwrapped environment."""
+        self.sim = sim
+
+    def act(self, observations: Any) -> NDArray[np.int64]:
+        """Return the action, shape (1,), for the current state of the environment.
+
+        Args:
+            observations: Observations with a leading dimension of 1, or a dict of them.
+
+        Raises:
+            ValueError: There is not exactly one environment.
+        """
+        rows = next(iter(observations.values())) if isinstance(observations, dict) else observations
+        if len(rows) != 1:
+            raise ValueError(f"a pilot drives one environment, not {len(rows)}")
+        return np.array([self.choose()], dtype=np.int64)
+
+    @abstractmethod
+    def choose(self) -> int:
+        """Choose the action for the current state."""

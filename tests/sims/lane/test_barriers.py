@@ -14,7 +14,7 @@ from mcaprl.sims.geometry.paths import point_at
 from mcaprl.sims.lane.camera import lane_mesh
 from mcaprl.sims.lane.course import BARRIER_HEIGHT_M, COURSE, SECOND_SQUARE_M, barriers
 from mcaprl.sims.lane.env import LaneKeepingEnv
-from mcaprl.sims.lane.obstacles import ray_length, world_at
+from mcaprl.sims.lane.rays import ray_length, world_at
 from mcaprl.sims.lane.rules import Car, located
 
 NORTH, SOUTH = math.pi / 2, -math.pi / 2

@@ -8,8 +8,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from mcaprl.sims.geometry.paths import further, point_of, project, spot_at
-from mcaprl.sims.lane.course import COURSE
-from mcaprl.sims.lane.path import (
+from mcaprl.sims.lane.course import (
+    COURSE,
     LONGEST_LOOK_M,
     Leg,
     course_point_ahead,

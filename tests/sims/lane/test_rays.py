@@ -13,8 +13,14 @@ from mcaprl.sims import make_sim
 from mcaprl.sims.geometry.bicycle import moving
 from mcaprl.sims.lane.course import buildings, rails
 from mcaprl.sims.lane.env import LaneKeepingEnv
-from mcaprl.sims.lane.obstacles import BODY_LENGTH_M, BODY_WIDTH_M, ray_length, touches
-from mcaprl.sims.lane.rays import RAYS_DEG, observe_rays
+from mcaprl.sims.lane.rays import (
+    BODY_LENGTH_M,
+    BODY_WIDTH_M,
+    RAYS_DEG,
+    observe_rays,
+    ray_length,
+    touches,
+)
 from mcaprl.sims.lane.rules import Car, located
 
 BOXES = (*rails(), *buildings())

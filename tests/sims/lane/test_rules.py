@@ -13,6 +13,7 @@ from mcaprl.sims.geometry.bicycle import moving
 from mcaprl.sims.geometry.paths import project
 from mcaprl.sims.lane.block import step_cars
 from mcaprl.sims.lane.course import COURSE
+from mcaprl.sims.lane.fleet import start_at_random
 from mcaprl.sims.lane.rules import (
     BRAKE,
     DRIVING,
@@ -30,7 +31,6 @@ from mcaprl.sims.lane.rules import (
     reward_of,
     wheel_angle,
 )
-from mcaprl.sims.lane.start import start_at_random
 
 STRAIGHT, RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT = 1, 2, 3, 4, 5
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 import mcaprl.sims
 from mcaprl.sims.drawing.scene import Color
 from mcaprl.sims.racer.env import RacerEnv
-from mcaprl.sims.racer.scene import ASPHALT, GRASS, NEXT_GATE, PAINT
-from mcaprl.sims.racer.view import INK, KEY_PX, PANEL_PX, PRESSED
+from mcaprl.sims.racer.scene import ASPHALT, GRASS, INK, KEY_PX, NEXT_GATE, PAINT, PANEL_PX, PRESSED
 from tests.support.sim_shapes import rotated
 
 ENV_ID = mcaprl.sims.SIMS["racer"]
