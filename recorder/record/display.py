@@ -25,22 +25,23 @@ from mcaprl.recorder.format.log_writer import LogTopics
 from mcaprl.recorder.format.schema import telemetry_message, telemetry_schema
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.layout import RETURN_SO_FAR
-from mcaprl.recorder.record.motion import Moment, motion_transforms
 from mcaprl.recorder.record.scene import (
     DepthSource,
     Frame,
+    Moment,
     MotionSource,
     PinholeSource,
     SceneSource,
     Shape,
     TelemetrySource,
+    Tracks,
     camera_info,
     depth_millimeters,
     marker_array,
+    motion_transforms,
     transforms,
 )
 from mcaprl.recorder.record.step_rows import ImageColumn
-from mcaprl.recorder.record.tracks import Tracks
 
 SCENE, SCENE_STATIC, TRACKS = "/scene", "/scene/static", "/scene/tracks"
 TF, TF_STATIC, TELEMETRY = "/tf", "/tf_static", "/telemetry"

@@ -3,15 +3,20 @@
 A simulator provides a scene by implementing one or more of the protocols below on its unwrapped
 environment. Shapes and frames are any objects with the attributes of `Shape` and `Frame`, so a
 simulator does not need to import this module. Axes follow REP 103: right-handed, z up, meters.
+
+A message of `/tf` at the log_time of a step contains the poses of the frames until the end of the
+step, each with its own stamp: a viewer interpolates between two poses, so it needs the pose after
+the current time, too. `/scene/tracks` shows the tracks of a vehicle in the episodes so far.
 """
 
 from __future__ import annotations
 
 import math
 import struct
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -310,3 +315,155 @@ def _header_to_action(frame: str, name: str, kind: int, action: int) -> bytes:
 def _rounded(numbers: Iterable[float], per_one: int) -> list[float]:
     """Round numbers to multiples of 1 / `per_one`."""
     return [round(number * per_one) / per_one for number in numbers]
+
+
+Moment = tuple[int, Sequence[Frame]]
+"""log_time in nanoseconds, and the moving coordinate frames at that time."""
+
+_TOLERANCE_M = 0.04
+_TOLERANCE_ROTATION = 0.01
+"""Maximum error of a quaternion component. For small angles, it is a rotation of 0.02 rad."""
+
+
+def motion_transforms(moments: Sequence[Moment], *, thins: bool = True) -> bytes:
+    """Encode the moments of a step as one `tf2_msgs/msg/TFMessage`, in order of time.
+
+    Args:
+        moments: Moments in order of time; all contain the same frames.
+        thins: Whether to omit an intermediate pose if linear interpolation between the remaining
+            poses differs from it by at most 0.04 m and 0.02 rad.
+    """
+    times = np.array([time_ns for time_ns, _ in moments], np.float64) - moments[0][0]
+    kept = []
+    for number in range(len(moments[0][1])):
+        frames = [each[number] for _, each in moments]
+        every = range(len(moments))
+        for k in knots(times, _scaled(frames)) if thins and len(moments) > 1 else every:
+            kept.append((moments[k][0], number, frames[k]))
+    kept.sort(key=lambda each: each[:2])
+    return timed_transforms([(time_ns, frame) for time_ns, _, frame in kept])
+
+
+def knots(times: NDArray[np.float64], values: NDArray[np.float64]) -> list[int]:
+    """Select rows from which linear interpolation reproduces the others with errors up to 1.
+
+    Args:
+        times: (N,) increasing times; N is at least 2.
+        values: (N, K) numbers.
+
+    Returns:
+        Increasing indices of the selected rows; the first is 0 and the last N - 1.
+
+    >>> times = np.arange(5.0)
+    >>> knots(times, times[:, None] * 7), knots(times, np.array([[0.0], [0], [0], [4], [8]]))
+    ([0, 4], [0, 2, 4])
+    """
+    if len(times) == 2:
+        return [0, 1]
+    share = ((times - times[0]) / (times[-1] - times[0]))[:, None]
+    missed = np.abs(values - values[0] - share * (values[-1] - values[0])).max(axis=1)
+    worst = int(missed.argmax())
+    if missed[worst] <= 1.0:
+        return [0, len(times) - 1]
+    after = knots(times[worst:], values[worst:])
+    return knots(times[: worst + 1], values[: worst + 1]) + [worst + k for k in after[1:]]
+
+
+def _scaled(frames: Sequence[Frame]) -> NDArray[np.float64]:
+    """Return (N, 7) positions and quaternions in units of their tolerances."""
+    positions = np.array([frame.position for frame in frames]) / _TOLERANCE_M
+    rotations = np.array([frame.rotation for frame in frames])
+    # A quaternion and its negative are the same rotation.
+    rotations *= np.where(rotations @ rotations[0] < 0.0, -1.0, 1.0)[:, None]
+    return np.column_stack([positions, rotations / _TOLERANCE_ROTATION])
+
+
+_MAX_TRACKS = 32
+_MAX_POINTS = 64
+_RAISED_M = 0.2
+_MIN_WIDTH_M = 0.05
+# A track is 1/250 of the world's size wide, so that it is visible in a view of the whole world. A
+# mark is five times as wide as a track.
+_WIDTHS_PER_WORLD, _WIDTHS_PER_MARK = 250, 5
+_LOW_RETURN, _HIGH_RETURN = np.array([0.30, 0.25, 0.80]), np.array([0.98, 0.85, 0.25])
+_FAILED: Quad = (0.90, 0.10, 0.10, 1.0)
+
+
+class TrackShape(NamedTuple):
+    """A track, or a mark at the end of a failed track. For the attributes, see `scene.Shape`."""
+
+    name: str
+    kind: str
+    color: Quad
+    points: NDArray[np.float64]
+    size: Vector
+    position: Vector = (0.0, 0.0, 0.0)
+    yaw_rad: float = 0.0
+    frame: str = "map"
+    text: str = ""
+
+
+class _Track(NamedTuple):
+    episode: int
+    points_m: NDArray[np.float64]
+    total_reward: float
+    failed: bool
+
+
+class Tracks:
+    """Tracks of the last 32 episodes, colored by return from blue (lowest) to yellow (highest)."""
+
+    def __init__(self) -> None:
+        """Start without tracks."""
+        self._tracks: deque[_Track] = deque(maxlen=_MAX_TRACKS)
+        self._points_m: list[Vector] = []
+
+    def begin(self) -> None:
+        """Begin an episode."""
+        self._points_m = []
+
+    def add(self, position_m: Vector) -> None:
+        """Add a position (x, y, z) of the vehicle in the map, meters."""
+        self._points_m.append(position_m)
+
+    def end(self, episode: int, total_reward: float, *, failed: bool) -> None:
+        """Keep the episode's track, reduced to at most 64 evenly spaced positions."""
+        points_m = np.array(self._points_m, np.float64).reshape(-1, 3)
+        if len(points_m) < 2:
+            return
+        kept = np.linspace(0, len(points_m) - 1, min(len(points_m), _MAX_POINTS)).round()
+        raised = points_m[kept.astype(int)] + [0.0, 0.0, _RAISED_M]
+        self._tracks.append(_Track(episode, raised, total_reward, failed))
+
+    def shapes(self) -> list[TrackShape]:
+        """Return a line for each track, and a red sphere at the end of each failed one."""
+        if not self._tracks:
+            return []
+        width_m = self._width_m()
+        shapes = [
+            TrackShape(f"track_{track.episode}", "line", color, track.points_m, (width_m, 0.0, 0.0))
+            for track, color in zip(self._tracks, self._colors(), strict=True)
+        ]
+        mark_m = _WIDTHS_PER_MARK * width_m
+        for track in self._tracks:
+            if track.failed:
+                x_m, y_m, z_m = track.points_m[-1].tolist()
+                size, nothing = (mark_m, mark_m, mark_m), np.empty((0, 3))
+                name, at = f"failed_{track.episode}", (x_m, y_m, z_m)
+                shapes.append(TrackShape(name, "sphere", _FAILED, nothing, size, at))
+        return shapes
+
+    def _width_m(self) -> float:
+        points_m = np.concatenate([track.points_m for track in self._tracks])
+        world_m = float(np.ptp(points_m, axis=0).max())
+        return max(_MIN_WIDTH_M, world_m / _WIDTHS_PER_WORLD)
+
+    def _colors(self) -> list[Quad]:
+        # Infinite returns and NaN have no color, so finite numbers replace them.
+        returns = np.nan_to_num([track.total_reward for track in self._tracks])
+        low, high = returns.min(), returns.max()
+        shares = np.ones(len(returns))
+        if high > low:
+            shares = returns / (high - low) - low / (high - low)
+        colors = _LOW_RETURN + shares[:, None] * (_HIGH_RETURN - _LOW_RETURN)
+        return [(red, green, blue, 1.0) for red, green, blue in colors.tolist()]

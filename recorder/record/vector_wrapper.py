@@ -35,12 +35,10 @@ from mcaprl.recorder.record.array_types import (
     one_each,
 )
 from mcaprl.recorder.record.display import Display
-from mcaprl.recorder.record.env_types import autoreset_mode, check_vector
 from mcaprl.recorder.record.infos import EpisodeInfos, final_info, info_of, info_reason
-from mcaprl.recorder.record.recorded_space import recorded_space
-from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
+from mcaprl.recorder.record.recorded_space import autoreset_mode, check_vector, recorded_space
+from mcaprl.recorder.record.session import EpisodeLog, FinishesAtExit, OpenEpisode, reason_of
 from mcaprl.recorder.record.step_rows import converter, converters
-from mcaprl.recorder.record.unclosed import FinishesAtExit
 from mcaprl.recorder.record.vector_rows import OpenRows, OpenSteps
 
 if TYPE_CHECKING:

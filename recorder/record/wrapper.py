@@ -24,17 +24,15 @@ from mcaprl.recorder.format.probability import SMALLEST, check_probability
 from mcaprl.recorder.format.spaces import action_leaf
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
-from mcaprl.recorder.record.env_types import check_single
 from mcaprl.recorder.record.infos import EpisodeInfos
-from mcaprl.recorder.record.recorded_space import recorded_space
-from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
+from mcaprl.recorder.record.recorded_space import check_single, recorded_space
+from mcaprl.recorder.record.session import EpisodeLog, FinishesAtExit, OpenEpisode, reason_of
 from mcaprl.recorder.record.step_rows import (
     ImageColumn,
     StepColumns,
     observation_store,
     reward_number,
 )
-from mcaprl.recorder.record.unclosed import FinishesAtExit
 
 _UNKNOWN = math.nan
 

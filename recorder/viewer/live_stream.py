@@ -41,19 +41,20 @@ from mcaprl.recorder.record.display import (
     ShownTopics,
 )
 from mcaprl.recorder.record.layout import TRAINING_TOPIC, VALUES_TOPIC, layout_of
-from mcaprl.recorder.record.motion import Moment, motion_transforms
 from mcaprl.recorder.record.scene import (
     DepthSource,
     Frame,
+    Moment,
     MotionSource,
     SceneSource,
     TelemetrySource,
+    Tracks,
     depth_millimeters,
     marker_array,
+    motion_transforms,
     transforms,
 )
 from mcaprl.recorder.record.step_rows import as_declared
-from mcaprl.recorder.record.tracks import Tracks
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT, ViewerServer
 from mcaprl.recorder.viewer.live_sink import LiveSink
 

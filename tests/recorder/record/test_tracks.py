@@ -15,7 +15,7 @@ import pytest
 import mcaprl
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.format import messages
-from mcaprl.recorder.record.tracks import Tracks
+from mcaprl.recorder.record.scene import Tracks
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.scene import Shape
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import mcaprl
-from mcaprl.recorder.record.unclosed import FinishesAtExit
+from mcaprl.recorder.record.session import FinishesAtExit
 from mcaprl.recorder.repair.check import check_log
 
 SINGLE = """

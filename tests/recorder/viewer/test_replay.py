@@ -19,7 +19,6 @@ from mcaprl.recorder.columns.topic import Topic
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.record.layout import layout_of
-from mcaprl.recorder.record.motion import motion_transforms
 from mcaprl.recorder.record.scene import (
     MARKER_TYPES,
     DepthSource,
@@ -27,6 +26,7 @@ from mcaprl.recorder.record.scene import (
     TelemetrySource,
     depth_millimeters,
     marker_array,
+    motion_transforms,
 )
 from mcaprl.recorder.viewer.scene_reader import moments_of_episode
 from mcaprl.sims import SIMS, make_sim
