@@ -6,9 +6,10 @@ Extra: `report`.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from mcaprl.errors import ReportError, import_extra
 from mcaprl.files import replacing
@@ -72,6 +73,44 @@ def save_png(figure: Any, path: Path) -> None:
     _make_literal(figure)
     with replacing(path, ReportError) as unfinished, matplotlib.rc_context(_LITERAL):
         figure.savefig(unfinished, format="png", bbox_inches="tight", facecolor="white")
+
+
+class Panel(NamedTuple):
+    """Part of a report: a figure of its page, and one of several axes of an image."""
+
+    caption: str
+    draw: Callable[[Any], None]
+    """Function that draws on axes."""
+    size: tuple[float, float] = (4.4, 2.6)
+    """Width and height of the figure, inches."""
+
+    def figure(self) -> Any:
+        """Draw the panel alone, without its caption."""
+        figure, axes = new_figure(self.size)
+        self.draw(axes)
+        return figure
+
+
+def save_panels(path: Path, panels: Sequence[Panel], title: str = "") -> None:
+    """Write panels as one PNG with three columns.
+
+    Raises:
+        ReportError: The file cannot be written.
+    """
+    columns = min(3, len(panels))
+    rows = -(-len(panels) // columns)
+    width, height = map(max, zip(*(panel.size for panel in panels), strict=True))
+    figure, grid = new_figure((columns * width, rows * height), rows, columns, grid=True)
+    for axes, panel in zip_longest(grid.flat, panels):
+        if panel is None:
+            axes.set_axis_off()
+        else:
+            panel.draw(axes)
+            caption = panel.caption.replace(": ", "\n", 1)
+            axes.set_title(caption, loc="left", fontsize=10)
+    if title:
+        figure.suptitle(title, x=0.02, ha="left", color=INK)
+    save_png(figure, path)
 
 
 def to_svg(figure: Any) -> str:

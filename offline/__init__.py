@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from mcaprl.offline.estimate.importance import ESTIMATORS, EpisodeTable
     from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
     from mcaprl.offline.policy import Scores
-    from mcaprl.offline.selection.portfolio import DETERMINISTIC
+    from mcaprl.offline.selection.choice import DETERMINISTIC
     from mcaprl.offline.training.train import train
 
 for _package in ("torch", "safetensors", "tensorboard"):
@@ -79,7 +79,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.offline.batches.buffer": ("TransitionBuffer",),
         "mcaprl.offline.estimate.evidence": ("EvidenceCollector", "fqe_config"),
         "mcaprl.offline.estimate.fqe": ("FQEConfig",),
-        "mcaprl.offline.selection.portfolio": ("DETERMINISTIC",),
+        "mcaprl.offline.selection.choice": ("DETERMINISTIC",),
         "mcaprl.offline.estimate.importance": ("ESTIMATORS", "EpisodeTable"),
         "mcaprl.offline.estimate.off_policy": ("OffPolicyEvaluator",),
         "mcaprl.offline.policy": ("Scores",),

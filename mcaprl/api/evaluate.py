@@ -296,10 +296,11 @@ def learning_curves(names: Sequence[str]) -> list[Figure]:
     for folder in folders:
         if folder in online:
             continue
-        from mcaprl.offline.training.curves import curve_figures
+        from mcaprl.offline.training.curves import curve_panels
 
         figures += [
-            Figure.of(f"{folder.name}: {term}", drawn) for term, drawn in curve_figures(folder)
+            Figure.of(f"{folder.name}: {panel.caption}", panel.figure())
+            for panel in curve_panels(folder)
         ]
     return figures
 

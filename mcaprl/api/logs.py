@@ -167,11 +167,10 @@ def info(
     are_logs = mapping is None and all(path.suffix == ".mcap" for path in paths)
     found = _describe(contents, paths, [*warned, *map(str, noted)], are_logs=are_logs)
     if report is not None:
-        from mcaprl.recorder.viewer.report import dataset_figure, dataset_page
+        from mcaprl.recorder.viewer.report import dataset_page
 
         folder = Path(report)
         write_json(folder / "dataset.json", found.to_json(), ReportError)
-        dataset_figure(folder / "dataset.png", contents, found.title)
         dataset_page(folder / PAGE_NAME, contents, found.title, found.rows(), found.findings)
     return found
 

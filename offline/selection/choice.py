@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from mcaprl.errors import TrainingError
 from mcaprl.files import parse_json, read_file, write_json
 from mcaprl.offline.estimate.off_policy import LEAST_SAMPLE_SIZE
-from mcaprl.offline.selection.portfolio import LogTraits
-from mcaprl.offline.selection.rule import Rating
 from mcaprl.page import Section, Table, write_page
 from mcaprl.texts import counted
 
@@ -36,9 +34,67 @@ EXPLANATION: Final = (
 )
 STOPPED_EARLY: Final = "stopped early"
 """Outcome of a candidate that was not trained with all updates, or cannot be chosen."""
+DETERMINISTIC: Final = 0.05
+"""If the entropy of the behavior policy is lower, candidates are rated by agreement with it."""
 _FEW_EPISODES: Final = 50
 _LOW_COVERAGE: Final = 0.5
-_NO_VALUE: Final = "-"
+
+
+@dataclass(frozen=True)
+class LogTraits:
+    """Properties of a log that determine which algorithms may work.
+
+    Attributes:
+        episodes: Number of episodes.
+        transitions: Number of transitions.
+        mean_return: Mean undiscounted return of the episodes.
+        return_spread: Standard deviation of these returns.
+        terminated: Fraction of the episodes that end in a terminal state.
+        entropy: Mean entropy of the behavior policy, from 0 (deterministic) to 1 (uniform). If all
+            logged probabilities are valid, it is computed from them, otherwise from the clone.
+        coverage: Mean fraction of the actions that are likely under the behavior policy.
+        probabilities: Whether the log has the probabilities of its actions.
+        problems: Problems that the lint found.
+    """
+
+    episodes: int
+    transitions: int
+    mean_return: float
+    return_spread: float
+    terminated: float
+    entropy: float
+    coverage: float
+    probabilities: bool
+    problems: tuple[str, ...]
+
+    @property
+    def is_deterministic(self) -> bool:
+        """Whether the behavior is almost deterministic."""
+        return self.entropy < DETERMINISTIC
+
+
+@dataclass(frozen=True)
+class Rating:
+    """Estimates of one candidate.
+
+    Attributes:
+        value: Mean estimated discounted return of the episodes.
+        interval: 95 % interval of that mean, by resampling.
+        agreement: Mean over episodes of the fraction of states with the logged action.
+        score: `value`, or `agreement` if the behavior is almost deterministic.
+        best_chance: Fraction of the resamplings in which no other candidate has a larger score.
+    """
+
+    value: float
+    interval: tuple[float, float]
+    agreement: float
+    score: float
+    best_chance: float
+
+    def __str__(self) -> str:
+        """Return the value with its interval."""
+        low, high = self.interval
+        return f"{self.value:.4g} ({low:.4g} to {high:.4g})"
 
 
 @dataclass(frozen=True)
@@ -63,22 +119,30 @@ class Tried:
     weighted: tuple[float, float] | None = None
     outcome: str = ""
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the attributes as plain JSON types."""
-        rating = self.rating.to_json() if self.rating else None
-        return {
-            **vars(self),
-            "rating": rating,
-            "weighted": self.weighted and list(self.weighted),
-        }
-
     @classmethod
     def from_json(cls, found: dict[str, Any]) -> Tried:
-        """Return the candidate that `to_json` returned."""
-        rating, weighted = found["rating"], found["weighted"]
-        if rating is not None:
-            rating = Rating(**{**rating, "interval": tuple(rating["interval"])})
-        return cls(**{**found, "rating": rating, "weighted": weighted and tuple(weighted)})
+        """Return the candidate of a file."""
+        rating = found["rating"]
+        return cls(**_tuples({**found, "rating": rating and Rating(**_tuples(rating))}))
+
+    def row(self, name: str) -> tuple[str, ...]:
+        """Return the row of the table of candidates."""
+        rating, weighted = self.rating, "-"
+        # Candidates that were stopped early do not take part in the last evaluation.
+        rated = rating is not None and self.outcome != STOPPED_EARLY
+        if self.weighted is not None:
+            value, size = self.weighted
+            weighted = f"{value:.4g}" if size >= LEAST_SAMPLE_SIZE else f"refused ({size:.1f})"
+        return (
+            name,
+            str(self.updates),
+            str(rating or "-"),
+            f"{rating.best_chance:.0%}" if rating and rated else "-",
+            f"{rating.agreement:.0%}" if rating else "-",
+            "-" if self.bellman_error is None else f"{self.bellman_error:.2f}",
+            weighted,
+            self.outcome,
+        )
 
 
 @dataclass(frozen=True)
@@ -103,27 +167,23 @@ class Choice:
     traits: LogTraits
     tried: dict[str, Tried]
 
+    @classmethod
+    def of(
+        cls, chosen: str, evaluated: int, traits: LogTraits, tried: dict[str, Tried], complete: bool
+    ) -> Choice:
+        """Put a choice among this number of evaluated candidates into words."""
+        reason, confidence = _words(chosen, tried[chosen].rating, evaluated, traits)
+        advice = _advice(traits, tried, complete)
+        return cls(chosen, reason, confidence, advice, complete, traits, tried)
+
     @property
     def rows(self) -> list[tuple[str, ...]]:
         """Rows of the table of candidates, with the columns `COLUMNS`."""
-        return [_row(name, one) for name, one in self.tried.items()]
+        return [one.row(name) for name, one in self.tried.items()]
 
     def write(self, run: Path) -> None:
-        """Write `choice.json` of a run.
-
-        Raises:
-            TrainingError: The file cannot be written.
-        """
-        found = {
-            "chosen": self.chosen,
-            "reason": self.reason,
-            "confidence": self.confidence,
-            "advice": list(self.advice),
-            "complete": self.complete,
-            "traits": self.traits.to_json(),
-            "tried": {name: one.to_json() for name, one in self.tried.items()},
-        }
-        write_json(run / CHOICE_NAME, found, TrainingError)
+        """Write `choice.json` of a run; raise TrainingError if it cannot be written."""
+        write_json(run / CHOICE_NAME, asdict(self), TrainingError)
 
     def write_report(self, folder: Path, title: str) -> Path:
         """Write the choice as an HTML page; return its path.
@@ -132,7 +192,7 @@ class Choice:
             MissingExtraError: Jinja2 is not installed.
             ReportError: The page cannot be written.
         """
-        log = [(name.replace("_", " "), _shown(value)) for name, value in _shown_traits(self)]
+        log = [(name.replace("_", " "), _shown(one)) for name, one in asdict(self.traits).items()]
         sections = [
             Section("Confidence", self.confidence),
             Section("Candidates", EXPLANATION, table=Table(COLUMNS, self.rows)),
@@ -153,101 +213,61 @@ def read_choice(run: Path) -> Choice:
     path = run / CHOICE_NAME
     try:
         found = parse_json(read_file(path))
-        traits = LogTraits(**{**found["traits"], "problems": tuple(found["traits"]["problems"])})
+        traits = LogTraits(**_tuples(found["traits"]))
         tried = {name: Tried.from_json(one) for name, one in found["tried"].items()}
-        return Choice(
-            found["chosen"],
-            found["reason"],
-            found["confidence"],
-            tuple(found["advice"]),
-            found["complete"],
-            traits,
-            tried,
-        )
+        return Choice(**_tuples({**found, "traits": traits, "tried": tried}))
     except FileNotFoundError as error:
         raise TrainingError(f"{run} has no {CHOICE_NAME}: is it a run of --algo auto?") from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise TrainingError(f"{path} cannot be read: {error}") from error
 
 
-def reason_of(chosen: str, ratings: Mapping[str, Rating], traits: LogTraits) -> str:
-    """Return why the rule chose a candidate, in words."""
-    if chosen not in ratings:
-        return f"{chosen} is used because the budget ended before any candidate was evaluated."
-    mine, count = ratings[chosen], counted(len(ratings), "candidate")
+def _tuples(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Return attributes from JSON, which has lists for tuples."""
+    return {name: tuple(one) if isinstance(one, list) else one for name, one in found.items()}
+
+
+def _words(
+    chosen: str, rating: Rating | None, evaluated: int, traits: LogTraits
+) -> tuple[str, str]:
+    """Return why the rule chose a candidate, and the confidence in the choice."""
+    if rating is None:
+        reason = f"{chosen} is used because the budget ended before any candidate was evaluated."
+        return reason, "Unknown, because no candidate was evaluated."
+    count = counted(evaluated, "candidate")
+    reason = f"{chosen} has the largest estimated value of {count}: {rating}."
     if traits.is_deterministic:
-        return (
-            f"{chosen} takes the logged action in {mine.agreement:.0%} of the states, most often of"
-            f" {count}. The behavior is almost deterministic (entropy {traits.entropy:.2f} of 1),"
-            " so the log has no evidence that other actions are better."
+        reason = (
+            f"{chosen} takes the logged action in {rating.agreement:.0%} of the states, most often"
+            f" of {count}. The behavior is almost deterministic (entropy {traits.entropy:.2f} of"
+            " 1), so the log has no evidence that other actions are better."
         )
-    return f"{chosen} has the largest estimated value of {count}: {_with_interval(mine)}."
-
-
-def confidence_of(chosen: str, ratings: Mapping[str, Rating]) -> str:
-    """Return the confidence in a choice, in words."""
-    if chosen not in ratings:
-        return "Unknown, because no candidate was evaluated."
-    chance = ratings[chosen].best_chance
-    return (
-        f"In {chance:.0%} of the resamplings of episodes, networks and models, {chosen}"
-        f" is the best of {counted(len(ratings), 'candidate')}. This does not include the bias"
-        " of the models, which a log does not show."
+    return reason, (
+        f"In {rating.best_chance:.0%} of the resamplings of episodes, networks and models, {chosen}"
+        f" is the best of {count}. This does not include the bias of the models, which a log does"
+        " not show."
     )
 
 
-def advice_for(traits: LogTraits, tried: Mapping[str, Tried], complete: bool) -> tuple[str, ...]:
+def _advice(traits: LogTraits, tried: Mapping[str, Tried], complete: bool) -> tuple[str, ...]:
     """Return what data, or which budget, would raise the confidence in the choice."""
-    advice = []
-    if not complete:
-        advice.append("Resume with a larger --budget-minutes: the budget ended early.")
-    if traits.episodes < _FEW_EPISODES:
-        advice.append(f"Record more episodes: {traits.episodes} are few for an interval.")
-    if traits.coverage < _LOW_COVERAGE:
-        advice.append(
-            f"Record episodes with 10 to 30 % random actions: only {traits.coverage:.0%} of the"
-            " actions are likely in the log, and candidates that take others cannot be evaluated."
-        )
-    if not traits.probabilities:
-        advice.append("Record behavior_prob, so that weighted estimates can be compared.")
-    if traits.problems:
-        advice.append(f"Correct what `mcaprl info` reports: {'; '.join(traits.problems)}.")
     names = [name for name, one in tried.items() if one.outcome in ("chosen", "runner-up")]
-    if len(names) > 1:
-        advice.append(f"Run {names[0]} and {names[1]} in a sim or on the robot, and compare them.")
-    return tuple(advice)
-
-
-def _row(name: str, one: Tried) -> tuple[str, ...]:
-    rating = one.rating
-    # Candidates that were stopped early do not take part in the last evaluation.
-    chance = rating.best_chance if rating and one.outcome != STOPPED_EARLY else None
-    return (
-        name,
-        str(one.updates),
-        _with_interval(rating) if rating else _NO_VALUE,
-        _NO_VALUE if chance is None else f"{chance:.0%}",
-        f"{rating.agreement:.0%}" if rating else _NO_VALUE,
-        _NO_VALUE if one.bellman_error is None else f"{one.bellman_error:.2f}",
-        _weighted(one.weighted),
-        one.outcome,
-    )
-
-
-def _with_interval(rating: Rating) -> str:
-    low, high = rating.interval
-    return f"{rating.value:.4g} ({low:.4g} to {high:.4g})"
-
-
-def _weighted(found: tuple[float, float] | None) -> str:
-    if found is None:
-        return _NO_VALUE
-    value, size = found
-    return f"{value:.4g}" if size >= LEAST_SAMPLE_SIZE else f"refused ({size:.1f})"
-
-
-def _shown_traits(choice: Choice) -> list[tuple[str, Any]]:
-    return list(choice.traits.to_json().items())
+    advice = {
+        "Resume with a larger --budget-minutes: the budget ended early.": not complete,
+        f"Record more episodes: {traits.episodes} are few for an interval.": (
+            traits.episodes < _FEW_EPISODES
+        ),
+        f"Record episodes with 10 to 30 % random actions: only {traits.coverage:.0%} of the"
+        " actions are likely in the log, and candidates that take others cannot be evaluated.": (
+            traits.coverage < _LOW_COVERAGE
+        ),
+        "Record behavior_prob, so that weighted estimates can be compared.": (
+            not traits.probabilities
+        ),
+        f"Correct what `mcaprl info` reports: {'; '.join(traits.problems)}.": bool(traits.problems),
+        f"Run {' and '.join(names)} in a sim or on the robot, and compare them.": len(names) > 1,
+    }
+    return tuple(text for text, applies in advice.items() if applies)
 
 
 def _shown(value: Any) -> str:
@@ -256,6 +276,6 @@ def _shown(value: Any) -> str:
             return "yes" if value else "no"
         case float():
             return f"{value:.3g}"
-        case list():
+        case tuple():
             return "; ".join(value) or "none"
     return str(value)

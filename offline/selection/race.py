@@ -7,9 +7,16 @@
     RUN/choice.json       what was chosen, and why
     RUN/seed-K            policy of the chosen candidate
 
-All candidates are trained with a fraction of the updates (the short training). The best of the
-finalists, by `rule`, are trained with the rest, and one of them is chosen. After the first
-candidate's short training, RUN/seed-K always has a policy, also if the run is interrupted.
+All candidates are trained with a fraction of the updates (the short training) and rated. The best
+of the finalists are trained with the rest and rated again, and the one with the largest score is
+chosen. After the first candidate's short training, RUN/seed-K always has a policy, also if the run
+is interrupted.
+
+The score of a candidate is the mean of its estimated values of the first states of the episodes:
+pessimistic FQE by models that were trained on other episodes (`mcaprl.offline.estimate.evidence`).
+The mean is over the episodes, the networks of the candidate, and the models. If the behavior policy
+is almost deterministic, the log has no evidence on other actions. In this case, the score is the
+fraction of the states in which the candidate takes the logged action.
 """
 
 from __future__ import annotations
@@ -18,49 +25,38 @@ import math
 import shutil
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import TrainingError, UsageError
+from mcaprl.errors import TrainingError, UnknownNameError, UsageError
 from mcaprl.files import parse_json, read_file, replacing_folder, subfolder, write_json
 from mcaprl.offline.algorithms.config import TrainingConfig
+from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.estimate.evidence import (
     FOLDS,
+    Clone,
     Evidence,
     EvidenceCollector,
     fqe_config,
+    likely,
     weighted_value,
 )
+from mcaprl.offline.estimate.values import by_rows
 from mcaprl.offline.policy import Policy, read_policy
-from mcaprl.offline.selection.choice import (
-    STOPPED_EARLY,
-    Choice,
-    Tried,
-    advice_for,
-    confidence_of,
-    reason_of,
-)
-from mcaprl.offline.selection.config import AUTO, AutoConfig
-from mcaprl.offline.selection.portfolio import (
-    Candidate,
-    LogTraits,
-    check_finalists,
-    eligible,
-    skipped_candidates,
-    traits_of,
-    tried,
-)
-from mcaprl.offline.selection.rule import Rating, ranked, rate
+from mcaprl.offline.selection.choice import STOPPED_EARLY, Choice, LogTraits, Rating, Tried
+from mcaprl.offline.selection.config import ALL, AUTO, AutoConfig
 from mcaprl.offline.training.metrics import OfflineSummary
 from mcaprl.offline.training.train import fingerprint, train, with_source
 from mcaprl.offline.training.watch import SHORT_HORIZON, horizon_warning
 from mcaprl.progress import ProgressCallback, TrainingProgress
+from mcaprl.recorder.dataset.lint import lint
+from mcaprl.recorder.format.probability import is_impossible
 from mcaprl.runs import (
     METRICS_NAME,
     POLICY_NAME,
@@ -75,52 +71,106 @@ from mcaprl.runs import (
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
+Floats = NDArray[np.float64]
 STAGES_NAME: Final = "stages.json"
+RESAMPLES: Final = 1_000
+LEAST_COVERAGE: Final = 0.5
+"""Fraction of the actions that must be likely in the log before Double DQN is tried."""
 ENSEMBLE: Final = 2
-"""Number of models that evaluate a policy.
-
-Each has its own halves of the log and its own weights.
-"""
+"""Number of models that evaluate a policy, each with its own halves of the log and weights."""
 SHARES: Final = (0.35, 0.5, 0.8, 0.95)
-"""Fractions of the budget after which the four phases end.
-
-The phases are the short training, its evaluation, the full training and its evaluation.
-"""
+"""Fractions of the budget after which the short training, its rating, the full training end."""
 CLONE_UPDATES: Final = 2_000
 """Maximum number of updates of the clone of the behavior policy."""
+_IQL_INTERVAL: Final = 50
+_OWN: Final = ("finalists", "survivors", "short_fraction", "model_updates")
 _NO_TIME: Final = "the budget ended before {} had a checkpoint: give more minutes"
 _PROBE_UPDATES: Final = 10
 _LEAST_MODEL_UPDATES: Final = 100
-_SHORT_MODEL_FRACTION: Final = 0.5
-
-
-class _Pause(Exception):
-    """Exception that a progress callback raises to stop a training."""
 
 
 @dataclass(frozen=True)
-class Stage:
-    """Evaluations of candidates after the same number of updates.
+class Candidate:
+    """Algorithm with settings that differ from the shared ones.
 
     Attributes:
-        tried: Results of each candidate.
+        name: Name in tables and of the folder of its run.
+        algo: Name of the algorithm.
+        special: Settings that differ from the shared ones.
     """
 
-    tried: dict[str, Tried]
+    name: str
+    algo: str
+    special: Mapping[str, Any]
 
-    @property
-    def ratings(self) -> dict[str, Rating]:
-        """Rating of each candidate that has one."""
-        return {name: one.rating for name, one in self.tried.items() if one.rating}
+    def config(self, shared: AutoConfig) -> TrainingConfig:
+        """Return the settings of the algorithm. Its special settings override the shared ones."""
+        _, defaults = choose_algorithm(self.algo)
+        names = {field.name for field in fields(defaults)}.difference(_OWN)
+        given = {
+            each.name: getattr(shared, each.name) for each in fields(shared) if each.name in names
+        }
+        if self.algo == "iql":
+            given["target_interval"] = min(_IQL_INTERVAL, shared.target_interval)
+        given["checkpoint_interval"] = shared.candidate_interval
+        return replace(defaults, **{**given, **self.special})
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the evaluations as plain JSON types."""
-        return {name: one.to_json() for name, one in self.tried.items()}
 
-    @classmethod
-    def from_json(cls, found: dict[str, Any]) -> Stage:
-        """Return the evaluations that `to_json` returned."""
-        return cls({name: Tried.from_json(one) for name, one in found.items()})
+PORTFOLIO: Final = (
+    Candidate("iql", "iql", {"normalize_advantages": True, "beta": 0.3}),
+    Candidate("cql-alpha-0.1", "cql", {"alpha": 0.1}),
+    Candidate("bcq", "bcq", {}),
+    Candidate("cql", "cql", {}),
+    Candidate("bc", "bc", {}),
+    Candidate("cql-scaled", "cql", {"scale_rewards": True}),
+    Candidate("double-dqn", "double-dqn", {}),
+)
+"""All candidates, in the order of their training; the first is used if none can be evaluated."""
+
+
+def eligible(config: AutoConfig, trying: Sequence[Candidate]) -> frozenset[str]:
+    """Return the finalists, or all candidates that are tried if one of the finalists is not."""
+    names = frozenset(one.name for one in trying)
+    finalists = frozenset(config.finalists.split(","))
+    return finalists if finalists <= names else names
+
+
+def rate(
+    values: Mapping[str, Floats],
+    agreements: Mapping[str, Floats],
+    *,
+    imitate: bool,
+    seed: int = 0,
+) -> dict[str, Rating]:
+    """Rate candidates by their values or by their agreement with the log, the best first.
+
+    Episodes are resampled, together with the networks and models. The chances include the noise of
+    the log and of the networks, but not the bias of the models, which a log does not show.
+
+    `values` has arrays (M, E) by candidate: the value of the first state of each of E episodes, for
+    each of M pairs of a network and a model. `agreements` has the fractions of the states of each
+    episode in which the candidate takes the logged action. They are the scores with `imitate`.
+    """
+    random = np.random.default_rng(seed)
+    counts = _counts(random, next(iter(values.values())).shape[1])
+    members = {name: _counts(random, len(mine)) for name, mine in values.items()}
+    drawn_values, drawn_agreements = (
+        {name: ((counts @ mine.T) * members[name]).sum(1) for name, mine in each.items()}
+        for each in (values, agreements)
+    )
+    best = np.stack(list((drawn_agreements if imitate else drawn_values).values())).argmax(0)
+    ratings = {}
+    for k, name in enumerate(values):
+        value, agreement = float(values[name].mean()), float(agreements[name].mean())
+        low, high = np.percentile(drawn_values[name], [2.5, 97.5]).tolist()
+        score, chance = agreement if imitate else value, float((best == k).mean())
+        ratings[name] = Rating(value, (low, high), agreement, score, chance)
+    return dict(sorted(ratings.items(), key=lambda each: -each[1].score))
+
+
+def _counts(random: np.random.Generator, size: int) -> Floats:
+    """Return the fraction (B, size) of each element in each of B resamplings."""
+    return random.multinomial(size, np.full(size, 1 / size), RESAMPLES) / size
 
 
 def select(
@@ -130,39 +180,20 @@ def select(
     *,
     seeds: int | None = None,
     seed: int | None = None,
-    weights: NDArray[np.float64] | None = None,
+    weights: Floats | None = None,
     resume: bool = False,
     device: str = "cpu",
     budget_minutes: float | None = None,
     progress: ProgressCallback = lambda now: None,
 ) -> tuple[Choice, list[OfflineSummary]]:
-    """Train all candidates on a dataset, and choose one policy from the log alone.
+    """Train all candidates, choose one from the log alone; return it and a summary per seed.
 
-    Args:
-        dataset: Dataset with discrete actions.
-        config: Settings.
-        out: Folder of the run; it must be empty or not exist.
-        seeds: Number of networks of each candidate; its estimates are averages over them. None
-            selects 1; with `resume`, that of the run.
-        seed: Seed of the first network. None selects 0; with `resume`, that of the run.
-        weights: (E,) relative sampling weight of a transition of each episode; default: all equal.
-        resume: Whether to resume the run in `out`.
-        device: `cpu` or `cuda`.
-        budget_minutes: Wall time after which no update is started; None for no bound.
-        progress: Callback for the progress of all candidates together.
-
-    Returns:
-        The choice, and a summary for each seed of the chosen candidate.
-
-    Raises:
-        OutputExistsError: `out` exists and is not empty.
-        SpaceError: The algorithms do not support these observations or actions.
-        TrainingError: A loss is not finite; `out` cannot be written, or contains a run with other
-            data or settings; or the budget ended before any policy was trained.
-        UnknownNameError: A finalist is not a candidate.
-        UsageError: There are too few episodes, or the run to resume has other seeds.
+    The arguments are those of `mcaprl.offline.train` and `mcaprl.train`.
     """
-    check_finalists(config)
+    known = [one.name for one in PORTFOLIO]
+    for name in config.finalists.split(","):
+        if name not in (*known, ALL):
+            raise UnknownNameError("candidate", name, known)
     dataset = with_source(dataset, config.mask_from)
     if len(dataset.episodes) < FOLDS:
         raise UsageError(f"--algo {AUTO} needs {FOLDS} episodes or more in the log")
@@ -171,48 +202,15 @@ def select(
     parts: dict[str, Any] = {"algo": AUTO, "config": config.to_json()}
     # The estimates of all candidates are averages over the same seeds, so none can be added.
     parts |= {"seeds": len(numbers), "seed": numbers.start, "data": fingerprint(dataset, weights)}
+    identity, size = RunIdentity(parts), len(dataset)
     with locked_run(out, resume):
-        open_run(
-            out,
-            RunIdentity(parts),
-            resume,
-            numbers,
-            env_id=dataset.env_id,
-            transitions=len(dataset),
-        )
-        race = _Race(
-            dataset,
-            config,
-            out,
-            numbers,
-            weights,
-            device,
-            _Clock(budget_minutes),
-            progress,
-        )
-        return race.run()
+        open_run(out, identity, resume, numbers, env_id=dataset.env_id, transitions=size)
+        budget_s = math.inf if budget_minutes is None else 60 * budget_minutes
+        return _Race(dataset, config, out, numbers, weights, device, budget_s, progress).run()
 
 
-class _Clock:
-    """Wall time of a run with a budget."""
-
-    def __init__(self, minutes: float | None) -> None:
-        self._began = time.perf_counter()
-        self._budget_s = math.inf if minutes is None else 60 * minutes
-
-    @property
-    def is_bounded(self) -> bool:
-        """Whether there is a budget."""
-        return self._budget_s < math.inf
-
-    @property
-    def elapsed_s(self) -> float:
-        """Seconds since the start."""
-        return time.perf_counter() - self._began
-
-    def left_s(self, share: float) -> float:
-        """Return the seconds until a fraction of the budget is used; 0 if it has been used."""
-        return max(0.0, share * self._budget_s - self.elapsed_s)
+class _Pause(Exception):
+    """Exception that a callback raises to stop a training or an evaluation."""
 
 
 class _Race:
@@ -224,118 +222,117 @@ class _Race:
         config: AutoConfig,
         out: Path,
         seeds: range,
-        weights: NDArray[np.float64],
+        weights: Floats,
         device: str,
-        clock: _Clock,
+        budget_s: float,
         progress: ProgressCallback,
     ) -> None:
         self._dataset, self._config, self._out = dataset, config, out
         self._seeds, self._weights, self._device = seeds, weights, device
-        self._clock, self._progress = clock, progress
+        self._began, self._budget_s = time.perf_counter(), budget_s
+        self._progress = progress
         self._in_time = True
-        self._eligible: frozenset[str] = frozenset()
+        self._done: dict[tuple[str, int], int] = {}
+        self._total = 0
 
     def run(self) -> tuple[Choice, list[OfflineSummary]]:
         """Run both stages. Return the choice, and a summary for each seed."""
-        clone, traits = self._look()
-        skipped = skipped_candidates(traits)
-        trying = tried(skipped)
+        clone = self._clone()
+        traits = _traits(self._dataset, clone)
+        skipped = _skipped(traits)
+        trying = {one.name: one for one in PORTFOLIO if one.name not in skipped}
+        among = eligible(self._config, list(trying.values()))
+
+        def finalists(names: Iterable[str]) -> list[str]:
+            return [name for name in names if name in among] or list(names)
+
         short, full = self._config.short_updates, self._config.updates
-        self._eligible = eligible(self._config, trying)
-        count = min(len(self._eligible), self._config.survivors)
-        total = len(trying) * short + count * (full - short)
-        bar = _Bar(self._progress, total)
-        self._warn_about_short_horizons(trying)
-        stages = self._read_stages()
-        for k, candidate in enumerate(trying):
-            share_s = self._clock.left_s(SHARES[0]) / (len(trying) - k)
-            self._train(candidate, short, share_s, bar)
-            self._publish(candidate.name, only_first=True)
-        names = [one.name for one in trying if self._updates(one.name)]
+        survivors = min(len(among), self._config.survivors)
+        self._total = len(trying) * short + survivors * (full - short)
+        _warn_about_short_horizons(trying.values(), self._config)
+        self._train(list(trying.values()), short, SHARES[0])
+        names = [name for name in trying if self._updates(name)]
         if not names:
-            raise TrainingError(_NO_TIME.format(trying[0].name))
-        first = stages.get("short") or self._evaluate(
-            "short",
-            names,
-            clone,
-            imitate=traits.is_deterministic,
-            fraction=_SHORT_MODEL_FRACTION,
-            share=SHARES[1],
-        )
-        going = self._finalists(names)
+            raise TrainingError(_NO_TIME.format(next(iter(trying))))
+        imitate = traits.is_deterministic
+        first = self._evaluate("short", names, clone, imitate, 0.5, SHARES[1])
+        going = finalists(names)
         if first:
-            going = self._finalists(ranked(first.ratings))[: self._config.survivors]
+            going = finalists(first)[: self._config.survivors]
             self._publish(going[0])
-        for k, name in enumerate(going):
-            candidate = next(one for one in trying if one.name == name)
-            self._train(candidate, full, self._clock.left_s(SHARES[2]) / (len(going) - k), bar)
-        second = stages.get("full") or self._evaluate(
-            "full",
-            going,
-            clone,
-            imitate=traits.is_deterministic,
-            fraction=1.0,
-            share=SHARES[3],
-        )
-        choice = self._choose(traits, skipped, first, second, names)
+        self._train([trying[name] for name in going], full, SHARES[2])
+        second = self._evaluate("full", going, clone, imitate, 1.0, SHARES[3])
+        last = second or first
+        order = finalists(last or names)
+        tried = {name: Tried(self._updates(name), outcome="not evaluated") for name in names}
+        tried |= {name: replace(one, outcome=STOPPED_EARLY) for name, one in first.items()}
+        tried |= second
+        for name, outcome in zip(order, ("chosen", "runner-up")[: len(last) or 1], strict=False):
+            tried[name] = replace(tried[name], outcome=outcome)
+        late = trying.keys() - tried.keys()
+        tried |= {name: Tried(outcome="no checkpoint within the budget") for name in late}
+        tried |= {name: Tried(outcome=f"not tried: {why}") for name, why in skipped.items()}
+        table = {name: tried[name] for name in dict.fromkeys([*order, *first, *trying, *tried])}
+        choice = Choice.of(order[0], len(last), traits, table, self._in_time)
         self._publish(choice.chosen)
         choice.write(self._out)
-        return choice, self._summaries(choice.chosen)
+        return choice, self._summaries(choice.chosen, trying[choice.chosen].algo)
 
-    def _warn_about_short_horizons(self, candidates: Sequence[Candidate]) -> None:
-        """Warn once about all candidates that have the same short horizon."""
-        found: dict[str, list[str]] = {}
-        for one in candidates:
-            if message := horizon_warning(one.config(self._config)):
-                found.setdefault(message, []).append(one.name)
-        for message, names in found.items():
-            warnings.warn(f"{', '.join(names)}: {message}", stacklevel=2)
+    def _left_s(self, share: float) -> float:
+        """Return the seconds until a fraction of the budget is used; 0 if it has been used."""
+        return max(0.0, self._began + share * self._budget_s - time.perf_counter())
 
-    def _finalists(self, names: Sequence[str]) -> list[str]:
-        """Return the finalists among the candidates; all candidates if none is a finalist."""
-        return [name for name in names if name in self._eligible] or list(names)
+    def _stop_after(self, ends: float) -> None:
+        """Raise `_Pause` if the time is up."""
+        if time.perf_counter() > ends:
+            self._in_time = False
+            raise _Pause
 
-    def _look(self) -> tuple[Policy, LogTraits]:
-        """Clone the behavior policy, and determine the properties of the log."""
-        count = min(self._config.updates, CLONE_UPDATES)
-        shared = replace(self._config, updates=count, held_out=0.0)
-        config = Candidate("clone", "bc", {}).config(shared)
-        ends = time.perf_counter() + self._clock.left_s(SHARES[0] / 2)
-
-        def stop(now: TrainingProgress) -> None:
-            if time.perf_counter() > ends:
-                self._in_time = False
-                raise _Pause
-
+    def _clone(self) -> Policy:
+        """Clone the behavior policy."""
+        updates = min(self._config.updates, CLONE_UPDATES)
+        config = replace(self._config, updates=updates, held_out=0.0)
+        ends = time.perf_counter() + self._left_s(SHARES[0] / 2)
         folder = self._out / "clone"
-        self._train_into(folder, config, range(1), stop)
+        self._train_into(
+            folder,
+            Candidate("clone", "bc", {}).config(config),
+            range(1),
+            lambda now: self._stop_after(ends),
+        )
         files = policy_files(folder)
         if not files:
             raise TrainingError(_NO_TIME.format("the clone of the behavior"))
-        clone = read_policy(files[0].parent)
-        return clone, traits_of(self._dataset, clone)
+        return read_policy(files[0].parent)
 
-    def _train(self, candidate: Candidate, until: int, share_s: float, bar: _Bar) -> None:
-        """Train a candidate until it has `until` updates or its share of the time is used."""
-        if self._updates(candidate.name) >= until:
-            return
-        if not share_s > 0:
-            self._in_time = False
-            return
-        ends = time.perf_counter() + share_s
-
-        def stop(now: TrainingProgress) -> None:
-            bar.show(candidate.name, now)
-            if now.seed != self._seeds[-1]:
-                return
-            if now.done >= until:
-                raise _Pause
-            if time.perf_counter() > ends:
+    def _train(self, candidates: Sequence[Candidate], until: int, share: float) -> None:
+        """Train candidates until they have `until` updates or their equal times are used."""
+        for k, candidate in enumerate(candidates):
+            left_s = self._left_s(share) / (len(candidates) - k)
+            if self._updates(candidate.name) >= until:
+                pass
+            elif left_s > 0:
+                progress = self._until(candidate.name, until, time.perf_counter() + left_s)
+                config = candidate.config(self._config)
+                self._train_into(self._folder(candidate.name), config, self._seeds, progress)
+            else:
                 self._in_time = False
-                raise _Pause
+            self._publish(candidate.name, only_new=True)
 
-        config = candidate.config(self._config)
-        self._train_into(self._folder(candidate.name), config, self._seeds, stop)
+    def _until(self, name: str, until: int, ends: float) -> ProgressCallback:
+        """Return a callback that reports all candidates as one training, and pauses this one."""
+
+        def report(now: TrainingProgress) -> None:
+            self._done[name, now.seed] = now.done
+            done = sum(count for (_, seed), count in self._done.items() if seed == now.seed)
+            total = self._total
+            self._progress(TrainingProgress(now.seed, min(done, total), total, now.terms))
+            if now.seed == self._seeds[-1]:
+                if now.done >= until:
+                    raise _Pause
+                self._stop_after(ends)
+
+        return report
 
     def _train_into(
         self, folder: Path, config: TrainingConfig, seeds: range, progress: ProgressCallback
@@ -357,90 +354,74 @@ class _Race:
                 progress=progress,
             )
 
-    def _agreements(self, evidence: Evidence) -> NDArray[np.float64]:
-        """Return the fraction (E,) of each episode's states where the policy agrees.
-
-        A policy agrees in a state if it takes the logged action.
-        """
-        lengths = self._dataset.episode_lengths
-        agrees = evidence.agrees.astype(np.float64)
-        return np.add.reduceat(agrees, np.cumsum(lengths) - lengths) / lengths
-
     def _evaluate(
         self,
         kind: str,
         names: Sequence[str],
         clone: Policy,
-        *,
         imitate: bool,
         fraction: float,
         share: float,
-    ) -> Stage | None:
-        """Evaluate candidates. Return None if the time is too short."""
-        policies = [(name, policy) for name in names for policy in self._policies(name)]
-        ends = time.perf_counter() + self._clock.left_s(share)
-        updates = round(self._config.model_updates * fraction)
-        if self._clock.is_bounded:
-            updates = min(updates, self._affordable(clone, policies, ends))
-        if updates < min(_LEAST_MODEL_UPDATES, self._config.model_updates * fraction):
-            self._in_time = False
-            return None
-        evidence: dict[str, list[Evidence]] = {name: [] for name in names}
-        try:
-            for member in range(ENSEMBLE):
-                found = self._collect(clone, policies, updates, member, ends)
-                for (name, _), one in zip(policies, found, strict=True):
-                    evidence[name].append(one)
-        except _Pause:
-            self._in_time = False
-            if not all(evidence.values()):
-                return None
-        values, agreements = (
-            {name: np.stack([table(one) for one in of_it]) for name, of_it in evidence.items()}
-            for table in (lambda one: one.first_values, self._agreements)
-        )
-        ratings = rate(values, agreements, imitate=imitate)
-        stage = Stage(
-            {name: self._tried(name, ratings[name], evidence[name]) for name in names},
-        )
-        if self._in_time:
-            self._write_stage(kind, stage)
-        return stage
+    ) -> dict[str, Tried]:
+        """Return the results of candidates, best first; an empty dict if the time is too short."""
+        stages = self._read_stages()
+        if kind not in stages:
+            found = self._collect(names, clone, self._config.model_updates * fraction, share)
+            stages[kind] = self._rate(found, imitate) if found else {}
+            if self._in_time:
+                content = {
+                    stage: {name: asdict(one) for name, one in tried.items()}
+                    for stage, tried in stages.items()
+                }
+                write_json(self._out / STAGES_NAME, content, TrainingError)
+        return stages[kind]
 
     def _collect(
-        self,
-        clone: Policy,
-        policies: Sequence[tuple[str, Policy]],
-        updates: int,
-        member: int,
-        ends: float,
-        ticks: list[float] | None = None,
-    ) -> list[Evidence]:
-        """Return one model's evidence for each policy. Raise `_Pause` if the time is up."""
+        self, names: Sequence[str], clone: Policy, wanted: float, share: float
+    ) -> dict[str, list[Evidence]]:
+        """Return the evidence of all models on the networks of each candidate, if time allows."""
+        policies = {name: self._policies(name) for name in names}
+        ends, updates = time.perf_counter() + self._left_s(share), round(wanted)
+        ticks: list[float] = []
 
         def check() -> None:
-            now = time.perf_counter()
-            if ticks is not None:
-                ticks.append(now)
-            if now > ends:
-                raise _Pause
+            ticks.append(time.perf_counter())
+            self._stop_after(ends)
 
-        model = fqe_config(self._config.gamma, updates)
-        collector = EvidenceCollector(self._dataset, clone, model, seed=member)
-        return collector.collect([policy for _, policy in policies], on_update=check)
+        def evaluate(updates: int, member: int) -> list[Evidence]:
+            model = fqe_config(self._config.gamma, updates)
+            collector = EvidenceCollector(self._dataset, clone, model, seed=member)
+            return collector.collect([one for each in policies.values() for one in each], check)
 
-    def _affordable(
-        self, clone: Policy, policies: Sequence[tuple[str, Policy]], ends: float
-    ) -> int:
-        """Run a few updates of the models, and estimate how many fit into the time."""
-        ticks: list[float] = []
-        try:
-            self._collect(clone, policies, _PROBE_UPDATES, 0, ends, ticks)
-        except _Pause:
-            return 0
-        began = time.perf_counter()
-        per_update_s = (ticks[-1] - ticks[0]) / (len(ticks) - 1)
-        return int(0.8 * (ends - began) / max(per_update_s * FOLDS * ENSEMBLE, 1e-9))
+        evidence: dict[str, list[Evidence]] = {}
+        with suppress(_Pause):
+            if math.isfinite(ends):
+                # A few updates show how many fit into the time.
+                evaluate(_PROBE_UPDATES, 0)
+                per_update_s = (ticks[-1] - ticks[0]) / (len(ticks) - 1)
+                left_s = ends - time.perf_counter()
+                affordable = 0.8 * left_s / max(per_update_s * FOLDS * ENSEMBLE, 1e-9)
+                updates = min(updates, int(affordable))
+            if updates < min(_LEAST_MODEL_UPDATES, wanted):
+                self._in_time = False
+                return {}
+            for member in range(ENSEMBLE):
+                found = iter(evaluate(updates, member))
+                for name, each in policies.items():
+                    evidence.setdefault(name, []).extend(next(found) for _ in each)
+        return evidence
+
+    def _rate(self, evidence: Mapping[str, list[Evidence]], imitate: bool) -> dict[str, Tried]:
+        lengths = self._dataset.episode_lengths
+        starts = np.cumsum(lengths) - lengths
+        values = {name: np.stack([one.first_values for one in e]) for name, e in evidence.items()}
+        agreements = {
+            name: np.stack([np.add.reduceat(one.agrees.astype(np.float64), starts) for one in e])
+            / lengths
+            for name, e in evidence.items()
+        }
+        ratings = rate(values, agreements, imitate=imitate)
+        return {name: self._tried(name, one, evidence[name]) for name, one in ratings.items()}
 
     def _tried(self, name: str, rating: Rating, evidence: Sequence[Evidence]) -> Tried:
         errors = [one.bellman_error for one in evidence if one.bellman_error is not None]
@@ -454,45 +435,6 @@ class _Race:
             tuple(np.mean(known, axis=0).tolist()) if known else None,
         )
 
-    def _choose(
-        self,
-        traits: LogTraits,
-        skipped: Mapping[str, str],
-        first: Stage | None,
-        second: Stage | None,
-        names: Sequence[str],
-    ) -> Choice:
-        """Return the choice according to the latest evaluation."""
-        last = second or first
-        ratings = last.ratings if last else {}
-        order = self._finalists(ranked(ratings))
-        chosen = (order or self._finalists(names))[0]
-        rest = [name for name in ranked(first.ratings) if name not in order] if first else []
-        known = {name: Tried(self._updates(name), outcome="not evaluated") for name in names}
-        for stage, outcome in ((first, STOPPED_EARLY), (second, "")):
-            for name, one in stage.tried.items() if stage else ():
-                known[name] = replace(one, outcome=outcome)
-        runners = [name for name in order if name != chosen][:1]
-        for name, outcome in [(name, "runner-up") for name in runners] + [(chosen, "chosen")]:
-            known[name] = replace(known[name], outcome=outcome)
-        shown = dict.fromkeys([chosen, *runners, *order, *rest, *names])
-        table = {name: known[name] for name in shown}
-        table |= {
-            one.name: Tried(outcome="no checkpoint within the budget")
-            for one in tried(skipped)
-            if one.name not in table
-        }
-        table |= {name: Tried(outcome=f"not tried: {why}") for name, why in skipped.items()}
-        return Choice(
-            chosen,
-            reason_of(chosen, ratings, traits),
-            confidence_of(chosen, ratings),
-            advice_for(traits, table, self._in_time),
-            self._in_time,
-            traits,
-            table,
-        )
-
     def _folder(self, name: str) -> Path:
         return self._out / "candidates" / name
 
@@ -503,50 +445,77 @@ class _Race:
     def _policies(self, name: str) -> list[Policy]:
         return [read_policy(file.parent) for file in policy_files(self._folder(name))]
 
-    def _publish(self, name: str, *, only_first: bool = False) -> None:
+    def _publish(self, name: str, *, only_new: bool = False) -> None:
         """Copy the policies of a candidate to the folders of the seeds in the run."""
         for seed in self._seeds:
             source, target = self._folder(name) / f"seed-{seed}", self._out / f"seed-{seed}"
-            if not (source / POLICY_NAME).exists() or (only_first and target.exists()):
+            if not (source / POLICY_NAME).exists() or (only_new and target.exists()):
                 continue
             with replacing_folder(target, TrainingError, overwrite=True) as folder:
                 for file in ("policy.safetensors", POLICY_NAME, METRICS_NAME):
                     shutil.copyfile(source / file, folder / file)
 
-    def _summaries(self, name: str) -> list[OfflineSummary]:
-        updates = self._updates(name)
-        algo = next(one.algo for one in tried({}) if one.name == name)
-        folders = [(seed, self._out / f"seed-{seed}") for seed in self._seeds]
-        seconds = self._clock.elapsed_s
+    def _summaries(self, name: str, algo: str) -> list[OfflineSummary]:
+        updates, seconds = self._updates(name), time.perf_counter() - self._began
         return [
-            OfflineSummary(folder, algo, seed, updates, 0, seconds, {}) for seed, folder in folders
+            OfflineSummary(self._out / f"seed-{seed}", algo, seed, updates, 0, seconds, {})
+            for seed in self._seeds
         ]
 
-    def _read_stages(self) -> dict[str, Stage]:
+    def _read_stages(self) -> dict[str, dict[str, Tried]]:
         path = self._out / STAGES_NAME
         if not path.exists():
             return {}
         try:
-            found = parse_json(read_file(path))
-            return {kind: Stage.from_json(stage) for kind, stage in found.items()}
+            stages = {}
+            for kind, stage in parse_json(read_file(path)).items():
+                ranked = sorted(stage, key=lambda name: -stage[name]["rating"]["score"])
+                stages[kind] = {name: Tried.from_json(stage[name]) for name in ranked}
+            return stages
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise TrainingError(f"cannot resume: {path} cannot be read: {error}") from error
 
-    def _write_stage(self, kind: str, stage: Stage) -> None:
-        stages = {**self._read_stages(), kind: stage}
-        content = {name: one.to_json() for name, one in stages.items()}
-        write_json(self._out / STAGES_NAME, content, TrainingError)
+
+def _traits(dataset: Dataset, clone: Clone) -> LogTraits:
+    """Return the properties of a log. The clone imitates its behavior policy."""
+    chances = by_rows(clone.action_probabilities, dataset.observations).astype(np.float64)
+    behavior = dataset.behavior_probs.astype(np.float64)
+    known = not bool((np.isnan(behavior) | is_impossible(behavior)).any())
+    logs = np.log(np.where(chances > 0, chances, 1.0))
+    nats = -np.log(behavior).mean() if known else -(chances * logs).sum(1).mean()
+    returns = dataset.statistics.returns
+    return LogTraits(
+        episodes=len(dataset.episodes),
+        transitions=len(dataset),
+        mean_return=float(returns.mean()),
+        return_spread=float(returns.std()),
+        terminated=float(dataset.terminated.sum() / len(dataset.episodes)),
+        entropy=float(nats / np.log(max(chances.shape[1], 2))),
+        coverage=float(likely(chances).mean()),
+        probabilities=known,
+        problems=tuple(one.what for one in lint(dataset) if one.severity == "problem"),
+    )
 
 
-class _Bar:
-    """Progress of all candidates together, reported as if it were one training."""
+def _skipped(traits: LogTraits) -> dict[str, str]:
+    """Return a dict from the name of each candidate that is not tried on a log to the reason."""
+    skipped = {}
+    if traits.coverage <= LEAST_COVERAGE:
+        skipped["double-dqn"] = (
+            f"only {traits.coverage:.0%} of the actions are likely in the log, and it overestimates"
+            " the others"
+        )
+    if traits.return_spread == 0 and traits.terminated == 0:
+        alike = "all episodes have the same return, so there is nothing to prefer"
+        skipped |= {one.name: alike for one in PORTFOLIO if one.algo not in ("bc", "bcq", "cql")}
+    return skipped
 
-    def __init__(self, report: ProgressCallback, total: int) -> None:
-        self._report, self._total = report, total
-        self._done: dict[tuple[str, int], int] = {}
 
-    def show(self, name: str, now: TrainingProgress) -> None:
-        """Report the updates of all candidates of a seed."""
-        self._done[name, now.seed] = now.done
-        done = sum(count for (_, seed), count in self._done.items() if seed == now.seed)
-        self._report(TrainingProgress(now.seed, min(done, self._total), self._total, now.terms))
+def _warn_about_short_horizons(candidates: Iterable[Candidate], shared: AutoConfig) -> None:
+    """Warn once about all candidates that have the same short horizon."""
+    found: dict[str, list[str]] = {}
+    for one in candidates:
+        if message := horizon_warning(one.config(shared)):
+            found.setdefault(message, []).append(one.name)
+    for message, names in found.items():
+        warnings.warn(f"{', '.join(names)}: {message}", stacklevel=2)

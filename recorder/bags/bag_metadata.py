@@ -7,6 +7,7 @@ and aliases, which can multiply the size of a value, are refused.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,55 +52,38 @@ def _values(events: Iterator[Any]) -> dict[str, Any]:
     Raises:
         LogError: A value has another type, or is nested too deeply.
     """
-    found: dict[str, Any] = {}
-    # Keys of the mappings that contain the current value. The key of a list is None, and so is that
-    # of a mapping before its next key.
-    keys: list[str | None] = []
-    are_lists: list[bool] = []
-    for event in events:
-        name = type(event).__name__
-        if name == "AliasEvent":
-            raise LogError("aliases are not supported")
-        is_key = bool(are_lists) and not are_lists[-1] and keys[-1] is None
-        if name in ("MappingStartEvent", "SequenceStartEvent"):
-            if is_key:
-                raise LogError("a key is not a text")
-            _check_type(keys, name)
-            keys.append(None)
-            are_lists.append(name == "SequenceStartEvent")
-            if len(keys) > MAX_METADATA_DEPTH:
-                raise LogError(f"it is nested in more than {MAX_METADATA_DEPTH} levels")
-            continue
-        if name == "ScalarEvent" and is_key:
-            keys[-1] = str(event.value)
-            continue
-        if name == "ScalarEvent":
-            _check_type(keys, name)
-            _store(found, keys, str(event.value))
-        elif name in ("MappingEndEvent", "SequenceEndEvent"):
-            keys.pop()
-            are_lists.pop()
-        if are_lists and not are_lists[-1]:
-            keys[-1] = None
-    if _ROOT not in found:
+    # The first two events begin the stream and the document. An empty stream has no third one.
+    start = next(islice(events, 2, None), None)
+    tree = _value(events, start) if start else None
+    found = tree.get(_ROOT) if isinstance(tree, dict) else None
+    if found is None:
         raise LogError(f"it has no {_ROOT}")
-    return {name: value for name, value in found.items() if name != _ROOT}
+    used: dict[str, Any] = {}
+    for name in (*_TEXTS, *_LISTS):
+        if isinstance(found, dict) and name in found:
+            kind, expected = (list, "a list") if name in _LISTS else (str, "a text")
+            if not isinstance(found[name], kind):
+                raise LogError(f"{name} is not {expected}")
+            texts = [each for each in found[name] if isinstance(each, str)]
+            if texts or kind is str:
+                used[name] = found[name] if kind is str else texts
+    return used
 
 
-def _check_type(keys: list[str | None], event: str) -> None:
-    """Check the type of the value with these keys, which begins with an event."""
-    if len(keys) != 2 or keys[0] != _ROOT:
-        return
-    expected = "SequenceStartEvent" if keys[1] in _LISTS else "ScalarEvent"
-    if keys[1] in (*_LISTS, *_TEXTS) and event != expected:
-        raise LogError(f"{keys[1]} is not {'a list' if keys[1] in _LISTS else 'a text'}")
-
-
-def _store(found: dict[str, Any], keys: list[str | None], text: str) -> None:
-    if keys[:1] != [_ROOT]:
-        return
-    found[_ROOT] = True
-    if len(keys) == 2 and keys[1] in _TEXTS:
-        found[str(keys[1])] = text
-    elif len(keys) == 3 and keys[1] in _LISTS and keys[2] is None:
-        found.setdefault(str(keys[1]), []).append(text)
+def _value(events: Iterator[Any], event: Any, depth: int = 0) -> Any:
+    """Return the text, list or dict that begins with an event."""
+    name = type(event).__name__
+    if depth > MAX_METADATA_DEPTH:
+        raise LogError(f"it is nested in more than {MAX_METADATA_DEPTH} levels")
+    if name == "AliasEvent":
+        raise LogError("aliases are not supported")
+    if name == "ScalarEvent":
+        return str(event.value)
+    values = []
+    while not type(event := next(events)).__name__.endswith("EndEvent"):
+        values.append(_value(events, event, depth + 1))
+        if name == "MappingStartEvent":
+            if not isinstance(values[-1], str):
+                raise LogError("a key is not a text")
+            values[-1] = values[-1], _value(events, next(events), depth + 1)
+    return values if name == "SequenceStartEvent" else dict(values)

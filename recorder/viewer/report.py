@@ -1,15 +1,16 @@
-"""Reports about a dataset: a PNG with histograms, and an HTML page. They need extra `report`."""
+"""Report about a dataset: an HTML page, and its plots as a PNG. Extra: `report`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, tick_labels, to_svg
+from mcaprl.figures import COLORS, INK, PALE, Panel, save_panels, tick_labels, to_svg
 from mcaprl.page import Card, Figure, Section, Table, write_page
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import calibration
@@ -30,29 +31,6 @@ _MAP_CELLS = 80
 _MAX_ROWS = 60
 
 
-def dataset_figure(path: Path, dataset: Dataset, title: str) -> None:
-    """Write a PNG with histograms of returns and lengths, and counts of actions and end reasons.
-
-    Args:
-        path: Path of the PNG; missing parent folders are created.
-        dataset: Dataset to plot.
-        title: Title of the figure.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-        ReportError: The file cannot be written.
-    """
-    figure, ((returns, lengths), (actions, ends)) = new_figure((9, 6.5), 2, 2)
-    statistics = dataset.statistics
-    mean = statistics.mean_return
-    _histogram(returns, statistics.returns, f"return per episode (mean {mean:.4g})")
-    _histogram(lengths, statistics.lengths, "steps per episode")
-    _bars(actions, _actions_taken(dataset), "actions")
-    _bars(ends, statistics.ends, "end reasons")
-    figure.suptitle(title, x=0.02, ha="left", color=INK)
-    save_png(figure, path)
-
-
 def dataset_page(
     path: Path,
     dataset: Dataset,
@@ -60,20 +38,17 @@ def dataset_page(
     facts: Sequence[tuple[str, str]],
     findings: Sequence[Problem],
 ) -> None:
-    """Write an HTML page about a dataset: facts, findings, plots, best and worst episodes.
+    """Write an HTML page about a dataset, and its plots as `dataset.png` beside it.
 
-    Args:
-        path: Path of the HTML file.
-        dataset: Dataset to report on.
-        title: Title of the page.
-        facts: Names and values for the table of facts.
-        findings: Findings of `lint`.
+    `facts` are names and values for the first table, and `findings` the results of `lint`.
 
     Raises:
         MissingExtraError: matplotlib or jinja2 is not installed.
-        ReportError: The file cannot be written.
+        ReportError: A file cannot be written.
     """
     tracks = tracks_of(dataset)
+    panels = _panels(dataset, tracks)
+    save_panels(path.with_name("dataset.png"), panels, title)
     statistics = dataset.statistics
     lead = (
         f"{counted(statistics.episodes, 'episode')}, {counted(statistics.steps, 'step')} of"
@@ -82,7 +57,7 @@ def dataset_page(
     sections = [
         Section("Overview", table=Table(("", ""), facts)),
         _findings_section(findings),
-        Section("Episodes", figures=_figures(dataset, tracks)),
+        Section("Episodes", figures=[Figure.of(one.caption, one.figure()) for one in panels]),
         *_calibration_section(dataset),
         Section(
             "Best and worst episodes",
@@ -116,40 +91,36 @@ def _calibration_section(dataset: Dataset) -> list[Section]:
     return [Section("Behavior probabilities", text, table=table)]
 
 
-def _figures(dataset: Dataset, tracks: Sequence[Positions]) -> list[Figure]:
+def _panels(dataset: Dataset, tracks: Sequence[Positions]) -> list[Panel]:
     statistics = dataset.statistics
-    small = (4.4, 2.6)
-    found = []
-    for caption, values in (
-        (f"Return per episode, mean {statistics.mean_return:.4g}", statistics.returns),
-        ("Steps per episode", statistics.lengths),
-    ):
-        figure, axes = new_figure(small)
-        _histogram(axes, values, "")
-        found.append(Figure.of(caption, figure))
-    figure, axes = new_figure(small)
-    axes.plot(statistics.returns, ".", color=COLORS[0], ms=4)
-    axes.set_xlabel("episode")
-    found.append(Figure.of("Return by episode, in the order of the log", figure))
+
+    def by_episode(axes: Any) -> None:
+        axes.plot(statistics.returns, ".", color=COLORS[0], ms=4)
+        axes.set_xlabel("episode")
+
+    found = [
+        Panel(
+            f"Return per episode, mean {statistics.mean_return:.4g}",
+            partial(_histogram, values=statistics.returns),
+        ),
+        Panel("Steps per episode", partial(_histogram, values=statistics.lengths)),
+        Panel("Return by episode, in the order of the log", by_episode),
+    ]
     for caption, counts in (
         ("Actions taken", _actions_taken(dataset)),
         ("End reasons", statistics.ends),
     ):
-        figure, axes = new_figure((small[0], max(1.6, 0.28 * len(counts) + 0.8)))
-        _bars(axes, counts, "")
-        found.append(Figure.of(caption, figure))
-    coverage = _coverage(tracks)
-    if coverage is not None:
-        found.append(Figure.of("Positions in meters; a stronger color means more steps", coverage))
+        size = (4.4, max(1.6, 0.28 * len(counts) + 0.8))
+        found.append(Panel(caption, partial(_bars, counts=counts), size))
+    places = np.concatenate([np.empty((0, 2)), *tracks])
+    if len(places):
+        caption = "Positions in meters; a stronger color means more steps"
+        found.append(Panel(caption, partial(_coverage, places=places), (4.4, 3.6)))
     return found
 
 
-def _coverage(tracks: Sequence[Positions]) -> Any:
-    """Plot the number of steps at each position; None if the log has no positions."""
-    places = np.concatenate([np.empty((0, 2)), *tracks])
-    if not len(places):
-        return None
-    figure, axes = new_figure((4.4, 3.6))
+def _coverage(axes: Any, places: Positions) -> None:
+    """Plot the number of steps at each position."""
     cell_m = max(float(np.ptp(places, axis=0).max()) / _MAP_CELLS, 1e-6)
     cells, counts = np.unique(np.rint(places / cell_m), axis=0, return_counts=True)
     shade = 0.15 + 0.85 * np.log1p(counts) / np.log1p(counts.max())
@@ -157,7 +128,6 @@ def _coverage(tracks: Sequence[Positions]) -> Any:
         *(cells * cell_m).T, s=6, c=COLORS[0], alpha=shade, marker="s", lw=0, rasterized=True
     )
     axes.set_aspect("equal")
-    return figure
 
 
 def _cards(dataset: Dataset, tracks: Sequence[Positions]) -> list[Card]:
@@ -196,21 +166,23 @@ def _thumbnail(episode: Episode, track: Positions, places: Positions) -> str:
 
     If the episode has no track, plot its cumulative reward instead.
     """
-    figure, axes = new_figure((3.2, 2.2))
-    if len(track):
+
+    def draw(axes: Any) -> None:
+        if not len(track):
+            # The first point makes an episode of one step visible.
+            axes.plot(np.cumsum([0.0, *episode.rewards]), color=COLORS[1])
+            axes.xaxis.get_major_locator().set_params(integer=True)
+            axes.set_xlabel("step")
+            axes.set_title("cumulative reward")
+            return
         stride = max(1, len(places) // 4000)
         axes.plot(*places[::stride].T, ".", color=PALE, ms=1, rasterized=True)
         axes.plot(*track.T, color=COLORS[1], lw=1.6)
         axes.plot(*track[-1], "x", color=INK, ms=6)
         axes.set_aspect("equal")
         axes.set_axis_off()
-    else:
-        # The first point makes an episode of one step visible.
-        axes.plot(np.cumsum([0.0, *episode.rewards]), color=COLORS[1])
-        axes.xaxis.get_major_locator().set_params(integer=True)
-        axes.set_xlabel("step")
-        axes.set_title("cumulative reward")
-    return to_svg(figure)
+
+    return to_svg(Panel("", draw, (3.2, 2.2)).figure())
 
 
 def _columns(dataset: Dataset) -> Table:
@@ -232,23 +204,21 @@ def _actions_taken(dataset: Dataset) -> dict[str, int]:
     return {names.get(value, str(value)): count for value, count in counts.items()}
 
 
-def _histogram(axes: Any, values: NDArray[Any], label: str) -> None:
+def _histogram(axes: Any, values: NDArray[Any]) -> None:
     axes.hist(values[np.isfinite(values)], bins=_BINS, color=COLORS[0])
-    axes.set_xlabel(label)
     axes.set_ylabel("episodes")
     axes.yaxis.get_major_locator().set_params(integer=True)
 
 
-def _bars(axes: Any, counts: Mapping[str, int], label: str) -> None:
+def _bars(axes: Any, counts: Mapping[str, int]) -> None:
     if not counts:
         axes.set_axis_off()
-        axes.text(0.5, 0.5, f"{label or 'actions'}: continuous", ha="center", color=INK)
+        axes.text(0.5, 0.5, "actions: continuous", ha="center", color=INK)
         return
     axes.barh(range(len(counts)), list(counts.values()), color=COLORS[0], height=0.7)
     axes.set_yticks(range(len(counts)), tick_labels(counts))
     axes.set_ylim(max(len(counts), 3) - 0.5, -0.5)
     axes.xaxis.get_major_locator().set_params(integer=True)
-    axes.set_xlabel(label)
 
 
 def tracks_of(dataset: Dataset) -> list[Positions]:

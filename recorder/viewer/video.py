@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from fractions import Fraction
 from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,7 +16,6 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import OutputExistsError, ReportError, UnknownNameError, UsageError, import_extra
 from mcaprl.files import replacing
-from mcaprl.recorder.viewer.gif import write_gif
 
 Image = NDArray[np.uint8]
 
@@ -31,9 +32,9 @@ _WEBP_OPTIONS: Final = {"quality": "50", "compression_level": "0"}
 # Codec, pixel format and options of the encoder.
 _ENCODERS: Final = {
     ".mp4": ("libx264", "yuv420p", _H264_OPTIONS),
+    ".gif": ("gif", "pal8", {}),
     ".webp": ("libwebp_anim", "bgra", _WEBP_OPTIONS),
 }
-_CONTAINER_OPTIONS: Final[dict[str, dict[str, str]]] = {".mp4": {}, ".webp": {"loop": "0"}}
 _COLUMNS = 3
 _GAP_PX = 6
 
@@ -49,11 +50,9 @@ def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
     Raises:
         UnknownNameError: The suffix of the path is not supported.
         OutputExistsError: The file exists and `overwrite` is not set.
-        MissingExtraError: imageio or PyAV is not installed.
+        MissingExtraError: PyAV for a video, or imageio for a contact sheet, is not installed.
     """
-    import_extra("imageio", "video")
-    if path.suffix in _ENCODERS:
-        import_extra("av", "video")
+    import_extra("av" if path.suffix in _ENCODERS else "imageio", "video")
     if path.suffix not in kinds:
         raise UnknownNameError("kind of output", path.suffix or path.name, kinds)
     if path.exists() and not overwrite:
@@ -77,17 +76,10 @@ def write_video(path: Path, images: Iterable[Image], fps: float) -> int:
         ReportError: The file cannot be written.
     """
     with replacing(path, ReportError) as unfinished:
-        count = _write(unfinished, path.suffix, images, fps)
+        count = _encode(unfinished, path.suffix, _of_one_size(images), fps)
         if count == 0:
             raise UsageError(f"{path}: the video has no frames")
     return count
-
-
-def _write(path: Path, kind: str, images: Iterable[Image], fps: float) -> int:
-    images = _of_one_size(images)
-    if kind == ".gif":
-        return write_gif(path, images, round(1000 / fps))
-    return _encode(path, kind, images, fps)
 
 
 def _of_one_size(images: Iterable[Image]) -> Iterator[Image]:
@@ -105,31 +97,65 @@ def _of_one_size(images: Iterable[Image]) -> Iterator[Image]:
 
 
 def _encode(path: Path, kind: str, images: Iterable[Image], fps: float) -> int:
-    """Write an H.264 encoded `.mp4`, or a `.webp`; see `write_video`."""
+    """Write images of one size; see `write_video`."""
     av = import_extra("av", "video")
-    # imageio does not offer the options of the encoders. Pillow keeps all frames of a WebP.
+    # imageio does not offer the options of the encoders. Pillow keeps all frames of a GIF or WebP.
     codec, pixels, options = _ENCODERS[kind]
+    rate = Fraction(fps).limit_denominator(10_000)
+    frames: Iterable[Any] = (_frame(image, kind) for image in images)
+    if kind == ".gif":
+        frames = _with_palettes(frames, rate)
     count, stream = 0, None
     # The encoder cannot be closed after a failed write, so it writes to memory.
     content = BytesIO()
-    with av.open(content, "w", format=kind[1:], options=_CONTAINER_OPTIONS[kind]) as container:
-        for count, image in enumerate(images, 1):  # noqa: B007
+    looping = {} if kind == ".mp4" else {"loop": "0"}
+    with av.open(content, "w", format=kind[1:], options=looping) as container:
+        for count, frame in enumerate(frames, 1):  # noqa: B007
             if stream is None:
-                rate = Fraction(fps).limit_denominator(10_000)
                 stream = container.add_stream(codec, rate=rate, options=options)
-                # H.264 needs an even height and width.
-                unit = 2 if kind == ".mp4" else 1
-                stream.height, stream.width = (edge // unit * unit for edge in image.shape[:2])
-                stream.pix_fmt = pixels
-            container.mux(stream.encode(_frame(image, kind)))
+                stream.height, stream.width, stream.pix_fmt = frame.height, frame.width, pixels
+            container.mux(stream.encode(frame))
         if stream is not None:
             container.mux(stream.encode())
     path.write_bytes(content.getvalue())
     return count
 
 
+def _with_palettes(frames: Iterable[Any], rate: Fraction) -> Iterator[Any]:
+    """Convert each RGB frame to a palette of 256 colors that fits it best."""
+    av, graph = import_extra("av", "video"), None
+    for number, frame in enumerate(chain(frames, [None])):
+        if frame is not None:
+            frame.pts, frame.time_base = number, 1 / rate
+            graph = graph or _palette_graph(av, frame)
+        if graph is not None:
+            graph.push(frame)
+            # PyAV raises BlockingIOError if a filter waits for the next frame.
+            with suppress(BlockingIOError, EOFError):
+                while True:
+                    yield graph.pull()
+
+
+def _palette_graph(av: Any, frame: Any) -> Any:
+    graph, base = av.filter.Graph(), frame.time_base
+    source = graph.add_buffer(
+        width=frame.width, height=frame.height, format=frame.format, time_base=base
+    )
+    both, palette = graph.add("split"), graph.add("palettegen", "stats_mode=single")
+    use, sink = graph.add("paletteuse", "new=1:dither=none"), graph.add("buffersink")
+    source.link_to(both)
+    both.link_to(use)
+    both.link_to(palette, 1)
+    palette.link_to(use, 0, 1)
+    use.link_to(sink)
+    graph.configure()
+    return graph
+
+
 def _frame(image: Image, kind: str) -> Any:
     av = import_extra("av", "video")
+    if kind == ".gif":
+        return av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
     if kind == ".webp":
         # Some versions of PyAV do not free images that they convert.
         alpha = np.full((*image.shape[:2], 1), 255, np.uint8)
@@ -138,6 +164,7 @@ def _frame(image: Image, kind: str) -> Any:
     # This module imports numba. PyAV's own conversion takes three times as long.
     from mcaprl.recorder.viewer.yuv import fill_frame
 
+    # H.264 needs an even height and width.
     height, width = (edge // 2 * 2 for edge in image.shape[:2])
     frame = av.VideoFrame(width, height, "yuv420p")
     fill_frame(image, frame)

@@ -181,8 +181,8 @@ def draw(faces: Faces, eye_m: Floats, axes: Floats, focal_px: float, inverse_z: 
             continue
         plane = _plane(corners)
         if plane.offset < 0.0:
-            count = _clip_near(corners, count, polygon)
-            _project(polygon, count, focal_px, inverse_z)
+            count = clip_near(corners, count, _NEAR_M, True, polygon)
+            project(polygon, count, focal_px, inverse_z.shape, polygon)
             rows = _spans(polygon, count, middles, left_u, right_u)
             _fill(rows, left_u, right_u, columns, plane, focal_px, inverse_z)
 
@@ -219,32 +219,34 @@ def _difference(corners: Floats, i: int) -> tuple[float, float, float]:
 
 
 @compiled
-def _clip_near(corners: Floats, corner_count: int, polygon: Floats) -> int:
-    """Clip a face at the near plane; write the corners to `polygon` and return their number."""
-    count = 0
-    for i in range(corner_count):
-        j = i + 1 if i + 1 < corner_count else 0
-        here_z, there_z = corners[i, 2], corners[j, 2]
-        if here_z >= _NEAR_M:
+def clip_near(corners: Floats, count: int, near_m: float, closed: bool, clipped: Floats) -> int:
+    """Clip a polygon, or a line that is not closed, at a near plane; return the new length."""
+    kept = 0
+    for i in range(count):
+        j = i + 1 if i + 1 < count else 0
+        here_m, there_m = corners[i, 2], corners[j, 2]
+        if here_m >= near_m:
             for k in range(3):
-                polygon[count, k] = corners[i, k]
-            count += 1
-        if (here_z >= _NEAR_M) != (there_z >= _NEAR_M):
-            share = (_NEAR_M - here_z) / (there_z - here_z)
+                clipped[kept, k] = corners[i, k]
+            kept += 1
+        if (here_m >= near_m) != (there_m >= near_m) and (closed or j > 0):
+            share = (near_m - here_m) / (there_m - here_m)
             for k in range(3):
-                polygon[count, k] = corners[i, k] + share * (corners[j, k] - corners[i, k])
-            count += 1
-    return count
+                clipped[kept, k] = corners[i, k] + share * (corners[j, k] - corners[i, k])
+            kept += 1
+    return kept
 
 
 @compiled
-def _project(polygon: Floats, count: int, focal_px: float, inverse_z: Floats) -> None:
-    """Replace the x and y of a polygon's corners by image coordinates u and v, pixels."""
-    height, width = inverse_z.shape
+def project(
+    corners: Floats, count: int, focal_px: float, shape: tuple[int, int], flat: Floats
+) -> None:
+    """Write the places of corners (K, 3) in an image to `flat`, pixels from its top left corner."""
+    height, width = shape
     for i in range(count):
-        scale = focal_px / polygon[i, 2]
-        polygon[i, 0] = 0.5 * width + scale * polygon[i, 0]
-        polygon[i, 1] = 0.5 * height + scale * polygon[i, 1]
+        scale = focal_px / corners[i, 2]
+        flat[i, 0] = 0.5 * width + scale * corners[i, 0]
+        flat[i, 1] = 0.5 * height + scale * corners[i, 1]
 
 
 @compiled

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled
+from mcaprl.sims.drawing.camera import clip_near, project
 
 Floats = NDArray[np.float64]
 Samples = NDArray[np.uint32]
@@ -181,8 +182,8 @@ def paint(faces: Faces, order: NDArray[np.int64], eye: Eye, samples: Samples) ->
                     dx * eye.axes[0, axis] + dy * eye.axes[1, axis] + dz * eye.axes[2, axis]
                 )
         width_m, light = faces.widths_m[face], 1.0
-        count = _clip_near(corners, count, width_m == 0.0, clipped)
-        _project(clipped, count, eye.focal_px, samples.shape, flat)
+        count = clip_near(corners, count, NEAR_M, width_m == 0.0, clipped)
+        project(clipped, count, SMOOTH * eye.focal_px, samples.shape, flat)
         if width_m > 0.0:
             if count < 2:
                 continue
@@ -199,43 +200,6 @@ def paint(faces: Faces, order: NDArray[np.int64], eye: Eye, samples: Samples) ->
             right = math.floor(min(rights[row], samples.shape[1] - 1.0))
             if left <= right:
                 samples[row, left : right + 1] = color
-
-
-@compiled
-def _clip_near(corners: Floats, count: int, closed: bool, clipped: Floats) -> int:
-    """Clip a closed polygon or a stroke at the near plane; return the new number of corners."""
-    kept = 0
-    for i in range(count):
-        j = (i + 1) % count
-        here_m, there_m = corners[i, 2], corners[j, 2]
-        if here_m >= NEAR_M:
-            clipped[kept] = corners[i]
-            kept += 1
-        if (here_m >= NEAR_M) != (there_m >= NEAR_M) and (closed or j > 0):
-            share = (NEAR_M - here_m) / (there_m - here_m)
-            for k in range(3):
-                clipped[kept, k] = corners[i, k] + share * (corners[j, k] - corners[i, k])
-            kept += 1
-    return kept
-
-
-@compiled
-def _project(
-    corners: Floats, count: int, focal_px: float, shape: tuple[int, int], flat: Floats
-) -> None:
-    """Project corners to the image.
-
-    Args:
-        corners: (K, 3) corners in camera coordinates.
-        count: Number of corners.
-        focal_px: Focal length.
-        shape: Height and width of the image in samples.
-        flat: (K, 2) output: distances right of and below the top left corner, in samples.
-    """
-    for i in range(count):
-        scale = SMOOTH * focal_px / corners[i, 2]
-        flat[i, 0] = 0.5 * shape[1] + scale * corners[i, 0]
-        flat[i, 1] = 0.5 * shape[0] + scale * corners[i, 1]
 
 
 @compiled

@@ -6,12 +6,24 @@ Extra: `report`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mcaprl.figures import BACKGROUND, COLORS, INK, PALE, new_figure, save_png, tick_labels, to_svg
+from mcaprl.figures import (
+    BACKGROUND,
+    COLORS,
+    INK,
+    PALE,
+    Panel,
+    new_figure,
+    save_panels,
+    save_png,
+    tick_labels,
+    to_svg,
+)
 from mcaprl.page import PAGE_NAME, Card, Figure, Section, Table, write_page
 from mcaprl.sims.drawing.scene import Shape
 from mcaprl.sims.drawing.top_view import patches
@@ -41,15 +53,8 @@ def comparison_figure(
 ) -> Any:
     """Draw mean returns with their intervals, and a dot for each training seed.
 
-    Args:
-        scores: Scores from top to bottom.
-        title: Title of the figure.
-        behavior: Mean return of the logged episodes, drawn as a line, and the lower and upper limit
-            of its interval, drawn as a band; None without a log.
-        width: Width of the figure in inches.
-
-    Raises:
-        MissingExtraError: Matplotlib is not installed.
+    `behavior` is the mean return of the logged episodes, drawn as a line, and the lower and upper
+    limit of its interval, drawn as a band.
     """
     figure, axes = new_figure((width, 0.62 * len(scores) + 1.8))
     if behavior is not None:
@@ -82,43 +87,17 @@ def comparison_figure(
     return figure
 
 
-def trajectory_figure(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> Any:
-    """Draw the trajectories of each policy on the map; a cross marks an episode that ended early.
-
-    Args:
-        scores: Scores; each score that has positions gets a panel.
-        world: Static shapes of the map.
-
-    Returns:
-        Figure, or None if no score has positions.
-
-    Raises:
-        MissingExtraError: Matplotlib is not installed.
-    """
-    shown = [score for score in scores if score.results[0][0].positions.size]
-    if not shown:
-        return None
-    columns = min(3, len(shown))
-    rows = -(-len(shown) // columns)
-    figure, panels = new_figure((4.2 * columns, 5.6 * rows), rows, columns, grid=True)
-    panels = panels.ravel()
-    for row, (axes, score) in enumerate(zip(panels, shown, strict=False)):
-        _draw_trajectories(axes, score, world, COLORS[row % len(COLORS)])
-        axes.set_title(f"{score.policy}\n{_ends(score)}")
-    for axes in panels[len(shown) :]:
-        axes.set_visible(False)
-    return figure
-
-
-def _trajectories(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> list[Figure]:
-    """Draw one figure for each policy, so that a narrow page can stack the figures."""
-    figures = []
-    for row, score in enumerate(scores):
-        if score.results[0][0].positions.size:
-            figure, axes = new_figure((4.2, 4.8))
-            _draw_trajectories(axes, score, world, COLORS[row % len(COLORS)])
-            figures.append(Figure.of(f"{score.policy}: {_ends(score)}", figure))
-    return figures
+def _trajectories(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> list[Panel]:
+    """Return a panel for each policy that has positions."""
+    return [
+        Panel(
+            f"{score.policy}: {_ends(score)}",
+            partial(_draw_trajectories, score=score, world=world, color=COLORS[row % len(COLORS)]),
+            (4.2, 4.8),
+        )
+        for row, score in enumerate(scores)
+        if score.results[0][0].positions.size
+    ]
 
 
 def _draw_trajectories(axes: Any, score: PolicyScore, world: Sequence[Shape], color: str) -> None:
@@ -151,35 +130,25 @@ def evaluation_page(
 ) -> None:
     """Write FOLDER/index.html, comparison.png and trajectories.png.
 
-    Args:
-        folder: Output folder, created if it does not exist.
-        title: Title of the page.
-        scores: Scores of the policies.
-        compared: Comparisons of pairs of policies.
-        world: Static shapes of the map.
-        behavior: Mean return of the logged episodes, and the lower and upper limit of its interval;
-            None without a log.
-        recorded: Pair of a log and a number N: the log contains the episodes of the first N
-            policies in `scores`. None without a log.
-        curves: Learning curves of the policies.
+    `behavior` is that of `comparison_figure`. `recorded` is a log and a number N: the log contains
+    the episodes of the first N policies in `scores`.
 
     Raises:
         MissingExtraError: Matplotlib or jinja2 is not installed.
         ReportError: A file cannot be written.
     """
     save_png(comparison_figure(scores, "mean return", behavior), folder / "comparison.png")
-    trajectories = trajectory_figure(scores, world)
-    if trajectories is not None:
-        save_png(trajectories, folder / "trajectories.png")
     comparison = comparison_figure(scores, "", behavior, width=5.6)
     figures = [Figure.of("Mean returns", comparison)]
     sections = [
         Section("Scores", figures=figures, table=_score_table(scores)),
         Section("Probability of improvement", _PAIRS, table=_improvement_table(compared)),
     ]
-    if trajectories is not None:
+    if panels := _trajectories(scores, world):
+        save_panels(folder / "trajectories.png", panels)
         text = "A cross marks the end of an episode before the time limit."
-        sections.append(Section("Trajectories", text, figures=_trajectories(scores, world)))
+        figures = [Figure.of(panel.caption, panel.figure()) for panel in panels]
+        sections.append(Section("Trajectories", text, figures=figures))
     cards = _cards(scores, world, recorded)
     sections.append(Section("Best and worst episodes", _CARDS, cards=cards))
     if curves:

@@ -15,8 +15,7 @@ from mcaprl.errors import OutputExistsError, TrainingError, UsageError
 from mcaprl.offline.policy import read_policy
 from mcaprl.offline.selection.choice import COLUMNS, read_choice
 from mcaprl.offline.selection.config import AutoConfig
-from mcaprl.offline.selection.portfolio import PORTFOLIO, eligible
-from mcaprl.offline.selection.race import select
+from mcaprl.offline.selection.race import PORTFOLIO, eligible, select
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
 from tests.offline.estimate.test_off_policy import log

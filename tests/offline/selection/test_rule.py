@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mcaprl.offline.selection.rule import ranked, rate
+from mcaprl.offline.selection.race import rate
 
 HALF = {"a": np.full((1, 2), 0.5), "b": np.full((1, 2), 0.75)}
 
@@ -16,7 +16,7 @@ def test_the_estimate_is_the_mean_over_episodes_networks_and_models() -> None:
     assert (found["a"].value, found["a"].agreement, found["a"].score) == (4, 0.5, 4)
     assert (found["b"].value, found["b"].agreement, found["b"].score) == (2, 0.75, 2)
     assert found["b"].interval == (2, 2)
-    assert ranked(found) == ["a", "b"]
+    assert list(found) == ["a", "b"]
 
 
 def test_chances_of_two_episodes_by_hand() -> None:
@@ -33,7 +33,7 @@ def test_chances_of_two_episodes_by_hand() -> None:
 def test_a_log_of_a_deterministic_behavior_is_imitated() -> None:
     values = {"a": np.array([[0.0, 4.0]]), "b": np.array([[-9.0, -9.0]])}
     found = rate(values, HALF, imitate=True)
-    assert ranked(found) == ["b", "a"]
+    assert list(found) == ["b", "a"]
     assert (found["b"].score, found["b"].value, found["b"].best_chance) == (0.75, -9, 1)
 
 

@@ -295,26 +295,27 @@ def test_images_of_a_sim_are_written_one_by_one(
 
 
 def test_frames_of_a_gif(tmp_path: Path) -> None:
-    """Each frame has the palette that Pillow chooses for it; equal frames have one duration."""
+    """Each frame has its own palette: up to 255 colors are exact, and others are close."""
     from PIL import Image as pillow
 
-    random = np.random.default_rng(0)
-    noise = random.integers(0, 256, (2, 41, 51, 3), np.uint8)
+    x, y = np.meshgrid(np.arange(51), np.arange(41))
+    smooth = np.stack([4 * x, 5 * y, 0 * x], -1).astype(np.uint8)
+    few = np.stack([16 * (x // 4), 0 * x, 16 * (y // 4)], -1).astype(np.uint8)
     flat = np.full((3, 41, 51, 3), 90, np.uint8)
     flat[1:, 5:9, 7:20] = 20, 40, 60
     flat[2, 30:, :3] = 200
-    images = [*noise, *flat[[0, 0, 1, 2, 2]]]
+    images = [smooth, few, *flat[[0, 0, 1, 2]]]
     path = tmp_path / "video.gif"
-    assert write_video(path, iter(images), 25.0) == 7
+    assert write_video(path, iter(images), 25.0) == 6
     with pillow.open(path) as video:
         assert video.info["loop"] == 0
-        for number, image in enumerate([*noise, *flat]):
+        for number, image in enumerate(images):
             video.seek(number)
-            expected = pillow.fromarray(image).convert("P", palette=pillow.Palette.ADAPTIVE)
-            np.testing.assert_array_equal(video.convert("RGB"), expected.convert("RGB"))
-            assert video.info["duration"] == (80 if number in (2, 4) else 40)
+            assert video.info["duration"] == 40
+            error = np.asarray(video.convert("RGB")).astype(float) - image
+            assert np.abs(error).mean() < (5.0 if image is smooth else 0.01), number
         with pytest.raises(EOFError):
-            video.seek(5)
+            video.seek(6)
 
 
 def test_frames_of_a_webp(tmp_path: Path) -> None:

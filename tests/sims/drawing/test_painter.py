@@ -16,7 +16,7 @@ AHEAD = np.column_stack([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Axes of a level camera that faces along x."""
 EYE = Eye(np.array([0.0, 0.0, ABOVE_M]), AHEAD, FOCAL_PX)
 SKY = (0.0, 0.0, 1.0)
-KERNELS = ("packed", "keys", "paint", "shrink", "_clip_near", "_project", "_stroke", "_light")
+KERNELS = ("packed", "keys", "paint", "shrink", "clip_near", "project", "_stroke", "_light")
 
 
 def faces(corners_m: Any, color: Any = (1.0, 1.0, 1.0), width_m: float = 0.0) -> Faces:
