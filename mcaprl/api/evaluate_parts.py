@@ -73,7 +73,7 @@ def results_on_ray(
         ClusterError: The cluster cannot be used, or workers died repeatedly.
         MissingExtraError: Ray is not installed.
     """
-    from mcaprl.ray.workers import WorkerDiedError, run_tasks
+    from mcaprl.ray.tasks import WorkerDiedError, advancing, run_tasks
 
     # Workers have other working directories, so all paths must be absolute.
     paths = {name: Path(name).absolute() for name in found if name not in SCRIPTED}
@@ -94,7 +94,7 @@ def results_on_ray(
                 parts,
                 workers=options.workers,
                 paths=list(paths.values()),
-                advance=advance,
+                on_message=advancing(advance),
             )
         except WorkerDiedError as error:
             name, _ = keys[error.index]
@@ -107,13 +107,13 @@ def results_on_ray(
     return results
 
 
-def _run_part(part: Part, report: Callable[[int], None]) -> list[EpisodeResult]:
+def _run_part(part: Part, send: Callable[[int], None]) -> list[EpisodeResult]:
     done = 0
 
     def on_episode(_: EpisodeResult) -> None:
         nonlocal done
         done += 1
-        report(done)
+        send(done)
 
     with closing(make_limited(part.sim, part.max_steps, **part.options)) as env:
         is_batched = part.is_batched and part.policy not in SCRIPTED

@@ -67,6 +67,9 @@ def cluster(address: str | None = None, *, workers: int | None = None) -> Iterat
     """
     connected = connect(address, workers=workers, store_bytes=SMALL_STORE_BYTES)
     ray = sys.modules["ray"]
+    if connected:
+        # Ray prints the death of each worker to stdout, where commands print their results.
+        ray._private.worker._worker_logs_enabled = False
     try:
         yield ray
     finally:

@@ -23,7 +23,7 @@ from ray.data.datasource import Datasource, ReadTask
 
 from mcaprl.errors import NoEpisodesError, SpaceError, UnknownNameError
 from mcaprl.ray.blocks import block_of, columns_of, empty_columns, keys_of, row_bytes
-from mcaprl.ray.workers import check_machine
+from mcaprl.ray.tasks import check_machine
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 from mcaprl.recorder.dataset.open import Episodes, episode_indexes
 from mcaprl.recorder.dataset.tables import described

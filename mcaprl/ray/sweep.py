@@ -29,7 +29,7 @@ from mcaprl.offline.training.train import train
 from mcaprl.progress import Advance, TrainingProgress
 from mcaprl.ray.cluster import restored_handlers
 from mcaprl.ray.sweep_file import SweepPlan, Trial
-from mcaprl.ray.workers import MOST_DEATHS, check_machine, check_machines
+from mcaprl.ray.tasks import MOST_DEATHS, check_machine, check_machines
 from mcaprl.recorder.dataset.log_reader import LogReader
 from mcaprl.recorder.format.metadata import installed_versions
 from mcaprl.runs import saved_updates
@@ -135,7 +135,7 @@ def sweep_on_ray(
     with locked_folder(out, TrainingError):
         check_machines([out, *(path for path, _ in logs)])
         _open(out, json.loads(json.dumps(identity)), resume)
-        names = tuple(f"{path}:{weight:g}" for path, weight in logs)
+        names = tuple(f"{path}:{weight!r}" for path, weight in logs)
         job = _Job(names, plan, out, installed_versions())
         with work_folder(out / "tune") as folder:
             _run(tune, job, folder, workers, advance)

@@ -13,7 +13,7 @@ import pytest
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import ClusterError, MissingExtraError, UsageError
-from mcaprl.ray import cluster, workers
+from mcaprl.ray import cluster, tasks
 from mcaprl.recorder.format.metadata import installed_versions
 from tests.ray.processes import open_files
 from tests.ray.seeded import SEEDED
@@ -104,7 +104,7 @@ def test_other_versions_of_packages_on_a_worker_are_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     versions = {**installed_versions(), "numpy": "1.2.3"}
-    monkeypatch.setattr(workers, "installed_versions", lambda: versions)
+    monkeypatch.setattr(tasks, "installed_versions", lambda: versions)
     with pytest.raises(ClusterError, match=r"the worker at 127\.0\.0\.1 has numpy .* 1\.2\.3: in"):
         mcaprl.record(SEEDED, tmp_path / "a", policy="random", episodes=2, ray=True)
 
@@ -112,7 +112,7 @@ def test_other_versions_of_packages_on_a_worker_are_one_line(
 @pytest.mark.usefixtures("ray_cluster")
 def test_a_path_that_a_worker_does_not_see_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(ClusterError, match=r"127\.0\.0\.1 cannot see .*/none: choose a path"):
-        workers.run_tasks(_nothing, [1, 2], paths=[tmp_path / "none"])
+        tasks.run_tasks(_nothing, [1, 2], paths=[tmp_path / "none"])
 
 
 def _nothing(request: int, report: Any) -> int:
@@ -121,8 +121,8 @@ def _nothing(request: int, report: Any) -> int:
 
 @pytest.mark.usefixtures("ray_cluster")
 def test_results_are_in_the_order_of_the_requests() -> None:
-    assert workers.run_tasks(_nothing, list(range(5)), workers=3) == [0, 1, 2, 3, 4]
-    assert workers.run_tasks(_nothing, []) == []
+    assert tasks.run_tasks(_nothing, list(range(5)), workers=3) == [0, 1, 2, 3, 4]
+    assert tasks.run_tasks(_nothing, []) == []
 
 
 @pytest.mark.usefixtures("ray_cluster")

@@ -21,11 +21,11 @@ from mcaprl.cli import run
 from mcaprl.errors import ClusterError, OutputExistsError, TrainingError, UsageError
 from mcaprl.offline.algorithms.config import BCConfig
 from mcaprl.offline.training.train import train
-from mcaprl.ray import sweep, workers
+from mcaprl.ray import sweep, tasks
 from mcaprl.ray.sweep import Score, TrialResult
 from mcaprl.ray.sweep_file import SweepPlan, Trial, read_plan
 from mcaprl.ray.sweep_report import table_of, write_sweep
-from mcaprl.ray.workers import check_machine
+from mcaprl.ray.tasks import check_machine
 from mcaprl.recorder.format.metadata import installed_versions
 from tests.ray.processes import open_files
 from tests.ray.seeded import SEEDED
@@ -245,13 +245,13 @@ def test_other_versions_and_unseen_paths_are_found_before_the_trials_start(
 
     monkeypatch.setattr(sweep, "_run", None)
     with monkeypatch.context() as patch:
-        patch.setattr(workers, "check_machine", check_elsewhere)
+        patch.setattr(tasks, "check_machine", check_elsewhere)
         with pytest.raises(
             ClusterError, match=r"127\.0\.0\.1 cannot see /elsewhere/.*: choose a path"
         ):
             start()
     versions = {**installed_versions(), "numpy": "1.2.3"}
-    monkeypatch.setattr(workers, "installed_versions", lambda: versions)
+    monkeypatch.setattr(tasks, "installed_versions", lambda: versions)
     with pytest.raises(ClusterError, match=r"the worker at 127\.0\.0\.1 has numpy .* 1\.2\.3: in"):
         start()
     assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,201 @@
+"""Tasks on the workers of a Ray cluster. If a worker is killed, Ray repeats its task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from mcaprl.errors import ClusterError, McaprlError
+from mcaprl.progress import Advance
+from mcaprl.ray.cluster import cpus
+from mcaprl.recorder.format.metadata import installed_versions
+
+T = TypeVar("T")
+Result = TypeVar("Result")
+Send = Callable[[Any], None]
+"""Function that sends a message of a task to the calling process."""
+Task = Callable[[T, Send], Result]
+"""Function of a module, called with a request.
+
+If a worker is killed, its task is repeated. The task must then have the same result.
+"""
+
+MOST_DEATHS = 10
+"""Number of deaths of workers at which their task fails."""
+_INTERVAL_S = 0.1
+
+
+class WorkerDiedError(Exception):
+    """Too many workers died while they ran one task.
+
+    Attributes:
+        index: Index of the task's request.
+        cause: Cause of the last death.
+    """
+
+    def __init__(self, index: int, cause: str) -> None:
+        """Store the index and the cause."""
+        super().__init__(index, cause)
+        self.index, self.cause = index, cause
+
+
+def run_tasks(
+    task: Task[T, Result],
+    requests: Sequence[T],
+    *,
+    workers: int | None = None,
+    gpus: int = 0,
+    paths: Sequence[Path] = (),
+    on_message: Callable[[int, Any], None] = lambda index, message: None,
+) -> list[Result]:
+    """Run a task for each request on the workers of the cluster that this process is connected to.
+
+    If a task fails, or this process is interrupted, all tasks end.
+
+    Args:
+        task: Function of a module.
+        requests: Arguments of the tasks; they are pickled.
+        workers: Largest number of tasks at a time, with one CPU each; default: number of CPUs of
+            the cluster.
+        gpus: Number of GPUs of each task.
+        paths: Paths that each worker must see.
+        on_message: Function called with the index of a request and a message of its task. The
+            messages of a repeated task are repeated, too.
+
+    Returns:
+        The results, in the order of the requests.
+
+    Raises:
+        ClusterError: A worker cannot start, has other versions, or does not see a path.
+        WorkerDiedError: Workers died repeatedly while they ran one task.
+        Exception: A task raised it.
+    """
+    import ray
+    from ray.util.queue import Queue
+
+    messages = Queue(actor_options={"num_cpus": 0})
+    run = ray.remote(run_task).options(num_cpus=1, num_gpus=gpus, max_retries=MOST_DEATHS - 1)
+    versions, most = installed_versions(), workers or cpus()
+    waiting, calls, results = list(enumerate(requests))[::-1], dict[Any, int](), {}
+    try:
+        while waiting or calls:
+            while waiting and len(calls) < most:
+                index, request = waiting.pop()
+                call = run.remote(task, request, index, messages, versions, list(paths))
+                calls[call] = index
+            ready, _ = ray.wait(list(calls), timeout=_INTERVAL_S)
+            # A task that has ended has sent all its messages.
+            for index, message in messages.get_nowait_batch(messages.qsize()):
+                on_message(index, message)
+            for call in ready:
+                index = calls.pop(call)
+                results[index] = _result(call, index)
+    finally:
+        for call in calls:
+            ray.cancel(call, force=True)
+        messages.shutdown(force=True)
+    return [results[index] for index in range(len(requests))]
+
+
+def run_task(
+    task: Task[T, Result],
+    request: T,
+    index: int,
+    messages: Any,
+    versions: dict[str, str],
+    paths: Sequence[Path],
+) -> Result:
+    """Check the machine of this worker, then run a task."""
+    check_machine(versions, paths)
+    return task(request, lambda message: messages.put((index, message)))
+
+
+def _result(call: Any, index: int) -> Any:
+    import ray
+
+    try:
+        return ray.get(call)
+    except ray.exceptions.RayTaskError as error:
+        # Errors of this package are one line. All other errors keep the worker's traceback.
+        raise error.cause if isinstance(error.cause, McaprlError | OSError) else error from None
+    except ray.exceptions.RayError as error:
+        raise WorkerDiedError(index, _cause(error)) from error
+
+
+def advancing(advance: Advance) -> Callable[[int, int], None]:
+    """Return a function for tasks whose messages are the amount of work that they have done.
+
+    A repeated task advances nothing until it has done more than the task of the killed worker.
+    """
+    done: dict[int, int] = {}
+
+    def on_message(index: int, amount: int) -> None:
+        if amount > done.get(index, 0):
+            advance(amount - done.get(index, 0))
+            done[index] = amount
+
+    return on_message
+
+
+def check_machine(versions: dict[str, str], paths: Sequence[Path]) -> None:
+    """Check that a worker's machine has the same versions and files as the calling process.
+
+    Raises:
+        ClusterError: A version differs, or a path does not exist here.
+    """
+    mine = installed_versions()
+    for name in versions.keys() | mine.keys():
+        if versions.get(name) != mine.get(name):
+            raise ClusterError(
+                f"the worker at {_here()} has {name} {mine.get(name, 'not installed')}, this"
+                f" process {versions.get(name, 'not installed')}: install the same versions on all"
+                " machines"
+            )
+    for path in paths:
+        if not path.exists():
+            raise ClusterError(
+                f"the worker at {_here()} cannot see {path}: choose a path on a file system that"
+                " all machines share"
+            )
+
+
+def check_machines(paths: Sequence[Path]) -> None:
+    """Check all machines of the cluster that this process is connected to.
+
+    Raises:
+        ClusterError: A machine has other versions, does not see a path, or cannot import mcaprl.
+    """
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    check = ray.remote(check_machine)
+    nodes = [one["NodeID"] for one in ray.nodes() if one["Alive"] and one["Resources"].get("CPU")]
+    calls = [
+        check.options(
+            num_cpus=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)
+        ).remote(installed_versions(), list(paths))
+        for node in nodes
+    ]
+    try:
+        ray.get(calls)
+    except ray.exceptions.RayError as error:
+        cause = getattr(error, "cause", None)
+        if isinstance(cause, McaprlError):
+            raise cause from None
+        raise ClusterError(
+            "the workers of the cluster cannot start: install mcaprl with the same extras on all"
+            f" machines ({_cause(error)})"
+        ) from None
+
+
+def _cause(error: Exception) -> str:
+    """Return the first sentences of Ray's explanation, which name the cause of a death."""
+    return str(error).strip().splitlines()[-1].partition(" Some common causes")[0]
+
+
+def _here() -> str:
+    """Return the address of this machine."""
+    import ray
+
+    return str(ray.util.get_node_ip_address())
