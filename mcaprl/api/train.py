@@ -171,16 +171,23 @@ def train(
             "progress": progress,
         }
         if ray:
-            from mcaprl.ray.training import TrainingRequest, train_on_ray
+            from mcaprl.ray.training import train_on_ray
 
+            assert weights is not None
             assert not isinstance(data, Dataset)
-
-            # Paths are absolute, because workers have other working directories.
-            job = TrainingRequest(
-                config, out.absolute(), numbers, threads, device, resume, other_data
-            )
             summaries = train_on_ray(
-                as_names(data), dataset, weights, job, workers=workers, progress=progress
+                as_names(data),
+                dataset,
+                weights,
+                config,
+                out.absolute(),  # because workers have other working directories
+                seeds=numbers,
+                resume=resume,
+                other_data=other_data,
+                threads=threads,
+                device=device,
+                workers=workers,
+                progress=progress,
             )
         elif isinstance(config, AutoConfig):
             choice, summaries = select(

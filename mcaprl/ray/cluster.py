@@ -26,7 +26,7 @@ _MIB = 1 << 20
 SMALL_STORE_BYTES: Final = 100 * _MIB
 # Ray listens on every network interface unless this variable is 0 before Ray is imported.
 _LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
-# Signals whose handlers Ray Train and Ray Tune replace. Windows has no SIGUSR1.
+# Signals whose handlers Ray Tune replaces. Windows has no SIGUSR1.
 _REPLACED: Final = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGUSR1") if hasattr(signal, name)
 )
@@ -106,7 +106,7 @@ def connect(
 
 @contextmanager
 def restored_handlers() -> Iterator[None]:
-    """Restore the signal handlers that Ray Train and Ray Tune replace and do not restore.
+    """Restore the signal handlers that Ray Tune replaces and does not restore.
 
     Without this context, Ctrl-C does not interrupt this process after a run.
     """

@@ -16,10 +16,7 @@ Result = TypeVar("Result")
 Send = Callable[[Any], None]
 """Function that sends a message of a task to the calling process."""
 Task = Callable[[T, Send], Result]
-"""Function of a module, called with a request.
-
-If a worker is killed, its task is repeated. The task must then have the same result.
-"""
+"""Function of a module, called with a request. If it is repeated, it must have the same result."""
 
 MOST_DEATHS = 10
 """Number of deaths of workers at which their task fails."""
@@ -27,15 +24,10 @@ _INTERVAL_S = 0.1
 
 
 class WorkerDiedError(Exception):
-    """Too many workers died while they ran one task.
-
-    Attributes:
-        index: Index of the task's request.
-        cause: Cause of the last death.
-    """
+    """Too many workers died while they ran the task of the request with this index."""
 
     def __init__(self, index: int, cause: str) -> None:
-        """Store the index and the cause."""
+        """Store the index, and the cause of the last death."""
         super().__init__(index, cause)
         self.index, self.cause = index, cause
 
@@ -49,25 +41,15 @@ def run_tasks(
     paths: Sequence[Path] = (),
     on_message: Callable[[int, Any], None] = lambda index, message: None,
 ) -> list[Result]:
-    """Run a task for each request on the workers of the cluster that this process is connected to.
+    """Run a task for each request on the cluster; return the results in the order of the requests.
 
-    If a task fails, or this process is interrupted, all tasks end.
-
-    Args:
-        task: Function of a module.
-        requests: Arguments of the tasks; they are pickled.
-        workers: Largest number of tasks at a time, with one CPU each; default: number of CPUs of
-            the cluster.
-        gpus: Number of GPUs of each task.
-        paths: Paths that each worker must see.
-        on_message: Function called with the index of a request and a message of its task. The
-            messages of a repeated task are repeated, too.
-
-    Returns:
-        The results, in the order of the requests.
+    At most `workers` tasks run at a time, with one CPU each. Their machines must have the versions
+    of this process, and see `paths`. `on_message` receives the index of a request and a message of
+    its task; those of a repeated task come again. If a task fails, or this process is interrupted,
+    all tasks end.
 
     Raises:
-        ClusterError: A worker cannot start, has other versions, or does not see a path.
+        ClusterError: A worker has other versions, or does not see a path.
         WorkerDiedError: Workers died repeatedly while they ran one task.
         Exception: A task raised it.
     """

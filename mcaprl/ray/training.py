@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mcaprl.errors import ClusterError
 from mcaprl.offline.algorithms.config import TrainingConfig
@@ -24,61 +27,31 @@ from mcaprl.runs import RunIdentity, locked_run
 from mcaprl.texts import counted
 
 
-@dataclass(frozen=True)
-class TrainingRequest:
-    """Request for a training. Its fields are the arguments of `mcaprl.train`."""
-
-    config: TrainingConfig
-    out: Path
-    seeds: range
-    threads: int
-    device: str
-    resume: bool
-    other_data: bool
-
-
-@dataclass(frozen=True)
-class _SeedTask:
-    """Training of one seed: the logs and weights as for `open_weighted`, and the request."""
-
-    data: list[str]
-    request: TrainingRequest
-    identity: RunIdentity
-    seed: int
-
-
 def train_on_ray(
     data: Sequence[str],
     dataset: Dataset,
-    weights: Any,
-    request: TrainingRequest,
+    weights: NDArray[np.float64],
+    config: TrainingConfig,
+    out: Path,
     *,
+    seeds: range,
+    resume: bool,
+    other_data: bool,
+    threads: int,
+    device: str,
     workers: int | None,
     progress: ProgressCallback,
 ) -> list[OfflineSummary]:
-    """Train on the cluster that this process is connected to.
-
-    Args:
-        data: Logs and weights, as for `open_weighted`; all workers must see local logs.
-        dataset: The same logs.
-        weights: Weights (E,) of the episodes.
-        request: The training.
-        workers: Largest number of seeds at a time; default: number of CPUs of the cluster, or
-            number of GPUs if the device is `cuda`.
-        progress: Function called with each row of metrics.
-
-    Returns:
-        One summary for each seed.
+    """Train on the workers, which read `data` again; it has been read as `dataset` and `weights`.
 
     Raises:
         ClusterError: The cluster has fewer processors, a machine has other versions or does not
             see a path, or workers died repeatedly.
         McaprlError: As for a local training.
     """
-    workers = _workers(workers, request.device)
-    config, out, seeds = request.config, request.out, request.seeds
+    workers = _workers(workers, device)
     dataset = with_source(dataset, config.mask_from)
-    identity = run_identity(dataset, config, weights, request.other_data)
+    identity = run_identity(dataset, config, weights, other_data)
     logs = weighted_logs(data)
     texts: dict[str, None] = {}
 
@@ -88,17 +61,17 @@ def train_on_ray(
         else:
             progress(message)
 
-    with locked_run(out, request.resume):
+    with locked_run(out, resume):
         paths = [out, *(path for path, _ in logs)]
         check_machines(paths)
-        start_run(dataset, config, out, identity, seeds, request.resume)
+        start_run(dataset, config, out, identity, seeds, resume)
         names = [f"{path}:{weight!r}" for path, weight in logs]
         try:
-            summaries = run_tasks(
-                _train_seed,
-                [_SeedTask(names, request, identity, seed) for seed in seeds],
+            return run_tasks(
+                partial(_train_seed, names, config, out, identity, threads, device),
+                seeds,
                 workers=workers,
-                gpus=int(request.device == "cuda"),
+                gpus=int(device == "cuda"),
                 paths=paths,
                 on_message=on_message,
             )
@@ -110,26 +83,28 @@ def train_on_ray(
         finally:
             for text in texts:
                 warnings.warn(text, stacklevel=3)
-    return summaries
 
 
-def _train_seed(task: _SeedTask, send: Send) -> OfflineSummary:
+def _train_seed(
+    data: list[str],
+    config: TrainingConfig,
+    out: Path,
+    identity: RunIdentity,
+    threads: int,
+    device: str,
+    seed: int,
+    send: Send,
+) -> OfflineSummary:
+    """Train one seed; send its rows of metrics, and warnings as texts."""
     import torch
 
-    request = task.request
-    torch.set_num_threads(request.threads)
+    torch.set_num_threads(threads)
+    seeds = range(seed, seed + 1)
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: send(str(message))
-        dataset, weights = open_weighted(task.data, threads=request.threads)
+        dataset, weights = open_weighted(data, threads=threads)
         (summary,) = train_seeds(
-            dataset,
-            request.config,
-            request.out,
-            task.identity,
-            range(task.seed, task.seed + 1),
-            weights=weights,
-            device=request.device,
-            report=send,
+            dataset, config, out, identity, seeds, weights=weights, device=device, report=send
         )
     return summary
 

@@ -225,13 +225,12 @@ def test_a_trial_killed_between_checkpoint_and_score_has_all_scores(
     monkeypatch.setattr(tune, "report", lambda found: reported.append(found["updates"]))
     tree = {"algos": ["bc"], "settings": {"updates": 8, "hidden": [8]}, "seeds": 2}
     plan = read_plan({**tree, "score": {"every": 4, "updates": 5, "fraction": 0.5}})
-    job = sweep._Job((str(log),), plan, tmp_path, installed_versions())
     (trial,) = plan.trials
-    sweep._train(job, trial, tmp_path / trial.name)
+    sweep._train([str(log)], plan, trial, tmp_path)
     whole = sweep._result(trial, tmp_path).scores
     assert [one.updates for one in whole] == reported == [4, 8]
     sweep._save(tmp_path / trial.name, whole[:1], "")
-    sweep._train(job, trial, tmp_path / trial.name)
+    sweep._train([str(log)], plan, trial, tmp_path)
     assert sweep._result(trial, tmp_path).scores == whole
     assert reported == [4, 8, 4, 8]
 
