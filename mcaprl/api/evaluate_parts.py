@@ -52,7 +52,7 @@ def results_on_ray(
         ClusterError: The cluster cannot be used, or workers died repeatedly.
         MissingExtraError: Ray is not installed.
     """
-    from mcaprl.ray.tasks import WorkerDiedError, advancing, run_tasks
+    from mcaprl.ray.tasks import WorkerDiedError, run_tasks
 
     # Workers have other working directories, so all paths must be absolute.
     paths = {name: Path(name).absolute() for name in found if name not in SCRIPTED}
@@ -69,7 +69,7 @@ def results_on_ray(
                 parts,
                 workers=options.workers,
                 paths=list(paths.values()),
-                on_message=advancing(advance),
+                advance=advance,
             )
         except WorkerDiedError as error:
             raise ClusterError(

@@ -120,7 +120,7 @@ def record_on_ray(
         LogError: Another recording is writing to the folder, or workers died repeatedly.
         ClusterError: The cluster cannot be used.
     """
-    from mcaprl.ray.tasks import WorkerDiedError, advancing, run_tasks
+    from mcaprl.ray.tasks import WorkerDiedError, run_tasks
 
     # Workers have other working directories, so all paths must be absolute.
     whole = replace(whole, out=whole.out.absolute(), policy=_absolute(whole.policy))
@@ -134,12 +134,12 @@ def record_on_ray(
                 shards,
                 workers=options.workers,
                 paths=paths,
-                on_message=advancing(advance),
+                advance=advance,
             )
         except WorkerDiedError as error:
             raise LogError(
-                f"{shards[error.index].out}: workers died repeatedly while they recorded it"
-                f" ({error.cause}); the other finished shards are kept"
+                f"{shards[error.index].out}: workers died repeatedly without finishing another"
+                f" episode ({error.cause}); the other finished shards are kept"
             ) from error
         shutil.rmtree(hidden)
         files = [

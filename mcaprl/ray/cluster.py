@@ -45,6 +45,8 @@ def local_settings() -> dict[str, str]:
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
         "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
         "RAY_USAGE_STATS_ENABLED": "0",
+        # By default, tasks that need too much memory are repeated without end.
+        "RAY_task_oom_retries": "10",
     }
 
 

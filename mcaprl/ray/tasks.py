@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from mcaprl.errors import ClusterError, McaprlError
 from mcaprl.progress import Advance
@@ -13,18 +13,25 @@ from mcaprl.recorder.format.metadata import installed_versions
 
 T = TypeVar("T")
 Result = TypeVar("Result")
-Send = Callable[[Any], None]
-"""Function that sends a message of a task to the calling process."""
+
+
+class Send(Protocol):
+    """Function that sends a task's amount of work so far, and news, to the calling process."""
+
+    def __call__(self, done: int, news: Any = None) -> None:
+        """Send a message."""
+
+
 Task = Callable[[T, Send], Result]
 """Function of a module, called with a request. If it is repeated, it must have the same result."""
 
 MOST_DEATHS = 10
-"""Number of deaths of workers at which their task fails."""
+"""Number of deaths of workers, without progress between them, at which a task fails."""
 _INTERVAL_S = 0.1
 
 
 class WorkerDiedError(Exception):
-    """Too many workers died while they ran the task of the request with this index."""
+    """Too many workers died in the task of the request with this index, without progress."""
 
     def __init__(self, index: int, cause: str) -> None:
         """Store the index, and the cause of the last death."""
@@ -39,40 +46,55 @@ def run_tasks(
     workers: int | None = None,
     gpus: int = 0,
     paths: Sequence[Path] = (),
-    on_message: Callable[[int, Any], None] = lambda index, message: None,
+    advance: Advance = lambda amount: None,
+    on_news: Callable[[Any], None] = lambda news: None,
 ) -> list[Result]:
     """Run a task for each request on the cluster; return the results in the order of the requests.
 
     At most `workers` tasks run at a time, with one CPU each. Their machines must have the versions
-    of this process, and see `paths`. `on_message` receives the index of a request and a message of
-    its task; those of a repeated task come again. If a task fails, or this process is interrupted,
-    all tasks end.
+    of this process, and see `paths`. `advance` is called with the amount of new work, and `on_news`
+    with the news that tasks send; repeated tasks send theirs again. If a task fails, or this
+    process is interrupted, all tasks end.
 
     Raises:
         ClusterError: A worker has other versions, or does not see a path.
-        WorkerDiedError: Workers died repeatedly while they ran one task.
+        WorkerDiedError: Workers died repeatedly, and the task made no progress.
         Exception: A task raised it.
     """
     import ray
     from ray.util.queue import Queue
 
-    messages = Queue(actor_options={"num_cpus": 0})
+    here = _on_node(ray.get_runtime_context().get_node_id())
+    messages = Queue(actor_options=here)
     run = ray.remote(run_task).options(num_cpus=1, num_gpus=gpus, max_retries=MOST_DEATHS - 1)
     versions, most = installed_versions(), workers or cpus()
-    waiting, calls, results = list(enumerate(requests))[::-1], dict[Any, int](), {}
+    waiting, calls, results = list(range(len(requests)))[::-1], dict[Any, int](), {}
+    done, progressed = [0] * len(requests), set[int]()
     try:
         while waiting or calls:
             while waiting and len(calls) < most:
-                index, request = waiting.pop()
-                call = run.remote(task, request, index, messages, versions, list(paths))
+                index = waiting.pop()
+                call = run.remote(task, requests[index], index, messages, versions, list(paths))
                 calls[call] = index
             ready, _ = ray.wait(list(calls), timeout=_INTERVAL_S)
             # A task that has ended has sent all its messages.
-            for index, message in messages.get_nowait_batch(messages.qsize()):
-                on_message(index, message)
+            for index, amount, news in messages.get_nowait_batch(messages.qsize()):
+                if amount > done[index]:
+                    advance(amount - done[index])
+                    done[index] = amount
+                    progressed.add(index)
+                if news is not None:
+                    on_news(news)
             for call in ready:
                 index = calls.pop(call)
-                results[index] = _result(call, index)
+                try:
+                    results[index] = _result(call, index, paths)
+                except WorkerDiedError:
+                    if index not in progressed:
+                        raise
+                    # Ray's retries are used up. Give the task new ones, because it gets on.
+                    progressed.remove(index)
+                    waiting.append(index)
     finally:
         for call in calls:
             ray.cancel(call, force=True)
@@ -90,34 +112,22 @@ def run_task(
 ) -> Result:
     """Check the machine of this worker, then run a task."""
     check_machine(versions, paths)
-    return task(request, lambda message: messages.put((index, message)))
+    return task(request, lambda done, news=None: messages.put((index, done, news)))
 
 
-def _result(call: Any, index: int) -> Any:
+def _result(call: Any, index: int, paths: Sequence[Path]) -> Any:
     import ray
 
     try:
         return ray.get(call)
     except ray.exceptions.RayTaskError as error:
         # Errors of this package are one line. All other errors keep the worker's traceback.
-        raise error.cause if isinstance(error.cause, McaprlError | OSError) else error from None
+        if isinstance(error.cause, McaprlError | OSError):
+            raise error.cause from None
+        check_machines(paths)
+        raise
     except ray.exceptions.RayError as error:
         raise WorkerDiedError(index, _cause(error)) from error
-
-
-def advancing(advance: Advance) -> Callable[[int, int], None]:
-    """Return a function for tasks whose messages are the amount of work that they have done.
-
-    A repeated task advances nothing until it has done more than the task of the killed worker.
-    """
-    done: dict[int, int] = {}
-
-    def on_message(index: int, amount: int) -> None:
-        if amount > done.get(index, 0):
-            advance(amount - done.get(index, 0))
-            done[index] = amount
-
-    return on_message
 
 
 def check_machine(versions: dict[str, str], paths: Sequence[Path]) -> None:
@@ -149,16 +159,10 @@ def check_machines(paths: Sequence[Path]) -> None:
         ClusterError: A machine has other versions, does not see a path, or cannot import mcaprl.
     """
     import ray
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    check = ray.remote(check_machine)
+    check, versions = ray.remote(check_machine), installed_versions()
     nodes = [one["NodeID"] for one in ray.nodes() if one["Alive"] and one["Resources"].get("CPU")]
-    calls = [
-        check.options(
-            num_cpus=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)
-        ).remote(installed_versions(), list(paths))
-        for node in nodes
-    ]
+    calls = [check.options(**_on_node(node)).remote(versions, list(paths)) for node in nodes]
     try:
         ray.get(calls)
     except ray.exceptions.RayError as error:
@@ -169,6 +173,13 @@ def check_machines(paths: Sequence[Path]) -> None:
             "the workers of the cluster cannot start: install mcaprl with the same extras on all"
             f" machines ({_cause(error)})"
         ) from None
+
+
+def _on_node(node: str) -> dict[str, Any]:
+    """Return options that run a task or an actor on this node, without a CPU for itself."""
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    return {"num_cpus": 0, "scheduling_strategy": NodeAffinitySchedulingStrategy(node, soft=False)}
 
 
 def _cause(error: Exception) -> str:

@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.batches.sources import open_weighted, weighted_logs
 from mcaprl.offline.training.metrics import OfflineSummary
 from mcaprl.offline.training.train import run_identity, start_run, train_seeds, with_source
-from mcaprl.progress import ProgressCallback
+from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.ray.cluster import cpus
 from mcaprl.ray.tasks import Send, WorkerDiedError, check_machines, run_tasks
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -55,11 +54,11 @@ def train_on_ray(
     logs = weighted_logs(data)
     texts: dict[str, None] = {}
 
-    def on_message(index: int, message: Any) -> None:
-        if isinstance(message, str):
-            texts[message] = None
+    def on_news(news: TrainingProgress | str) -> None:
+        if isinstance(news, str):
+            texts[news] = None
         else:
-            progress(message)
+            progress(news)
 
     with locked_run(out, resume):
         paths = [out, *(path for path, _ in logs)]
@@ -73,7 +72,7 @@ def train_on_ray(
                 workers=workers,
                 gpus=int(device == "cuda"),
                 paths=paths,
-                on_message=on_message,
+                on_news=on_news,
             )
         except WorkerDiedError as error:
             raise ClusterError(
@@ -101,10 +100,17 @@ def _train_seed(
     torch.set_num_threads(threads)
     seeds = range(seed, seed + 1)
     with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_, **__: send(str(message))
+        warnings.showwarning = lambda message, *_, **__: send(0, str(message))
         dataset, weights = open_weighted(data, threads=threads)
         (summary,) = train_seeds(
-            dataset, config, out, identity, seeds, weights=weights, device=device, report=send
+            dataset,
+            config,
+            out,
+            identity,
+            seeds,
+            weights=weights,
+            device=device,
+            report=lambda now: send(now.done, now),
         )
     return summary
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
 import subprocess
 import sys
@@ -123,6 +125,29 @@ def _nothing(request: int, report: Any) -> int:
 def test_results_are_in_the_order_of_the_requests() -> None:
     assert tasks.run_tasks(_nothing, list(range(5)), workers=3) == [0, 1, 2, 3, 4]
     assert tasks.run_tasks(_nothing, []) == []
+
+
+@pytest.mark.usefixtures("ray_cluster")
+def test_a_task_that_makes_progress_is_repeated_after_any_number_of_deaths(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tasks, "MOST_DEATHS", 2)
+    amounts: list[int] = []
+    news: list[Any] = []
+    run = tasks.run_tasks(_dying, [tmp_path], advance=amounts.append, on_news=news.append)
+    assert run == [5]
+    assert sum(amounts) == 5
+    assert news == [f"attempt {number}" for number in range(6)]
+
+
+def _dying(folder: Path, send: Any) -> int:
+    """Kill this worker in the first five attempts, each of which makes progress."""
+    attempt = len(list(folder.iterdir()))
+    (folder / str(attempt)).touch()
+    send(attempt, f"attempt {attempt}")
+    if attempt < 5:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return attempt
 
 
 @pytest.mark.usefixtures("ray_cluster")

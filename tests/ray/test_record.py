@@ -196,7 +196,7 @@ def test_a_sim_that_kills_each_worker_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mcaprl.ray.tasks.MOST_DEATHS", 2)
-    with pytest.raises(LogError, match=r"shard-00\.mcap: workers died repeatedly while"):
+    with pytest.raises(LogError, match=r"shard-00\.mcap: workers died repeatedly without"):
         record(tmp_path / "a", 2, shards=1, sim_options={"dies": True})
     assert "manifest.json" not in contents(tmp_path / "a")
 
