@@ -9,9 +9,9 @@ The encoders of images are described in `mcaprl.architecture`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, cast
+from typing import Protocol, cast
 
 import numpy as np
 import torch
@@ -49,37 +49,22 @@ class ImageInput:
         shift = None if self.shift is None else np.tile(self.shift, (1, 1, count))
         return replace(self, shape=(height, width, channels * count), shift=shift)
 
-    def normalized_to(
-        self,
-        images: NDArray[np.uint8],
-        position: Callable[[int], tuple[int, int]] = lambda count: (0, count),
-        gather: Callable[[Any], list[Any]] = lambda value: [value],
-    ) -> ImageInput:
+    def normalized_to(self, images: NDArray[np.uint8]) -> ImageInput:
         """Return the input with the mean image as shift and the standard deviation as scale.
 
         All pixels of the images (N, height, width) or (N, height, width, channels) share one scale.
         Pixels that hardly change therefore keep small values.
-
-        Args:
-            images: All images, or those of this process.
-            position: Function that accepts the number of `images`. It returns two numbers of
-                images: of the processes before this one, and of all processes.
-            gather: Function that accepts the value of this process, and returns the values of
-                all processes.
         """
-        first, number = position(len(images))
-        used = np.linspace(0, number - 1, min(number, _MAX_IMAGES)).astype(np.int64) - first
-        used = used[(used >= 0) & (used < len(images))]
+        number = len(images)
+        used = np.linspace(0, number - 1, min(number, _MAX_IMAGES)).astype(np.int64)
         total = np.zeros(self.shape)
         squares = 0.0
         for rows in np.split(used, range(_IMAGES_AT_ONCE, len(used), _IMAGES_AT_ONCE)):
             pixels = np.asarray(images[rows]).reshape(-1, *self.shape).astype(np.float64)
             total += pixels.sum(0)
             squares += float(np.square(pixels).sum())
-        counts, totals, parts = zip(*gather((len(used), total, squares)), strict=True)
-        count, squares = sum(counts), sum(parts)
-        mean = sum(totals) / count
-        variance = squares / (count * mean.size) - float(np.square(mean).mean())
+        mean = total / len(used)
+        variance = squares / (len(used) * mean.size) - float(np.square(mean).mean())
         scale = math.sqrt(variance) if variance > _SMALLEST_VARIANCE else self.scale
         return replace(self, shift=mean.astype(np.float32), scale=scale)
 

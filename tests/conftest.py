@@ -105,12 +105,7 @@ def ray_cluster() -> Iterator[None]:
         patch.setenv("RAY_worker_niceness", "0")
         assert connect(LOCAL, workers=2, store_bytes=200 << 20)
     logging.getLogger("ray.data").setLevel(logging.ERROR)
-    with pytest.MonkeyPatch.context() as patch:
-        # Ray Train finds a dead or finished worker within this time, and needs no process that
-        # watches for machines which a cloud is about to take away.
-        patch.setenv("RAY_TRAIN_HEALTH_CHECK_INTERVAL_S", "0.2")
-        patch.setenv("RAY_TRAIN_ENABLE_PREEMPTION_WATCHER", "0")
-        yield
+    yield
     # Ray's thread for errors sometimes waits for the server forever: end the server after 10 s.
     command = ["pkill", "-P", str(os.getpid()), "gcs_server"]
     timer = threading.Timer(10, subprocess.run, [command])

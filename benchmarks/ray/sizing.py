@@ -21,8 +21,6 @@ from mcaprl.recorder import LogReader
 
 EPISODES = 60
 FILE_BYTES = 1e9
-# Each worker stores the seven arrays of `GroupShare` for all episodes: 56 bytes per episode.
-_EPISODE_BYTES = 56
 
 
 @dataclass(frozen=True)
@@ -98,15 +96,9 @@ def sizing(
         ),
         ("reading the summaries", f"{transitions * rates.index_s / 60:.3g} CPU minutes", ""),
         (
-            "memory for training, all workers",
+            "memory for training, each worker",
             f"{transitions * rates.buffer_bytes / 1e9:.3g} GB",
-            f"x {rates.buffer_bytes:.0f} B",
-        ),
-        (
-            f"memory for training, each of {workers}",
-            f"{transitions * rates.buffer_bytes / workers / 1e9:.3g} GB",
-            f"and {episodes * _EPISODE_BYTES / 1e6:.0f} MB for the lengths of all episodes;"
-            " about twice as much while it reads",
+            f"x {rates.buffer_bytes:.0f} B; about twice as much while it reads",
         ),
         (
             f"recording by {workers} workers",

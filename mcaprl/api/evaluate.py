@@ -15,7 +15,7 @@ import gymnasium as gym
 
 from mcaprl.api.cluster import ClusterOptions
 from mcaprl.api.environments import all_options, trained_options
-from mcaprl.api.evaluate_parts import Part, results_on_ray
+from mcaprl.api.evaluate_parts import results_on_ray
 from mcaprl.api.policies import SCRIPTED, Names, as_names, policies_of, policy_names
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import ReportError, UsageError, import_extra
@@ -192,8 +192,18 @@ def evaluate(
             total = sum(map(len, found.values())) * episodes
             advance = stack.enter_context(progress("evaluating", total))
             if ray:
-                request = Part(sim, options, seed, is_batched, max_steps, mask_from=source)
-                results = results_on_ray(request, found, episodes, on_cluster, advance)
+                results = results_on_ray(
+                    found,
+                    episodes,
+                    on_cluster,
+                    advance,
+                    sim=sim,
+                    sim_options=options,
+                    seed=seed,
+                    is_batched=is_batched,
+                    max_steps=max_steps,
+                    mask_from=source,
+                )
                 scores = {name: score_of(shown[name], results[name], env) for name in found}
                 found = {}
             envs = make_sims(sim, episodes, **options) if is_batched and found else None

@@ -10,13 +10,24 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from mcaprl.api.cluster import ClusterOptions
 from mcaprl.api.policies import SCRIPTED
 from mcaprl.api.record_file import FileRequest, record_file, try_request
-from mcaprl.errors import LogError, OutputExistsError
+from mcaprl.errors import LogError, NoStepsError, OutputExistsError
 from mcaprl.files import check_target, locked_file, locked_folder
 from mcaprl.progress import Advance
-from mcaprl.recorder.dataset.manifest import MANIFEST_NAME, LogFile, write_manifest
+from mcaprl.recorder.dataset.log_reader import LogReader
+from mcaprl.recorder.dataset.manifest import (
+    MANIFEST_NAME,
+    UNFINISHED_NAME,
+    LogFile,
+    unfinished_folder,
+    write_manifest,
+)
+from mcaprl.recorder.format.episode_summary import INTERRUPTED
+from mcaprl.recorder.repair.recover import recover_log
 from mcaprl.sims.evaluation.rollout import EpisodeResult
 from mcaprl.texts import counted
 from mcaprl.workers import WorkerEndedError, run_workers
@@ -109,8 +120,7 @@ def record_on_ray(
         LogError: Another recording is writing to the folder, or workers died repeatedly.
         ClusterError: The cluster cannot be used.
     """
-    from mcaprl.ray.shards import unfinished_folder
-    from mcaprl.ray.workers import WorkerDiedError, run_tasks
+    from mcaprl.ray.tasks import WorkerDiedError, run_tasks
 
     # Workers have other working directories, so all paths must be absolute.
     whole = replace(whole, out=whole.out.absolute(), policy=_absolute(whole.policy))
@@ -120,7 +130,11 @@ def record_on_ray(
         paths = [hidden] if whole.policy in SCRIPTED else [hidden, Path(whole.policy)]
         try:
             results = run_tasks(
-                _record_on_worker, shards, workers=options.workers, paths=paths, advance=advance
+                _record_on_worker,
+                shards,
+                workers=options.workers,
+                paths=paths,
+                advance=advance,
             )
         except WorkerDiedError as error:
             raise LogError(
@@ -136,34 +150,77 @@ def record_on_ray(
     return [result for shard in results for result in shard]
 
 
-def _record_on_worker(request: FileRequest, report: Callable[[int], None]) -> list[EpisodeResult]:
-    """Record a shard, or continue it if its worker was killed. Return all episodes of the shard."""
-    from mcaprl.ray.shards import Shard, episodes_of
+def _record_on_worker(request: FileRequest, send: Callable[[int], None]) -> list[EpisodeResult]:
+    """Record a shard, or continue that of a killed worker. Return all episodes of the shard.
 
-    shard = Shard(request.out)
-    if not shard.is_complete:
-        kept = shard.resume()
+    Until the shard is complete, its log is in the hidden folder.
+    """
+    unfinished = request.out.parent / UNFINISHED_NAME / request.out.name
+    if not request.out.exists():
+        kept = _repaired(unfinished)
         done = len(kept) if request.episodes else sum(result.length for result in kept)
-        report(done)
+        send(done)
         rest = (request.episodes or request.steps or 0) - done
 
         def on_episode(result: EpisodeResult) -> None:
             nonlocal done
             done += 1 if request.episodes else result.length
-            report(done)
+            send(done)
 
         if rest > 0:
             part = replace(
                 request,
-                out=shard.unfinished,
+                out=unfinished,
                 episodes=rest if request.episodes else None,
                 steps=rest if request.steps else None,
                 overwrite=False,
                 append=bool(kept),
             )
             record_file(part, on_episode)
-        shard.publish()
-    return episodes_of(shard.path)
+        with unfinished.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(unfinished, request.out)
+    return _episodes_of(request.out)
+
+
+def _repaired(path: Path) -> list[EpisodeResult]:
+    """Repair the log of a killed worker, so that it can be continued; return its episodes.
+
+    Raises:
+        LogError: A worker is still recording the log, or the log cannot be written.
+    """
+    if not path.exists():
+        return []
+    repaired = path.with_suffix(".repaired")
+    with locked_file(path):
+        pass
+    try:
+        recover_log(path, repaired, overwrite=True)
+        kept = _episodes_of(repaired)
+    except LogError:
+        # The file has no finished episode.
+        kept = []
+    # A worker that was stopped instead of killed has closed the log with an interrupted episode.
+    # Such a log is recorded again from its beginning.
+    if kept and kept[-1].reason != INTERRUPTED:
+        os.replace(repaired, path)
+        return kept
+    repaired.unlink(missing_ok=True)
+    path.unlink()
+    return []
+
+
+def _episodes_of(path: Path) -> list[EpisodeResult]:
+    """Return the result of each episode of a log, without positions."""
+    try:
+        summaries = LogReader(path).episode_summaries()
+    except NoStepsError:
+        return []
+    nowhere = np.empty((0, 2))
+    return [
+        EpisodeResult(one.seed or 0, one.total_reward, one.length, one.reason, nowhere)
+        for one in summaries
+    ]
 
 
 def _count(whole: FileRequest, parts: int | None) -> int:

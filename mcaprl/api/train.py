@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,14 +84,13 @@ def train(
             docs/bags.md.
         budget_minutes: Wall time of `auto`, minutes; None for no bound.
         report: Output folder of the HTML page on the choice of `auto`.
-        ray: Whether Ray workers train, each on some of the episodes. The result is that of one
-            process, except for rounding. All workers must see the logs and `out`.
+        ray: Whether Ray workers train, each of them one seed after the other. The result is that of
+            one process. All workers must see the logs and `out`.
         workers: Number of Ray workers; default: number of CPUs of the cluster, or with `cuda` its
             number of GPUs.
         address: Address of a Ray cluster, `HOST:PORT` or `auto`; default: RAY_ADDRESS, else a
             local cluster for this call.
-        on_data: Function called with the algorithm and the dataset before the first update;
-            not called with `ray`, because no single process holds the dataset.
+        on_data: Function called with the algorithm and the dataset before the first update.
         progress: Function called with each row of metrics.
         **settings: Settings of the algorithm. Missing settings have the algorithm's defaults; with
             `resume`, they have the values of the run.
@@ -140,29 +139,11 @@ def train(
     check_settings(algo, defaults, settings)
     config = type(defaults)(**settings)
     _check_choice(algo, budget_minutes, report, follow, other_data)
-    if ray:
-        if follow or mapping is not None or isinstance(data, Dataset) or algo == AUTO:
-            raise UsageError(
-                "--ray trains one algorithm on the paths of logs, without --follow and --mapping"
-            )
-        from mcaprl.ray.training import TrainingRequest, train_on_ray
-
-        # Paths are absolute, because workers have other working directories.
-        job = TrainingRequest(
-            config,
-            out.absolute(),
-            numbers,
-            threads,
-            device,
-            resume,
-            other_data,
+    if ray and (follow or mapping is not None or isinstance(data, Dataset) or algo == AUTO):
+        raise UsageError(
+            "--ray trains one algorithm on the paths of logs, without --follow and --mapping"
         )
-        with on_cluster.connected():
-            summaries = train_on_ray(as_names(data), job, workers=workers, progress=progress)
-        with suppress(MissingExtraError):
-            draw_curves(out)
-        return summaries
-    with torch_threads(threads):
+    with on_cluster.connected() if ray else nullcontext(), torch_threads(threads):
         growing, weights = None, None
         if mapping is not None and not isinstance(data, Dataset):
             if follow:
@@ -189,7 +170,26 @@ def train(
             "device": device,
             "progress": progress,
         }
-        if isinstance(config, AutoConfig):
+        if ray:
+            from mcaprl.ray.training import train_on_ray
+
+            assert weights is not None
+            assert not isinstance(data, Dataset)
+            summaries = train_on_ray(
+                as_names(data),
+                dataset,
+                weights,
+                config,
+                out.absolute(),  # because workers have other working directories
+                seeds=numbers,
+                resume=resume,
+                other_data=other_data,
+                threads=threads,
+                device=device,
+                workers=workers,
+                progress=progress,
+            )
+        elif isinstance(config, AutoConfig):
             choice, summaries = select(
                 dataset, config, out, budget_minutes=budget_minutes, **request
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from gymnasium import spaces
@@ -11,7 +12,6 @@ from torch import Tensor
 from mcaprl.offline.algorithms.config import DoubleDQNConfig
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
-from mcaprl.offline.batches.share import Share
 
 
 class ReplayBuffer:
@@ -22,8 +22,7 @@ class ReplayBuffer:
     observations of all rows, followed by the next observations of all rows.
 
     Attributes:
-        transitions: All transitions. `transitions.share` draws rows of each agent from the agent's
-            own transitions.
+        transitions: All transitions; each agent draws from its own.
     """
 
     def __init__(
@@ -55,7 +54,7 @@ class ReplayBuffer:
         rows = slots * self._width
         vectors = torch.zeros(2 * rows, encoder.width, device=device)
         self._own = OwnRows(agents, envs, slots, config.n_steps, device, seed)
-        self.transitions = TransitionBuffer(
+        self.transitions = OwnTransitions(
             encoder=encoder,
             action_space=action_space,
             packing=config.packing,
@@ -64,8 +63,8 @@ class ReplayBuffer:
             places=torch.arange(2 * rows, device=device).view(2, rows),
             actions=torch.zeros(rows, dtype=torch.int64, device=device),
             returns=torch.zeros(2, rows, device=device),
-            share=self._own,
             is_fixed=False,
+            own=self._own,
         )
         # The views below have one row for each slot.
         self._observations, self._next_observations = vectors.view(2, slots, self._width, -1)
@@ -125,8 +124,8 @@ class ReplayBuffer:
         return torch.arange(first, first + self._width, device=self._returns.device)
 
 
-class OwnRows(Share):
-    """Draws of K agents from a `ReplayBuffer`; each agent draws from its own environments.
+class OwnRows:
+    """Rows of the environments of each of K agents.
 
     Attributes:
         steps: Number of completed slots so far, including those that were replaced.
@@ -142,19 +141,32 @@ class OwnRows(Share):
         self._generator = torch.Generator(device).manual_seed(seed)
         self._first = torch.arange(agents, device=device).unsqueeze(1) * envs
 
-    def draw(
-        self, buffer: TransitionBuffer, count: int, generators: Sequence[torch.Generator]
-    ) -> tuple[Tensor, None]:
-        """Draw rows as described for `Share`, with one generator on the device for all agents."""
+    def draw(self, count: int) -> Tensor:
+        """Draw `count` rows for each agent, (K * count,), with one generator for all agents."""
         stored = min(self.steps, self._slots) - self.n_steps + 1
         drawn = torch.randint(
             stored * self._envs,
-            (len(generators), count),
+            (len(self._first), count),
             generator=self._generator,
-            device=buffer.device,
+            device=self._first.device,
         )
         # The last step with a known return has the age 0.
         ages = drawn // self._envs
         slots = (self.steps - self.n_steps - ages) % self._slots
         rows = slots * self._width + self._first + drawn % self._envs
-        return rows.flatten(), None
+        return rows.flatten()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OwnTransitions(TransitionBuffer):
+    """Transitions from which each agent draws its own.
+
+    Attributes:
+        own: Rows of each agent.
+    """
+
+    own: OwnRows
+
+    def draw(self, count: int, generators: Sequence[torch.Generator]) -> Tensor:
+        """Draw rows of each agent; the draws of `own` replace those of the generators."""
+        return self.own.draw(count)

@@ -26,7 +26,7 @@ _MIB = 1 << 20
 SMALL_STORE_BYTES: Final = 100 * _MIB
 # Ray listens on every network interface unless this variable is 0 before Ray is imported.
 _LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
-# Signals whose handlers Ray Train and Ray Tune replace. Windows has no SIGUSR1.
+# Signals whose handlers Ray Tune replaces. Windows has no SIGUSR1.
 _REPLACED: Final = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGUSR1") if hasattr(signal, name)
 )
@@ -45,6 +45,8 @@ def local_settings() -> dict[str, str]:
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
         "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
         "RAY_USAGE_STATS_ENABLED": "0",
+        # By default, tasks that need too much memory are repeated without end.
+        "RAY_task_oom_retries": "10",
     }
 
 
@@ -67,6 +69,9 @@ def cluster(address: str | None = None, *, workers: int | None = None) -> Iterat
     """
     connected = connect(address, workers=workers, store_bytes=SMALL_STORE_BYTES)
     ray = sys.modules["ray"]
+    if connected:
+        # Ray prints the death of each worker to stdout, where commands print their results.
+        ray._private.worker._worker_logs_enabled = False
     try:
         yield ray
     finally:
@@ -103,7 +108,7 @@ def connect(
 
 @contextmanager
 def restored_handlers() -> Iterator[None]:
-    """Restore the signal handlers that Ray Train and Ray Tune replace and do not restore.
+    """Restore the signal handlers that Ray Tune replaces and does not restore.
 
     Without this context, Ctrl-C does not interrupt this process after a run.
     """

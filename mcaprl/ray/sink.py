@@ -16,9 +16,13 @@ from ray.data.block import BlockAccessor
 from mcaprl.errors import OutputExistsError, UsageError
 from mcaprl.files import parse_json, temporary_folder
 from mcaprl.ray.blocks import Columns, dataset_of
-from mcaprl.ray.shards import unfinished_folder
-from mcaprl.ray.workers import check_machine
-from mcaprl.recorder.dataset.manifest import MANIFEST_NAME, LogFile, write_manifest
+from mcaprl.ray.tasks import check_machine
+from mcaprl.recorder.dataset.manifest import (
+    MANIFEST_NAME,
+    LogFile,
+    unfinished_folder,
+    write_manifest,
+)
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata, installed_versions
 from mcaprl.storage.remote import check_upload, is_url, upload
 

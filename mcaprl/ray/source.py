@@ -23,7 +23,7 @@ from ray.data.datasource import Datasource, ReadTask
 
 from mcaprl.errors import NoEpisodesError, SpaceError, UnknownNameError
 from mcaprl.ray.blocks import block_of, columns_of, empty_columns, keys_of, row_bytes
-from mcaprl.ray.workers import check_machine
+from mcaprl.ray.tasks import check_machine
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 from mcaprl.recorder.dataset.open import Episodes, episode_indexes
 from mcaprl.recorder.dataset.tables import described
@@ -37,16 +37,10 @@ _LEAST_BYTES = 16 << 20
 
 @dataclass(frozen=True)
 class _Group:
-    """Episodes of one log that become one block.
-
-    Attributes:
-        path: Path of the log.
-        episodes: (E,) increasing indexes of the episodes in the log.
-        first: Index of the log's first episode over all logs.
-        rows: Number of transitions.
-    """
+    """Episodes of one log that become one block; `rows` is their number of transitions."""
 
     path: Path
+    # (E,) increasing indexes in the log, whose first episode has the index `first` over all logs.
     episodes: NDArray[np.int64]
     first: int
     rows: int
@@ -54,14 +48,7 @@ class _Group:
 
 @dataclass(frozen=True)
 class _Wanted:
-    """Columns that every task reads, and metadata for their blocks.
-
-    Attributes:
-        names: Names of the columns.
-        keys: Keys of the observations in these columns; None for all.
-        metadata: Metadata of a block's schema: the spaces, as `Dataset.to_arrow` stores them.
-        versions: Versions of the packages of the calling process.
-    """
+    """Columns that every task reads, and metadata for their blocks."""
 
     names: list[str]
     keys: tuple[str, ...] | None
@@ -89,19 +76,9 @@ class LogSource(Datasource):  # type: ignore[misc]
     ) -> None:
         """Read the summaries of the logs, but no transitions.
 
-        Args:
-            paths: Logs.
-            columns: Names of the columns; default: all.
-            episodes: Episodes to read, counted over all logs; default: all.
-            blocks: Minimum number of blocks; default: chosen by the size of the data.
-            least: Minimum number of blocks if `blocks` is None.
-            most_bytes: Maximum size of a block; only a block of a single episode may be larger.
-
-        Raises:
-            LogError: A log cannot be read, or no log has a finished episode.
-            SpaceError: The spaces of the logs differ.
-            UnknownNameError: There is no such column.
-            UsageError: There is no such episode.
+        There are at least `blocks` blocks, by default as many as the size of the data asks for, but
+        at least `least`. Only a block of a single episode may have more than `most_bytes`. The
+        other arguments, and the errors, are those of `mcaprl.ray.read`.
         """
         super().__init__()
         # The constructor of the base class does not set this attribute.
@@ -201,11 +178,7 @@ class LogSource(Datasource):  # type: ignore[misc]
     def _chosen_episodes(
         self,
     ) -> Iterator[tuple[Path, int, NDArray[np.int64], NDArray[np.int64]]]:
-        """Yield the path and the chosen episodes of each log.
-
-        The items of each tuple are the path, the index of the log's first episode over all logs,
-        the indexes of the chosen episodes in the log, and the lengths of these episodes.
-        """
+        """Yield each log, the index of its first episode, and its chosen indexes and lengths."""
         first = 0
         for path, lengths in zip(self._paths, self._lengths, strict=True):
             mine = np.arange(len(lengths))

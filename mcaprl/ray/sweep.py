@@ -29,7 +29,7 @@ from mcaprl.offline.training.train import train
 from mcaprl.progress import Advance, TrainingProgress
 from mcaprl.ray.cluster import restored_handlers
 from mcaprl.ray.sweep_file import SweepPlan, Trial
-from mcaprl.ray.workers import MOST_DEATHS, check_machine, check_machines
+from mcaprl.ray.tasks import MOST_DEATHS, check_machine, check_machines
 from mcaprl.recorder.dataset.log_reader import LogReader
 from mcaprl.recorder.format.metadata import installed_versions
 from mcaprl.runs import saved_updates
@@ -85,16 +85,6 @@ class TrialResult:
         return "finished" if updates == self.trial.config.updates else "stopped early"
 
 
-@dataclass(frozen=True)
-class _Job:
-    """Arguments that all trials have in common."""
-
-    data: tuple[str, ...]
-    plan: SweepPlan
-    out: Path
-    versions: dict[str, str]
-
-
 def sweep_on_ray(
     data: Sequence[str],
     plan: SweepPlan,
@@ -104,25 +94,9 @@ def sweep_on_ray(
     resume: bool,
     advance: Advance,
 ) -> list[TrialResult]:
-    """Run the trials on the cluster that this process is connected to.
+    """Run the trials on the cluster; return the results, best score first.
 
-    Args:
-        data: Logs and weights, as for `open_weighted`; all workers must see the local files among
-            them.
-        plan: What to try.
-        out: Folder to create; an absolute path that all workers see.
-        workers: Largest number of trials at a time; default: CPUs of the cluster.
-        resume: Whether to continue the sweep in `out`.
-        advance: Function called with 1 after each trial.
-
-    Returns:
-        The results, best score first.
-
-    Raises:
-        OutputExistsError: `out` exists.
-        TrainingError: All trials failed, or `out` contains a different sweep or no sweep.
-        ClusterError: A machine has other versions, or does not see a path.
-        McaprlError: The logs cannot be read.
+    The arguments and errors are those of `mcaprl.sweep`; `advance` is called after each trial.
     """
     tune = import_extra("ray.tune", "ray")
     logs = weighted_logs(data)
@@ -135,10 +109,12 @@ def sweep_on_ray(
     with locked_folder(out, TrainingError):
         check_machines([out, *(path for path, _ in logs)])
         _open(out, json.loads(json.dumps(identity)), resume)
-        names = tuple(f"{path}:{weight:g}" for path, weight in logs)
-        job = _Job(names, plan, out, installed_versions())
+        names = [f"{path}:{weight!r}" for path, weight in logs]
         with work_folder(out / "tune") as folder:
-            _run(tune, job, folder, workers, advance)
+            run = partial(_try, names, plan, out, installed_versions())
+            errors = _run(tune, run, plan, folder, workers, advance)
+        for error in errors:
+            raise TrainingError(f"{out}: {str(error).strip().splitlines()[-1]}")
     results = [_result(one, out) for one in plan.trials]
     if not any(one.scores for one in results):
         raise TrainingError(f"{out}: all trials failed; the first one: {results[0].status}")
@@ -163,8 +139,10 @@ def _open(out: Path, identity: dict[str, Any], resume: bool) -> None:
     write_json(path, identity, TrainingError)
 
 
-def _run(tune: Any, job: _Job, folder: Path, workers: int | None, advance: Advance) -> None:
-    plan = job.plan
+def _run(
+    tune: Any, run: Any, plan: SweepPlan, folder: Path, workers: int | None, advance: Advance
+) -> list[Exception]:
+    """Run a function for each trial, in the folder of Ray Tune; return Ray's errors."""
     most = max(one.config.updates for one in plan.trials)
     scheduler = None
     if plan.stop and most > plan.score.every:
@@ -186,7 +164,7 @@ def _run(tune: Any, job: _Job, folder: Path, workers: int | None, advance: Advan
     for name in ("ray.tune", "ray.train"):
         logging.getLogger(name).setLevel(logging.ERROR)
     tuner = tune.Tuner(
-        tune.with_resources(partial(_try, job), {"CPU": 1}),
+        tune.with_resources(run, {"CPU": 1}),
         param_space={"number": tune.grid_search(list(range(len(plan.trials))))},
         tune_config=tune.TuneConfig(scheduler=scheduler, max_concurrent_trials=workers),
         run_config=tune.RunConfig(
@@ -198,38 +176,38 @@ def _run(tune: Any, job: _Job, folder: Path, workers: int | None, advance: Advan
         ),
     )
     with restored_handlers():
-        found = tuner.fit()
-    for error in found.errors:
-        raise TrainingError(f"{job.out}: {str(error).strip().splitlines()[-1]}")
+        return list(tuner.fit().errors)
 
 
-def _try(job: _Job, chosen: dict[str, int]) -> None:
-    """Run one trial on a worker of Ray Tune.
-
-    If its worker was killed before, continue the trial.
-    """
-    trial = job.plan.trials[chosen["number"]]
-    folder = job.out / trial.name
+def _try(
+    data: Sequence[str],
+    plan: SweepPlan,
+    out: Path,
+    versions: dict[str, str],
+    chosen: dict[str, int],
+) -> None:
+    """Run one trial on a worker of Ray Tune, or continue that of a killed worker."""
+    trial = plan.trials[chosen["number"]]
     try:
-        check_machine(job.versions, [job.out])
-        _train(job, trial, folder)
+        check_machine(versions, [out])
+        _train(data, plan, trial, out)
     except McaprlError as error:
         # A failed trial does not end the sweep: other settings may work.
-        _save(folder, _result(trial, job.out).scores, str(error))
+        _save(out / trial.name, _result(trial, out).scores, str(error))
 
 
-def _train(job: _Job, trial: Trial, folder: Path) -> None:
+def _train(data: Sequence[str], plan: SweepPlan, trial: Trial, out: Path) -> None:
     from ray import tune
 
-    plan = job.plan
-    dataset, weights = open_weighted(job.data)
+    folder = out / trial.name
+    dataset, weights = open_weighted(data)
     learned, kept = _divided(len(weights), plan.score.fraction)
     evaluator = OffPolicyEvaluator(
         dataset._take(kept),
         FQEConfig(gamma=plan.score.gamma, updates=plan.score.updates),
         _SPLIT_SEED,
     )
-    earlier = _result(trial, job.out).scores
+    earlier = _result(trial, out).scores
     scores = list(earlier)
     for score in earlier:
         tune.report({"score": score.mean, "updates": score.updates})

@@ -74,7 +74,7 @@ class IQL(Learner):
         )
         advantage = q_a_tm1 - v_tm1.detach().squeeze(1)
         if self.config.normalize_advantages:
-            advantage = self.normalized(advantage, batch.factors)
+            advantage = self.normalized(advantage)
         weight = (self.config.beta * advantage).exp().clamp(max=MAX_WEIGHT)
         logits_tm1 = self.outputs("logits", batch.observations)
         policy_loss = weight * cross_entropy(logits_tm1, batch.actions)
@@ -92,11 +92,10 @@ class IQL(Learner):
         terms = {"q": q_a_tm1, "td_error": (self.targets(batch) - q_a_tm1).abs()}
         return {name: self.in_reward_units(term) for name, term in terms.items()}
 
-    def normalized(self, advantages: Tensor, factors: Tensor | None = None) -> Tensor:
+    def normalized(self, advantages: Tensor) -> Tensor:
         """Divide the advantages (R,) of each seed by their root mean square in the seed's batch."""
         of_seeds = advantages.view(len(self.seeds), -1)
-        squares = advantages.square()
-        squares = self.batch_means(squares if factors is None else squares * factors)
+        squares = self.batch_means(advantages.square())
         return (of_seeds / squares.sqrt().clamp_min(_SMALLEST_ADVANTAGE).unsqueeze(1)).flatten()
 
     @torch.no_grad()

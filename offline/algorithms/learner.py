@@ -85,7 +85,6 @@ class Learner(ABC):
         }
         self.target_networks: dict[str, TargetNetwork] = {}
         self._sync_interval = 0
-        self._losses: nn.Module | None = None
         weights = [model.weights for model in self.models.values()]
         self.scalars: dict[str, nn.Parameter] = {}
         groups = [{"params": weights, "rate_factor": 1.0, "weight_decay": config.weight_decay}]
@@ -94,9 +93,9 @@ class Learner(ABC):
             groups, lr=self._new_rate(), fused=True, capturable=on_gpu
         )
         self._reset_moments(weights)
-        # Processes wait for each other on the CPU, and kernels of images take longer than launches.
-        alone, vectors = buffer.share.processes == 1, not buffer.encoder.image_inputs
-        self._is_captured = on_gpu and alone and vectors and self.can_be_captured
+        # Kernels of images take longer than their launches.
+        vectors = not buffer.encoder.image_inputs
+        self._is_captured = on_gpu and vectors and self.can_be_captured
         self._captured: CapturedUpdate | None = None
 
     @abstractmethod
@@ -125,21 +124,20 @@ class Learner(ABC):
         Update target networks if this is due.
 
         Returns:
-            The terms of `losses`, multiplied by the factors of the batch, and detached. On a GPU,
-            the next update overwrites them.
+            The terms of `losses`, detached. On a GPU, the next update overwrites them.
 
         Raises:
             NotFiniteError: The loss is NaN or infinite; the weights have not changed.
         """
         buffer = self.buffer
-        rows, factors = buffer.share.draw(buffer, self.config.batch_size, self.samplers)
+        rows = buffer.draw(self.config.batch_size, self.samplers)
         if self._is_captured and self._captured is None:
             self._captured = CapturedUpdate(self._gradients, self.optimizer, rows)
         if self._captured is None:
-            terms = self._gradients(rows.to(buffer.device), factors)
+            terms = self._gradients(rows.to(buffer.device))
         else:
             terms = self._captured.gradients(rows)
-        if not math.isfinite(buffer.share.average(terms["loss"].sum()).item()):
+        if not math.isfinite(terms["loss"].sum().item()):
             raise self._not_finite(self.seed_means(terms))
         for group in self.optimizer.param_groups:
             rate = self.config.learning_rate_at(self.step) * group["rate_factor"]
@@ -157,16 +155,13 @@ class Learner(ABC):
                 target.sync(self.models[name])
         return terms
 
-    def _gradients(self, rows: Tensor, factors: Tensor | None = None) -> dict[str, Tensor]:
+    def _gradients(self, rows: Tensor) -> dict[str, Tensor]:
         """Compute the gradients of all weights for rows (R,) of the buffer, on its device.
 
         Returns:
-            The terms of `losses`, multiplied by the factors of the rows, and detached.
+            The terms of `losses`, detached.
         """
-        batch = self.buffer.batch(rows, factors)
-        if self._losses is None:
-            self._losses = self.buffer.share.wrap(_Losses(self))
-        terms = {name: batch.weighted(term) for name, term in self._losses(batch).items()}
+        terms = self.losses(self.buffer.batch(rows))
         self.optimizer.zero_grad()
         # A seed's loss depends only on that seed's weights, so one sum yields all gradients.
         torch.autograd.backward(terms["loss"].sum() / (len(rows) // len(self.seeds)))
@@ -182,7 +177,7 @@ class Learner(ABC):
             interval: Number of updates between two syncs, the same for all target networks.
             next_states: Whether the target network evaluates next states instead of states.
         """
-        rows = self.config.batch_size * interval // self.buffer.share.processes
+        rows = self.config.batch_size * interval
         self._sync_interval = interval
         self.target_networks[name] = TargetNetwork(
             self.models[name], self.buffer, rows, next_states=next_states
@@ -231,11 +226,8 @@ class Learner(ABC):
         return [{name: means[name][k] for name in means} for k in range(len(self.seeds))]
 
     def batch_means(self, values: Tensor) -> Tensor:
-        """Return each seed's mean (K,) of values (R,), over the batches of all processes.
-
-        For statistics of a batch in `losses`, pass the values through `Batch.weighted` first.
-        """
-        return self.buffer.share.average(values.view(len(self.seeds), -1).mean(1))
+        """Return each seed's mean (K,) of values (R,)."""
+        return values.view(len(self.seeds), -1).mean(1)
 
     def outputs(self, name: str, observations: Observations) -> Tensor:
         """Return a model's outputs, with minus infinity for actions that are not allowed."""
@@ -331,20 +323,6 @@ class Learner(ABC):
                 if not math.isfinite(value):
                     return NotFiniteError(f"{name} of seed {seed} is {value}", self.step + 1)
         return NotFiniteError("the sum of the losses overflows float32", self.step + 1)
-
-
-class _Losses(nn.Module):
-    """Wrapper of `Learner.losses` as a module, so that its gradients can be averaged."""
-
-    def __init__(self, learner: Learner) -> None:
-        super().__init__()
-        for name, weights in learner._learned().items():
-            self.register_parameter(name, weights)
-        self._function = learner.losses
-
-    def forward(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the losses of a batch."""
-        return self._function(batch)
 
 
 def _copy(into: Tensor, tensor: Tensor) -> None:

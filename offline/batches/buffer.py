@@ -8,6 +8,7 @@ read.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -24,7 +25,6 @@ from mcaprl.networks import ImageInput
 from mcaprl.offline.batches.items import n_step_returns, returns_to_go
 from mcaprl.offline.batches.observations import FramesOnDisk, ObservationEncoder, Observations
 from mcaprl.offline.batches.packing import Packing
-from mcaprl.offline.batches.share import ALONE, Share
 from mcaprl.recorder.dataset.values import is_beyond_float32
 from mcaprl.recorder.format.spaces import check_actions
 from mcaprl.texts import counted
@@ -54,8 +54,6 @@ class Batch:
         discounts: (R,) float32, gamma to the power of the number of steps between the two
             observations; 0 if the episode terminated, but not if it was truncated.
         next_observations: R observations, up to n steps later.
-        factors: (R,) float32, factors of the rows in means over the batch, which several processes
-            share; None if all are 1. See `Share.draw`.
     """
 
     rows: Tensor
@@ -64,11 +62,6 @@ class Batch:
     rewards: Tensor
     discounts: Tensor
     next_observations: Observations
-    factors: Tensor | None = None
-
-    def weighted(self, values: Tensor) -> Tensor:
-        """Return values (R,) times the factors of the rows."""
-        return values if self.factors is None else values * self.factors
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +81,6 @@ class TransitionBuffer:
         drawable: (M,) int64, rows with a weight above 0; None if all weights are above 0.
         cumulative: (M,) float64, cumulative weights of the drawable rows; None if the weights are
             equal.
-        share: Share of all data that these transitions make up.
         is_fixed: Whether the transitions stay the same during training.
     """
 
@@ -103,7 +95,6 @@ class TransitionBuffer:
     reward_scale: float = 1.0
     drawable: Tensor | None = None
     cumulative: Tensor | None = None
-    share: Share = ALONE
     is_fixed: bool = True
 
     @classmethod
@@ -115,7 +106,6 @@ class TransitionBuffer:
         encoder: ObservationEncoder | None = None,
         reward_scale: float | None = None,
         weights: NDArray[np.float64] | None = None,
-        share: Share = ALONE,
     ) -> TransitionBuffer:
         """Pack a dataset.
 
@@ -126,7 +116,6 @@ class TransitionBuffer:
             reward_scale: Divisor of the rewards; default: see `packing.scale_rewards`.
             weights: (E,) relative sampling weight of each transition of an episode; default: all
                 equal.
-            share: Share of all data that the dataset makes up; normalization uses all data.
 
         Raises:
             SpaceError: The actions are not discrete or are outside their space, or no network
@@ -139,15 +128,15 @@ class TransitionBuffer:
         if encoder is None:
             encoder = ObservationEncoder(dataset.observation_space, joint.count)
             if packing.normalize and len(dataset):
-                encoder.normalize_to(dataset.frames, share)
+                encoder.normalize_to(dataset.frames)
             elif packing.center_images and len(dataset):
-                encoder.center_images(dataset.frames, share)
+                encoder.center_images(dataset.frames)
         if len(dataset) == 0:
             raise TrainingError("the dataset has no transitions to learn from")
         lengths = dataset.episode_lengths
         _check_rewards(dataset.rewards)
         if reward_scale is None:
-            spread = packing.scale_rewards and return_spread(dataset, packing.gamma, share)
+            spread = packing.scale_rewards and return_spread(dataset, packing.gamma)
             reward_scale = spread or 1.0
         places, returns = n_step_returns(dataset, packing.n_steps, packing.gamma)
         returns[0] /= reward_scale
@@ -170,7 +159,6 @@ class TransitionBuffer:
             actions=torch.from_numpy(actions),
             returns=torch.from_numpy(returns),
             reward_scale=reward_scale,
-            share=share,
         )
         return buffer if weights is None else buffer.with_weights(np.repeat(weights, lengths))
 
@@ -207,8 +195,12 @@ class TransitionBuffer:
             draws.clamp_(max=len(self.cumulative) - 1)
         return draws if self.drawable is None else self.drawable.index_select(0, draws)
 
-    def batch(self, rows: Tensor, factors: Tensor | None = None) -> Batch:
-        """Return the transitions of rows (R,), with their factors in means."""
+    def draw(self, count: int, generators: Sequence[torch.Generator]) -> Tensor:
+        """Draw `count` row numbers for each of K seeds, (K * count,)."""
+        return torch.cat([self.sample_rows(count, one) for one in generators])
+
+    def batch(self, rows: Tensor) -> Batch:
+        """Return the transitions of rows (R,)."""
         here, there = self.places.index_select(1, rows)
         rewards, discounts = self.returns.index_select(1, rows)
         actions = self.actions.index_select(0, rows)
@@ -217,7 +209,7 @@ class TransitionBuffer:
             states = self.observe(torch.cat((here, there))).split(len(rows))
         else:
             states = [self.observe(here), self.observe(there)]
-        return Batch(rows, states[0], actions, rewards, discounts, states[1], factors)
+        return Batch(rows, states[0], actions, rewards, discounts, states[1])
 
     def with_weights(self, weights: NDArray[np.float64]) -> TransitionBuffer:
         """Return the same transitions with relative sampling weights (N,).
@@ -260,7 +252,7 @@ class TransitionBuffer:
         return [image.stacked(self.packing.frame_stack) for image in self.encoder.image_inputs]
 
 
-def return_spread(dataset: Dataset, gamma: float, share: Share = ALONE) -> float:
+def return_spread(dataset: Dataset, gamma: float) -> float:
     """Return the standard deviation of the discounted returns of all transitions.
 
     A return ends at the end of the episode, even if the episode was truncated. The result is 0 if a
@@ -268,7 +260,7 @@ def return_spread(dataset: Dataset, gamma: float, share: Share = ALONE) -> float
     """
     with np.errstate(over="ignore", invalid="ignore"):
         returns = returns_to_go(dataset.rewards, dataset.episode_lengths, gamma)
-        spread = float(share.moments(len(returns), returns.mean(), returns.std())[1])
+        spread = float(returns.std())
     return spread if math.isfinite(spread) else 0.0
 
 

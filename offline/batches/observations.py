@@ -22,7 +22,6 @@ from torch import Tensor
 from mcaprl.errors import SpaceError
 from mcaprl.masks import MASK_KEY, allowed_actions
 from mcaprl.networks import ImageInput
-from mcaprl.offline.batches.share import ALONE, Share
 from mcaprl.recorder.dataset.mapped import Frames, MappedImages
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, observation_leaves
 
@@ -172,26 +171,25 @@ class ObservationEncoder:
         self.shift = np.zeros(self.width, np.float32)
         self.scale = np.repeat(np.where(bytes_, 255, 1), widths).astype(np.float32)
 
-    def normalize_to(self, observations: Any, share: Share = ALONE) -> None:
+    def normalize_to(self, observations: Any) -> None:
         """Normalize all inputs to mean 0 and standard deviation 1 over these observations.
 
         Each number has its own scale; all pixels of an image share one scale. A constant input
-        keeps its default scale and becomes 0. If the observations are a share of all data, the
-        result is that of all data.
+        keeps its default scale and becomes 0.
         """
-        self.center_images(observations, share)
+        self.center_images(observations)
         self.shift, scale = np.zeros_like(self.shift), self.scale
         self.scale = np.ones_like(scale)
         vector = self._vector(observations).astype(np.float64)
-        mean, deviation = share.moments(len(vector), vector.mean(0), vector.std(0))
-        constant = deviation <= 1e-6 * share.largest(np.abs(vector).max(0, initial=0))
+        mean, deviation = vector.mean(0), vector.std(0)
+        constant = deviation <= 1e-6 * np.abs(vector).max(0, initial=0)
         self.shift = mean.astype(np.float32)
         self.scale = np.where(constant, scale, deviation).astype(np.float32)
 
-    def center_images(self, observations: Any, share: Share = ALONE) -> None:
+    def center_images(self, observations: Any) -> None:
         """Normalize all images to mean 0 and standard deviation 1 over these observations."""
         self.image_inputs = [
-            image.normalized_to(leaf.of(observations), share.position, share.gather)
+            image.normalized_to(leaf.of(observations))
             for image, leaf in zip(self.image_inputs, self.images, strict=True)
         ]
 

@@ -11,7 +11,7 @@ import warnings
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,6 @@ from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.batches.buffer import TransitionBuffer, choose_device
 from mcaprl.offline.batches.observations import ObservationEncoder
-from mcaprl.offline.batches.share import Share
 from mcaprl.offline.policy import read_policy, save_policy
 from mcaprl.offline.training.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
 from mcaprl.offline.training.follow import CHECK_INTERVAL, GrowingLogs, with_more_data
@@ -100,73 +99,77 @@ def train(
     """
     folder = Path(out)
     numbers = choose_seeds(folder, seeds, seed, resume)
-    place = choose_device(device)
-    learner_type, config = choose_algorithm(algo)
+    choose_device(device)
+    _, config = choose_algorithm(algo)
     dataset = with_source(dataset, config.mask_from)
     weights = np.ones(len(dataset.episodes)) if weights is None else weights
-    check_weights(weights, len(dataset.episodes))
-    data = fingerprint(dataset, weights)
-    identity = RunIdentity(identity_parts(config, data), other_data, longer=True)
+    identity = run_identity(dataset, config, weights, other_data)
     with locked_run(folder, resume):
-        if resume and (message := schedule_warning(read_updates(folder), config)):
-            warnings.warn(message, stacklevel=2)
-        held_out = choose_held_out(len(weights), config.held_out)
-        encoder, reward_scale = earlier_scales(folder) if resume and other_data else (None, None)
-        buffer = TransitionBuffer.from_dataset(
-            dataset,
-            config.packing,
-            encoder=encoder,
-            reward_scale=reward_scale,
-            weights=without(weights, held_out),
-        ).to(place)
-        size = len(dataset)
-        open_run(folder, identity, resume, numbers, env_id=dataset.env_id, transitions=size)
-        if message := horizon_warning(config):
-            warnings.warn(message, stacklevel=2)
-        run = _run(folder, identity, dataset, buffer, held_out, follow)
+        run = _prepared(
+            dataset, config, folder, identity, weights, device, reuses=resume, follow=follow
+        )
+        start_run(dataset, config, folder, identity, numbers, resume)
         with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
-            return run.train(learner_type, config, numbers, report)
+            return run.train(config, numbers, report)
 
 
-def train_share(
+def train_seeds(
     dataset: Dataset,
     config: TrainingConfig,
-    out: Path,
+    folder: Path,
     identity: RunIdentity,
-    share: Share,
-    held_out: NDArray[np.int64],
     seeds: range,
     *,
+    weights: NDArray[np.float64],
     device: str,
-    scales: tuple[ObservationEncoder | None, float | None],
     report: ProgressCallback,
 ) -> list[OfflineSummary]:
-    """Train in one of several processes. The first process writes the files of the run.
+    """Train some seeds of a run that another process has locked and started.
 
-    Args:
-        dataset: Episodes of this process.
-        config: Settings.
-        out: Folder of the run, which exists and is locked; checkpoints in it are continued.
-        identity: Identity of the run.
-        share: Share of this process in all data; its episodes are in `dataset`.
-        held_out: Numbers of the held-out episodes in the dataset.
-        seeds: Seeds of the networks.
-        device: Device of the data, the networks and the updates.
-        scales: Encoder and divisor of the rewards of an earlier run, if they are reused.
-        report: Callback for each row of metrics, called in the first process.
-
-    Returns:
-        One summary for each seed.
+    The seeds continue from their checkpoints. The other arguments are those of `train`.
 
     Raises:
-        SpaceError, TrainingError: As for `train`.
+        SpaceError, TrainingError, UsageError: As for `train`.
     """
-    encoder, reward_scale = scales
-    buffer = TransitionBuffer.from_dataset(
-        dataset, config.packing, encoder=encoder, reward_scale=reward_scale, share=share
-    ).to(choose_device(device))
-    run = _run(out, identity, dataset, buffer, held_out, None)
-    return run.train(choose_algorithm(config)[0], config, seeds, report)
+    dataset = with_source(dataset, config.mask_from)
+    run = _prepared(dataset, config, folder, identity, weights, device, reuses=True)
+    return run.train(config, seeds, report)
+
+
+def run_identity(
+    dataset: Dataset, config: TrainingConfig, weights: NDArray[np.float64], other_data: bool
+) -> RunIdentity:
+    """Return the identity of the run of a dataset with the weights (E,) of its episodes.
+
+    Raises:
+        UsageError: The weights are not valid.
+    """
+    n_episodes = len(dataset.episodes)
+    if weights.shape != (n_episodes,) or not np.isfinite(weights).all() or (weights < 0).any():
+        raise UsageError(f"weights must be {n_episodes} numbers of at least 0, one per episode")
+    data = fingerprint(dataset, weights)
+    parts = {"algo": choose_algorithm(config)[0].name, "config": config.to_json(), "data": data}
+    return RunIdentity(parts, other_data, longer=True)
+
+
+def start_run(
+    dataset: Dataset,
+    config: TrainingConfig,
+    folder: Path,
+    identity: RunIdentity,
+    seeds: range,
+    resume: bool,
+) -> None:
+    """Write or check the config of a locked run; warn of settings that hardly learn.
+
+    Raises:
+        OutputExistsError, TrainingError: As for `train`.
+    """
+    late = schedule_warning(read_updates(folder), config) if resume else None
+    size = len(dataset)
+    open_run(folder, identity, resume, seeds, env_id=dataset.env_id, transitions=size)
+    for message in filter(None, (late, horizon_warning(config))):
+        warnings.warn(message, stacklevel=3)
 
 
 def with_source(dataset: Dataset, source: str) -> Dataset:
@@ -176,30 +179,28 @@ def with_source(dataset: Dataset, source: str) -> Dataset:
     return dataset.with_action_mask(source)
 
 
-def identity_parts(config: TrainingConfig, data: str) -> dict[str, Any]:
-    """Return the parts of a run's identity; `data` is a fingerprint of the data and weights."""
-    learner_type, _ = choose_algorithm(config)
-    return {"algo": learner_type.name, "config": config.to_json(), "data": data}
-
-
-def without(weights: NDArray[np.float64], held_out: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the weights (E,) of episodes. The weights of held-out episodes are 0."""
-    return np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights)
-
-
-def _run(
+def _prepared(
+    dataset: Dataset,
+    config: TrainingConfig,
     folder: Path,
     identity: RunIdentity,
-    dataset: Dataset,
-    buffer: TransitionBuffer,
-    held_out: NDArray[np.int64],
-    follow: GrowingLogs | None,
+    weights: NDArray[np.float64],
+    device: str,
+    *,
+    reuses: bool,
+    follow: GrowingLogs | None = None,
 ) -> _Run:
-    gamma, share = buffer.packing.gamma, buffer.share
-    validation = None
-    if share.position(len(held_out))[1]:
-        validation = HeldOut(dataset, buffer, held_out, gamma)
-    limit = largest_return(dataset, gamma, share)
+    """Pack the data of a run; with other data and `reuses`, in the scales of its policies."""
+    held_out = choose_held_out(len(weights), config.held_out)
+    drawn = np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights)
+    reuses = reuses and identity.other_data
+    encoder, reward_scale = earlier_scales(folder) if reuses else (None, None)
+    buffer = TransitionBuffer.from_dataset(
+        dataset, config.packing, encoder=encoder, reward_scale=reward_scale, weights=drawn
+    ).to(choose_device(device))
+    gamma = buffer.packing.gamma
+    validation = HeldOut(dataset, buffer, held_out, gamma) if len(held_out) else None
+    limit = largest_return(dataset, gamma)
     return _Run(folder, identity, dataset, buffer, validation, limit, held_out, follow)
 
 
@@ -228,14 +229,10 @@ class _Run:
     follow: GrowingLogs | None
 
     def train(
-        self,
-        learner_type: type[Learner],
-        config: TrainingConfig,
-        seeds: range,
-        report: ProgressCallback,
+        self, config: TrainingConfig, seeds: range, report: ProgressCallback
     ) -> list[OfflineSummary]:
         """Train seeds, in parallel if their checkpoints are at the same update."""
-        summaries = []
+        learner_type, summaries = choose_algorithm(config)[0], []
         for start in self._starts(seeds):
             learner = learner_type(config, self.buffer, list(start))
             for seed, checkpoint in start.items():
@@ -247,17 +244,10 @@ class _Run:
     def _starts(self, seeds: range) -> list[dict[int, Checkpoint | None]]:
         """Return seeds with their checkpoints, grouped by the number of finished updates."""
         groups: dict[int, dict[int, Checkpoint | None]] = {}
-        # The first process reads the checkpoints for all processes, so that they continue with the
-        # same update.
-        for seed in seeds if self.writes else ():
+        for seed in seeds:
             checkpoint = read_checkpoint(seed_folder(self.folder, seed), self.identity)
             groups.setdefault(checkpoint.step if checkpoint else 0, {})[seed] = checkpoint
-        return self.buffer.share.from_first(list(groups.values()))
-
-    @property
-    def writes(self) -> bool:
-        """Whether this process writes the files of the run."""
-        return self.buffer.share.is_first
+        return list(groups.values())
 
     def _train_learner(self, learner: Learner, report: ProgressCallback) -> list[OfflineSummary]:
         """Run the remaining updates of a learner's seeds."""
@@ -270,13 +260,11 @@ class _Run:
                 stack.enter_context(
                     closing(MetricsWriter(seed_folder(self.folder, seed), learner.step + 1))
                 )
-                for seed in (seeds if learner.step < updates and self.writes else ())
+                for seed in (seeds if learner.step < updates else ())
             ]
             while learner.step < updates:
                 learner = self._with_new_episodes(learner)
                 before, terms = terms, self._train_to_next_stop(learner, metrics)
-                if not self.writes:
-                    continue
                 warned = warned or self._warn(before, terms)
                 for seed, mine in zip(seeds, terms, strict=True):
                     report(TrainingProgress(seed, learner.step, updates, mine))
@@ -306,9 +294,9 @@ class _Run:
             size = {"transitions": float(len(learner.buffer))}
             values = [mine | size for mine in values]
         rate = config.learning_rate_at(learner.step - 1)
-        for writer, mine in zip(metrics, values, strict=self.writes):
+        for writer, mine in zip(metrics, values, strict=True):
             writer.write(learner.step, rate, mine)
-        if checkpoint_due and self.writes:
+        if checkpoint_due:
             self._save(learner)
         return values
 
@@ -371,9 +359,3 @@ def fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
     if len(set(weights.tolist())) < 2:
         return dataset.fingerprint
     return hashlib.sha256(dataset.fingerprint.encode() + weights.tobytes()).hexdigest()
-
-
-def check_weights(weights: NDArray[np.float64], n_episodes: int) -> None:
-    """Raise a UsageError unless there is one valid weight for each episode."""
-    if weights.shape != (n_episodes,) or not np.isfinite(weights).all() or (weights < 0).any():
-        raise UsageError(f"weights must be {n_episodes} numbers of at least 0, one per episode")

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from mcaprl.offline.algorithms.config import BootstrapConfig, TrainingConfig
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.batches.buffer import TransitionBuffer
-from mcaprl.offline.batches.share import ALONE, Share
 from mcaprl.texts import counted
 
 if TYPE_CHECKING:
@@ -50,23 +49,19 @@ class HeldOut:
         lengths = dataset.episode_lengths
         rows = np.flatnonzero(np.isin(np.repeat(np.arange(len(lengths)), lengths), episodes))
         returns = monte_carlo_returns(dataset, episodes, gamma)
-        share, known = buffer.share, np.isfinite(returns)
-        if share.largest(known.any()):
+        known = np.isfinite(returns)
+        if known.any():
             rows, returns = rows[known], returns[known]
-        first, total = share.position(len(rows))
-        chosen = np.unique(np.linspace(0, total - 1, MAX_ROWS).round().astype(np.int64))
-        mine = chosen[(chosen >= first) & (chosen < first + len(rows))] - first
-        self._rows, self._total = torch.from_numpy(rows[mine]), len(chosen)
-        self._buffer = buffer
-        self.mean_return = float(np.concatenate(share.gather(returns[mine])).mean())
+        chosen = np.unique(np.linspace(0, len(rows) - 1, MAX_ROWS).round().astype(np.int64))
+        self._rows, self._buffer = torch.from_numpy(rows[chosen]), buffer
+        self.mean_return = float(returns[chosen].mean())
 
     def terms(self, learner: Learner) -> list[dict[str, float]]:
         """Return each seed's validation metrics, whose names have the prefix `held_out_`."""
-        seeds = len(learner.seeds)
-        rows = self._rows.expand(seeds, -1)
-        batch = self._buffer.batch(*self._buffer.share.part(rows, self._total, self._buffer.device))
+        rows = self._rows.expand(len(learner.seeds), -1).flatten()
+        batch = self._buffer.batch(rows.to(self._buffer.device))
         with torch.no_grad():
-            terms = {name: batch.weighted(term) for name, term in learner.validate(batch).items()}
+            terms = learner.validate(batch)
         means = learner.seed_means({f"held_out_{name}": term for name, term in terms.items()})
         has_values = "q" in learner.models and math.isfinite(self.mean_return)
         known = {"held_out_return": self.mean_return} if has_values else {}
@@ -116,11 +111,10 @@ def monte_carlo_returns(
     return np.concatenate(returns) if returns else np.empty(0)
 
 
-def largest_return(dataset: Dataset, gamma: float, share: Share = ALONE) -> float:
+def largest_return(dataset: Dataset, gamma: float) -> float:
     """Return an upper bound on the absolute value of the discounted return of any episode."""
-    longest, reward = share.largest((dataset.episode_lengths.max(), np.abs(dataset.rewards).max()))
-    steps = float(longest) if gamma == 1 else 1 / (1 - gamma)
-    return float(reward) * steps
+    steps = float(dataset.episode_lengths.max()) if gamma == 1 else 1 / (1 - gamma)
+    return float(np.abs(dataset.rewards).max()) * steps
 
 
 def horizon_warning(config: TrainingConfig) -> str | None:

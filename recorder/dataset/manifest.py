@@ -13,10 +13,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from mcaprl.errors import LogError
-from mcaprl.files import parse_json, read_file, write_json
+from mcaprl.files import fresh_folder, parse_json, read_file, write_json
 from mcaprl.storage.remote import RemotePath, as_path, is_url
 
 MANIFEST_NAME = "manifest.json"
+UNFINISHED_NAME = ".unfinished"
+"""Hidden folder of the logs that are not complete yet."""
 _VERSION = "1"
 
 
@@ -35,6 +37,15 @@ class LogFile:
     episodes: int
     steps: int
     size_bytes: int
+
+
+def unfinished_folder(folder: Path) -> Path:
+    """Create a hidden folder for the unfinished logs of a folder, and return its path.
+
+    Raises:
+        OutputExistsError: Another program's folder, a file or a link is at this path.
+    """
+    return fresh_folder(folder / UNFINISHED_NAME)
 
 
 def write_manifest(folder: Path, files: Sequence[LogFile]) -> Path:

@@ -44,8 +44,7 @@ def test_a_batch_has_the_returns_of_the_recorded_steps(
         died, cut = torch.from_numpy(terminated[t]), torch.from_numpy(truncated[t])
         replay.add_outcomes(torch.full((WIDTH,), t + 1.0), died, cut, seen + 0.5)
     data = replay.transitions
-    rows, factors = data.share.draw(data, 64, [torch.Generator()] * AGENTS)
-    assert factors is None
+    rows = data.draw(64, [torch.Generator()] * AGENTS)
     batch = data.batch(rows)
     for row in range(len(rows)):
         t, e = divmod(int(batch.observations.vector[row]), 100)
@@ -71,7 +70,7 @@ def test_all_transitions_of_an_agent_are_drawn() -> None:
         no = torch.zeros(WIDTH, dtype=torch.bool)
         replay.add_outcomes(torch.zeros(WIDTH), no, no, seen)
     data = replay.transitions
-    rows, _ = data.share.draw(data, 600, [torch.Generator()] * AGENTS)
+    rows = data.draw(600, [torch.Generator()] * AGENTS)
     for agent, mine in enumerate(data.batch(rows).observations.vector.view(AGENTS, -1)):
         own = range(agent * ENVS, (agent + 1) * ENVS)
         expected = {100.0 * t + e for t in range(2, SLOTS + 2) for e in own}

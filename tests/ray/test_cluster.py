@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
 import subprocess
 import sys
@@ -13,7 +15,7 @@ import pytest
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import ClusterError, MissingExtraError, UsageError
-from mcaprl.ray import cluster, workers
+from mcaprl.ray import cluster, tasks
 from mcaprl.recorder.format.metadata import installed_versions
 from tests.ray.processes import open_files
 from tests.ray.seeded import SEEDED
@@ -104,7 +106,7 @@ def test_other_versions_of_packages_on_a_worker_are_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     versions = {**installed_versions(), "numpy": "1.2.3"}
-    monkeypatch.setattr(workers, "installed_versions", lambda: versions)
+    monkeypatch.setattr(tasks, "installed_versions", lambda: versions)
     with pytest.raises(ClusterError, match=r"the worker at 127\.0\.0\.1 has numpy .* 1\.2\.3: in"):
         mcaprl.record(SEEDED, tmp_path / "a", policy="random", episodes=2, ray=True)
 
@@ -112,7 +114,7 @@ def test_other_versions_of_packages_on_a_worker_are_one_line(
 @pytest.mark.usefixtures("ray_cluster")
 def test_a_path_that_a_worker_does_not_see_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(ClusterError, match=r"127\.0\.0\.1 cannot see .*/none: choose a path"):
-        workers.run_tasks(_nothing, [1, 2], paths=[tmp_path / "none"])
+        tasks.run_tasks(_nothing, [1, 2], paths=[tmp_path / "none"])
 
 
 def _nothing(request: int, report: Any) -> int:
@@ -121,8 +123,31 @@ def _nothing(request: int, report: Any) -> int:
 
 @pytest.mark.usefixtures("ray_cluster")
 def test_results_are_in_the_order_of_the_requests() -> None:
-    assert workers.run_tasks(_nothing, list(range(5)), workers=3) == [0, 1, 2, 3, 4]
-    assert workers.run_tasks(_nothing, []) == []
+    assert tasks.run_tasks(_nothing, list(range(5)), workers=3) == [0, 1, 2, 3, 4]
+    assert tasks.run_tasks(_nothing, []) == []
+
+
+@pytest.mark.usefixtures("ray_cluster")
+def test_a_task_that_makes_progress_is_repeated_after_any_number_of_deaths(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tasks, "MOST_DEATHS", 2)
+    amounts: list[int] = []
+    news: list[Any] = []
+    run = tasks.run_tasks(_dying, [tmp_path], advance=amounts.append, on_news=news.append)
+    assert run == [5]
+    assert sum(amounts) == 5
+    assert news == [f"attempt {number}" for number in range(6)]
+
+
+def _dying(folder: Path, send: Any) -> int:
+    """Kill this worker in the first five attempts, each of which makes progress."""
+    attempt = len(list(folder.iterdir()))
+    (folder / str(attempt)).touch()
+    send(attempt, f"attempt {attempt}")
+    if attempt < 5:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return attempt
 
 
 @pytest.mark.usefixtures("ray_cluster")

@@ -63,7 +63,7 @@ def test_options_that_exclude_each_other(tmp_path: Path) -> None:
 
 
 def test_a_sim_that_kills_each_worker_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mcaprl.ray.workers.MOST_DEATHS", 1)
+    monkeypatch.setattr("mcaprl.ray.tasks.MOST_DEATHS", 1)
     with pytest.raises(ClusterError, match="died repeatedly while they evaluated random"):
         mcaprl.evaluate("random", SEEDED, episodes=1, ray=True, sim_options={"dies": True})
 

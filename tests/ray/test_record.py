@@ -150,7 +150,7 @@ class Killer(threading.Thread):
         randoms = random.Random(1)
         while self.killed < self.kills and not self.done.wait(0.2 * randoms.random()):
             if self.progress.wait(0.1):
-                workers = titled("ray::Worker")
+                workers = titled("ray::run_task")
                 if workers:
                     self.progress.clear()
                     os.kill(workers[0], signal.SIGKILL)
@@ -195,7 +195,7 @@ def test_killed_workers_lose_and_double_no_episode(tmp_path: Path) -> None:
 def test_a_sim_that_kills_each_worker_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mcaprl.ray.workers.MOST_DEATHS", 2)
+    monkeypatch.setattr("mcaprl.ray.tasks.MOST_DEATHS", 2)
     with pytest.raises(LogError, match=r"shard-00\.mcap: workers died repeatedly without"):
         record(tmp_path / "a", 2, shards=1, sim_options={"dies": True})
     assert "manifest.json" not in contents(tmp_path / "a")

@@ -21,11 +21,11 @@ from mcaprl.cli import run
 from mcaprl.errors import ClusterError, OutputExistsError, TrainingError, UsageError
 from mcaprl.offline.algorithms.config import BCConfig
 from mcaprl.offline.training.train import train
-from mcaprl.ray import sweep, workers
+from mcaprl.ray import sweep, tasks
 from mcaprl.ray.sweep import Score, TrialResult
 from mcaprl.ray.sweep_file import SweepPlan, Trial, read_plan
 from mcaprl.ray.sweep_report import table_of, write_sweep
-from mcaprl.ray.workers import check_machine
+from mcaprl.ray.tasks import check_machine
 from mcaprl.recorder.format.metadata import installed_versions
 from tests.ray.processes import open_files
 from tests.ray.seeded import SEEDED
@@ -225,13 +225,12 @@ def test_a_trial_killed_between_checkpoint_and_score_has_all_scores(
     monkeypatch.setattr(tune, "report", lambda found: reported.append(found["updates"]))
     tree = {"algos": ["bc"], "settings": {"updates": 8, "hidden": [8]}, "seeds": 2}
     plan = read_plan({**tree, "score": {"every": 4, "updates": 5, "fraction": 0.5}})
-    job = sweep._Job((str(log),), plan, tmp_path, installed_versions())
     (trial,) = plan.trials
-    sweep._train(job, trial, tmp_path / trial.name)
+    sweep._train([str(log)], plan, trial, tmp_path)
     whole = sweep._result(trial, tmp_path).scores
     assert [one.updates for one in whole] == reported == [4, 8]
     sweep._save(tmp_path / trial.name, whole[:1], "")
-    sweep._train(job, trial, tmp_path / trial.name)
+    sweep._train([str(log)], plan, trial, tmp_path)
     assert sweep._result(trial, tmp_path).scores == whole
     assert reported == [4, 8, 4, 8]
 
@@ -245,13 +244,13 @@ def test_other_versions_and_unseen_paths_are_found_before_the_trials_start(
 
     monkeypatch.setattr(sweep, "_run", None)
     with monkeypatch.context() as patch:
-        patch.setattr(workers, "check_machine", check_elsewhere)
+        patch.setattr(tasks, "check_machine", check_elsewhere)
         with pytest.raises(
             ClusterError, match=r"127\.0\.0\.1 cannot see /elsewhere/.*: choose a path"
         ):
             start()
     versions = {**installed_versions(), "numpy": "1.2.3"}
-    monkeypatch.setattr(workers, "installed_versions", lambda: versions)
+    monkeypatch.setattr(tasks, "installed_versions", lambda: versions)
     with pytest.raises(ClusterError, match=r"the worker at 127\.0\.0\.1 has numpy .* 1\.2\.3: in"):
         start()
     assert list(tmp_path.iterdir()) == []

@@ -5,23 +5,21 @@ The weights must equal those of one process, also if a worker is killed.
 
 from __future__ import annotations
 
-import io
 import os
 import shutil
 import signal
-from dataclasses import dataclass, replace
+import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.reader import make_reader
 
 import mcaprl
 from mcaprl.cli import run
-from mcaprl.errors import ClusterError, LogError, SpaceError, UsageError
+from mcaprl.errors import ClusterError, SpaceError, TrainingError, UsageError
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.format.metadata import installed_versions
-from mcaprl.runs import read_curve
 from tests.ray.processes import titled
 from tests.ray.seeded import SEEDED
 from tests.support.paths import GOLDEN
@@ -30,11 +28,10 @@ pytest.importorskip("torch")
 from safetensors.torch import load_file
 
 from mcaprl.offline.training.metrics import OfflineSummary
-from mcaprl.ray import training, workers
+from mcaprl.ray import tasks, training
 
 pytestmark = pytest.mark.usefixtures("ray_cluster")
-EARLY, LATE, UPDATES = 1e-5, 1e-4, 300
-"""Relative differences of the loss terms after 50 and 300 updates, as docs/ray.md says."""
+UPDATES = 1200
 OPTIONS: dict[str, Any] = {
     "algo": "iql",
     "updates": UPDATES,
@@ -42,8 +39,8 @@ OPTIONS: dict[str, Any] = {
     "hidden": (8, 8),
     "seeds": 2,
     "held_out": 0.2,
-    "log_interval": 50,
-    "checkpoint_interval": 50,
+    "log_interval": 100,
+    "checkpoint_interval": 100,
     "target_interval": 20,
     "normalize": True,
     "scale_rewards": True,
@@ -69,7 +66,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @dataclass
 class Trained:
-    """A training by one process, and the same training by two workers, one of which was killed.
+    """A training by one process, and the same training by two workers, both of which were killed.
 
     Attributes:
         data: Arguments for the logs.
@@ -94,54 +91,48 @@ def trained(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Trained:
 
     def progress(now: TrainingProgress) -> None:
         if not done:
-            os.kill(titled("RayTrainWorker")[-1], signal.SIGKILL)
+            for process in titled("ray::run_task"):
+                os.kill(process, signal.SIGKILL)
         done.append((now.seed, now.done))
 
     found = mcaprl.train(data, folder / "ray", ray=True, workers=2, progress=progress, **OPTIONS)
     return Trained(data, mcaprl.train(data, folder / "local", **OPTIONS), found, done)
 
 
-@pytest.mark.long
-def test_weights_are_those_of_one_process_if_a_worker_is_killed(trained: Trained) -> None:
+def test_weights_are_those_of_one_process_if_workers_are_killed(trained: Trained) -> None:
     assert [one.seed for one in trained.found] == [0, 1]
-    assert all(0 < one.resumed_at < one.steps for one in trained.found), "no worker was lost"
+    assert any(0 < one.resumed_at < one.steps for one in trained.found), "no worker was lost"
     assert {(0, UPDATES), (1, UPDATES)} <= set(trained.done)
     for mine, theirs in zip(trained.found, trained.local, strict=True):
-        assert mine.terms == pytest.approx(theirs.terms, abs=LATE, rel=LATE)
-        curves = [read_curve(one.folder / "metrics.csv") for one in (mine, theirs)]
-        assert curves[0].keys() == curves[1].keys()
-        for name, values in curves[0].items():
-            assert len(values) == len(curves[1][name]) == UPDATES / 50
-            assert values[0] == pytest.approx(curves[1][name][0], abs=EARLY, rel=EARLY)
+        assert mine.terms == theirs.terms
+        for name in ("metrics.csv", "policy.safetensors", "policy.json"):
+            assert (mine.folder / name).read_bytes() == (theirs.folder / name).read_bytes()
         pair = [load_file(one.folder / "checkpoint.safetensors") for one in (mine, theirs)]
         assert pair[0].keys() == pair[1].keys()
-        assert pair[0]["generator.sampler"].equal(pair[1]["generator.sampler"])
-        for name, tensor in pair[0].items():
-            if name.endswith(".weights"):
-                assert (tensor - pair[1][name]).abs().max() < 0.02
+        assert all(tensor.equal(pair[1][name]) for name, tensor in pair[0].items())
     ray, local = (results[0].folder.parent for results in (trained.found, trained.local))
     assert sorted(path.name for path in ray.iterdir()) == sorted(p.name for p in local.iterdir())
+    assert (ray / "config.json").read_bytes() == (local / "config.json").read_bytes()
 
 
-@pytest.mark.long
-def test_a_run_is_resumed_by_another_number_of_workers_with_the_same_data(
-    trained: Trained, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("began_with", ["ray", "local"])
+def test_a_run_is_resumed_with_and_without_ray(
+    trained: Trained, tmp_path: Path, capsys: pytest.CaptureFixture[str], began_with: str
 ) -> None:
     out = tmp_path / "run"
-    shutil.copytree(trained.found[0].folder.parent, out)
+    began = trained.found if began_with == "ray" else trained.local
+    shutil.copytree(began[0].folder.parent, out)
     # Seed 1 continues from the beginning, and seed 0 is finished.
     (out / "seed-1" / "checkpoint.safetensors").unlink()
-    resumed = ["--out", str(out), "--resume", "--ray", "--workers", "1"]
+    ray = ["--ray", "--workers", "1"]
+    resumed = ["--out", str(out), "--resume", *(ray if began_with == "local" else [])]
     assert run(["train-offline", *trained.data, *resumed]) == 0
     printed = capsys.readouterr().out
     assert f"{out / 'seed-0'}: finished before, with {UPDATES} updates" in printed
     assert f"{out / 'seed-1'}: {UPDATES} updates, " in printed
-    mine, theirs = (
-        read_curve(path / "metrics.csv") for path in (out / "seed-1", trained.local[1].folder)
-    )
-    for name, values in mine.items():
-        assert values[-1] == pytest.approx(theirs[name][-1], abs=LATE, rel=LATE)
-    assert run(["train-offline", trained.data[0], *resumed]) == 1
+    mine, theirs = (path / "policy.safetensors" for path in (out / "seed-1", began[1].folder))
+    assert mine.read_bytes() == theirs.read_bytes()
+    assert run(["train-offline", trained.data[0], "--out", str(out), "--resume", *ray]) == 1
     error = capsys.readouterr().err
     assert "was trained on other data" in error
     assert error.count("\n") == 1
@@ -166,29 +157,49 @@ def test_options_that_cannot_be_used_with_ray(logs: Path, tmp_path: Path) -> Non
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.long
-def test_an_error_of_a_worker_ends_the_training_as_one_line(
+def test_an_error_of_a_worker_ends_the_training_as_one_line(logs: Path, tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match=r"update \d+ of .* Last good checkpoint") as raised:
+        mcaprl.train(
+            logs, tmp_path / "run", algo="bc", learning_rate=1e30, updates=9, seeds=2, ray=True
+        )
+    assert "\n" not in str(raised.value)
+
+
+def test_a_training_whose_workers_die_is_one_line(
     logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Damage the last log, which only one of the workers reads. No worker is started again."""
-    from ray.train.torch import TorchTrainer
+    monkeypatch.setattr("mcaprl.ray.tasks.MOST_DEATHS", 1)
 
-    fit, ended = TorchTrainer.fit, []
-    monkeypatch.setattr(TorchTrainer, "fit", lambda trainer: ended.append(fit(trainer)))
-    monkeypatch.setattr(training, "MOST_DEATHS", 0)
-    shutil.copytree(logs, tmp_path / "logs")
-    content = bytearray((logs / "1.mcap").read_bytes())
-    summary = make_reader(io.BytesIO(content)).get_summary()
-    assert summary is not None
-    chunk = summary.chunk_indexes[-1]
-    content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
-    (tmp_path / "logs" / "1.mcap").write_bytes(content)
-    with pytest.raises(
-        LogError, match=r"1\.mcap: the chunk at byte .* does not match its CRC"
-    ) as raised:
-        mcaprl.train(tmp_path / "logs", tmp_path / "run", algo="bc", updates=1, ray=True, workers=2)
-    assert "\n" not in str(raised.value)
-    assert len(ended) == 1
+    def progress(now: TrainingProgress) -> None:
+        for process in titled("ray::run_task"):
+            os.kill(process, signal.SIGKILL)
+
+    with pytest.raises(ClusterError, match=r"the checkpoints are kept: continue with --resume \("):
+        mcaprl.train(
+            logs,
+            tmp_path / "run",
+            algo="bc",
+            updates=10**6,
+            log_interval=10,
+            ray=True,
+            progress=progress,
+        )
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_an_interrupted_training_ends_its_workers(logs: Path, tmp_path: Path, seeds: int) -> None:
+    options: dict[str, Any] = {"algo": "bc", "updates": 10**6, "log_interval": 10}
+
+    def progress(now: TrainingProgress) -> None:
+        raise KeyboardInterrupt
+
+    out = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        mcaprl.train(logs, out, seeds=seeds, ray=True, progress=progress, **options)
+    ends = time.monotonic() + 30
+    while titled("ray::run_task") and time.monotonic() < ends:
+        time.sleep(0.1)
+    assert not titled("ray::run_task")
 
 
 def test_other_versions_and_unseen_paths_are_found_before_the_workers_start(
@@ -197,15 +208,12 @@ def test_other_versions_and_unseen_paths_are_found_before_the_workers_start(
     def train() -> None:
         mcaprl.train(logs, tmp_path / "run", algo="bc", updates=1, ray=True, workers=2)
 
-    monkeypatch.setattr(training, "_fit", None)
-    summaries = training._read_summaries([str(logs)])
-    unseen = replace(summaries, paths=[summaries.paths[0], tmp_path / "none.mcap"])
     with monkeypatch.context() as patch:
-        patch.setattr(training, "_read_summaries", lambda data: unseen)
+        patch.setattr(training, "weighted_logs", lambda data: [(tmp_path / "none.mcap", 1.0)])
         with pytest.raises(ClusterError, match=r"127\.0\.0\.1 cannot see .*/none\.mcap: choose"):
             train()
     versions = {**installed_versions(), "numpy": "1.2.3"}
-    monkeypatch.setattr(workers, "installed_versions", lambda: versions)
+    monkeypatch.setattr(tasks, "installed_versions", lambda: versions)
     with pytest.raises(ClusterError, match=r"the worker at 127\.0\.0\.1 has numpy .* 1\.2\.3: in"):
         train()
     assert list(tmp_path.iterdir()) == []
