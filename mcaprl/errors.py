@@ -37,6 +37,10 @@ class McaprlError(Exception):
 
     exit_code: ClassVar[int] = 1
 
+    def __str__(self) -> str:
+        """Return the message as one line, also if it quotes a message of a library."""
+        return " ".join(line.strip() for line in super().__str__().split("\n"))
+
 
 class UsageError(McaprlError):
     """The request is invalid."""

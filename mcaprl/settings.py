@@ -8,14 +8,22 @@ from __future__ import annotations
 import ast
 import functools
 import inspect
+import numbers
 import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields, is_dataclass
-from typing import Any
+from typing import Any, get_type_hints
 
 from mcaprl.errors import UsageError
 
 _MAX_FRAME_STACK = 1_000
+_KINDS: dict[object, str] = {
+    bool: "true or false",
+    int: "an integer",
+    str: "a text",
+    tuple[int, ...]: "a list of integers",
+}
+"""What the values of a field must be, by its type."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +46,9 @@ class Settings:
     """number of updates (offline) or environment steps (online) between checkpoints"""
 
     def __post_init__(self) -> None:
-        """Validate the ranges of the settings."""
+        """Validate the types and ranges of the settings."""
+        for name, kind in get_type_hints(type(self)).items():
+            self._require(name, _is_of(getattr(self, name), kind), _KINDS.get(kind, "a number"))
         self._require_positive("frame_stack", "checkpoint_interval")
         allowed = f"at most {_MAX_FRAME_STACK}"
         self._require("frame_stack", self.frame_stack <= _MAX_FRAME_STACK, allowed)
@@ -61,6 +71,18 @@ class Settings:
     def _require_fraction(self, *names: str) -> None:
         for name in names:
             self._require(name, 0 <= getattr(self, name) <= 1, "within [0, 1]")
+
+
+def _is_of(value: object, kind: object) -> bool:
+    """Return whether a value has the type of a field; fields of other types are not checked."""
+    if kind == tuple[int, ...]:
+        return isinstance(value, tuple | list) and all(_is_of(each, int) for each in value)
+    if kind not in (int, float):
+        return not isinstance(kind, type) or isinstance(value, kind)
+    number = numbers.Integral if kind is int else numbers.Real
+    # Larger integers cannot be converted to a float.
+    is_large = isinstance(value, int) and abs(value) > sys.float_info.max
+    return isinstance(value, number) and not isinstance(value, bool) and not is_large
 
 
 def check_settings(algo: str, config: Settings | type[Settings], given: Iterable[str]) -> None:

@@ -27,6 +27,10 @@ def test_every_error_can_be_pickled(kind: type[errors.McaprlError]) -> None:
     assert kind.exit_code in (1, 2)
 
 
+def test_a_message_that_quotes_lines_is_one_line() -> None:
+    assert str(errors.LogError("a.mcap: no:\n  line 2\n")) == "a.mcap: no: line 2 "
+
+
 def test_every_error_is_in_the_diagram() -> None:
     assert errors.__doc__ is not None
     for kind in subclasses(errors.McaprlError):

@@ -110,9 +110,14 @@ def describe_seeds(summaries: Sequence[OfflineSummary]) -> list[str]:
 
 
 def _rows_before(path: Path, update: int) -> list[str]:
-    """Return the header and the rows of earlier updates, without a row that a kill cut off."""
+    """Return the header and the rows of earlier updates, without damaged rows or cut ones."""
     if update == 1 or not path.exists():
         return []
-    header, *rows = path.read_text().splitlines(keepends=True)
+    header, *rows = path.read_text(errors="replace").splitlines(keepends=True) or [""]
     whole = (row for row in rows if row.count(",") == header.count(","))
-    return [header, *(row for row in whole if int(row.split(",")[0]) < update)]
+    numbered = ((row.split(",")[0], row) for row in whole)
+    return [header, *(row for number, row in numbered if _is_before(number, update))]
+
+
+def _is_before(number: str, update: int) -> bool:
+    return number.isascii() and number.isdecimal() and len(number) < 20 and int(number) < update

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import re
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mcaprl.errors import UnknownNameError, UsageError
@@ -32,6 +35,33 @@ def test_a_setting_of_one_algorithm_is_not_offered_by_another() -> None:
     assert "alpha" in field_help(CQLConfig)
     assert "alpha" not in field_help(DQNConfig)
     assert "gamma" not in field_help(BCConfig)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("updates", "9", "updates must be an integer, got 9"),
+        ("updates", 9.0, "an integer"),
+        ("updates", True, "an integer"),
+        ("updates", math.inf, "an integer"),
+        ("updates", 10**400, "an integer"),
+        ("learning_rate", "fast", "learning_rate must be a number, got fast"),
+        ("learning_rate", 10**400, "a number"),
+        ("hidden", None, "hidden must be a list of integers"),
+        ("hidden", ["a"], "a list of integers"),
+        ("normalize", 1, "true or false"),
+        ("encoder", [], "a text"),
+    ],
+)
+def test_settings_have_the_type_of_their_field(name: str, value: Any, message: str) -> None:
+    with pytest.raises(UsageError, match=re.escape(message)):
+        CQLConfig(**{name: value})
+
+
+def test_numbers_of_numpy_are_settings() -> None:
+    given: dict[str, Any] = {"updates": np.int64(3), "alpha": np.float32(0.5), "gamma": 1}
+    config = CQLConfig(**given)
+    assert (config.updates, config.alpha, config.gamma) == (3, 0.5, 1)
 
 
 def test_the_learning_rate_decays_linearly_to_its_final_fraction() -> None:

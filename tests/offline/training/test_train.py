@@ -256,11 +256,11 @@ def test_a_run_killed_at_random_moments_resumes_bit_for_bit(tmp_path: Path) -> N
         assert_same_result(tmp_path / "cut", tmp_path / "whole", seed)
 
 
-def test_an_incomplete_row_after_a_kill_is_dropped(whole: OfflineSummary, tmp_path: Path) -> None:
+def test_incomplete_and_damaged_rows_are_dropped(whole: OfflineSummary, tmp_path: Path) -> None:
     with pytest.raises(Stopped):
         train(corridor(), SHORT_CQL, tmp_path / "cut", progress=StopAt(50))
-    with (tmp_path / "cut" / "seed-0" / "metrics.csv").open("a") as file:
-        file.write("60,0.00")
+    with (tmp_path / "cut" / "seed-0" / "metrics.csv").open("ab") as file:
+        file.write(b"\xff\n9x,0\n60,0.00")
     train(corridor(), SHORT_CQL, tmp_path / "cut", resume=True, progress=silent)
     assert_same_result(tmp_path / "cut", whole.folder.parent)
 

@@ -14,7 +14,7 @@ import pytest
 
 import mcaprl
 from mcaprl.errors import LogError, McaprlError
-from mcaprl.recorder.dataset.formats import budget
+from mcaprl.recorder.dataset.formats import budget, parquet_files
 from mcaprl.recorder.dataset.formats.registry import FORMATS, write_format
 from tests.support.damage.datasets import dataset, write_all
 
@@ -218,6 +218,67 @@ def test_parquet_columns_that_unpack_to_too_much_are_refused(tmp_path: Path) -> 
         writer.write_table(pyarrow.Table.from_arrays([column], schema=schema))
     assert path.stat().st_size < 100_000
     _fails(tmp_path / "set", "episode has shape .* too large for the")
+
+
+@pytest.fixture
+def nested_table(tmp_path: Path) -> Path:
+    """Write a table with lists, texts, missing values and statistics in two row groups."""
+    import pyarrow
+    from pyarrow import parquet
+
+    values = {"x": [0.5, None, 2.0], "y": [[1, 2], [], [3]], "z.a": ["a", "b", "a"]}
+    more = {"w": [{"u": [True], "v": b"1"}] * 3, "f": pyarrow.array([1.0, 2.0, 3.0], "float32")}
+    path = tmp_path / "nested.parquet"
+    with parquet.ParquetWriter(path, pyarrow.table({**values, **more}).schema) as writer:
+        for _ in range(2):
+            writer.write_table(pyarrow.table({**values, **more}))
+    return path
+
+
+def test_sizes_in_the_footer_of_parquet_are_those_of_pyarrow(nested_table: Path) -> None:
+    from pyarrow import parquet
+
+    metadata = parquet.ParquetFile(nested_table).metadata
+    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+    expected = [
+        (column.path_in_schema, column.num_values, column.total_uncompressed_size)
+        for group in groups
+        for column in (group.column(number) for number in range(group.num_columns))
+    ]
+    found = parquet_files._row_groups(nested_table)
+    assert [rows for rows, _ in found] == [3, 3]
+    assert expected == [
+        (".".join(each.words), each.values, each.stored_bytes)
+        for _, columns in found
+        for each in columns
+    ]
+
+
+def test_no_damaged_byte_in_the_footer_of_parquet_ends_the_process(nested_table: Path) -> None:
+    """PyArrow aborts the process if it is asked for columns with some damaged statistics."""
+    code = (
+        "import struct, sys\n"
+        "from pathlib import Path\n"
+        "from mcaprl.errors import LogError\n"
+        "from mcaprl.recorder.dataset.formats.parquet_files import read_table\n"
+        "path = Path(sys.argv[1])\n"
+        "data, refused = path.read_bytes(), 0\n"
+        "start = len(data) - 8 - struct.unpack('<I', data[-8:-4])[0]\n"
+        "for place in range(start, len(data)):\n"
+        "    for flip in (1, 16, 255):\n"
+        "        path.write_bytes(data[:place] + bytes([data[place] ^ flip]) + data[place + 1:])\n"
+        "        try:\n"
+        "            read_table(path)\n"
+        "        except LogError:\n"
+        "            refused += 1\n"
+        "print(3 * (len(data) - start), refused)\n"
+    )
+    command = [sys.executable, "-c", code, str(nested_table)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr[-2000:]
+    cases, refused = map(int, done.stdout.split())
+    assert cases > 3000
+    assert refused > 1000
 
 
 @pytest.mark.parametrize(
