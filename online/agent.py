@@ -16,7 +16,6 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, make_output_format
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -27,8 +26,8 @@ from mcaprl.online.checkpoint import load_checkpoint, save_checkpoint
 from mcaprl.online.config import DQNConfig
 from mcaprl.online.curves import CurvePoint, write_curve
 from mcaprl.online.evaluation import Evaluation, FirstEpisodes
-from mcaprl.online.features import normalize_images
-from mcaprl.online.frames import StackedVecEnv, parts_of, parts_of_space
+from mcaprl.online.features import inputs_of, normalize_images
+from mcaprl.online.frames import StackedVecEnv, channels_first, parts_of, parts_of_space
 from mcaprl.online.live import LiveTraining
 from mcaprl.online.policy import describe_run, save_policy
 from mcaprl.online.recording import ActionDescriber, recorded
@@ -330,11 +329,13 @@ def center_images(model: BaseAlgorithm, task: Task, seed: int) -> None:
         seen = [envs.reset(seed=seed)[0]]
         while len(seen) * task.config.envs < CENTERING_STEPS:
             seen.append(envs.step(envs.action_space.sample())[0])
-    frames = {
-        key: np.concatenate([parts_of(each)[key] for each in seen])
-        for key, space in parts_of_space(envs.single_observation_space).items()
-        if is_image_space(space)
-    }
+    space = envs.single_observation_space
+    vectors = inputs_of(channels_first(space))[0]
+    frames = {}
+    for key, part in parts_of_space(space).items():
+        if key not in vectors:
+            images = np.concatenate([parts_of(each)[key] for each in seen])
+            frames[key] = np.moveaxis(images, 1, -1) if channels_first(part) == part else images
     if frames:
         normalize_images(model.policy, frames, task.config.frame_stack)
 

@@ -82,10 +82,13 @@ class Dataset(Conversions):
                 registered, else Discrete up to the largest integer action, or an unbounded Box.
 
         Raises:
-            SpaceError: Lengths or shapes do not agree with each other or with the spaces.
+            SpaceError: Lengths or shapes do not agree with each other or with the spaces, or an
+                action is not finite.
         """
         from mcaprl.recorder.dataset.arrays import columns_of_arrays, description_of
+        from mcaprl.recorder.dataset.values import check_finite, numbers
 
+        check_finite("actions", numbers("actions", actions))
         description = description_of(env_id, observations, actions, observation_space, action_space)
         steps = (actions, rewards, terminated, truncated, behavior_probs)
         columns = dict(zip(STEP_COLUMNS, steps, strict=True))

@@ -146,7 +146,7 @@ def test_pickles_are_equal_and_shared() -> None:
     assert torch.equal(copy[:]["reward"], data[:]["reward"])
 
 
-@pytest.mark.parametrize(("method", "count"), [("fork", 2), ("spawn", 1)])
+@pytest.mark.parametrize(("method", "count"), [("fork", 2), ("spawn", 1), ("forkserver", 1)])
 def test_workers_read_all_items(method: str, count: int, log_path: Path) -> None:
     numbered([40, 30, 50]).save(log_path)
     data = TransitionDataset(log_path)
