@@ -21,7 +21,7 @@ from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 from mcaprl.recorder.edit.source import Edited, FinishedLog
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.episode_summary import INTERRUPTED, EpisodeSummary, add_up
-from mcaprl.recorder.format.rows import make_final
+from mcaprl.recorder.format.rows import Part, Shorten
 from mcaprl.recorder.format.schema import message_dtype
 from mcaprl.recorder.format.selected_copy import Source, copy_selected
 from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
@@ -51,6 +51,12 @@ class _Piece:
     @property
     def is_whole(self) -> bool:
         return self.start == 0 and self.stop == self.length
+
+    def part(self, log: FinishedLog) -> Part:
+        first = int(log.firsts[self.episode])
+        start_ns, end_ns = (int(log.times[first + step]) for step in (self.start, self.stop))
+        count = self.stop - self.start
+        return Part(start_ns, end_ns, self.start, count, is_cut=self.stop < self.length)
 
 
 def slice_log(
@@ -82,9 +88,9 @@ def slice_log(
         spans,
         also=log.states(spans),
     )
-    more = _shorten(log, cut, source) if cut else []
+    summaries = _shorten(log, cut, source) if cut else []
     with replacing(Path(out), LogError, overwrite=overwrite) as unfinished:
-        copied = copy_selected([source], unfinished, log.top_level, more)
+        copied = copy_selected([source], unfinished, log.top_level, summaries)
     transitions = sum(piece.stop - piece.start for piece in pieces)
     return Edited(
         Path(out), len(pieces), transitions, copied.messages, copied.whole, copied.rewritten
@@ -170,35 +176,15 @@ def _without_single_records(
     return low, high
 
 
-def _shorten(
-    log: FinishedLog, pieces: list[_Piece], source: Source
-) -> list[tuple[int, int, bytes]]:
+def _shorten(log: FinishedLog, pieces: list[_Piece], source: Source) -> list[EpisodeSummary]:
     """Make `source` change the records of shortened episodes; return their new summaries.
 
     Raises:
         LogError: Another program or version wrote the messages of `/rl/step` or `/rl/episode`.
     """
-    channels = log.reader.channels_of(STEP_TOPIC)
-    dtypes = {one.id: _step_dtype(log, one) for one in channels}
-    firsts, times = log.firsts, log.times
-    starts = [int(times[firsts[one.episode] + one.start]) for one in pieces]
-    ends = [int(times[firsts[one.episode] + one.stop]) for one in pieces]
-    # The end flags are set in the last transition, the record before the final record.
-    lasts = [int(times[firsts[one.episode] + one.stop - 1]) for one in pieces]
-
-    def change(channel: Channel, time_ns: int, payload: memoryview) -> None:
-        number = int(np.searchsorted(ends, time_ns))
-        piece, row = pieces[number], np.frombuffer(payload, dtypes[channel.id], 1)
-        row["step"] -= piece.start
-        if piece.stop < piece.length:
-            if time_ns == lasts[number]:
-                row["truncated"] = True
-            elif time_ns == ends[number]:
-                make_final(row)
-
-    spans = np.array([starts, ends], np.int64).T
-    source.changed = {one.id: spans for one in channels}
-    source.change = change
+    dtypes = {one.id: _step_dtype(log, one) for one in log.reader.channels_of(STEP_TOPIC)}
+    change = Shorten([piece.part(log) for piece in pieces], dtypes)
+    source.change, source.changed = change, dict.fromkeys(dtypes, change.spans)
     listed = log.reader.channel_of(EPISODE_TOPIC)
     if listed is None:
         return []
@@ -208,7 +194,7 @@ def _shorten(
             " shortened; choose a part of whole episodes"
         )
     source.without = {listed.id: log.spans[[one.episode for one in pieces], 1]}
-    return _new_summaries(log.path, listed.id, pieces)
+    return _new_summaries(log.path, pieces)
 
 
 def _step_dtype(log: FinishedLog, channel: Channel) -> np.dtype[Any]:
@@ -222,10 +208,8 @@ def _step_dtype(log: FinishedLog, channel: Channel) -> np.dtype[Any]:
     return dtype
 
 
-def _new_summaries(
-    path: Path, channel_id: int, pieces: list[_Piece]
-) -> list[tuple[int, int, bytes]]:
-    """Return channel id, log_time and bytes of a new summary for each shortened episode."""
+def _new_summaries(path: Path, pieces: list[_Piece]) -> list[EpisodeSummary]:
+    """Return a new summary for each shortened episode."""
     numbers: NDArray[np.int64] = np.array([piece.episode for piece in pieces])
     whole = LogReader(path, Selection(columns=())).read(numbers)
     found = []
@@ -242,5 +226,5 @@ def _new_summaries(
         if piece.start > 0:
             # The seed and the options of the reset do not reproduce the first state of the part.
             summary = summary._replace(seed=None, options="")
-        found.append((channel_id, summary.end_time_ns, summary.to_message()))
+        found.append(summary)
     return found
