@@ -15,8 +15,7 @@ from mcaprl.api.ranges import check_port, check_positive
 from mcaprl.errors import ReportError, UnknownNameError
 from mcaprl.files import check_target, replacing
 from mcaprl.recorder.viewer.page.episode_data import LogPage
-from mcaprl.recorder.viewer.page.html import page_html
-from mcaprl.recorder.viewer.page.server import PageServer
+from mcaprl.recorder.viewer.page.server import PageServer, page_html
 from mcaprl.storage.remote import as_path
 
 _KINDS = (".html", ".htm")

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from mcaprl.api.data import Paths
 from mcaprl.files import check_log_name
-from mcaprl.recorder.edit.cut import filter_log, split_log
 from mcaprl.recorder.edit.join import merge_logs
-from mcaprl.recorder.edit.piece import Bounds, slice_log
+from mcaprl.recorder.edit.piece import Bounds, filter_log, slice_log, split_log
 from mcaprl.recorder.edit.source import Edited
 
 

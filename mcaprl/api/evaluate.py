@@ -35,9 +35,8 @@ from mcaprl.sims.evaluation.evaluate import (
     score_of,
 )
 from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
-from mcaprl.sims.evaluation.limits import StepLimit, make_limited, warn_of_cuts
 from mcaprl.sims.evaluation.pilots import has_pilot
-from mcaprl.sims.evaluation.rollout import Policy
+from mcaprl.sims.evaluation.rollout import Policy, StepLimit, make_limited, warn_of_cuts
 from mcaprl.sims.evaluation.statistics import mean_interval
 
 RESULT_NAME = "evaluation.json"

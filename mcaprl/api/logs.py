@@ -18,7 +18,7 @@ from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import Calibration, calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
-from mcaprl.recorder.viewer.surprises import Surprise, moments_of
+from mcaprl.recorder.viewer.report import Surprise, moments_of
 from mcaprl.texts import size
 
 if TYPE_CHECKING:

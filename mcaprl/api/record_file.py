@@ -15,8 +15,7 @@ from mcaprl.api.policies import policies_of, policy_names
 from mcaprl.files import work_folder
 from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.sims import make_sim
-from mcaprl.sims.evaluation.limits import make_limited
-from mcaprl.sims.evaluation.rollout import EpisodeResult, EpsilonGreedy, rollout
+from mcaprl.sims.evaluation.rollout import EpisodeResult, EpsilonGreedy, make_limited, rollout
 
 
 @dataclass(frozen=True)

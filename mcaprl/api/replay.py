@@ -30,8 +30,13 @@ from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.log_layout import attached_layout
 from mcaprl.recorder.viewer.playback import Player, Track
-from mcaprl.recorder.viewer.player_server import MAX_SPEED, MIN_SPEED, LiveServer
-from mcaprl.recorder.viewer.prefix import prefixes_of, side_by_side
+from mcaprl.recorder.viewer.player_server import (
+    MAX_SPEED,
+    MIN_SPEED,
+    LiveServer,
+    prefixes_of,
+    side_by_side,
+)
 from mcaprl.recorder.viewer.scene_reader import SeenStep, moments_of_episode
 from mcaprl.recorder.viewer.verify import Comparison, Verification
 from mcaprl.recorder.viewer.verify import verify as verify_dataset

@@ -12,10 +12,9 @@ from mcap.records import Channel, ChunkIndex, Metadata, Schema
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.chunks import Scratch, chunk_header, chunk_records
 from mcaprl.recorder.columns.message_rows import RECORD_HEADER_BYTES
-from mcaprl.recorder.columns.records import contents_of, map_file, only, parse_record
+from mcaprl.recorder.columns.records import contents_of, crc32, map_file, only, parse_record
 from mcaprl.recorder.columns.salvage import Damage, ValidRecord, intact_summary, valid_records
 from mcaprl.recorder.columns.writer import COMPRESSIONS, McapWriter
 from mcaprl.texts import counted

@@ -18,7 +18,6 @@ from mcap.records import Channel, ChunkIndex, Schema
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError
-from mcaprl.recorder.columns.append import TopLevelRecord
 from mcaprl.recorder.columns.chunks import Scratch
 from mcaprl.recorder.columns.message_rows import (
     INDEX_ENTRY,
@@ -28,6 +27,7 @@ from mcaprl.recorder.columns.message_rows import (
 )
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import MAGIC, RECORD_HEADER, contents_of
+from mcaprl.recorder.columns.summary import TopLevelRecord
 from mcaprl.recorder.columns.valid_copy import writer_like
 from mcaprl.recorder.columns.writer import McapWriter
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
