@@ -130,8 +130,7 @@ class NetworkSettings(Settings):
     """
 
     encoder: str = AUTO
-    """convolutions over images: nature, compact, or auto (compact for images with one channel);
-    images with an edge below 36 pixels always have two convolutions of 3x3 pixels"""
+    """convolutions over images: nature, compact, or auto (compact for images with one channel)"""
     channels: tuple[int, ...] = ()
     """output channels of the convolutions; by default, nature has 32,64,64 and compact 16,32"""
     center_images: bool = True
