@@ -16,25 +16,24 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, make_output_format
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.errors import TrainingError
 from mcaprl.files import subfolder, write_atomically
+from mcaprl.frames import is_image, parts_of, parts_of_space
 from mcaprl.online.algorithms import make_model, own_architecture
 from mcaprl.online.checkpoint import load_checkpoint, save_checkpoint
 from mcaprl.online.config import DQNConfig
 from mcaprl.online.curves import CurvePoint, write_curve
 from mcaprl.online.evaluation import Evaluation, FirstEpisodes
 from mcaprl.online.features import normalize_images
-from mcaprl.online.frames import StackedVecEnv, parts_of, parts_of_space
 from mcaprl.online.live import LiveTraining
-from mcaprl.online.policy import describe_run, save_policy
 from mcaprl.online.recording import ActionDescriber, recorded
 from mcaprl.online.task import Task
-from mcaprl.online.vec_env import BatchedVecEnv
+from mcaprl.online.vec_env import BatchedVecEnv, StackedVecEnv
 from mcaprl.online.warm_start import fill_buffer, take_weights
+from mcaprl.online.zip_file import describe_run, save_policy
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import BEST_NAME, CHECKPOINT_NAME, CURVE_NAME, writing
@@ -333,7 +332,7 @@ def center_images(model: BaseAlgorithm, task: Task, seed: int) -> None:
     frames = {
         key: np.concatenate([parts_of(each)[key] for each in seen])
         for key, space in parts_of_space(envs.single_observation_space).items()
-        if is_image_space(space)
+        if is_image(space)
     }
     if frames:
         normalize_images(model.policy, frames, task.config.frame_stack)

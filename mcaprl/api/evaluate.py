@@ -18,6 +18,7 @@ from mcaprl.api.environments import all_options, trained_options
 from mcaprl.api.evaluate_parts import results_on_ray
 from mcaprl.api.policies import SCRIPTED, Names, as_names, policies_of, policy_names
 from mcaprl.api.ranges import check_least
+from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import ReportError, UsageError, import_extra
 from mcaprl.files import check_log_name, check_target, check_writable, write_json
 from mcaprl.page import Figure
@@ -37,7 +38,6 @@ from mcaprl.sims.evaluation.evaluate import (
 from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
 from mcaprl.sims.evaluation.limits import StepLimit, make_limited, warn_of_cuts
 from mcaprl.sims.evaluation.pilots import has_pilot
-from mcaprl.sims.evaluation.rollout import Policy
 from mcaprl.sims.evaluation.statistics import mean_interval
 
 RESULT_NAME = "evaluation.json"
@@ -186,7 +186,7 @@ def evaluate(
         is_batched = is_plain and env.spec is not None and bool(env.spec.vector_entry_point)
         found = _policies(names, env)
         shown, scores = policy_names(list(found)), {}
-        sources = [getattr(one, "mask_from", "") for each in found.values() for one in each]
+        sources = [one.mask_from for each in found.values() for one in each]
         source = next(filter(None, sources), "") if mask_from is None else mask_from
         with ExitStack() as stack:
             total = sum(map(len, found.values())) * episodes
@@ -239,7 +239,7 @@ def evaluate(
     return result
 
 
-def _policies(names: Sequence[str], env: gym.Env[Any, Any]) -> dict[str, list[Policy | None]]:
+def _policies(names: Sequence[str], env: gym.Env[Any, Any]) -> dict[str, list[BasePolicy]]:
     """Return a dict from names to policies; it includes `random` and, if there is one, `pilot`."""
     scripted = SCRIPTED if has_pilot(env) else ("random",)
     return {name: policies_of(name, env) for name in dict.fromkeys([*names, *scripted])}

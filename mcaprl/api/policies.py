@@ -5,21 +5,23 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.base_policy import BasePolicy, RandomPolicy
 from mcaprl.errors import McaprlError, PolicyError, UnknownNameError, UsageError
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.format.action_commands import ActionCommands
 from mcaprl.recorder.record.recorded_space import RecordedSpace, recorded_like
 from mcaprl.runs import BEST_NAME, CONFIG_NAME, POLICY_NAME, policy_files
-from mcaprl.sims.evaluation.rollout import Policy, check_fit, same_form
+from mcaprl.sims.evaluation.rollout import check_fit, same_form
+
+if TYPE_CHECKING:
+    from mcaprl.offline.policy import Policy
 
 SCRIPTED = ("pilot", "random")
 Names = str | Path | Sequence[str | Path]
@@ -35,60 +37,7 @@ def as_names(policies: Names) -> list[str]:
     return [str(policies)] if isinstance(policies, str | Path) else list(map(str, policies))
 
 
-class TrainedPolicy(Policy, Protocol):
-    """Loaded policy with NumPy inputs and outputs; B is the batch size, A the number of actions.
-
-    A policy that stacks k > 1 frames stores the observations of the last k calls of `act` since
-    `begin`. The other methods of such a policy accept stacks (B, k, *shape), oldest frame first.
-    """
-
-    @property
-    def algo(self) -> str:
-        """Name of the training algorithm."""
-
-    @property
-    def observation_space(self) -> spaces.Space[Any] | None:
-        """Space of one observation; None if the file has no bounds."""
-
-    @property
-    def action_space(self) -> spaces.Space[Any]:
-        """Space of one action."""
-
-    @property
-    def env_id(self) -> str:
-        """Gymnasium id of the training environment; empty if unknown."""
-
-    @property
-    def env_kwargs(self) -> dict[str, Any]:
-        """Arguments of the training environment."""
-
-    @property
-    def frame_stack(self) -> int:
-        """Number of successive observations that the networks receive."""
-
-    @property
-    def action_commands(self) -> ActionCommands | None:
-        """Commands of a robot that the actions stand for, `fields` and `commands`; else None."""
-
-    def begin(self) -> None:
-        """Drop the stored observations at the start of an episode."""
-
-    def q_values(self, observations: Any) -> NDArray[Any]:
-        """Return Q-values (B, A), in the order of the action space.
-
-        Raises:
-            PolicyError: The policy has no Q-values, or the observations have another shape.
-        """
-
-    def action_probabilities(self, observations: Any) -> NDArray[Any]:
-        """Return the probabilities (B, A) of all actions: 0 or 1 if the policy is greedy.
-
-        Raises:
-            PolicyError: The observations have another shape.
-        """
-
-
-def load_policy(path: str | Path) -> TrainedPolicy:
+def load_policy(path: str | Path) -> Policy:
     """Load a trained policy, without unpickling or executing anything in its files.
 
     Args:
@@ -102,12 +51,12 @@ def load_policy(path: str | Path) -> TrainedPolicy:
     return _load(_found_files(Path(path))[0])
 
 
-def load_policies(path: str | Path) -> list[TrainedPolicy]:
+def load_policies(path: str | Path) -> list[Policy]:
     """Load the policies of all seeds of a run, sorted by seed; see `load_policy`."""
     return [_load(file) for file in _found_files(Path(path))]
 
 
-def export(run: str | Path, out: str | Path, *, overwrite: bool = False) -> TrainedPolicy:
+def export(run: str | Path, out: str | Path, *, overwrite: bool = False) -> Policy:
     """Write a trained policy as ONNX, which ONNX Runtime runs without this package.
 
     The inputs are the parts of an observation, with the same names as in the log. The outputs are
@@ -134,11 +83,11 @@ def export(run: str | Path, out: str | Path, *, overwrite: bool = False) -> Trai
     return policy
 
 
-def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
+def policies_of(name: str, env: gym.Env[Any, Any]) -> list[BasePolicy]:
     """Return the policies that a name refers to; a run has one policy per training seed.
 
     Args:
-        name: `pilot`, a path, or `random`, for which the result is [None].
+        name: `pilot`, `random` or a path.
         env: Environment in which the policies will act.
 
     Raises:
@@ -147,7 +96,7 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
         PolicyError: The path contains no policy, or the policy's spaces differ from those of `env`.
     """
     if name == "random":
-        return [None]
+        return [RandomPolicy(env.action_space)]
     if name == "pilot":
         from mcaprl.sims.evaluation.pilots import has_pilot, make_pilot
 
@@ -159,25 +108,18 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
     return [_fitted(policy, env) for policy in policies]
 
 
-@dataclass(frozen=True)
-class _PartPolicy:
+class _PartPolicy(BasePolicy):
     """A policy that receives observations in the form of the log that it was trained on."""
 
-    policy: TrainedPolicy
-    recorded: RecordedSpace
-
-    @property
-    def name(self) -> str:
-        return self.policy.name
-
-    def begin(self) -> None:
-        self.policy.begin()
+    def __init__(self, policy: BasePolicy, recorded: RecordedSpace) -> None:
+        self.name, self.begin = policy.name, policy.begin  # type: ignore[method-assign]
+        self._policy, self._recorded = policy, recorded
 
     def act(self, observations: Any) -> NDArray[Any]:
-        return self.policy.act(self.recorded.of(observations))
+        return self._policy.act(self._recorded.of(observations))
 
 
-def _fitted(policy: TrainedPolicy, env: gym.Env[Any, Any]) -> Policy:
+def _fitted(policy: BasePolicy, env: gym.Env[Any, Any]) -> BasePolicy:
     """Return a policy that acts in an environment.
 
     The environment may have more observations than the policy needs, or a Tuple instead of a Dict.
@@ -195,7 +137,7 @@ def _fitted(policy: TrainedPolicy, env: gym.Env[Any, Any]) -> Policy:
     return policy
 
 
-def trained_policies(name: str, dataset: Dataset) -> list[TrainedPolicy]:
+def trained_policies(name: str, dataset: Dataset) -> list[Policy]:
     """Load the policies of all seeds of a run, and check that they fit a log.
 
     Raises:
@@ -213,7 +155,7 @@ def trained_policies(name: str, dataset: Dataset) -> list[TrainedPolicy]:
             trained, logged = getattr(policy, role), getattr(dataset, role)
             if trained is not None and not same_form(trained, logged):
                 hint = ""
-                if role == "observation_space" and (source := getattr(policy, "mask_from", "")):
+                if role == "observation_space" and (source := policy.mask_from):
                     hint = f'; open it and pass with_action_mask("{source}")'
                 raise PolicyError(
                     f"{name} was trained on {role} {trained}; the log has {logged}{hint}"
@@ -267,11 +209,11 @@ def _found_files(path: Path) -> list[Path]:
     return files
 
 
-def _load(file: Path) -> TrainedPolicy:
+def _load(file: Path) -> Policy:
     if file.name == POLICY_NAME:
         from mcaprl.offline.policy import read_policy
 
         return read_policy(file.parent)
-    from mcaprl.online.policy import read_policy as read_model
+    from mcaprl.online.zip_file import read_policy as read_model
 
     return read_model(file)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mcaprl.api.cluster import ClusterOptions
 from mcaprl.api.data import MAPPING_NAME, Data, Definitions, MappingFile, mapping_tree, open_data
 from mcaprl.api.environments import all_options
-from mcaprl.api.policies import TrainedPolicy, as_names, is_policy, load_policies
+from mcaprl.api.policies import as_names, is_policy, load_policies
 from mcaprl.api.ranges import check_least, check_port, check_positive
 from mcaprl.api.replay import LiveAddress
 from mcaprl.errors import MissingExtraError, TrainingError, UsageError, import_extra
@@ -26,6 +26,7 @@ from mcaprl.settings import check_settings, flag, settings_from_json
 from mcaprl.storage.remote import check_upload, upload_all
 
 if TYPE_CHECKING:
+    from mcaprl.offline.policy import Policy
     from mcaprl.offline.training.metrics import OfflineSummary
     from mcaprl.online.train import OnlineSummary
 
@@ -401,7 +402,7 @@ def _train_on_device(
         )
 
 
-def _experience(sources: list[str]) -> tuple[Dataset | None, list[TrainedPolicy] | None]:
+def _experience(sources: list[str]) -> tuple[Dataset | None, list[Policy] | None]:
     """Return the dataset of the logs in `sources`, and the policies of the run in `sources`.
 
     The dataset is None if there are no logs, and the list of policies is None if there is no run.

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import gymnasium as gym
 
-from mcaprl.ends import STEP_LIMIT
+from mcaprl.limits import STEP_LIMIT
 from mcaprl.sims import make_sim, make_sims
 from mcaprl.sims.evaluation.rollout import EpisodeResult
 

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,26 +16,14 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from mcaprl.base_policy import BasePolicy, RandomPolicy
 from mcaprl.errors import PolicyError
+from mcaprl.frames import mapped
 from mcaprl.joint_actions import joint_actions
 from mcaprl.masks import allowed_actions, masked
 
 MOST_NUMBERED = 1 << 62
 """Largest number of actions that a policy chooses among by their numbers."""
-
-
-class Policy(Protocol):
-    """Scripted or trained policy.
-
-    A policy with memory has a method `begin`, which is called at the start of each episode.
-    """
-
-    @property
-    def name(self) -> str:
-        """Name in logs and tables."""
-
-    def act(self, observations: Any) -> NDArray[Any]:
-        """Return actions (B, *action shape) for observations (B, *shape) or a dict of them."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +51,7 @@ class EpsilonGreedy:
 
     def __init__(
         self,
-        policy: Policy | None,
+        policy: BasePolicy | None,
         epsilon: float,
         action_space: spaces.Space[Any],
         mask_from: str = "",
@@ -71,25 +59,24 @@ class EpsilonGreedy:
         """Follow `policy`, but take a random action with probability `epsilon`.
 
         Args:
-            policy: Policy, or None for random actions.
+            policy: Policy; None or a `RandomPolicy` for random actions.
             epsilon: Probability of a random action, 0 to 1; ignored if there is no policy.
             action_space: Space of the random actions.
             mask_from: Source of the mask of random actions if there is no policy; see
                 `mcaprl.masks`. A policy has its own source.
         """
-        self.policy = policy
+        self.policy = policy = None if isinstance(policy, RandomPolicy) else policy
         self.epsilon = 1.0 if policy is None else epsilon
         self.name = "random" if policy is None else policy.name
         self._space = action_space
         self._joint = joint_actions(action_space)
-        self.mask_from = mask_from if policy is None else getattr(policy, "mask_from", "")
+        self.mask_from = mask_from if policy is None else policy.mask_from
         self.begin(0)
 
     def begin(self, seed: int) -> None:
         """Start an episode: reset the policy's memory and seed the exploration."""
-        reset_memory = getattr(self.policy, "begin", None)
-        if reset_memory is not None:
-            reset_memory()
+        if self.policy is not None:
+            self.policy.begin()
         self._random = np.random.default_rng([seed, 1])
         self._space.seed(seed)
 
@@ -105,7 +92,11 @@ class EpsilonGreedy:
         """
         if self.mask_from:
             observation = masked(observation, info, self.mask_from)
-        greedy = None if self.policy is None else self.policy.act(_batch(observation))[0]
+        greedy = (
+            None
+            if self.policy is None
+            else self.policy.act(mapped(lambda part: np.asarray(part)[None], observation))[0]
+        )
         explores = self.epsilon > 0 and self._random.random() < self.epsilon
         joint = self._joint
         if joint is None or joint.count > MOST_NUMBERED:
@@ -220,7 +211,7 @@ def rollout(
 
 def batch_rollout(
     envs: gym.vector.VectorEnv[Any, Any, Any],
-    policy: Policy,
+    policy: BasePolicy,
     seeds: Sequence[int],
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> list[EpisodeResult]:
@@ -262,7 +253,7 @@ def batch_rollout(
 
 
 def check_fit(
-    policy: Any, env: gym.Env[Any, Any], observation_space: spaces.Space[Any] | None = None
+    policy: BasePolicy, env: gym.Env[Any, Any], observation_space: spaces.Space[Any] | None = None
 ) -> None:
     """Validate that the spaces of a trained policy and of an environment match; see `same_form`.
 
@@ -290,11 +281,10 @@ def check_fit(
             )
 
 
-def _other_arguments(policy: Any, env: gym.Env[Any, Any]) -> dict[str, Any]:
+def _other_arguments(policy: BasePolicy, env: gym.Env[Any, Any]) -> dict[str, Any]:
     """Return the arguments of the training environment that differ from those of `env`."""
     own = env.spec.kwargs if env.spec else {}
-    arguments = getattr(policy, "env_kwargs", {})
-    return {key: value for key, value in arguments.items() if own.get(key) != value}
+    return {key: value for key, value in policy.env_kwargs.items() if own.get(key) != value}
 
 
 def as_options(arguments: Mapping[str, Any]) -> str:
@@ -325,14 +315,6 @@ def same_form(space: spaces.Space[Any], other: spaces.Space[Any]) -> bool:
     if isinstance(space, spaces.Box) and isinstance(other, spaces.Box):
         return (space.shape, space.dtype) == (other.shape, other.dtype)
     return space == other
-
-
-def _batch(observation: Any) -> Any:
-    if isinstance(observation, tuple):
-        return tuple(map(_batch, observation))
-    if isinstance(observation, dict):
-        return {key: _batch(part) for key, part in observation.items()}
-    return np.asarray(observation)[None]
 
 
 def _position(telemetry: Callable[[], dict[str, float]] | None) -> tuple[float, float] | None:

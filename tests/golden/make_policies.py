@@ -21,13 +21,13 @@ from stable_baselines3 import A2C, DQN, PPO
 from mcaprl.api.policies import load_policy
 from mcaprl.architecture import Architecture
 from mcaprl.errors import PolicyError
+from mcaprl.frames import stacked_space
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.policy import save_policy
 from mcaprl.online.features import NetworkDQNPolicy, normalize_images, policy_arguments
-from mcaprl.online.frames import stacked_space
-from mcaprl.online.policy import describe_run
-from mcaprl.online.policy import save_policy as save_model
+from mcaprl.online.zip_file import describe_run
+from mcaprl.online.zip_file import save_policy as save_model
 from mcaprl.recorder.dataset.dataset import Dataset
 
 FOLDER = Path(__file__).parent / "policies"
