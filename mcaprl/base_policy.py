@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -13,6 +13,13 @@ from numpy.typing import NDArray
 from mcaprl.errors import PolicyError, UsageError
 from mcaprl.joint_actions import JointActions
 from mcaprl.masks import allowed_actions
+
+
+class Actor(Protocol):
+    """Anything with the method of a policy that selects actions."""
+
+    def act(self, observations: Any) -> Any:
+        """Return actions (B, *shape) for observations (B, *shape) or nested dicts of them."""
 
 
 class BasePolicy:
@@ -28,6 +35,8 @@ class BasePolicy:
         frame_stack: Number of successive observations that determine an action.
         action_commands: Commands of a robot that the actions stand for; None if unknown.
         mask_from: Source of the action mask; see `mcaprl.masks`.
+        is_deterministic: Whether `act` has no randomness. If not, recordings have no
+            `behavior_prob`.
     """
 
     name: str = "policy"
@@ -39,6 +48,7 @@ class BasePolicy:
     frame_stack: int = 1
     action_commands: Any = None
     mask_from: str = ""
+    is_deterministic: bool = True
 
     def begin(self) -> None:
         """Drop what the policy stores, at the start of an episode."""
@@ -109,7 +119,9 @@ class RandomPolicy(BasePolicy):
 
 
 class _ForeignPolicy(BasePolicy):
-    """Policy with the members that another object has."""
+    """Policy with the members that another object has; it may be random."""
+
+    is_deterministic = False
 
     def __init__(self, policy: object) -> None:
         known = [name for name in dir(BasePolicy) if not name.startswith("_")]

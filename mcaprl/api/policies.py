@@ -3,29 +3,65 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from functools import cached_property
+from os import PathLike, fspath
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium as gym
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.base_policy import BasePolicy, RandomPolicy
+from mcaprl.base_policy import BasePolicy, RandomPolicy, as_policy
 from mcaprl.errors import McaprlError, PolicyError, UnknownNameError, UsageError
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.recorded_space import RecordedSpace, recorded_like
-from mcaprl.runs import BEST_NAME, CONFIG_NAME, POLICY_NAME, policy_files
+from mcaprl.runs import BEST_NAME, CONFIG_NAME, POLICY_NAME, RunSummary, policy_files
 from mcaprl.sims.evaluation.rollout import check_fit, same_form
 
 if TYPE_CHECKING:
     from mcaprl.offline.policy import Policy
 
 SCRIPTED = ("pilot", "random")
-Names = str | Path | Sequence[str | Path]
-"""`pilot`, `random` or the path of a policy, or several of them."""
+Names = str | PathLike[str] | Sequence[str | PathLike[str]]
+"""`pilot`, `random` or the path of a policy, or several of them; a `Run` is a path."""
+Summary = TypeVar("Summary", bound=RunSummary)
+
+
+class Run(list[Summary]):
+    """Trained run: the list of the summaries of its seeds, with its folder and its policies.
+
+    Attributes:
+        folder: Run folder.
+    """
+
+    def __init__(self, folder: Path, summaries: Iterable[Summary]) -> None:
+        """Store the folder and one summary for each seed."""
+        super().__init__(summaries)
+        self.folder = folder
+
+    def __fspath__(self) -> str:
+        """Return the path of the folder, so that functions accept a run as a path."""
+        return str(self.folder)
+
+    @property
+    def summaries(self) -> list[Summary]:
+        """One summary for each seed."""
+        return list(self)
+
+    @cached_property
+    def policy(self) -> Policy:
+        """Policy of the first seed, as `load_policy` returns it; it is loaded on first use."""
+        return load_policy(self.folder)
+
+    @cached_property
+    def policies(self) -> list[Policy]:
+        """Policies of all seeds."""
+        return load_policies(self.folder)
 
 
 def as_names(policies: Names) -> list[str]:
@@ -34,10 +70,33 @@ def as_names(policies: Names) -> list[str]:
     >>> as_names("random"), as_names(["pilot", Path("runs/cql")])
     (['random'], ['pilot', 'runs/cql'])
     """
-    return [str(policies)] if isinstance(policies, str | Path) else list(map(str, policies))
+    if isinstance(policies, str | PathLike):
+        return [fspath(policies)]
+    return [fspath(one) for one in policies]
 
 
-def load_policy(path: str | Path) -> Policy:
+def by_name(policies: Any) -> dict[str, str | BasePolicy]:
+    """Return the names and objects of one or more policies, by names for tables.
+
+    Raises:
+        UsageError: An object is not a policy.
+
+    >>> by_name("runs/cql"), list(by_name([RandomPolicy(None), RandomPolicy(None), "pilot"]))
+    ({'runs/cql': 'runs/cql'}, ['random-2', 'random-3', 'pilot'])
+    """
+    several = isinstance(policies, Sequence) and not isinstance(policies, str | PathLike)
+    found: dict[str, str | BasePolicy] = {}
+    for one in policies if several else [policies]:
+        if isinstance(one, str | PathLike):
+            found[fspath(one)] = fspath(one)
+            continue
+        policy = as_policy(one)
+        names = itertools.chain([policy.name], (f"{policy.name}-{n}" for n in itertools.count(2)))
+        found[next(name for name in names if name not in {*found, *SCRIPTED})] = policy
+    return found
+
+
+def load_policy(path: str | PathLike[str]) -> Policy:
     """Load a trained policy, without unpickling or executing anything in its files.
 
     Args:
@@ -51,12 +110,12 @@ def load_policy(path: str | Path) -> Policy:
     return _load(_found_files(Path(path))[0])
 
 
-def load_policies(path: str | Path) -> list[Policy]:
+def load_policies(path: str | PathLike[str]) -> list[Policy]:
     """Load the policies of all seeds of a run, sorted by seed; see `load_policy`."""
     return [_load(file) for file in _found_files(Path(path))]
 
 
-def export(run: str | Path, out: str | Path, *, overwrite: bool = False) -> Policy:
+def export(run: str | PathLike[str], out: str | Path, *, overwrite: bool = False) -> Policy:
     """Write a trained policy as ONNX, which ONNX Runtime runs without this package.
 
     The inputs are the parts of an observation, with the same names as in the log. The outputs are
@@ -83,11 +142,11 @@ def export(run: str | Path, out: str | Path, *, overwrite: bool = False) -> Poli
     return policy
 
 
-def policies_of(name: str, env: gym.Env[Any, Any]) -> list[BasePolicy]:
+def policies_of(name: str | BasePolicy, env: gym.Env[Any, Any]) -> list[BasePolicy]:
     """Return the policies that a name refers to; a run has one policy per training seed.
 
     Args:
-        name: `pilot`, `random` or a path.
+        name: `pilot`, `random` or a path, or a policy itself.
         env: Environment in which the policies will act.
 
     Raises:
@@ -95,6 +154,8 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[BasePolicy]:
         UsageError: The sim has no pilot, or there is no such path.
         PolicyError: The path contains no policy, or the policy's spaces differ from those of `env`.
     """
+    if isinstance(name, BasePolicy):
+        return [_fitted(name, env)]
     if name == "random":
         return [RandomPolicy(env.action_space)]
     if name == "pilot":

@@ -48,11 +48,25 @@ class StepLimit(gym.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, info
 
 
-def make_limited(name: str, max_steps: int | None, /, **kwargs: Any) -> gym.Env[Any, Any]:
+class _Borrowed(gym.Wrapper[Any, Any, Any, Any]):
+    """A wrapper of a caller's environment, which leaves it open."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def make_or_borrow(name: str | gym.Env[Any, Any], /, **kwargs: Any) -> gym.Env[Any, Any]:
+    """Make a sim as `make_sim` does, or wrap an environment so that `close` leaves it open."""
+    return make_sim(name, **kwargs) if isinstance(name, str) else _Borrowed(name)
+
+
+def make_limited(
+    name: str | gym.Env[Any, Any], max_steps: int | None, /, **kwargs: Any
+) -> gym.Env[Any, Any]:
     """Make an environment whose episodes end.
 
     Args:
-        name: As in `make_sim`.
+        name: As in `make_sim`, or an environment, which `close` leaves open.
         max_steps: Limit on the steps of an episode; None for `DEFAULT_MAX_STEPS` if the environment
             has no time limit, and otherwise for no other limit.
         **kwargs: As in `make_sim`.
@@ -60,7 +74,7 @@ def make_limited(name: str, max_steps: int | None, /, **kwargs: Any) -> gym.Env[
     Raises:
         UnknownNameError, MissingExtraError, UsageError: As in `make_sim`.
     """
-    env = make_sim(name, **kwargs)
+    env = make_or_borrow(name, **kwargs)
     if max_steps is None and not _has_time_limit(env):
         max_steps = DEFAULT_MAX_STEPS
     return env if max_steps is None else StepLimit(env, max_steps)

@@ -114,6 +114,8 @@ class EpsilonGreedy:
             number, action = own, greedy
         by_chance = self.epsilon / len(allowed) if number in allowed else 0.0
         chance = by_chance + (1 - self.epsilon) * (number == own)
+        if self.policy is not None and not self.policy.is_deterministic:
+            chance = math.nan
         return (action if joint.shape else int(action)), chance
 
 
