@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from mcaprl.api.evaluate import evaluate
     from mcaprl.api.layout import layout
     from mcaprl.api.logs import check, info, recover
-    from mcaprl.api.policies import export, load_policy
+    from mcaprl.api.policies import Run, export, load_policy
     from mcaprl.api.record import record
     from mcaprl.api.replay import render, replay, verify
     from mcaprl.api.sweep import sweep
@@ -55,6 +55,7 @@ __all__ = [
     "PolicyError",
     "RecordMcap",
     "RecordVecMcap",
+    "Run",
     "UsageError",
     "__version__",
     "annotate",
@@ -107,7 +108,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.api.data": ["open_data as open"],
         "mcaprl.api.edit": ["filter", "merge", "slice", "split"],
         "mcaprl.api.logs": ["check", "info", "recover"],
-        "mcaprl.api.policies": ["export", "load_policy"],
+        "mcaprl.api.policies": ["Run", "export", "load_policy"],
         "mcaprl.api.replay": ["render", "replay", "verify"],
         "mcaprl.api.train": ["train", "train_online"],
         "mcaprl.ray": ["ray"],

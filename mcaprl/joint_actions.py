@@ -61,13 +61,13 @@ class JointActions:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of one value."""
+        """Shape of one value; () for a Discrete space alone."""
         return tuple(self.space.shape or ())
 
     @property
     def first(self) -> int:
         """Smallest action as one integer: the start of a Discrete space, otherwise 0."""
-        return int(self.starts[0]) if isinstance(self.space, spaces.Discrete) else 0
+        return 0 if self.shape else int(self.starts[0])
 
     @property
     def strides(self) -> tuple[int, ...]:
@@ -84,7 +84,7 @@ class JointActions:
         """Return the values (N, *shape) of indexes (N,): int64, or the dtype of the space."""
         digits = np.stack(np.unravel_index(indexes, self.sizes), 1) + self.starts
         found = digits.reshape(len(indexes), *self.shape)
-        return found if isinstance(self.space, spaces.Discrete) else found.astype(self.space.dtype)
+        return found.astype(self.space.dtype) if self.shape else found
 
     def contain(self, values: NDArray[Any]) -> NDArray[np.bool_]:
         """Return whether each of the values (N, *shape) is in the space."""

@@ -65,3 +65,5 @@ MAX_OPEN_LOGS: Final = 1000
 """Logs that a stream keeps open, because each takes memory and one of the system's 65,530 maps."""
 CLIENT_TIMEOUT_S: Final = 10.0
 """Time that a viewer may take for its request or for the next part of an answer."""
+STEP_LIMIT: Final = "step_limit"
+"""Reason of an episode's end: the caller's limit on its steps, not the environment, ended it."""

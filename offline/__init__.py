@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     )
     from mcaprl.offline.algorithms.cql import CQL
     from mcaprl.offline.algorithms.dqn import DoubleDQN
+    from mcaprl.offline.algorithms.heads import build_head
     from mcaprl.offline.algorithms.learner import Learner
     from mcaprl.offline.algorithms.registry import ALGORITHMS
     from mcaprl.offline.batches.buffer import TransitionBuffer
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from mcaprl.offline.estimate.fqe import FQEConfig
     from mcaprl.offline.estimate.importance import ESTIMATORS, EpisodeTable
     from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
-    from mcaprl.offline.policy import Scores
     from mcaprl.offline.selection.choice import DETERMINISTIC
     from mcaprl.offline.training.train import train
 
@@ -55,9 +55,9 @@ __all__ = [
     "FQEConfig",
     "Learner",
     "OffPolicyEvaluator",
-    "Scores",
     "TrainingConfig",
     "TransitionBuffer",
+    "build_head",
     "fqe_config",
     "train",
 ]
@@ -74,6 +74,7 @@ __getattr__ = lazy_attributes(
         ),
         "mcaprl.offline.algorithms.cql": ("CQL",),
         "mcaprl.offline.algorithms.dqn": ("DoubleDQN",),
+        "mcaprl.offline.algorithms.heads": ("build_head",),
         "mcaprl.offline.algorithms.learner": ("Learner",),
         "mcaprl.offline.algorithms.registry": ("ALGORITHMS",),
         "mcaprl.offline.batches.buffer": ("TransitionBuffer",),
@@ -82,7 +83,6 @@ __getattr__ = lazy_attributes(
         "mcaprl.offline.selection.choice": ("DETERMINISTIC",),
         "mcaprl.offline.estimate.importance": ("ESTIMATORS", "EpisodeTable"),
         "mcaprl.offline.estimate.off_policy": ("OffPolicyEvaluator",),
-        "mcaprl.offline.policy": ("Scores",),
         "mcaprl.offline.training.train": ("train",),
     },
 )

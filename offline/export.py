@@ -27,7 +27,8 @@ from torch import Tensor, nn
 
 from mcaprl.errors import PolicyError, import_extra
 from mcaprl.files import replacing
-from mcaprl.offline.batches.observations import Observations, discrete_sizes, has_channels_first
+from mcaprl.offline.algorithms.heads import DiscreteHead
+from mcaprl.offline.batches.observations import Observations, codes_of, has_channels_first
 from mcaprl.offline.policy import Policy
 from mcaprl.recorder.format.spaces import space_to_json
 
@@ -38,10 +39,10 @@ class ExportedPolicy(nn.Module):
     def __init__(self, policy: Policy) -> None:
         """Wrap a policy's networks and normalization."""
         super().__init__()
-        self.scores = policy.scores
+        assert isinstance(policy.head, DiscreteHead)
+        self.head: DiscreteHead = policy.head
         self.encoder = policy.encoder
         self.frame_stack = policy.frame_stack
-        self.joint = policy.joint
         self.shift = torch.from_numpy(policy.encoder.shift)
         self.scale = torch.from_numpy(policy.encoder.scale)
 
@@ -71,20 +72,8 @@ class ExportedPolicy(nn.Module):
         if self.frame_stack > 1:
             inputs = tuple(part.flatten(0, 1) for part in inputs)
         observations = self._encode(inputs).stacked(self.frame_stack)
-        scores = self.scores(observations)
-        return self._actions(scores.argmax(1)), scores
-
-    def _actions(self, best: Tensor) -> Tensor:
-        """Return the actions with these numbers (B,), as `JointActions.values` does in NumPy."""
-        joint = self.joint
-        if isinstance(joint.space, spaces.Discrete):
-            return best + joint.first
-        elements = [
-            best // stride % size + int(start)
-            for stride, size, start in zip(joint.strides, joint.sizes, joint.starts, strict=True)
-        ]
-        dtype = torch.from_numpy(np.empty(0, joint.space.dtype)).dtype
-        return torch.stack(elements, 1).reshape(-1, *joint.shape).to(dtype)
+        scores = self.head.scores(observations)
+        return self.head.best(scores), scores
 
     def _encode(self, inputs: tuple[Tensor, ...]) -> Observations:
         """Encode observations in torch as `ObservationEncoder.encode` does in NumPy."""
@@ -116,7 +105,7 @@ def export_onnx(policy: object, path: Path, *, overwrite: bool = True) -> None:
         OutputExistsError: The file exists and is not to be replaced, or is not a regular file.
         PolicyError: The policy is not from an offline run, or the file cannot be written.
     """
-    if not isinstance(policy, Policy):
+    if not isinstance(policy, Policy) or not isinstance(policy.head, DiscreteHead):
         raise PolicyError(f"{getattr(policy, 'name', policy)} is not a policy of train-offline")
     for package in ("onnx", "onnxscript"):
         import_extra(package, "export")
@@ -139,8 +128,9 @@ def export_onnx(policy: object, path: Path, *, overwrite: bool = True) -> None:
 
 def _metadata(policy: Policy) -> dict[str, str]:
     """Return the properties of the ONNX file that describe its outputs."""
-    joint = policy.joint
-    if isinstance(joint.space, spaces.Discrete):
+    assert isinstance(policy.head, DiscreteHead)
+    joint = policy.head.joint
+    if not joint.shape:
         order = f"scores[:, k] is the score of action k + {joint.first}"
     else:
         elements = f"numpy.unravel_index(k, {joint.sizes})"
@@ -166,13 +156,14 @@ def _quiet() -> Iterator[None]:
 def _numbers(values: Tensor, space: spaces.Space[Any]) -> Tensor:
     """Return values of a space as numbers (B, width); discrete values are one-hot encoded."""
     flat = values.reshape(values.shape[0], -1)
-    sizes = discrete_sizes(space)
-    if sizes is None:
+    codes = codes_of(space)
+    if codes is None:
         return flat.float()
-    assert isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
-    starts = np.ravel(space.start)
-    codes = [
-        nn.functional.one_hot(column.long() - int(start), int(size)).float()
-        for column, start, size in zip(flat.unbind(1), starts, sizes, strict=True)
-    ]
-    return torch.cat(codes, 1)
+    columns = (flat - torch.from_numpy(codes.starts)).long().unbind(1)
+    return torch.cat(
+        [
+            nn.functional.one_hot(one, n).float()
+            for n, one in zip(codes.sizes, columns, strict=True)
+        ],
+        1,
+    )

@@ -1,11 +1,8 @@
 """Trained policies, saved as safetensors and JSON; loading executes no code from a file.
 
-`policy.json` describes the networks and how they select actions; `policy.safetensors` contains
-their weights and the normalization of observations. A policy selects the action with the largest
-
-    q_values            values Q(s, a)                                    dqn, double-dqn, cql
-    logits              log probabilities of actions, unnormalized        bc, iql
-    filtered_q_values   Q(s, a) of actions likely under the logits        bcq
+`policy.json` describes the networks and how they select actions (`offline.algorithms.heads`);
+`policy.safetensors` contains their weights and the normalization of observations. Files of
+Stable-Baselines3 become the same class by `online.zip_file`.
 """
 
 from __future__ import annotations
@@ -13,27 +10,28 @@ from __future__ import annotations
 import copy
 import json
 import math
-from collections import deque
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, cast
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from safetensors import SafetensorError
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcaprl.architecture import architecture_of
+from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
 from mcaprl.files import parse_json, read_file, write_json
+from mcaprl.frames import FrameStack, mapped
 from mcaprl.joint_actions import JointActions
 from mcaprl.masks import OBSERVATION_KEY, has_source
 from mcaprl.networks import ImageInput, Network, check_size
-from mcaprl.offline.algorithms.learner import ActsBy, Learner
-from mcaprl.offline.algorithms.losses import allowed_only, likely_actions, mean_values
+from mcaprl.offline.algorithms.heads import Head, build_head
+from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.batches.buffer import discrete_actions
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
 from mcaprl.recorder.format.action_commands import ActionCommands
@@ -53,48 +51,25 @@ _IMAGE_SCALE = "observation.image_{}.scale"
 _BAD_CONTENT = (ValueError, TypeError, KeyError, AttributeError, RuntimeError, SpaceError)
 
 
-class Scores(nn.Module):
-    """Networks that compute a score of each action; the policy selects the highest score."""
-
-    def __init__(self, networks: dict[str, Network], acts_by: ActsBy, threshold: float) -> None:
-        """Wrap the networks `q` or `logits`, or both."""
-        super().__init__()
-        self.networks = nn.ModuleDict(networks)
-        self.acts_by = acts_by
-        self.threshold = threshold
-
-    def outputs(self, name: str, observations: Observations) -> Tensor:
-        """Return values or logits (B, A), with minus infinity for actions that are not allowed."""
-        outputs = mean_values(self.networks[name](observations))
-        return allowed_only(outputs, observations.mask)
-
-    def forward(self, observations: Observations) -> Tensor:
-        """Return the scores (B, A)."""
-        if self.acts_by == "logits":
-            return self.outputs("logits", observations)
-        values = self.outputs("q", observations)
-        if self.acts_by == "q_values":
-            return values
-        return allowed_only(
-            values, likely_actions(self.outputs("logits", observations), self.threshold)
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Policy:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Policy(BasePolicy):
     """Trained policy with NumPy inputs and outputs, for B observations and A actions.
 
+    A policy with a `frame_stack` of k > 1 stores the observations of the last k calls of `act`
+    since `begin`. All methods accept stacks (B, k, *shape), oldest frame first; all methods but
+    `act` need them.
+
     Attributes:
-        name: Folder names of the run and the seed.
+        name: Folder names of the run and the seed, or name of the file.
         algo: Name of the training algorithm.
-        observation_space: Space of one observation.
-        action_space: Space of one action. Its values are numbered as 0 to A - 1; each combination
-            of the elements of a MultiDiscrete or MultiBinary space is one action.
-        env_id: ID of the environment in the training log; empty if unknown.
+        observation_space: Space of one observation; None if the file lacks its bounds.
+        action_space: Space of one action. The values of a finite space are numbered as 0 to A - 1;
+            each combination of the elements of a MultiDiscrete or MultiBinary space is one action.
+        env_id: ID of the environment in which the policy was trained; empty if unknown.
         env_kwargs: Keyword arguments of that environment.
-        frame_stack: Number of successive observations in one input; see `act`.
+        frame_stack: Number of successive observations in one input.
         encoder: Encoder of observations as tensors.
-        scores: Networks that score actions.
+        head: Networks, and how they select actions.
         reward_scale: Divisor of the rewards in the training. `q_values` returns values in units of
             the logged rewards, without this divisor.
         action_commands: Commands of a robot that the actions stand for; None if unknown.
@@ -105,24 +80,23 @@ class Policy:
 
     name: str
     algo: str
-    observation_space: spaces.Space[Any]
+    observation_space: spaces.Space[Any] | None
     action_space: spaces.Space[Any]
     env_id: str
-    env_kwargs: dict[str, Any]
+    env_kwargs: dict[str, Any] = field()
     frame_stack: int
     encoder: ObservationEncoder = field(repr=False)
-    scores: Scores = field(repr=False)
+    head: Head = field(repr=False)
     reward_scale: float = 1.0
     action_commands: ActionCommands | None = None
     mask_from: str = ""
-    _seen: deque[Observations] = field(default_factory=deque, init=False, repr=False)
 
     def begin(self) -> None:
         """Drop the stored frames. The next observations start new episodes."""
-        self._seen.clear()
+        self._frames.clear()
 
     @property
-    def env_observation_space(self) -> spaces.Space[Any]:
+    def env_observation_space(self) -> spaces.Space[Any] | None:
         """Observation space of the environment, without a mask from `mask_from`."""
         space = self.observation_space
         if not self.mask_from:
@@ -130,57 +104,72 @@ class Policy:
         assert isinstance(space, spaces.Dict)
         return space[OBSERVATION_KEY]
 
-    @cached_property
-    def joint(self) -> JointActions:
-        """Numbering of the actions: the order of the axis A."""
-        return discrete_actions(self.action_space)
-
+    @torch.inference_mode()
     def act(self, observations: Any) -> NDArray[Any]:
         """Return the best actions (B, *shape) in `action_space`; a tie selects the first action.
-
-        A policy with `frame_stack` k > 1 stores the observations of the last k calls since `begin`.
-        It also accepts stacks (B, k, *shape), oldest first; it stores nothing in this case.
 
         Raises:
             PolicyError: The shape of the observations is not (B, *shape).
         """
+        observations = self.encoder.arranged(observations)
         if self.frame_stack > 1 and not self._is_stack(observations):
             inputs = self._stack_onto_stored(self._encode(observations))
         else:
             inputs = self._inputs(observations)
-        with torch.inference_mode():
-            best = cast(NDArray[np.int64], self.scores(inputs).argmax(1).numpy())
-        return self.joint.values(best)
+        return self.head.actions(inputs).numpy()
 
-    def q_values(self, observations: Any) -> NDArray[np.float32]:
-        """Return the values (B, A) of all actions; minus infinity for masked actions.
+    @torch.inference_mode()
+    def log_prob(self, observations: Any, actions: NDArray[Any]) -> NDArray[np.float32]:
+        """Return the log probabilities (B,) of actions (B, *shape), which must be in the space.
 
-        Observations are (B, *shape), or (B, k, *shape) for a frame stack of k.
-
-        Raises:
-            PolicyError: The policy has no values, or the observations have another shape.
-        """
-        if "q" not in self.scores.networks:
-            raise PolicyError(f"{self.name} ({self.algo}) has no Q-values, only probabilities")
-        with torch.inference_mode():
-            values = self.scores.outputs("q", self._inputs(observations))
-            return cast(NDArray[np.float32], values.numpy())
-
-    def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
-        """Return the probabilities (B, A) of all actions.
-
-        A policy that selects by Q-values is greedy: the action of `act` has probability 1.
-        Observations are (B, *shape), or (B, k, *shape) for a frame stack of k.
+        A policy that selects by Q-values is greedy: minus infinity for all actions but that of
+        `act`.
 
         Raises:
             PolicyError: The observations have another shape.
         """
-        with torch.inference_mode():
-            scores = self.scores(self._inputs(observations))
-            if self.scores.acts_by == "logits":
-                return cast(NDArray[np.float32], scores.softmax(1).numpy())
-            best = nn.functional.one_hot(scores.argmax(1), scores.shape[1])
-            return cast(NDArray[np.float32], best.float().numpy())
+        return cast(
+            NDArray[np.float32], self.head.log_prob(self._inputs(observations), actions).numpy()
+        )
+
+    @torch.inference_mode()
+    def scores(self, observations: Any) -> NDArray[np.float32] | None:
+        """Return the scores (B, A) of all actions, of which `act` selects the largest.
+
+        These are Q-values or logits. The result is None if the actions are not finite in number.
+
+        Raises:
+            PolicyError: The observations have another shape.
+        """
+        scores = self.head.scores(self._inputs(observations))
+        return None if scores is None else scores.numpy()
+
+    @torch.inference_mode()
+    def q_values(self, observations: Any) -> NDArray[np.float32]:
+        """Return the values (B, A) of all actions; minus infinity for masked actions.
+
+        Raises:
+            PolicyError: The policy has no values, or the observations have another shape.
+        """
+        values = self.head.q_values(self._inputs(observations))
+        if values is None:
+            raise PolicyError(f"{self.name} ({self.algo}) has no Q-values, only probabilities")
+        return cast(NDArray[np.float32], values.numpy())
+
+    @torch.inference_mode()
+    def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
+        """Return the probabilities (B, A) of all actions.
+
+        A policy that selects by Q-values is greedy: the action of `act` has probability 1.
+
+        Raises:
+            PolicyError: The actions are not finite in number, or the observations have another
+                shape.
+        """
+        found = self.head.probabilities(self._inputs(observations))
+        if found is None:
+            raise PolicyError(f"{self.name} ({self.algo}) has no probabilities, only densities")
+        return cast(NDArray[np.float32], found.numpy())
 
     def _is_stack(self, observations: Any) -> bool:
         """Return whether `observations` are stacks (B, frame_stack, *shape)."""
@@ -192,6 +181,7 @@ class Policy:
 
     def _inputs(self, observations: Any) -> Observations:
         """Return the networks' inputs without using stored frames."""
+        observations = self.encoder.arranged(observations)
         if self.frame_stack == 1:
             return self._encode(observations)
         if not self._is_stack(observations):
@@ -199,23 +189,18 @@ class Policy:
                 f"{self.name} has a frame stack of {self.frame_stack}: observations must be"
                 f" (B, {self.frame_stack}, *shape), oldest first"
             )
-        return self._encode(_flatten(observations)).stacked(self.frame_stack)
+        flat = mapped(lambda part: part.reshape(-1, *part.shape[2:]), observations)
+        return self._encode(flat).stacked(self.frame_stack)
+
+    @cached_property
+    def _frames(self) -> FrameStack:
+        return FrameStack(self.frame_stack)
 
     def _stack_onto_stored(self, now: Observations) -> Observations:
-        """Store observations, and return stacks of the last k observations.
-
-        In the first steps of an episode, copies of the oldest observation fill the stack.
-        """
-        if self._seen and len(self._seen[-1]) != len(now):
-            self.begin()
-        # The environment may use the memory of its observations again.
-        now = now.like([part.clone() for part in now.parts()])
-        self._seen.extend([now] * (1 if self._seen else self.frame_stack))
-        while len(self._seen) > self.frame_stack:
-            self._seen.popleft()
-        columns = zip(*(past.parts() for past in self._seen), strict=True)
-        stacks = [torch.stack(column, 1).flatten(0, 1) for column in columns]
-        return now.like(stacks).stacked(self.frame_stack)
+        """Store observations, and return stacks of the last k observations."""
+        stacks = self._frames.see(dict(enumerate(part.numpy() for part in now.parts())))
+        parts = [torch.from_numpy(stack).flatten(0, 1) for stack in stacks.values()]
+        return now.like(parts).stacked(self.frame_stack)
 
     def _encode(self, observations: Any) -> Observations:
         try:
@@ -292,8 +277,6 @@ def read_policy(folder: Path) -> Policy:
 
 
 def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]) -> Policy:
-    if description["acts_by"] not in get_args(ActsBy):
-        raise ValueError(f"acts_by {description['acts_by']!r} is not supported")
     observation_space = space_from_json(json.dumps(description["observation_space"]))
     action_space = space_from_json(json.dumps(description["action_space"]))
     mask_from = str(description.get("mask_from", ""))
@@ -315,8 +298,9 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
         name: Network(encoder.width * stack, images, tuple(outputs), architecture)
         for name, outputs in description["outputs"].items()
     }
-    scores = Scores(networks, description["acts_by"], float(description["threshold"]))
-    scores.networks.load_state_dict(weights)
+    threshold = float(description["threshold"])
+    head = build_head(description["acts_by"], networks, action_space, threshold)
+    head.networks.load_state_dict(weights)
     commands = description.get("action_commands")
     return Policy(
         name=f"{folder.resolve().parent.name}/{folder.resolve().name}",
@@ -327,7 +311,7 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
         env_kwargs=description["env_kwargs"],
         frame_stack=stack,
         encoder=encoder,
-        scores=scores.eval(),
+        head=head.eval(),
         reward_scale=float(description.get("reward_scale", 1.0)),
         action_commands=None
         if commands is None
@@ -344,10 +328,3 @@ def _image_input(image: ImageInput, number: int, weights: dict[str, Tensor]) -> 
     if shift.shape != image.shape:
         raise ValueError(f"the mean image has shape {shift.shape}, but images have {image.shape}")
     return replace(image, shift=shift, scale=float(weights.pop(_IMAGE_SCALE.format(number))))
-
-
-def _flatten(observations: Any) -> Any:
-    """Reshape (B, k, *shape) to (B * k, *shape), also in nested dicts."""
-    if isinstance(observations, dict):
-        return {key: _flatten(part) for key, part in observations.items()}
-    return observations.reshape(-1, *observations.shape[2:])

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from mcaprl.online.curves import VALUES, CurvePoint, curve_figure, draw_curves, read_run
     from mcaprl.online.evaluation import FRESH_SEED, SELECTION_SEED, measure_scale
     from mcaprl.online.live import LiveTraining
-    from mcaprl.online.policy import OnlinePolicy, describe_run, read_policy, save_policy
     from mcaprl.online.presets import SIM_SETTINGS
     from mcaprl.online.task import Task
+    from mcaprl.online.zip_file import describe_run, read_policy, save_policy
 
 for _package in ("stable_baselines3", "tensorboard"):
     if find_spec(_package) is None:
@@ -37,7 +37,6 @@ __all__ = [
     "Agent",
     "CurvePoint",
     "LiveTraining",
-    "OnlinePolicy",
     "Task",
     "curve_figure",
     "describe_run",
@@ -56,8 +55,8 @@ __getattr__ = lazy_attributes(
         "mcaprl.online.curves": ("VALUES", "CurvePoint", "curve_figure", "draw_curves", "read_run"),
         "mcaprl.online.evaluation": ("FRESH_SEED", "SELECTION_SEED", "measure_scale"),
         "mcaprl.online.live": ("LiveTraining",),
-        "mcaprl.online.policy": ("OnlinePolicy", "describe_run", "read_policy", "save_policy"),
         "mcaprl.online.presets": ("SIM_SETTINGS",),
         "mcaprl.online.task": ("Task",),
+        "mcaprl.online.zip_file": ("describe_run", "read_policy", "save_policy"),
     },
 )

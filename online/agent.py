@@ -21,19 +21,19 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.errors import TrainingError
 from mcaprl.files import subfolder, write_atomically
+from mcaprl.frames import parts_of, parts_of_space
 from mcaprl.online.algorithms import make_model, own_architecture
 from mcaprl.online.checkpoint import load_checkpoint, save_checkpoint
 from mcaprl.online.config import DQNConfig
 from mcaprl.online.curves import CurvePoint, write_curve
 from mcaprl.online.evaluation import Evaluation, FirstEpisodes
-from mcaprl.online.features import inputs_of, normalize_images
-from mcaprl.online.frames import StackedVecEnv, channels_first, parts_of, parts_of_space
+from mcaprl.online.features import channels_first, inputs_of, normalize_images
 from mcaprl.online.live import LiveTraining
-from mcaprl.online.policy import describe_run, save_policy
 from mcaprl.online.recording import ActionDescriber, recorded
 from mcaprl.online.task import Task
-from mcaprl.online.vec_env import BatchedVecEnv
+from mcaprl.online.vec_env import BatchedVecEnv, StackedVecEnv
 from mcaprl.online.warm_start import fill_buffer, take_weights
+from mcaprl.online.zip_file import describe_run, save_policy
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import BEST_NAME, CHECKPOINT_NAME, CURVE_NAME, writing

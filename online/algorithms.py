@@ -9,12 +9,12 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.architecture import SMALL_EDGE, Architecture
 from mcaprl.errors import SpaceError, UnknownNameError, UsageError
+from mcaprl.frames import is_image, parts_of_space
 from mcaprl.joint_actions import joint_actions
 from mcaprl.online.config import (
     CONFIGS,
@@ -23,9 +23,14 @@ from mcaprl.online.config import (
     OnlineConfig,
 )
 from mcaprl.online.double_dqn import DoubleDQN, WarmDQN
-from mcaprl.online.features import NetworkDQNPolicy, inputs_of, policy_arguments, pools_of
+from mcaprl.online.features import (
+    NetworkDQNPolicy,
+    channels_first,
+    inputs_of,
+    policy_arguments,
+    pools_of,
+)
 from mcaprl.online.frame_buffer import FrameReplayBuffer
-from mcaprl.online.frames import channels_first, parts_of_space
 
 
 @dataclass(frozen=True)
@@ -73,13 +78,14 @@ def check_spaces(
         SpaceError: The algorithm does not support the spaces.
     """
     find_algorithm(algo)
-    if not isinstance(action_space, spaces.Discrete):
+    joint = joint_actions(action_space)
+    if joint is None or joint.shape:
         hint = ""
-        if joint_actions(action_space) is not None:
+        if joint is not None:
             hint = ": wrap the environment so that one Discrete action has all elements, or record"
             hint += " and train offline (train-offline)"
         raise SpaceError(f"{algo} needs discrete actions, got {action_space}{hint}")
-    if action_space.start != 0:
+    if joint.first != 0:
         raise SpaceError(
             f"{algo} needs actions that start at 0, got {action_space}:"
             " wrap the environment in gymnasium.wrappers.TransformAction"
@@ -170,11 +176,11 @@ def _arguments(config: OnlineConfig, space: spaces.Space[Any]) -> dict[str, Any]
 def _has_small_images(space: spaces.Space[Any]) -> bool:
     """Return whether SB3's own networks refuse images of the space."""
     parts = parts_of_space(channels_first(space)).values()
-    return any(is_image_space(part) and min(part.shape[1:]) < SMALL_EDGE for part in parts)
+    return any(is_image(part) and min(part.shape[1:]) < SMALL_EDGE for part in parts)
 
 
 def _has_images(space: spaces.Space[Any]) -> bool:
-    return any(is_image_space(part) for part in parts_of_space(space).values())
+    return any(is_image(part) for part in parts_of_space(space).values())
 
 
 @dataclass(frozen=True)
@@ -194,4 +200,4 @@ class ExponentialSchedule:
 def _policy_name(space: spaces.Space[Any]) -> str:
     if isinstance(space, spaces.Dict):
         return "MultiInputPolicy"
-    return "CnnPolicy" if is_image_space(space) else "MlpPolicy"
+    return "CnnPolicy" if is_image(space) else "MlpPolicy"

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import ConvertCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from mcaprl.ends import STEP_LIMIT
+from mcaprl.frames import mapped, rows_of
+from mcaprl.limits import STEP_LIMIT
 from mcaprl.online.curves import CurvePoint
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.vector_wrapper import VectorWrapper
@@ -171,13 +173,14 @@ class FirstEpisodes(VectorWrapper):
         observations, rewards, terminated, truncated, infos = result
         numbers = np.flatnonzero(self._open)
         if len(numbers):
-            following = _rows(observations, numbers)
+            following = rows_of(observations, numbers)
             ended = terminated[numbers] | truncated[numbers]
             for row in np.flatnonzero(ended).tolist():
-                _put_row(following, row, infos["final_obs"][numbers[row]])
+                last = infos["final_obs"][numbers[row]]
+                mapped(partial(_put, row), following, last)
             step = _Step(
                 numbers,
-                _rows(self._observations, numbers),
+                rows_of(self._observations, numbers),
                 np.asarray(actions)[numbers],
                 rewards[numbers],
                 terminated[numbers],
@@ -197,7 +200,10 @@ class FirstEpisodes(VectorWrapper):
         environments = np.concatenate([step.environments for step in self._steps])
         order = np.argsort(environments, kind="stable")
         columns = {
-            name: _rows(_joined([getattr(step, name) for step in self._steps]), order)
+            name: mapped(
+                lambda *parts: np.concatenate(parts)[order],
+                *(getattr(step, name) for step in self._steps),
+            )
             for name in _Step._fields[1:]
         }
         return Dataset.from_arrays(
@@ -209,22 +215,5 @@ class FirstEpisodes(VectorWrapper):
         )
 
 
-def _rows(values: Any, numbers: NDArray[np.int64]) -> Any:
-    """Return a copy of the rows with these indices, of an array or of each array in a dict."""
-    if isinstance(values, dict):
-        return {key: _rows(part, numbers) for key, part in values.items()}
-    return values[numbers]
-
-
-def _put_row(values: Any, row: int, value: Any) -> None:
-    if isinstance(values, dict):
-        for key, part in values.items():
-            _put_row(part, row, value[key])
-    else:
-        values[row] = value
-
-
-def _joined(parts: Sequence[Any]) -> Any:
-    if isinstance(parts[0], dict):
-        return {key: _joined([part[key] for part in parts]) for key in parts[0]}
-    return np.concatenate(parts)
+def _put(row: int, values: NDArray[Any], value: Any) -> None:
+    values[row] = value

@@ -13,14 +13,14 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecTransposeImage
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import Tensor, nn
 
 from mcaprl.architecture import Architecture
+from mcaprl.frames import is_image, map_space, parts_of, parts_of_space, stack_axis
 from mcaprl.networks import Convolutions, ImageInput, Trunk, make_head
-from mcaprl.online.frames import parts_of, parts_of_space
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE
 
 
@@ -90,6 +90,16 @@ def policy_arguments(architecture: Architecture) -> dict[str, Any]:
     }
 
 
+def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """Return the space as SB3's networks receive it, with image channels first."""
+
+    def first(box: spaces.Box) -> spaces.Space[Any]:
+        is_last = is_image(box) and stack_axis(box) == -1
+        return VecTransposeImage.transpose_space(box) if is_last else box
+
+    return map_space(first, space)
+
+
 def inputs_of(space: spaces.Space[Any]) -> tuple[list[str], list[ImageInput]]:
     """Return the keys of the vectors, and an `ImageInput` for each channels-first image.
 
@@ -97,7 +107,7 @@ def inputs_of(space: spaces.Space[Any]) -> tuple[list[str], list[ImageInput]]:
     """
     vectors, images = [], []
     for key, part in parts_of_space(space).items():
-        if is_image_space(part) and min(part.shape[1:]) >= MIN_IMAGE_EDGE:
+        if is_image(part) and min(part.shape[1:]) >= MIN_IMAGE_EDGE:
             channels, height, width = part.shape
             images.append(ImageInput((height, width, channels)))
         else:

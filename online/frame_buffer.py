@@ -23,7 +23,16 @@ from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from mcaprl.online.frames import WHOLE, joined, parts_of, parts_of_space, stack_axis, whole_of
+from mcaprl.frames import (
+    WHOLE,
+    frame_rows,
+    joined,
+    map_space,
+    parts_of,
+    parts_of_space,
+    stack_axis,
+    whole_of,
+)
 
 _FIRST_FINALS = 64
 _COLUMNS = ("final_of", "ages", "actions", "rewards", "dones", "timeouts")
@@ -260,8 +269,8 @@ class FrameReplayBuffer(BaseBuffer):
         """
         oldest = self.pos if self.full else 0
         stored = np.minimum(self.ages[rows, envs], (rows - oldest) % self.buffer_size)
-        places: NDArray[np.int64] = rows[:, None] - np.minimum(before, stored[:, None])
-        return places % self.buffer_size
+        places: NDArray[np.int64] = frame_rows(rows, rows - stored, before) % self.buffer_size
+        return places
 
     def _ages_after(self, row: int) -> NDArray[np.int64]:
         """Return the `ages` (N,) of the frames in the row that follows this one."""
@@ -313,8 +322,9 @@ def _pooled_space(space: spaces.Space[Any], pool: int) -> spaces.Box:
 
 def _frame_space(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
     """Return the space of a single frame of a stack."""
-    if isinstance(space, spaces.Dict):
-        return spaces.Dict({key: _frame_space(part, count) for key, part in space.items()})
-    assert isinstance(space, spaces.Box)
-    low, high = (np.split(end, count, stack_axis(space))[-1] for end in (space.low, space.high))
-    return spaces.Box(low, high, dtype=space.dtype)
+
+    def newest(box: spaces.Box) -> spaces.Space[Any]:
+        low, high = (np.split(end, count, stack_axis(box))[-1] for end in (box.low, box.high))
+        return spaces.Box(low, high, dtype=cast(Any, box.dtype))
+
+    return map_space(newest, space)

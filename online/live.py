@@ -19,6 +19,7 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 
+from mcaprl.frames import rows_of
 from mcaprl.online.algorithms import check_spaces
 from mcaprl.online.recording import behavior_probabilities, exploration
 from mcaprl.online.task import Task
@@ -205,7 +206,7 @@ class WatchedBatch(VectorWrapper):
         self.after_forward()
         self._stream.pause()
         return {
-            "observation": _row(self._observations, WATCHED),
+            "observation": rows_of(self._observations, WATCHED),
             "action": actions[WATCHED],
             "behavior_prob": float(probability),
             "epsilon": exploration(model),
@@ -250,7 +251,7 @@ class WatchedBatch(VectorWrapper):
 
 def _values(model: BaseAlgorithm, action: NDArray[Any]) -> dict[str, Any]:
     """Return the learner's values for the watched environment, as fields of `values_schema`."""
-    observation = _row(model._last_obs, slice(WATCHED, WATCHED + 1))
+    observation = rows_of(model._last_obs, slice(WATCHED, WATCHED + 1))
     tensor: Any = model.policy.obs_to_tensor(observation)[0]
     with torch.inference_mode():
         if isinstance(model, DQN):
@@ -272,10 +273,3 @@ def _values(model: BaseAlgorithm, action: NDArray[Any]) -> dict[str, Any]:
         "policy_action": best,
         "agrees": best == taken,
     }
-
-
-def _row(observations: Any, which: int | slice) -> Any:
-    """Return the observations at an index or slice of the batch."""
-    if isinstance(observations, dict):
-        return {key: part[which] for key, part in observations.items()}
-    return observations[which]

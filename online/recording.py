@@ -154,8 +154,7 @@ def behavior_probabilities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArr
     """
     if not isinstance(model, DQN):
         return _likelihoods(model, actions)
-    assert isinstance(model.action_space, spaces.Discrete)
-    epsilon, count = exploration(model), int(model.action_space.n)
+    epsilon, count = exploration(model), int(cast(spaces.Discrete, model.action_space).n)
     if epsilon == 1.0:
         return np.full(len(actions), 1 / count)
     with torch.inference_mode():

@@ -29,9 +29,9 @@ from mcaprl.online.algorithms import check_spaces
 from mcaprl.online.curves import IMAGE_NAME, SCORES_NAME, draw_curves, read_run
 from mcaprl.online.evaluation import FRESH_SEED, SELECTION_SEED, measure_scale
 from mcaprl.online.live import LiveTraining
-from mcaprl.online.policy import read_policy
 from mcaprl.online.recording import log_paths
 from mcaprl.online.task import Task
+from mcaprl.online.zip_file import read_policy
 from mcaprl.progress import ProgressCallback, terminal_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.layout import LAYOUT_NAME

@@ -14,9 +14,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from mcaprl.frames import FrameStack, joined, mapped, parts_of, stacked_space, whole_of
 from mcaprl.sims.evaluation.rollout import episode_seed
 
 
@@ -126,3 +127,31 @@ class BatchedVecEnv(VecEnv):
     ) -> list[bool]:
         """Return False for each environment, because only the batch can be wrapped."""
         return [False] * len(list(self._get_indices(indices)))
+
+
+class StackedVecEnv(VecEnvWrapper):
+    """Wrapper whose observations are stacks of the last k observations."""
+
+    def __init__(self, venv: VecEnv, count: int) -> None:
+        """Stack `count` observations; `venv` must reset an environment when its episode ends."""
+        self._frames = FrameStack(count)
+        super().__init__(venv, stacked_space(venv.observation_space, count))
+
+    def reset(self) -> VecEnvObs:
+        """Start new episodes in all environments."""
+        self._frames.clear()
+        return self._joined(self._frames.see(parts_of(self.venv.reset())))
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step all environments; stack the observations, and also each `terminal_observation`."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        self._frames.see(parts_of(observations))
+        for row in np.flatnonzero(dones).tolist():
+            last = parts_of(infos[row]["terminal_observation"])
+            stack = self._joined(self._frames.ending(row, last))
+            infos[row]["terminal_observation"] = mapped(lambda part: part[0], stack)
+            self._frames.begin_one(row)
+        return self._joined(self._frames.frames), rewards, dones, infos
+
+    def _joined(self, frames: dict[Any, NDArray[Any]]) -> VecEnvObs:
+        return cast(VecEnvObs, joined(whole_of(frames), self.venv.observation_space))

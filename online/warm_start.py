@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,20 +10,14 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
 from mcaprl.errors import PolicyError, SpaceError, UsageError
+from mcaprl.frames import joined, mapped, parts_of, parts_of_space, stacked_space, whole_of
 from mcaprl.networks import Convolutions, Trunk
+from mcaprl.offline.policy import Policy
+from mcaprl.online.features import channels_first
 from mcaprl.online.frame_buffer import FrameReplayBuffer
-from mcaprl.online.frames import (
-    channels_first,
-    joined,
-    parts_of,
-    parts_of_space,
-    stacked_space,
-    whole_of,
-)
 from mcaprl.recorder.dataset.dataset import Dataset
 
 _CHECKED = 64
@@ -79,12 +73,12 @@ def _add(buffer: Any, dataset: Dataset, steps: NDArray[np.int64], cut: bool) -> 
     )
 
 
-def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) -> None:
+def take_weights(model: BaseAlgorithm, policy: Policy, space: spaces.Space[Any]) -> None:
     """Copy the weights of a trained Q-network into a DQN, layer by layer.
 
     Args:
         model: Fresh model.
-        policy: Policy with the attributes `name` and `q_values`, and with a network.
+        policy: Policy of `load_policy`.
         space: Space of a single observation, sampled to verify that both networks produce the
             same values.
 
@@ -94,14 +88,14 @@ def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) ->
     """
     if not isinstance(model, DQN):
         raise UsageError(f"{type(model).__name__} has no Q-values to copy from a policy")
-    frames = getattr(policy, "frame_stack", 1)
+    frames = policy.frame_stack
     if stacked_space(channels_first(space), frames) != model.observation_space:
         raise PolicyError(
             f"{policy.name} stacks {frames} observations, but the agent stacks another number: pass"
             " --frame-stack"
         )
     stacks = _sample_stacks(space, frames)
-    expected = policy.q_values(stacks if frames > 1 else _first_frames(stacks))
+    expected = policy.q_values(stacks if frames > 1 else mapped(lambda part: part[:, 0], stacks))
     _copy_layers(policy, model.q_net)
     model.q_net_target.load_state_dict(model.q_net.state_dict())
     with torch.inference_mode():
@@ -114,13 +108,13 @@ def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) ->
         )
 
 
-def _copy_layers(policy: Any, ours: nn.Module) -> None:
+def _copy_layers(policy: Policy, ours: nn.Module) -> None:
     """Copy the weights of a policy's network, and its normalization, into an agent's network.
 
     Raises:
         PolicyError: The networks differ.
     """
-    theirs = _network_of(policy)
+    theirs = policy.head.networks["q"]
     if _weights_of(theirs) != _weights_of(ours):
         raise PolicyError(
             f"{policy.name} has layers {_chain(theirs)}, but the agent has {_chain(ours)}:"
@@ -131,9 +125,8 @@ def _copy_layers(policy: Any, ours: nn.Module) -> None:
     for source, target in zip(_convolutions(theirs), _convolutions(ours), strict=False):
         target.shift.copy_(source.shift)
         target.scale.copy_(source.scale)
-    encoder = getattr(policy, "encoder", None)
-    if encoder is not None and encoder.width:
-        _fold_normalization(ours, encoder, getattr(policy, "frame_stack", 1))
+    if policy.encoder.width:
+        _fold_normalization(ours, policy.encoder, policy.frame_stack)
 
 
 def _fold_normalization(network: nn.Module, encoder: Any, count: int) -> None:
@@ -157,10 +150,6 @@ def _sample_stacks(space: spaces.Space[Any], count: int) -> Any:
     return whole_of({k: v.reshape(_CHECKED, count, *v.shape[1:]) for k, v in columns.items()})
 
 
-def _first_frames(frames: Any) -> Any:
-    return whole_of({key: part[:, 0] for key, part in parts_of(frames).items()})
-
-
 def _check_space(role: str, space: spaces.Space[Any], model: BaseAlgorithm) -> None:
     own = getattr(model, role)
     if space != own:
@@ -169,19 +158,9 @@ def _check_space(role: str, space: spaces.Space[Any], model: BaseAlgorithm) -> N
 
 def _channels_first(values: Any, space: spaces.Space[Any]) -> Any:
     """Transpose images (N, height, width, channels) for SB3; return other values unchanged."""
-    if isinstance(space, spaces.Dict):
-        return {key: _channels_first(values[key], part) for key, part in space.items()}
-    if is_image_space(space) and channels_first(space) != space:
-        return np.moveaxis(values, -1, 1)
-    return values
-
-
-def _network_of(policy: Any) -> nn.Module:
-    """Return the module that computes a policy's Q-values."""
-    modules = [value for value in vars(policy).values() if isinstance(value, nn.Module)]
-    if not modules:
-        raise PolicyError(f"{policy.name} has no network to copy weights from")
-    return cast(nn.Module, getattr(modules[0], "q_net", modules[0]))
+    is_last = {key: part != channels_first(part) for key, part in parts_of_space(space).items()}
+    parts = parts_of(values)
+    return whole_of({k: np.moveaxis(parts[k], -1, 1) if is_last[k] else parts[k] for k in is_last})
 
 
 def _layers(network: nn.Module) -> list[Any]:

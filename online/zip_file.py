@@ -6,6 +6,8 @@ only the plain values and the weights. Files of this package also contain `mcapr
 description of the policy, which SB3 ignores. For files of plain SB3, the description is derived
 from the names of the weights, and from the plain text that SB3 stores with each pickled space or
 class. Dict observations are not supported in files of plain SB3.
+
+`read_policy` wraps SB3's networks as those of a `mcaprl.offline.policy.Policy`.
 """
 
 from __future__ import annotations
@@ -14,17 +16,52 @@ import io
 import json
 import pickle
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, cast
 
+import numpy as np
 import torch
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from torch import Tensor
+from stable_baselines3.common.policies import (
+    ActorCriticCnnPolicy,
+    ActorCriticPolicy,
+    BasePolicy,
+    MultiInputActorCriticPolicy,
+)
+from stable_baselines3.dqn.policies import CnnPolicy, DQNPolicy, MultiInputPolicy
+from torch import Tensor, nn
 
-from mcaprl.errors import PolicyError, TrainingError
+from mcaprl.architecture import Architecture, architecture_of
+from mcaprl.errors import PolicyError, SpaceError, TrainingError
 from mcaprl.files import check_regular, parse_json, write_atomically
+from mcaprl.frames import (
+    is_image,
+    map_space,
+    parts_of,
+    parts_of_space,
+    stack_axis,
+    stacked_space,
+    whole_of,
+)
+from mcaprl.networks import check_size
+from mcaprl.offline.algorithms.heads import build_head
+from mcaprl.offline.batches.observations import ObservationEncoder, Observations
+from mcaprl.offline.policy import Policy
+from mcaprl.online.features import NetworkDQNPolicy, channels_first, inputs_of, policy_arguments
+from mcaprl.recorder.format.spaces import (
+    check_actions,
+    check_elements,
+    observation_leaves,
+    space_from_json,
+    space_to_json,
+)
+from mcaprl.runs import BEST_NAME
+from mcaprl.storage.tensor_files import check_widths
 
+FORMAT_VERSION = 1
 OWN_NAME = "mcaprl.json"
 _DATA_NAME = "data"
 _MAX_JSON_BYTES = 2**24
@@ -39,6 +76,18 @@ _LEFT_OUT = (
     "_last_obs",
     "_last_original_obs",
 )
+_LEAST_IMAGE_FEATURES = 256
+_POLICY_TYPES: Final[dict[str, tuple[type[BasePolicy], ...]]] = {
+    "q-network": (DQNPolicy, CnnPolicy, MultiInputPolicy),
+    "actor-critic": (ActorCriticPolicy, ActorCriticCnnPolicy, MultiInputActorCriticPolicy),
+}
+"""SB3's policy classes for vectors, images and dicts. Files with other classes are refused."""
+_ACTIVATIONS: Final[dict[str, type[torch.nn.Module]]] = {
+    "ReLU": torch.nn.ReLU,
+    "Tanh": torch.nn.Tanh,
+    "ELU": torch.nn.ELU,
+    "LeakyReLU": torch.nn.LeakyReLU,
+}
 _KNOWN_KWARGS = {"net_arch", "activation_fn", "optimizer_kwargs", "optimizer_class", "use_sde"}
 
 
@@ -88,6 +137,240 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any], dict[str, Te
     if not (isinstance(own, dict) and isinstance(data, dict) and _are_weights(weights)):
         raise PolicyError(f"{path} is not a model of Stable-Baselines3: its parts have wrong types")
     return own, data, weights
+
+
+def save_policy(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -> None:
+    """Save a model with a description of its policy, so that it loads without unpickling.
+
+    Args:
+        path: `.zip` file to replace.
+        model: Model of SB3.
+        description: Description as `describe_run` returns it.
+    """
+    q_network = isinstance(model.policy, DQNPolicy)
+    own = {
+        "format_version": FORMAT_VERSION,
+        "network": "q-network" if q_network else "actor-critic",
+        "activation": "ReLU" if q_network else "Tanh",
+        "steps": model.num_timesteps,
+        **description,
+    }
+    write_model(path, model, own)
+
+
+def describe_run(
+    algo: str,
+    hidden: tuple[int, ...],
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    env_id: str,
+    env_kwargs: dict[str, Any],
+    frame_stack: int = 1,
+    architecture: Architecture | None = None,
+) -> dict[str, Any]:
+    """Return the description that all policies of a run share, as plain JSON types.
+
+    `architecture` is None if the network is one of SB3's.
+    """
+    own = {} if architecture is None else {"architecture": asdict(architecture)}
+    return {
+        **own,
+        "algo": algo,
+        "net_arch": list(hidden),
+        "frame_stack": frame_stack,
+        "observation_space": json.loads(space_to_json(observation_space)),
+        "action_space": json.loads(space_to_json(action_space)),
+        "env_id": env_id,
+        "env_kwargs": env_kwargs,
+    }
+
+
+def read_policy(path: Path) -> Policy:
+    """Read the policy in a `.zip` of this package or of plain SB3.
+
+    Raises:
+        PolicyError: There is no such file, or it is broken.
+    """
+    own, data, weights = read_model(path)
+    try:
+        if own and own.get("format_version") != FORMAT_VERSION:
+            raise ValueError(f"format_version {own.get('format_version')} is not supported")
+        return _build(path, own or describe_sb3(data, weights), weights, exact=bool(own))
+    except (ValueError, TypeError, KeyError, RuntimeError, AssertionError, SpaceError) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise PolicyError(f"cannot load the policy in {path}: {reason}") from error
+    except PolicyError as error:
+        raise PolicyError(f"cannot load the policy in {path}: {error}") from error
+
+
+def _build(
+    path: Path, description: dict[str, Any], weights: dict[str, Any], *, exact: bool
+) -> Policy:
+    observation_space = space_from_json(json.dumps(description["observation_space"]))
+    action_space = space_from_json(json.dumps(description["action_space"]))
+    frames = int(description.get("frame_stack", 1))
+    check_actions(action_space)
+    check_elements(frames * sum(leaf.size for leaf in observation_leaves(observation_space)))
+    shape = channels_first(stacked_space(observation_space, frames))
+    kind, found = description["network"], description.get("architecture")
+    if found is not None:
+        network = _own_network(kind, architecture_of(found), shape, action_space, weights)
+    else:
+        for widths in _layers(observation_space, frames, description["net_arch"]):
+            check_widths(widths, weights)
+        network = _policy_type(kind, shape)(
+            shape,
+            action_space,
+            lambda _: 0.0,
+            net_arch=description["net_arch"],
+            activation_fn=_ACTIVATIONS[description["activation"]],
+        )
+    network.load_state_dict(weights)
+    network.set_training_mode(False)
+    is_critic = isinstance(network, ActorCriticPolicy)
+    inner: nn.Module = _Actor(network) if is_critic else cast(Any, network).q_net
+    model = ModelNetwork(inner, channels_last(observation_space), frames)
+    folder = path.resolve().parent
+    return Policy(
+        name=f"{folder.parent.name}/{folder.name}" if path.name == BEST_NAME else path.stem,
+        algo=description["algo"],
+        observation_space=observation_space if exact else None,
+        action_space=action_space,
+        env_id=description.get("env_id", ""),
+        env_kwargs=description.get("env_kwargs", {}),
+        frame_stack=frames,
+        encoder=ModelEncoder(observation_space),
+        head=build_head(
+            "logits" if is_critic else "q_values",
+            {"logits" if is_critic else "q": model},
+            action_space,
+        ).eval(),
+    )
+
+
+def _own_network(
+    kind: str,
+    architecture: Architecture,
+    space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    weights: dict[str, Any],
+) -> BasePolicy:
+    """Create an SB3 policy with this package's network, after checking the number of weights."""
+    parts, (vectors, images) = parts_of_space(space), inputs_of(space)
+    width = sum(int(np.prod(parts[key].shape)) for key in vectors)
+    check_size(architecture, width, images, int(cast(spaces.Discrete, action_space).n), weights)
+    policy_type: Any = {"q-network": NetworkDQNPolicy, "actor-critic": ActorCriticPolicy}[kind]
+    network: BasePolicy = policy_type(
+        space, action_space, lambda _: 0.0, **policy_arguments(architecture)
+    )
+    return network
+
+
+def _layers(space: spaces.Space[Any], frames: int, net_arch: Any) -> Iterator[list[int]]:
+    """Yield the widths of successive layers for each part of the observation.
+
+    Args:
+        space: Space of one observation.
+        frames: Number of successive observations that the network receives.
+        net_arch: Widths of SB3's hidden layers: one list, a dict of lists, or None.
+    """
+    chains = net_arch.values() if isinstance(net_arch, dict) else [net_arch or ()]
+    for leaf in observation_leaves(space):
+        if leaf.encoding is None:
+            yield from ([leaf.size * frames, *chain] for chain in chains)
+        else:
+            # SB3's image extractors have at least this many output features.
+            features = Architecture(()).features(leaf.shape)
+            yield [max(features, 1), _LEAST_IMAGE_FEATURES]
+            yield from (list(chain) for chain in chains)
+
+
+def _policy_type(network: str, space: spaces.Space[Any]) -> type[BasePolicy]:
+    vectors, images, dicts = _POLICY_TYPES[network]
+    if isinstance(space, spaces.Dict):
+        return dicts
+    return images if is_image(space) else vectors
+
+
+class ModelEncoder(ObservationEncoder):
+    """Encoder for SB3's networks, which normalize images and have no masks.
+
+    Images in the files and observations of SB3 may have their channels first.
+    """
+
+    is_image = staticmethod(is_image)
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        """Create the encoder for a space of observations."""
+        super().__init__(channels_last(space), 0, mask_key="")
+        self.scale[:] = 1
+
+    def arranged(self, observations: Any) -> Any:
+        """Return observations with channels last."""
+        images = {leaf.path: leaf.shape for leaf in self.images}
+        return whole_of(
+            {
+                key: _moved(part, images.get((key,) if key else ()))
+                for key, part in parts_of(observations).items()
+            }
+        )
+
+
+class ModelNetwork(nn.Module):
+    """Network of SB3 with `Observations` as input."""
+
+    def __init__(self, network: nn.Module, space: spaces.Space[Any], frames: int) -> None:
+        """Wrap a network for stacks of observations of a space with channels last."""
+        super().__init__()
+        self.network = network
+        self._parts = parts_of_space(space)
+        self._frames = frames
+
+    def forward(self, observations: Observations) -> Tensor:
+        """Map observations to values or logits (B, A)."""
+        images = iter(observations.images)
+        sizes = [box.shape for box in self._parts.values() if not is_image(box)]
+        frames = observations.vector.view(len(observations), self._frames, -1)
+        vectors = iter(torch.split(frames, [int(np.prod(shape)) for shape in sizes], 2))
+        inputs = {
+            key: next(images).permute(0, 3, 1, 2)
+            if is_image(box)
+            else torch.cat(torch.unflatten(next(vectors), 2, box.shape or (1,)).unbind(1), -1)
+            for key, box in self._parts.items()
+        }
+        return cast(Tensor, self.network(whole_of(inputs)))
+
+
+class _Actor(nn.Module):
+    """Logits of an actor-critic policy."""
+
+    def __init__(self, policy: BasePolicy) -> None:
+        super().__init__()
+        self.policy: Any = policy
+
+    def forward(self, inputs: Any) -> Tensor:
+        policy = self.policy
+        features = BasePolicy.extract_features(policy, inputs, policy.pi_features_extractor)
+        return cast(Tensor, policy.action_net(policy.mlp_extractor.forward_actor(features)))
+
+
+def channels_last(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """Return a space in which the channels of images are last."""
+
+    def last(box: spaces.Box) -> spaces.Space[Any]:
+        if stack_axis(box) == -1:
+            return box
+        low, high = (np.moveaxis(end, -3, -1) for end in (box.low, box.high))
+        return spaces.Box(low, high, dtype=cast(Any, box.dtype))
+
+    return map_space(last, space)
+
+
+def _moved(images: Any, shape: tuple[int, ...] | None) -> Any:
+    """Return images (..., height, width, channels) of a shape, whose channels may be first."""
+    if shape is None or np.shape(images)[-3:] != (shape[2], *shape[:2]):
+        return images
+    return images if np.shape(images)[-3:] == shape else np.moveaxis(images, -3, -1)
 
 
 def _read(archive: zipfile.ZipFile, name: str, most: int) -> bytes:

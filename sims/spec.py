@@ -47,7 +47,7 @@ class SimSpec:
     """Steps after which an episode is truncated."""
     pilot: str | Callable[[Any], Any] | None = None
     """Class or function, or its `module:name`, that accepts the unwrapped environment and returns
-    its scripted policy (`mcaprl.sims.evaluation.rollout.Policy`)."""
+    its scripted policy (`mcaprl.base_policy.BasePolicy`)."""
     engine: str | None = None
     """Module that the sim requires and that the extra `sims` installs."""
 

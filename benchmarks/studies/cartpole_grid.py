@@ -29,7 +29,7 @@ import mcaprl
 from benchmarks.page import write_section
 from benchmarks.studies.cartpole_data import NAMES, make_logs
 from mcaprl.files import write_json
-from mcaprl.offline import ALGORITHMS, BootstrapConfig, Scores, TransitionBuffer
+from mcaprl.offline import ALGORITHMS, BootstrapConfig, TransitionBuffer, build_head
 
 UPDATES, EVALUATED_AT, EPISODES = 5000, (4000, 4500, 5000), 10
 SHARED: dict[str, Any] = {
@@ -89,11 +89,12 @@ def ours(data: mcaprl.Dataset, algo: str, seeds: int) -> list[float]:
 def greedy(learner: Any, seed: int) -> Act:
     """Return the greedy policy of a seed's current network."""
     networks = {name: learner.network(name, seed) for name in learner.policy_models}
-    scores = Scores(networks, learner.acts_by, getattr(learner.config, "threshold", 0.0))
+    threshold = getattr(learner.config, "threshold", 0.0)
+    head = build_head(learner.acts_by, networks, learner.buffer.action_space, threshold)
 
     def act(observations: NDArray[Any]) -> NDArray[Any]:
         with torch.no_grad():
-            return scores(learner.buffer.encoder.encode(observations)).argmax(1).numpy()
+            return head.scores(learner.buffer.encoder.encode(observations)).argmax(1).numpy()
 
     return act
 

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 import mcaprl
 from mcaprl.offline import FQEConfig, OffPolicyEvaluator
+from mcaprl.sims import Policy
 from tests.support import two_state_task as task
 
 ESTIMATORS = ("PDIS", "WPDIS", "DR", "WDR")
 
 
-class _Evaluated:
+class _Evaluated(Policy):
     """Policy that is evaluated in the two-state task."""
 
     def action_probabilities(self, observations: Any) -> NDArray[np.float64]:

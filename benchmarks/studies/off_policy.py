@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 import mcaprl
 from mcaprl.offline import ESTIMATORS, EpisodeTable, FQEConfig, OffPolicyEvaluator
+from mcaprl.sims import Policy
 from tests.support import two_state_task as task
 
 SCOPE_RL_NAMES: Final = {
@@ -81,7 +82,7 @@ def _as_scope_rl(table: EpisodeTable) -> dict[str, Any]:
     }
 
 
-class Balance:
+class Balance(Policy):
     """A CartPole policy without training: it pushes to the side to which the pole falls."""
 
     def __init__(self, look_ahead_s: float) -> None:

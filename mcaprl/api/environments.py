@@ -39,8 +39,39 @@ def all_options(
     return given | dict(others or {})
 
 
+def name_of(sim: str | gym.Env[Any, Any]) -> str:
+    """Return the name of a sim, or the id or class of an environment.
+
+    Raises:
+        UsageError: This is not a single environment.
+    """
+    if isinstance(sim, str):
+        return sim
+    if not isinstance(sim, gym.Env):
+        raise UsageError(f"{sim!r} is not a single environment: pass a gymnasium.Env, or a name")
+    return sim.spec.id if sim.spec else type(sim.unwrapped).__name__
+
+
+def check_names(*given: object) -> None:
+    """Check that sims and policies are given by names, which other processes can use.
+
+    Raises:
+        UsageError: One of them is an object.
+    """
+    objects = [each for each in given if not isinstance(each, str)]
+    if objects:
+        raise UsageError(
+            f"several processes need names of sims and policies, not {objects[0]!r}: pass a name"
+            " or a path, or use one process"
+        )
+
+
 def trained_options(
-    names: Iterable[str], sim: str, options: dict[str, Any], *, trust_env: bool
+    names: Iterable[str],
+    sim: str | gym.Env[Any, Any],
+    options: dict[str, Any],
+    *,
+    trust_env: bool,
 ) -> dict[str, Any]:
     """Return the arguments of an environment in which policies act.
 
@@ -49,11 +80,20 @@ def trained_options(
 
     Args:
         names: Names or paths of policies.
-        sim: Short name or Gymnasium id.
+        sim: Short name or Gymnasium id, or an environment, which has no other arguments.
         options: Given arguments.
         trust_env: Whether the arguments in the files of policies may be passed to environments
             other than the sims of `SIMS`. If not, a warning names the arguments.
+
+    Raises:
+        UsageError: There are arguments for an environment that has been made.
     """
+    if not isinstance(sim, str):
+        if options:
+            raise UsageError(
+                f"{', '.join(options)}: arguments are for a sim that is given by its name"
+            )
+        return {}
     paths = [Path(name) for name in names if name not in SCRIPTED and Path(name).exists()]
     if options or not paths:
         return options

@@ -11,13 +11,14 @@ from mcaprl.api.data import Data, Definitions, MappingFile, named, opened
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
 from mcaprl.api.ranges import check_fraction, check_least
 from mcaprl.api.train import torch_threads
+from mcaprl.base_policy import BasePolicy, RandomPolicy
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.calibration import Calibration, calibration
 from mcaprl.texts import counted
 
 if TYPE_CHECKING:
     from mcaprl.offline.estimate.behavior import BehaviorEstimate
-    from mcaprl.offline.estimate.off_policy import Estimate, PolicyEstimates, StochasticPolicy
+    from mcaprl.offline.estimate.off_policy import Estimate, PolicyEstimates
     from mcaprl.recorder.dataset.dataset import Dataset
 
 
@@ -151,13 +152,13 @@ def estimate(
     )
 
 
-def _policies(names: Sequence[str], dataset: Dataset) -> dict[str, StochasticPolicy | None]:
-    """Load the policies, and return them by their names in tables; `random` has the value None."""
+def _policies(names: Sequence[str], dataset: Dataset) -> dict[str, BasePolicy]:
+    """Load the policies, and return them by their names in tables."""
     shown = policy_names(names)
-    found: dict[str, StochasticPolicy | None] = {}
+    found: dict[str, BasePolicy] = {}
     for name in dict.fromkeys(names):
         if name == "random":
-            found[name] = None
+            found[name] = RandomPolicy(dataset.action_space)
             continue
         loaded = trained_policies(name, dataset)
         for policy in loaded:

@@ -14,10 +14,11 @@ from typing import Any
 import gymnasium as gym
 
 from mcaprl.api.cluster import ClusterOptions
-from mcaprl.api.environments import all_options, trained_options
+from mcaprl.api.environments import all_options, check_names, name_of, trained_options
 from mcaprl.api.evaluate_parts import results_on_ray
-from mcaprl.api.policies import SCRIPTED, Names, as_names, policies_of, policy_names
+from mcaprl.api.policies import SCRIPTED, Names, by_name, policies_of, policy_names
 from mcaprl.api.ranges import check_least
+from mcaprl.base_policy import Actor, BasePolicy
 from mcaprl.errors import ReportError, UsageError, import_extra
 from mcaprl.files import check_log_name, check_target, check_writable, write_json
 from mcaprl.page import Figure
@@ -36,7 +37,7 @@ from mcaprl.sims.evaluation.evaluate import (
 )
 from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
 from mcaprl.sims.evaluation.pilots import has_pilot
-from mcaprl.sims.evaluation.rollout import Policy, StepLimit, make_limited, warn_of_cuts
+from mcaprl.sims.evaluation.rollout import StepLimit, make_limited, warn_of_cuts
 from mcaprl.sims.evaluation.statistics import mean_interval
 
 RESULT_NAME = "evaluation.json"
@@ -92,8 +93,8 @@ class Evaluation:
 
 
 def evaluate(
-    policies: Names,
-    sim: str,
+    policies: Names | Actor | Sequence[Names | Actor],
+    sim: str | gym.Env[Any, Any],
     *,
     episodes: int = 30,
     max_steps: int | None = None,
@@ -118,9 +119,10 @@ def evaluate(
     Random actions and the sim's pilot are always evaluated, too.
 
     Args:
-        policies: `pilot`, `random`, the path of a trained policy, or a list of these. Each seed of
+        policies: `pilot`, `random`, the path of a trained policy, a policy or another object with a
+            method `act(observations)` for batches of observations, or a list of these. Each seed of
             a run is evaluated.
-        sim: Short name of a sim, or a Gymnasium id.
+        sim: Short name of a sim, a Gymnasium id, or an environment, which stays open.
         episodes: Number of episodes for each policy and training seed.
         max_steps: Steps after which an episode is truncated, with the reason `step_limit`. None
             selects 27,000 if the environment has no time limit.
@@ -164,8 +166,12 @@ def evaluate(
         raise UsageError("--record needs one process: omit --ray")
     if keys is not None and record is None:
         raise UsageError("--keys selects what --record writes: omit it, or pass --record")
-    names, options = as_names(policies), all_options(observation, rules, sim_options)
-    options = trained_options(names, sim, options, trust_env=trust_env)
+    given, options = by_name(policies), all_options(observation, rules, sim_options)
+    paths = [policy for policy in given.values() if isinstance(policy, str)]
+    options = trained_options(paths, sim, options, trust_env=trust_env)
+    if ray:
+        check_names(sim, *given.values())
+    sim_name = name_of(sim)
     log, folder = (None if path is None else Path(path) for path in (record, report))
     if log is not None:
         check_log_name(log)
@@ -181,11 +187,11 @@ def evaluate(
             check_target(log, overwrite=overwrite)
         world = list(getattr(env.unwrapped, "static_scene", list)())
         # Batched sims have no other limit than their own, and no recorder of single episodes.
-        is_plain = log is None and not isinstance(env, StepLimit)
+        is_plain = isinstance(sim, str) and log is None and not isinstance(env, StepLimit)
         is_batched = is_plain and env.spec is not None and bool(env.spec.vector_entry_point)
-        found = _policies(names, env)
-        shown, scores = policy_names(list(found)), {}
-        sources = [getattr(one, "mask_from", "") for each in found.values() for one in each]
+        found = _policies(given, env)
+        shown, scores = {name: name for name in found} | policy_names(paths), {}
+        sources = [one.mask_from for each in found.values() for one in each]
         source = next(filter(None, sources), "") if mask_from is None else mask_from
         with ExitStack() as stack:
             total = sum(map(len, found.values())) * episodes
@@ -205,7 +211,7 @@ def evaluate(
                 )
                 scores = {name: score_of(shown[name], results[name], env) for name in found}
                 found = {}
-            envs = make_sims(sim, episodes, **options) if is_batched and found else None
+            envs = make_sims(sim_name, episodes, **options) if is_batched and found else None
             recorder = None
             if log is not None:
                 recorder = RecordMcap(
@@ -213,7 +219,7 @@ def evaluate(
                 )
                 stack.enter_context(closing(recorder))
             for name, candidates in found.items():
-                recorded = recorder if name in names else None
+                recorded = recorder if name in given else None
                 scores[name] = evaluate_policy(
                     recorded or env,
                     candidates,
@@ -226,22 +232,25 @@ def evaluate(
                     on_episode=lambda result: advance(1),
                 )
         for score in scores.values():
-            warn_of_cuts(itertools.chain(*score.results), score.policy, sim)
+            warn_of_cuts(itertools.chain(*score.results), score.policy, sim_name)
     random, pilot = scores["random"], scores.get("pilot")
     normalized = [normalize(score, random, pilot) for score in scores.values()]
     if logged is not None:
         value = Scale.of(random, pilot).score(logged.mean_return)
         logged = replace(logged, normalized_score=None if math.isnan(value) else value)
-    result = Evaluation(sim, seed, logged, tuple(normalized), tuple(improvements(normalized)))
+    result = Evaluation(sim_name, seed, logged, tuple(normalized), tuple(improvements(normalized)))
     if folder is not None:
-        _write_report(folder, result, world, log, names)
+        _write_report(folder, result, world, None if log is None else (log, len(given)), paths)
     return result
 
 
-def _policies(names: Sequence[str], env: gym.Env[Any, Any]) -> dict[str, list[Policy | None]]:
+def _policies(
+    given: Mapping[str, str | BasePolicy], env: gym.Env[Any, Any]
+) -> dict[str, list[BasePolicy]]:
     """Return a dict from names to policies; it includes `random` and, if there is one, `pilot`."""
     scripted = SCRIPTED if has_pilot(env) else ("random",)
-    return {name: policies_of(name, env) for name in dict.fromkeys([*names, *scripted])}
+    every = {**given, **dict(zip(scripted, scripted, strict=True))}
+    return {name: policies_of(policy, env) for name, policy in every.items()}
 
 
 def _set_policy(recorder: RecordMcap | None, name: str) -> None:
@@ -269,7 +278,11 @@ def _behavior(data: str, env: gym.Env[Any, Any], record: Path | None) -> LoggedR
 
 
 def _write_report(
-    folder: Path, result: Evaluation, world: list[Any], log: Path | None, names: Sequence[str]
+    folder: Path,
+    result: Evaluation,
+    world: list[Any],
+    log: tuple[Path, int] | None,
+    names: Sequence[str],
 ) -> None:
     from mcaprl.sims.evaluation.report import evaluation_page
 
@@ -283,7 +296,7 @@ def _write_report(
         list(result.improvements),
         world,
         band,
-        None if log is None else (log, len(set(names))),
+        log,
         learning_curves([name for name in names if name not in SCRIPTED]),
     )
 

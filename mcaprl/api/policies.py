@@ -3,27 +3,65 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from functools import cached_property
+from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium as gym
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.base_policy import BasePolicy, RandomPolicy, as_policy
 from mcaprl.errors import McaprlError, PolicyError, UnknownNameError, UsageError
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.format.action_commands import ActionCommands
 from mcaprl.recorder.record.recorded_space import RecordedSpace, recorded_like
-from mcaprl.runs import BEST_NAME, CONFIG_NAME, POLICY_NAME, policy_files
-from mcaprl.sims.evaluation.rollout import Policy, check_fit, same_form
+from mcaprl.runs import BEST_NAME, CONFIG_NAME, POLICY_NAME, RunSummary, policy_files
+from mcaprl.sims.evaluation.rollout import check_fit, same_form
+
+if TYPE_CHECKING:
+    from mcaprl.offline.policy import Policy
 
 SCRIPTED = ("pilot", "random")
-Names = str | Path | Sequence[str | Path]
-"""`pilot`, `random` or the path of a policy, or several of them."""
+Names = str | PathLike[str] | Sequence[str | PathLike[str]]
+"""`pilot`, `random` or the path of a policy, or several of them; a `Run` is a path."""
+Summary = TypeVar("Summary", bound=RunSummary)
+
+
+class Run(list[Summary]):
+    """Trained run: the list of the summaries of its seeds, with its folder and its policies.
+
+    Attributes:
+        folder: Run folder.
+    """
+
+    def __init__(self, folder: Path, summaries: Iterable[Summary]) -> None:
+        """Store the folder and one summary for each seed."""
+        super().__init__(summaries)
+        self.folder = folder
+
+    def __fspath__(self) -> str:
+        """Return the path of the folder, so that functions accept a run as a path."""
+        return str(self.folder)
+
+    @property
+    def summaries(self) -> list[Summary]:
+        """One summary for each seed."""
+        return list(self)
+
+    @cached_property
+    def policy(self) -> Policy:
+        """Policy of the first seed, as `load_policy` returns it; it is loaded on first use."""
+        return load_policy(self.folder)
+
+    @cached_property
+    def policies(self) -> list[Policy]:
+        """Policies of all seeds."""
+        return load_policies(self.folder)
 
 
 def as_names(policies: Names) -> list[str]:
@@ -32,63 +70,33 @@ def as_names(policies: Names) -> list[str]:
     >>> as_names("random"), as_names(["pilot", Path("runs/cql")])
     (['random'], ['pilot', 'runs/cql'])
     """
-    return [str(policies)] if isinstance(policies, str | Path) else list(map(str, policies))
+    if isinstance(policies, str | PathLike):
+        return [fspath(policies)]
+    return [fspath(one) for one in policies]
 
 
-class TrainedPolicy(Policy, Protocol):
-    """Loaded policy with NumPy inputs and outputs; B is the batch size, A the number of actions.
+def by_name(policies: Any) -> dict[str, str | BasePolicy]:
+    """Return the names and objects of one or more policies, by names for tables.
 
-    A policy that stacks k > 1 frames stores the observations of the last k calls of `act` since
-    `begin`. The other methods of such a policy accept stacks (B, k, *shape), oldest frame first.
+    Raises:
+        UsageError: An object is not a policy.
+
+    >>> by_name("runs/cql"), list(by_name([RandomPolicy(None), RandomPolicy(None), "pilot"]))
+    ({'runs/cql': 'runs/cql'}, ['random-2', 'random-3', 'pilot'])
     """
-
-    @property
-    def algo(self) -> str:
-        """Name of the training algorithm."""
-
-    @property
-    def observation_space(self) -> spaces.Space[Any] | None:
-        """Space of one observation; None if the file has no bounds."""
-
-    @property
-    def action_space(self) -> spaces.Space[Any]:
-        """Space of one action."""
-
-    @property
-    def env_id(self) -> str:
-        """Gymnasium id of the training environment; empty if unknown."""
-
-    @property
-    def env_kwargs(self) -> dict[str, Any]:
-        """Arguments of the training environment."""
-
-    @property
-    def frame_stack(self) -> int:
-        """Number of successive observations that the networks receive."""
-
-    @property
-    def action_commands(self) -> ActionCommands | None:
-        """Commands of a robot that the actions stand for, `fields` and `commands`; else None."""
-
-    def begin(self) -> None:
-        """Drop the stored observations at the start of an episode."""
-
-    def q_values(self, observations: Any) -> NDArray[Any]:
-        """Return Q-values (B, A), in the order of the action space.
-
-        Raises:
-            PolicyError: The policy has no Q-values, or the observations have another shape.
-        """
-
-    def action_probabilities(self, observations: Any) -> NDArray[Any]:
-        """Return the probabilities (B, A) of all actions: 0 or 1 if the policy is greedy.
-
-        Raises:
-            PolicyError: The observations have another shape.
-        """
+    several = isinstance(policies, Sequence) and not isinstance(policies, str | PathLike)
+    found: dict[str, str | BasePolicy] = {}
+    for one in policies if several else [policies]:
+        if isinstance(one, str | PathLike):
+            found[fspath(one)] = fspath(one)
+            continue
+        policy = as_policy(one)
+        names = itertools.chain([policy.name], (f"{policy.name}-{n}" for n in itertools.count(2)))
+        found[next(name for name in names if name not in {*found, *SCRIPTED})] = policy
+    return found
 
 
-def load_policy(path: str | Path) -> TrainedPolicy:
+def load_policy(path: str | PathLike[str]) -> Policy:
     """Load a trained policy, without unpickling or executing anything in its files.
 
     Args:
@@ -102,12 +110,12 @@ def load_policy(path: str | Path) -> TrainedPolicy:
     return _load(_found_files(Path(path))[0])
 
 
-def load_policies(path: str | Path) -> list[TrainedPolicy]:
+def load_policies(path: str | PathLike[str]) -> list[Policy]:
     """Load the policies of all seeds of a run, sorted by seed; see `load_policy`."""
     return [_load(file) for file in _found_files(Path(path))]
 
 
-def export(run: str | Path, out: str | Path, *, overwrite: bool = False) -> TrainedPolicy:
+def export(run: str | PathLike[str], out: str | Path, *, overwrite: bool = False) -> Policy:
     """Write a trained policy as ONNX, which ONNX Runtime runs without this package.
 
     The inputs are the parts of an observation, with the same names as in the log. The outputs are
@@ -134,11 +142,11 @@ def export(run: str | Path, out: str | Path, *, overwrite: bool = False) -> Trai
     return policy
 
 
-def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
+def policies_of(name: str | BasePolicy, env: gym.Env[Any, Any]) -> list[BasePolicy]:
     """Return the policies that a name refers to; a run has one policy per training seed.
 
     Args:
-        name: `pilot`, a path, or `random`, for which the result is [None].
+        name: `pilot`, `random` or a path, or a policy itself.
         env: Environment in which the policies will act.
 
     Raises:
@@ -146,8 +154,10 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
         UsageError: The sim has no pilot, or there is no such path.
         PolicyError: The path contains no policy, or the policy's spaces differ from those of `env`.
     """
+    if isinstance(name, BasePolicy):
+        return [_fitted(name, env)]
     if name == "random":
-        return [None]
+        return [RandomPolicy(env.action_space)]
     if name == "pilot":
         from mcaprl.sims.evaluation.pilots import has_pilot, make_pilot
 
@@ -159,25 +169,18 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
     return [_fitted(policy, env) for policy in policies]
 
 
-@dataclass(frozen=True)
-class _PartPolicy:
+class _PartPolicy(BasePolicy):
     """A policy that receives observations in the form of the log that it was trained on."""
 
-    policy: TrainedPolicy
-    recorded: RecordedSpace
-
-    @property
-    def name(self) -> str:
-        return self.policy.name
-
-    def begin(self) -> None:
-        self.policy.begin()
+    def __init__(self, policy: BasePolicy, recorded: RecordedSpace) -> None:
+        self.name, self.begin = policy.name, policy.begin  # type: ignore[method-assign]
+        self._policy, self._recorded = policy, recorded
 
     def act(self, observations: Any) -> NDArray[Any]:
-        return self.policy.act(self.recorded.of(observations))
+        return self._policy.act(self._recorded.of(observations))
 
 
-def _fitted(policy: TrainedPolicy, env: gym.Env[Any, Any]) -> Policy:
+def _fitted(policy: BasePolicy, env: gym.Env[Any, Any]) -> BasePolicy:
     """Return a policy that acts in an environment.
 
     The environment may have more observations than the policy needs, or a Tuple instead of a Dict.
@@ -195,7 +198,7 @@ def _fitted(policy: TrainedPolicy, env: gym.Env[Any, Any]) -> Policy:
     return policy
 
 
-def trained_policies(name: str, dataset: Dataset) -> list[TrainedPolicy]:
+def trained_policies(name: str, dataset: Dataset) -> list[Policy]:
     """Load the policies of all seeds of a run, and check that they fit a log.
 
     Raises:
@@ -213,7 +216,7 @@ def trained_policies(name: str, dataset: Dataset) -> list[TrainedPolicy]:
             trained, logged = getattr(policy, role), getattr(dataset, role)
             if trained is not None and not same_form(trained, logged):
                 hint = ""
-                if role == "observation_space" and (source := getattr(policy, "mask_from", "")):
+                if role == "observation_space" and (source := policy.mask_from):
                     hint = f'; open it and pass with_action_mask("{source}")'
                 raise PolicyError(
                     f"{name} was trained on {role} {trained}; the log has {logged}{hint}"
@@ -267,11 +270,11 @@ def _found_files(path: Path) -> list[Path]:
     return files
 
 
-def _load(file: Path) -> TrainedPolicy:
+def _load(file: Path) -> Policy:
     if file.name == POLICY_NAME:
         from mcaprl.offline.policy import read_policy
 
         return read_policy(file.parent)
-    from mcaprl.online.policy import read_policy as read_model
+    from mcaprl.online.zip_file import read_policy as read_model
 
     return read_model(file)

@@ -5,16 +5,20 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from mcaprl.api.cluster import ClusterOptions
-from mcaprl.api.environments import all_options, trained_options
+from mcaprl.api.environments import all_options, check_names, name_of, trained_options
+from mcaprl.api.policies import by_name
 from mcaprl.api.ranges import check_fraction, check_least, check_positive
 from mcaprl.api.record_file import FileRequest, record_file
 from mcaprl.api.shards import record_on_ray, record_shards
+from mcaprl.base_policy import Actor
 from mcaprl.errors import UsageError
 from mcaprl.files import check_log_name
 from mcaprl.progress import ProgressBar, no_progress
@@ -51,10 +55,10 @@ class Recording:
 
 
 def record(
-    sim: str,
+    sim: str | gym.Env[Any, Any],
     out: str | Path,
     *,
-    policy: str | Path = "pilot",
+    policy: str | PathLike[str] | Actor = "pilot",
     epsilon: float = 0.0,
     episodes: int | None = None,
     steps: int | None = None,
@@ -83,9 +87,11 @@ def record(
     """Record episodes of a sim into an MCAP file; write each episode when it ends.
 
     Args:
-        sim: Short name of a sim, or a Gymnasium id.
+        sim: Short name of a sim, a Gymnasium id, or an environment, which stays open.
         out: File to write; with several processes, a folder with one file per process.
-        policy: `pilot`, `random`, or the path of a trained policy.
+        policy: `pilot`, `random`, the path of a trained policy, a policy or another object with a
+            method `act(observations)` for batches of observations. Only policies of this package,
+            and those with a true attribute `is_deterministic`, get a `behavior_prob`.
         epsilon: Probability of a random action instead of the policy's.
         episodes: Number of episodes; exclusive with `steps`.
         steps: Number of steps; exclusive with `episodes`.
@@ -129,15 +135,18 @@ def record(
         MissingExtraError: Ray is not installed.
     """
     options = all_options(observation, rules, sim_options)
+    sim_name, ((shown, chosen),) = name_of(sim), by_name([policy]).items()
     request = FileRequest(
         sim=sim,
         out=Path(out),
-        policy=str(policy),
+        policy=chosen,
         epsilon=epsilon,
         episodes=episodes,
         steps=steps,
         seed=seed,
-        sim_options=trained_options([str(policy)], sim, options, trust_env=trust_env),
+        sim_options=trained_options(
+            [chosen] if isinstance(chosen, str) else [], sim, options, trust_env=trust_env
+        ),
         scene=scene,
         camera=camera,
         infos=infos,
@@ -149,6 +158,8 @@ def record(
         max_steps=max_steps,
     )
     _check_request(request, envs)
+    if ray or envs > 1:
+        check_names(sim, chosen)
     on_cluster = ClusterOptions(ray, workers, address)
     on_cluster.check(shards=shards)
     if ray:
@@ -157,7 +168,7 @@ def record(
         check_log_name(request.out)
     if upload is not None:
         check_upload(upload, overwrite=overwrite or append)
-    with progress(f"recording {sim}", episodes or steps) as advance:
+    with progress(f"recording {sim_name}", episodes or steps) as advance:
 
         def on_episode(result: EpisodeResult) -> None:
             advance(1 if episodes else result.length)
@@ -168,7 +179,7 @@ def record(
             results = record_file(request, on_episode)
         else:
             results = record_shards(request, envs, on_episode)
-    warn_of_cuts(results, request.policy, sim)
+    warn_of_cuts(results, shown, sim_name)
     files = _files(request.out, rotated=request.rotate_mb is not None)
     if upload is not None:
         upload_all([*files, request.out / MANIFEST_NAME] if ray else files, upload)

@@ -12,10 +12,16 @@ from typing import Any
 import gymnasium as gym
 
 from mcaprl.api.policies import policies_of, policy_names
+from mcaprl.base_policy import BasePolicy
 from mcaprl.files import work_folder
 from mcaprl.recorder.record.wrapper import RecordMcap
-from mcaprl.sims import make_sim
-from mcaprl.sims.evaluation.rollout import EpisodeResult, EpsilonGreedy, make_limited, rollout
+from mcaprl.sims.evaluation.rollout import (
+    EpisodeResult,
+    EpsilonGreedy,
+    make_limited,
+    make_or_borrow,
+    rollout,
+)
 
 
 @dataclass(frozen=True)
@@ -26,9 +32,9 @@ class FileRequest:
         first_episode: Number of the first episode; an episode's seed depends on its number.
     """
 
-    sim: str
+    sim: str | gym.Env[Any, Any]
     out: Path
-    policy: str
+    policy: str | BasePolicy
     epsilon: float
     episodes: int | None
     steps: int | None
@@ -44,6 +50,13 @@ class FileRequest:
     rotate_mb: float | None
     max_steps: int | None
     first_episode: int = 0
+
+    @property
+    def policy_name(self) -> str:
+        """Name of the policy in the log."""
+        if isinstance(self.policy, BasePolicy):
+            return self.policy.name
+        return policy_names([self.policy])[self.policy]
 
 
 def record_file(
@@ -88,7 +101,7 @@ def try_request(request: FileRequest) -> None:
 def _env(request: FileRequest) -> gym.Env[Any, Any]:
     # A number of steps ends the recording, so it needs no default limit.
     if request.steps is not None and request.max_steps is None:
-        return make_sim(request.sim, **request.sim_options)
+        return make_or_borrow(request.sim, **request.sim_options)
     return make_limited(request.sim, request.max_steps, **request.sim_options)
 
 
@@ -101,7 +114,7 @@ def _recorder(request: FileRequest, env: gym.Env[Any, Any], behavior: EpsilonGre
     return RecordMcap(
         env,
         request.out,
-        policy=policy_names([request.policy])[request.policy],
+        policy=request.policy_name,
         epsilon=behavior.epsilon,
         seed=request.seed,
         compression=request.compression,

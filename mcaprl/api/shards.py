@@ -123,11 +123,11 @@ def record_on_ray(
     from mcaprl.ray.tasks import WorkerDiedError, run_tasks
 
     # Workers have other working directories, so all paths must be absolute.
-    whole = replace(whole, out=whole.out.absolute(), policy=_absolute(whole.policy))
+    whole = replace(whole, out=whole.out.absolute(), policy=_absolute(str(whole.policy)))
     shards = _divided(whole, _count(whole, parts))
     with options.connected(), _new_folder(whole, shards[0]):
         hidden = unfinished_folder(whole.out)
-        paths = [hidden] if whole.policy in SCRIPTED else [hidden, Path(whole.policy)]
+        paths = [hidden] if whole.policy in SCRIPTED else [hidden, Path(str(whole.policy))]
         try:
             results = run_tasks(
                 _record_on_worker,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mcaprl.api.cluster import ClusterOptions
 from mcaprl.api.data import MAPPING_NAME, Data, Definitions, MappingFile, mapping_tree, open_data
 from mcaprl.api.environments import all_options
-from mcaprl.api.policies import TrainedPolicy, as_names, is_policy, load_policies
+from mcaprl.api.policies import Run, as_names, is_policy, load_policies
 from mcaprl.api.ranges import check_least, check_port, check_positive
 from mcaprl.api.replay import LiveAddress
 from mcaprl.errors import MissingExtraError, TrainingError, UsageError, import_extra
@@ -26,6 +26,7 @@ from mcaprl.settings import check_settings, flag, settings_from_json
 from mcaprl.storage.remote import check_upload, upload_all
 
 if TYPE_CHECKING:
+    from mcaprl.offline.policy import Policy
     from mcaprl.offline.training.metrics import OfflineSummary
     from mcaprl.online.train import OnlineSummary
 
@@ -53,7 +54,7 @@ def train(
     on_data: Callable[[str, Dataset], None] = lambda algo, dataset: None,
     progress: ProgressCallback = lambda now: None,
     **settings: Any,
-) -> list[OfflineSummary]:
+) -> Run[OfflineSummary]:
     """Train a policy offline; the same seed, data and machine produce the same weights.
 
     The run folder contains the policy, checkpoints and metrics of each seed, and `curves.png` if
@@ -96,7 +97,7 @@ def train(
             `resume`, they have the values of the run.
 
     Returns:
-        One summary for each seed.
+        The list of the summaries of all seeds, which also has the `folder` and the `policy`.
 
     Raises:
         UnknownNameError: There is no such algorithm.
@@ -207,7 +208,7 @@ def train(
         write_json(out / MAPPING_NAME, tree, TrainingError)
     with suppress(MissingExtraError):
         draw_curves(out)
-    return summaries
+    return Run(out, summaries)
 
 
 def _check_choice(
@@ -258,7 +259,7 @@ def train_online(
     on_live: Callable[[LiveAddress], None] = lambda address: None,
     progress: ProgressCallback = lambda now: None,
     **settings: Any,
-) -> list[OnlineSummary]:
+) -> Run[OnlineSummary]:
     """Train a policy in a sim; the same seed and machine produce the same curve.
 
     Args:
@@ -300,7 +301,7 @@ def train_online(
             the sim; with `resume`, they have the values of the run.
 
     Returns:
-        One summary for each seed.
+        The list of the summaries of all seeds, which also has the `folder` and the `policy`.
 
     Raises:
         UnknownNameError: There is no such sim, algorithm or preset.
@@ -338,7 +339,8 @@ def train_online(
             max_steps=max_steps is not None,
         )
         numbers = choose_seeds(out, seeds, seed, resume)
-        return _train_on_device(sim, out, device, numbers, threads, options, settings, progress)
+        found = _train_on_device(sim, out, device, numbers, threads, options, settings, progress)
+        return Run(out, found)
     resumed = out if resume else None
     task = choose_task(
         sim, algo, options, settings, preset=preset, max_steps=max_steps, resumed=resumed
@@ -368,7 +370,7 @@ def train_online(
     if upload is not None and record is not None:
         folder = Path(record)
         upload_all(sorted(folder.glob("*.mcap")) if folder.is_dir() else [folder], upload)
-    return trained
+    return Run(out, trained)
 
 
 def _check_device_request(**given: bool) -> None:
@@ -401,7 +403,7 @@ def _train_on_device(
         )
 
 
-def _experience(sources: list[str]) -> tuple[Dataset | None, list[TrainedPolicy] | None]:
+def _experience(sources: list[str]) -> tuple[Dataset | None, list[Policy] | None]:
     """Return the dataset of the logs in `sources`, and the policies of the run in `sources`.
 
     The dataset is None if there are no logs, and the list of policies is None if there is no run.

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from mcaprl.offline.algorithms.config import DoubleDQNConfig, DQNConfig
-from mcaprl.offline.algorithms.learner import ActsBy, Learner
+from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.algorithms.losses import (
     allowed_only,
     chosen,
@@ -38,7 +38,7 @@ class DQN(Learner):
 
     name = "dqn"
     config_type = DQNConfig
-    acts_by: ClassVar[ActsBy] = "q_values"
+    acts_by: ClassVar[str] = "q_values"
     policy_models: ClassVar[tuple[str, ...]] = ("q",)
     can_be_captured = True
     config: DQNConfig

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -18,9 +18,6 @@ from mcaprl.offline.algorithms.losses import allowed_only
 from mcaprl.offline.algorithms.models import ALIGNMENT, Model, TargetNetwork, build_model
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
-
-ActsBy = Literal["q_values", "logits", "filtered_q_values"]
-"""Kinds of network outputs from which a trained policy selects actions; see `policy`."""
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -47,7 +44,7 @@ class Learner(ABC):
     Attributes:
         name: Name of the algorithm in commands and in `mcaprl.train`.
         config_type: Dataclass of the algorithm's settings.
-        acts_by: Kind of outputs from which the policy selects actions.
+        acts_by: Key of `heads.HEADS`: how the policy selects actions.
         policy_models: Names of the models that the policy needs.
         can_be_captured: Whether `losses` can be part of a CUDA graph: tensors have shapes that do
             not depend on values, and no value is read by the CPU.
@@ -60,7 +57,7 @@ class Learner(ABC):
 
     name: ClassVar[str]
     config_type: ClassVar[type[TrainingConfig]]
-    acts_by: ClassVar[ActsBy]
+    acts_by: ClassVar[str]
     policy_models: ClassVar[tuple[str, ...]]
     can_be_captured: ClassVar[bool] = False
     config: TrainingConfig

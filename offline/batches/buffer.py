@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
+from mcaprl.frames import frame_rows
 from mcaprl.joint_actions import JointActions, joint_actions
 from mcaprl.networks import ImageInput
 from mcaprl.offline.batches.items import n_step_returns, returns_to_go
@@ -237,9 +238,8 @@ class TransitionBuffer:
         if count == 1:
             return self.frames.rows(places)
         ages = torch.arange(count - 1, -1, -1, device=places.device)
-        stacks = places.unsqueeze(1) - ages
-        first = self.starts.index_select(0, places).unsqueeze(1)
-        return self.frames.rows(torch.maximum(stacks, first).flatten()).stacked(count)
+        rows = frame_rows(places, self.starts.index_select(0, places), ages)
+        return self.frames.rows(rows.flatten()).stacked(count)
 
     @property
     def vector_width(self) -> int:
@@ -293,7 +293,7 @@ def discrete_actions(space: spaces.Space[Any]) -> JointActions:
     if joint is None:
         raise SpaceError(f"offline learning needs discrete actions, got {space}")
     check_actions(space)
-    if not isinstance(space, spaces.Discrete) and joint.count > MAX_JOINT_ACTIONS:
+    if joint.shape and joint.count > MAX_JOINT_ACTIONS:
         raise SpaceError(
             f"{space} has {counted(joint.count, 'combination')} of actions; offline learning uses"
             f" at most {MAX_JOINT_ACTIONS:,}: record with fewer or coarser actions"

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from mcaprl.architecture import SMALL_EDGE
 from mcaprl.errors import SpaceError
+from mcaprl.joint_actions import JointActions, joint_actions
 from mcaprl.masks import MASK_KEY, allowed_actions
 from mcaprl.networks import ImageInput
 from mcaprl.recorder.dataset.mapped import Frames, MappedImages
@@ -144,7 +145,7 @@ class ObservationEncoder:
         scale: (V,) float32, divisor of the shifted vector.
     """
 
-    def __init__(self, space: spaces.Space[Any], n_actions: int) -> None:
+    def __init__(self, space: spaces.Space[Any], n_actions: int, mask_key: str = MASK_KEY) -> None:
         """Create the encoder, without normalization.
 
         Raises:
@@ -152,13 +153,13 @@ class ObservationEncoder:
         """
         self.space = space
         leaves = {leaf.path: leaf for leaf in observation_leaves(space)}
-        self.mask = leaves.pop((MASK_KEY,), None)
+        self.mask = leaves.pop((mask_key,), None)
         if self.mask is not None and self.mask.shape != (n_actions,):
             shape = self.mask.shape
             raise SpaceError(f"{MASK_KEY} has shape {shape}, but there are {n_actions} actions")
         kinds = [(leaf, leaf.of(space)) for leaf in leaves.values()]
-        self.images = [leaf for leaf, part in kinds if _is_image(part)]
-        self.numbers = [(leaf, part) for leaf, part in kinds if not _is_image(part)]
+        self.images = [leaf for leaf, part in kinds if self.is_image(part)]
+        self.numbers = [(leaf, part) for leaf, part in kinds if not self.is_image(part)]
         if not kinds:
             raise SpaceError(f"the observation contains only {MASK_KEY}")
         self.image_inputs = [ImageInput(_image_shape(leaf.shape)) for leaf in self.images]
@@ -169,6 +170,17 @@ class ObservationEncoder:
         ]
         self.shift = np.zeros(self.width, np.float32)
         self.scale = np.repeat(np.where(bytes_, 255, 1), widths).astype(np.float32)
+
+    @staticmethod
+    def is_image(space: spaces.Space[Any]) -> bool:
+        """Return whether a space has uint8 images: (height, width), with or without channels."""
+        if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
+            return False
+        return len(space.shape) in (2, 3) and min(_image_shape(space.shape)[:2]) >= MIN_IMAGE_EDGE
+
+    def arranged(self, observations: Any) -> Any:
+        """Return observations (B, ...) of an environment in the form of `space`."""
+        return observations
 
     def normalize_to(self, observations: Any) -> None:
         """Normalize all inputs to mean 0 and standard deviation 1 over these observations.
@@ -242,15 +254,8 @@ class ObservationEncoder:
         return vector / self.scale if (self.scale != 1).any() else vector
 
     def _allowed(self, observations: Any) -> Tensor | None:
-        allowed = allowed_actions(observations)
+        allowed = None if self.mask is None else allowed_actions(observations)
         return None if allowed is None else torch.from_numpy(allowed)
-
-
-def _is_image(space: spaces.Space[Any]) -> bool:
-    """Return whether a space has uint8 images: (height, width), with or without channels."""
-    if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
-        return False
-    return len(space.shape) in (2, 3) and min(_image_shape(space.shape)[:2]) >= MIN_IMAGE_EDGE
 
 
 def has_channels_first(shape: tuple[int, ...]) -> bool:
@@ -276,32 +281,31 @@ def _channels_last(images: Any, leaf: Leaf) -> Any:
     return np.moveaxis(images, 1, -1) if has_channels_first(leaf.shape) else images
 
 
-def discrete_sizes(space: spaces.Space[Any]) -> NDArray[np.int64] | None:
-    """Return the sizes of a Discrete or MultiDiscrete space; None for other spaces."""
-    if isinstance(space, spaces.Discrete):
-        return np.array([space.n])
-    return space.nvec.ravel() if isinstance(space, spaces.MultiDiscrete) else None
+def codes_of(space: spaces.Space[Any]) -> JointActions | None:
+    """Return the elements of a Discrete or MultiDiscrete space, which are one-hot encoded.
+
+    The result is None for other spaces, whose values are numbers.
+    """
+    return None if isinstance(space, spaces.MultiBinary) else joint_actions(space)
 
 
 def _width(space: spaces.Space[Any]) -> int:
-    sizes = discrete_sizes(space)
-    return int(np.prod(space.shape or ()) if sizes is None else sizes.sum())
+    codes = codes_of(space)
+    return int(np.prod(space.shape or ()) if codes is None else sum(codes.sizes))
 
 
 def _numbers(values: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
     """Return values of a space as numbers (B, width); discrete values are one-hot encoded."""
-    sizes = discrete_sizes(space)
+    codes = codes_of(space)
     flat = np.asarray(values).reshape(len(values), -1)
-    if sizes is None:
+    if codes is None:
         return flat.astype(np.float32, copy=False)
-    assert isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
-    counted = flat - np.ravel(space.start)
-    if ((counted < 0) | (counted >= sizes)).any():
+    if not codes.contain(flat).all():
         raise SpaceError(f"observations are not in their space {space}")
-    codes = [
-        np.eye(n, dtype=np.float32)[column] for n, column in zip(sizes, counted.T, strict=True)
-    ]
-    return np.concatenate(codes, 1)
+    columns = (flat - codes.starts).T
+    return np.concatenate(
+        [np.eye(n, dtype=np.float32)[one] for n, one in zip(codes.sizes, columns, strict=True)], 1
+    )
 
 
 def _tensor(array: Any, dtype: Any) -> Tensor:

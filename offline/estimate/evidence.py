@@ -20,12 +20,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError, UsageError
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.items import returns_to_go
@@ -47,23 +48,6 @@ LIKELY: Final = 0.1
 """An action is likely if its probability is at least this fraction of the largest probability."""
 LOW_PERCENTILE: Final = 1.0
 _SYNCS_PER_HORIZON: Final = 6.0
-
-
-class Actor(Protocol):
-    """Trained policy that selects actions."""
-
-    def act(self, observations: Any) -> NDArray[Any]:
-        """Return the actions (B, *shape) for B observations."""
-
-    def q_values(self, observations: Any) -> NDArray[np.floating[Any]]:
-        """Return the values (B, A); raise PolicyError if the policy has none."""
-
-
-class Clone(Protocol):
-    """Policy that imitates the behavior of a log."""
-
-    def action_probabilities(self, observations: Any) -> NDArray[np.floating[Any]]:
-        """Return the probabilities (B, A) of the actions for B observations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +98,7 @@ class EvidenceCollector:
     def __init__(
         self,
         dataset: Dataset,
-        clone: Clone,
+        clone: BasePolicy,
         config: FQEConfig,
         *,
         pessimistic: bool = True,
@@ -151,7 +135,7 @@ class EvidenceCollector:
         self.low_value = float(np.percentile(returns, LOW_PERCENTILE))
 
     def collect(
-        self, policies: Sequence[Actor], on_update: Callable[[], None] = lambda: None
+        self, policies: Sequence[BasePolicy], on_update: Callable[[], None] = lambda: None
     ) -> list[Evidence]:
         """Return the evidence for each policy.
 
@@ -172,7 +156,7 @@ class EvidenceCollector:
             for policy, mine, found in zip(policies, actions, values.swapaxes(0, 1), strict=True)
         ]
 
-    def _actions(self, policy: Actor, observations: Any) -> NDArray[np.int64]:
+    def _actions(self, policy: BasePolicy, observations: Any) -> NDArray[np.int64]:
         """Return the indexes (N,) of the policy's actions, from 0."""
         return self._buffer.joint.indexes(by_rows(policy.act, observations))
 
@@ -213,7 +197,7 @@ class EvidenceCollector:
 
     def _evidence(
         self,
-        policy: Actor,
+        policy: BasePolicy,
         actions: NDArray[np.int64],
         values: Floats,
         logged_values: Floats,
@@ -235,7 +219,7 @@ class EvidenceCollector:
             bellman_error=bellman_error,
         )
 
-    def _own_values(self, policy: Actor) -> tuple[float | None, float | None]:
+    def _own_values(self, policy: BasePolicy) -> tuple[float | None, float | None]:
         """Return `own_value` and `bellman_error` of a policy; see `Evidence`."""
         try:
             q, q_t = (

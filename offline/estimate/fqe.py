@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from mcaprl.offline.algorithms.config import TrainingConfig
-from mcaprl.offline.algorithms.learner import ActsBy, Learner
+from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.algorithms.losses import chosen, expected_sarsa_target, square_regression
 from mcaprl.offline.algorithms.models import outputs_of_buffer
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
@@ -71,7 +71,7 @@ class FQE(Learner):
 
     name = "fqe"
     config_type: ClassVar[type[TrainingConfig]] = FQEConfig
-    acts_by: ClassVar[ActsBy] = "q_values"
+    acts_by: ClassVar[str] = "q_values"
     policy_models: ClassVar[tuple[str, ...]] = ("q",)
     config: FQEConfig
 

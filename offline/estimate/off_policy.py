@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mcaprl.base_policy import BasePolicy, RandomPolicy
 from mcaprl.errors import SpaceError, UsageError
-from mcaprl.masks import allowed_actions
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.estimate.fqe import FQE, FQEConfig
 from mcaprl.offline.estimate.importance import (
@@ -45,13 +45,6 @@ PREFERENCE: Final = ("WDR", "WPDIS", "DR", "PDIS")
 """Estimators for rankings, from the most to the least reliable."""
 _STANDARD_ERRORS = 4.0
 """Deviation of the mean weight from 1, in standard errors, above which an estimate is refused."""
-
-
-class StochasticPolicy(Protocol):
-    """Interface of policies that can be evaluated."""
-
-    def action_probabilities(self, observations: Any) -> NDArray[np.floating]:
-        """Return the probabilities (B, A) of the actions for B observations."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +139,7 @@ class OffPolicyEvaluator:
 
     def evaluate(
         self,
-        policy: StochasticPolicy | None,
+        policy: BasePolicy | None,
         name: str,
         *,
         epsilon: float = 0.0,
@@ -188,18 +181,17 @@ class OffPolicyEvaluator:
         """Number of calls of `on_update` in `evaluate`."""
         return FOLDS * self._config.updates
 
-    def _probabilities(
-        self, policy: StochasticPolicy | None, epsilon: float
-    ) -> tuple[Floats, Floats]:
+    def _probabilities(self, policy: BasePolicy | None, epsilon: float) -> tuple[Floats, Floats]:
         """Return a policy's action probabilities (N, A) at the observations and the next ones.
 
         With probability `epsilon`, the policy takes a random action.
         """
         both = (self._dataset.observations, self._dataset.next_observations)
-        pi, pi_next = (self._uniform(observations) for observations in both)
+        random = RandomPolicy(self._dataset.action_space)
+        pi, pi_next = map(random.action_probabilities, both)
         if policy is None:
             return pi, pi_next
-        if getattr(policy, "frame_stack", 1) == 1:
+        if policy.frame_stack == 1:
             own, own_next = (by_rows(policy.action_probabilities, part) for part in both)
         else:
             each = [
@@ -216,14 +208,6 @@ class OffPolicyEvaluator:
             (1 - epsilon) * own.astype(np.float64) + epsilon * pi,
             (1 - epsilon) * own_next.astype(np.float64) + epsilon * pi_next,
         )
-
-    def _uniform(self, observations: Any) -> Floats:
-        """Return equal probabilities (N, A) of the allowed actions."""
-        allowed = allowed_actions(observations)
-        if allowed is None:
-            allowed = np.ones((len(self._buffer), self._buffer.joint.count), bool)
-        uniform: Floats = allowed / allowed.sum(axis=1, keepdims=True)
-        return uniform
 
     def _model(
         self, pi: Floats, pi_next: Floats, on_update: Callable[[], None]

@@ -9,14 +9,16 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.base_policy import BasePolicy, batch_size
 from mcaprl.errors import PolicyError, UsageError
+from mcaprl.frames import mapped, rows_of, stacked_frames
 from mcaprl.joint_actions import joint_actions
 from mcaprl.offline.algorithms.config import DQNConfig
 from mcaprl.offline.algorithms.losses import q_learning_target
@@ -27,22 +29,8 @@ Columns = dict[str, NDArray[Any]]
 _ROWS_AT_ONCE = 4096
 
 
-class ValuePolicy(Protocol):
-    """A trained policy with discrete actions."""
-
-    @property
-    def name(self) -> str:
-        """Name of the policy."""
-
-    def q_values(self, observations: Any) -> NDArray[np.float32]:
-        """Return the values (B, A); raise PolicyError if the policy has none."""
-
-    def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
-        """Return the probabilities (B, A)."""
-
-
 def value_columns(
-    policy: ValuePolicy, episode: Episode, action_space: spaces.Space[Any], gamma: float
+    policy: BasePolicy, episode: Episode, action_space: spaces.Space[Any], gamma: float
 ) -> Columns:
     """Return the fields (T, ...) of `recorder.format.schema.values_schema` for an episode.
 
@@ -84,13 +72,17 @@ def value_columns(
     }
 
 
-def policy_inputs(policy: object, episode: Episode) -> Any:
+def policy_inputs(policy: BasePolicy, episode: Episode) -> Any:
     """Return an episode's observations (T + 1, ...), including the last next observation.
 
     For a policy with a frame stack of k > 1, they are stacks (T + 1, k, ...), oldest frame first.
     """
-    frames = _with_last(episode.observations, episode.next_observations)
-    return _stacked(frames, getattr(policy, "frame_stack", 1))
+    frames = mapped(
+        lambda seen, following: np.concatenate([seen, following[-1:]]),
+        episode.observations,
+        episode.next_observations,
+    )
+    return stacked_frames(frames, policy.frame_stack)
 
 
 def td_errors(
@@ -139,10 +131,9 @@ def by_rows(function: Callable[[Any], NDArray[Any]], observations: Any) -> NDArr
 
     The limit bounds the memory that networks need for images.
     """
-    part = next(iter(observations.values())) if isinstance(observations, dict) else observations
-    starts = range(0, len(part), _ROWS_AT_ONCE)
+    starts = range(0, batch_size(observations), _ROWS_AT_ONCE)
     return np.concatenate(
-        [function(_rows(observations, start, start + _ROWS_AT_ONCE)) for start in starts]
+        [function(rows_of(observations, slice(at, at + _ROWS_AT_ONCE))) for at in starts]
     )
 
 
@@ -156,29 +147,3 @@ def gamma_of_run(path: Path) -> float:
             except (ValueError, KeyError, TypeError):
                 break
     return DQNConfig().gamma
-
-
-def _rows(observations: Any, start: int, stop: int) -> Any:
-    if isinstance(observations, dict):
-        return {key: _rows(part, start, stop) for key, part in observations.items()}
-    return observations[start:stop]
-
-
-def _with_last(observations: Any, next_observations: Any) -> Any:
-    """Return the observations of all steps, followed by the last next observation: (T + 1, ...)."""
-    if isinstance(observations, dict):
-        return {k: _with_last(observations[k], next_observations[k]) for k in observations}
-    return np.concatenate([observations, next_observations[-1:]])
-
-
-def _stacked(observations: Any, count: int) -> Any:
-    """Return frame stacks (T + 1, count, ...), oldest frame first.
-
-    If `count` is 1, no axis is added.
-    """
-    if count == 1:
-        return observations
-    if isinstance(observations, dict):
-        return {key: _stacked(part, count) for key, part in observations.items()}
-    rows = np.arange(len(observations))[:, None] - np.arange(count)[::-1]
-    return observations[np.maximum(rows, 0)]

@@ -34,13 +34,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import TrainingError, UnknownNameError, UsageError
 from mcaprl.files import parse_json, read_file, replacing_folder, subfolder, write_json
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.estimate.evidence import (
     FOLDS,
-    Clone,
     Evidence,
     EvidenceCollector,
     fqe_config,
@@ -476,7 +476,7 @@ class _Race:
             raise TrainingError(f"cannot resume: {path} cannot be read: {error}") from error
 
 
-def _traits(dataset: Dataset, clone: Clone) -> LogTraits:
+def _traits(dataset: Dataset, clone: BasePolicy) -> LogTraits:
     """Return the properties of a log. The clone imitates its behavior policy."""
     chances = by_rows(clone.action_probabilities, dataset.observations).astype(np.float64)
     behavior = dataset.behavior_probs.astype(np.float64)

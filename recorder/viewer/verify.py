@@ -17,8 +17,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.ends import STEP_LIMIT
 from mcaprl.errors import LogError, McaprlError, SpaceError
+from mcaprl.frames import rows_of
+from mcaprl.limits import STEP_LIMIT
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
@@ -292,13 +293,7 @@ def _bits(array: NDArray[Any]) -> NDArray[Any]:
 def _at(episode: Episode, step: int) -> Any:
     """Return the logged observation at a step; `step` is from 0 to the episode's length."""
     source = episode.observations if step < episode.length else episode.next_observations
-    return _row(source, min(step, episode.length - 1))
-
-
-def _row(arrays: Any, row: int) -> Any:
-    if isinstance(arrays, dict):
-        return {key: _row(part, row) for key, part in arrays.items()}
-    return arrays[row]
+    return rows_of(source, min(step, episode.length - 1))
 
 
 def _checked_paths(dataset: Dataset, env: gym.Env[Any, Any]) -> Paths:

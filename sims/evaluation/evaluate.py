@@ -13,10 +13,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.base_policy import BasePolicy
 from mcaprl.sims.evaluation.rollout import (
     EpisodeResult,
     EpsilonGreedy,
-    Policy,
     batch_rollout,
     episode_seed,
     rollout,
@@ -96,7 +96,7 @@ class PolicyScore:
 
 def evaluate(
     env: gym.Env[Any, Any],
-    policies: Sequence[Policy | None],
+    policies: Sequence[BasePolicy | None],
     *,
     name: str,
     episodes: int,
@@ -142,7 +142,7 @@ def evaluate(
 
 def greedy_episodes(
     env: gym.Env[Any, Any],
-    policy: Policy | None,
+    policy: BasePolicy | None,
     *,
     episodes: int,
     seed: int,
@@ -152,7 +152,7 @@ def greedy_episodes(
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> list[EpisodeResult]:
     """Run episodes of one policy greedily; arguments as for `evaluate` and `rollout`."""
-    if envs is not None and policy is not None and not getattr(policy, "mask_from", ""):
+    if envs is not None and policy is not None and not policy.mask_from:
         numbers = range(first_episode, first_episode + episodes)
         seeds = [episode_seed(seed, episode) for episode in numbers]
         return batch_rollout(envs, policy, seeds, on_episode)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 
+from mcaprl.base_policy import BasePolicy, as_policy
 from mcaprl.errors import UnknownNameError
 from mcaprl.sims import SIMS
-from mcaprl.sims.evaluation.rollout import Policy
 from mcaprl.sims.spec import SimSpec
 
 
-def make_pilot(env: gym.Env[Any, Any]) -> Policy:
+def make_pilot(env: gym.Env[Any, Any]) -> BasePolicy:
     """Create the pilot of the sim in `env`, which may be wrapped.
 
     Raises:
@@ -21,7 +21,7 @@ def make_pilot(env: gym.Env[Any, Any]) -> Policy:
     spec = _spec_of(env)
     if spec is None:
         raise UnknownNameError("environment with a pilot", _id_of(env), SIMS)
-    return cast(Policy, spec.make_pilot(env.unwrapped))
+    return as_policy(spec.make_pilot(env.unwrapped))
 
 
 def has_pilot(env: gym.Env[Any, Any]) -> bool:

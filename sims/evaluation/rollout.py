@@ -1,8 +1,4 @@
-"""Episodes of a policy in an environment or a vector environment, and limits on their steps.
-
-An environment without a time limit may never end an episode, for example if a greedy policy walks
-against a wall.
-"""
+"""Episodes of a policy in an environment or a vector environment."""
 
 from __future__ import annotations
 
@@ -14,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
@@ -22,9 +18,11 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from mcaprl.ends import STEP_LIMIT
+from mcaprl.base_policy import BasePolicy, RandomPolicy
 from mcaprl.errors import PolicyError
+from mcaprl.frames import mapped
 from mcaprl.joint_actions import joint_actions
+from mcaprl.limits import STEP_LIMIT
 from mcaprl.masks import allowed_actions, masked
 from mcaprl.sims import make_sim, make_sims
 
@@ -59,11 +57,25 @@ class StepLimit(gym.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, info
 
 
-def make_limited(name: str, max_steps: int | None, /, **kwargs: Any) -> gym.Env[Any, Any]:
+class _Borrowed(gym.Wrapper[Any, Any, Any, Any]):
+    """A wrapper of a caller's environment, which leaves it open."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def make_or_borrow(name: str | gym.Env[Any, Any], /, **kwargs: Any) -> gym.Env[Any, Any]:
+    """Make a sim as `make_sim` does, or wrap an environment so that `close` leaves it open."""
+    return make_sim(name, **kwargs) if isinstance(name, str) else _Borrowed(name)
+
+
+def make_limited(
+    name: str | gym.Env[Any, Any], max_steps: int | None, /, **kwargs: Any
+) -> gym.Env[Any, Any]:
     """Make an environment whose episodes end.
 
     Args:
-        name: As in `make_sim`.
+        name: As in `make_sim`, or an environment, which `close` leaves open.
         max_steps: Limit on the steps of an episode; None for `DEFAULT_MAX_STEPS` if the environment
             has no time limit, and otherwise for no other limit.
         **kwargs: As in `make_sim`.
@@ -71,7 +83,7 @@ def make_limited(name: str, max_steps: int | None, /, **kwargs: Any) -> gym.Env[
     Raises:
         UnknownNameError, MissingExtraError, UsageError: As in `make_sim`.
     """
-    env = make_sim(name, **kwargs)
+    env = make_or_borrow(name, **kwargs)
     if max_steps is None and not _has_time_limit(env):
         max_steps = DEFAULT_MAX_STEPS
     return env if max_steps is None else StepLimit(env, max_steps)
@@ -143,20 +155,6 @@ MOST_NUMBERED = 1 << 62
 """Largest number of actions that a policy chooses among by their numbers."""
 
 
-class Policy(Protocol):
-    """Scripted or trained policy.
-
-    A policy with memory has a method `begin`, which is called at the start of each episode.
-    """
-
-    @property
-    def name(self) -> str:
-        """Name in logs and tables."""
-
-    def act(self, observations: Any) -> NDArray[Any]:
-        """Return actions (B, *action shape) for observations (B, *shape) or a dict of them."""
-
-
 @dataclass(frozen=True)
 class EpisodeResult:
     """Result of one episode.
@@ -182,7 +180,7 @@ class EpsilonGreedy:
 
     def __init__(
         self,
-        policy: Policy | None,
+        policy: BasePolicy | None,
         epsilon: float,
         action_space: spaces.Space[Any],
         mask_from: str = "",
@@ -190,25 +188,24 @@ class EpsilonGreedy:
         """Follow `policy`, but take a random action with probability `epsilon`.
 
         Args:
-            policy: Policy, or None for random actions.
+            policy: Policy; None or a `RandomPolicy` for random actions.
             epsilon: Probability of a random action, 0 to 1; ignored if there is no policy.
             action_space: Space of the random actions.
             mask_from: Source of the mask of random actions if there is no policy; see
                 `mcaprl.masks`. A policy has its own source.
         """
-        self.policy = policy
+        self.policy = policy = None if isinstance(policy, RandomPolicy) else policy
         self.epsilon = 1.0 if policy is None else epsilon
         self.name = "random" if policy is None else policy.name
         self._space = action_space
         self._joint = joint_actions(action_space)
-        self.mask_from = mask_from if policy is None else getattr(policy, "mask_from", "")
+        self.mask_from = mask_from if policy is None else policy.mask_from
         self.begin(0)
 
     def begin(self, seed: int) -> None:
         """Start an episode: reset the policy's memory and seed the exploration."""
-        reset_memory = getattr(self.policy, "begin", None)
-        if reset_memory is not None:
-            reset_memory()
+        if self.policy is not None:
+            self.policy.begin()
         self._random = np.random.default_rng([seed, 1])
         self._space.seed(seed)
 
@@ -224,7 +221,11 @@ class EpsilonGreedy:
         """
         if self.mask_from:
             observation = masked(observation, info, self.mask_from)
-        greedy = None if self.policy is None else self.policy.act(_batch(observation))[0]
+        greedy = (
+            None
+            if self.policy is None
+            else self.policy.act(mapped(lambda part: np.asarray(part)[None], observation))[0]
+        )
         explores = self.epsilon > 0 and self._random.random() < self.epsilon
         joint = self._joint
         if joint is None or joint.count > MOST_NUMBERED:
@@ -242,6 +243,8 @@ class EpsilonGreedy:
             number, action = own, greedy
         by_chance = self.epsilon / len(allowed) if number in allowed else 0.0
         chance = by_chance + (1 - self.epsilon) * (number == own)
+        if self.policy is not None and not self.policy.is_deterministic:
+            chance = math.nan
         return (action if joint.shape else int(action)), chance
 
 
@@ -339,7 +342,7 @@ def rollout(
 
 def batch_rollout(
     envs: gym.vector.VectorEnv[Any, Any, Any],
-    policy: Policy,
+    policy: BasePolicy,
     seeds: Sequence[int],
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> list[EpisodeResult]:
@@ -381,7 +384,7 @@ def batch_rollout(
 
 
 def check_fit(
-    policy: Any, env: gym.Env[Any, Any], observation_space: spaces.Space[Any] | None = None
+    policy: BasePolicy, env: gym.Env[Any, Any], observation_space: spaces.Space[Any] | None = None
 ) -> None:
     """Validate that the spaces of a trained policy and of an environment match; see `same_form`.
 
@@ -409,11 +412,10 @@ def check_fit(
             )
 
 
-def _other_arguments(policy: Any, env: gym.Env[Any, Any]) -> dict[str, Any]:
+def _other_arguments(policy: BasePolicy, env: gym.Env[Any, Any]) -> dict[str, Any]:
     """Return the arguments of the training environment that differ from those of `env`."""
     own = env.spec.kwargs if env.spec else {}
-    arguments = getattr(policy, "env_kwargs", {})
-    return {key: value for key, value in arguments.items() if own.get(key) != value}
+    return {key: value for key, value in policy.env_kwargs.items() if own.get(key) != value}
 
 
 def as_options(arguments: Mapping[str, Any]) -> str:
@@ -444,14 +446,6 @@ def same_form(space: spaces.Space[Any], other: spaces.Space[Any]) -> bool:
     if isinstance(space, spaces.Box) and isinstance(other, spaces.Box):
         return (space.shape, space.dtype) == (other.shape, other.dtype)
     return space == other
-
-
-def _batch(observation: Any) -> Any:
-    if isinstance(observation, tuple):
-        return tuple(map(_batch, observation))
-    if isinstance(observation, dict):
-        return {key: _batch(part) for key, part in observation.items()}
-    return np.asarray(observation)[None]
 
 
 def _position(telemetry: Callable[[], dict[str, float]] | None) -> tuple[float, float] | None:

@@ -6,13 +6,15 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from operator import index
-from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.base_policy import BasePolicy
+from mcaprl.joint_actions import JointActions
 from mcaprl.sims.vehicle.arguments import check_action, check_name
 from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
 
@@ -229,14 +231,15 @@ def before_end(moments: Sequence[Frames], duration_s: float) -> list[tuple[float
 AnySim = TypeVar("AnySim")
 
 
-class ScriptedPilot(ABC, Generic[AnySim]):
+class ScriptedPilot(BasePolicy, ABC, Generic[AnySim]):
     """Policy that reads the full state of one environment instead of its observations."""
 
-    name: ClassVar[str] = "pilot"
+    name = "pilot"
 
     def __init__(self, sim: AnySim) -> None:
         """Drive the vehicle of `sim`, an unwrapped environment."""
         self.sim = sim
+        self.action_space = getattr(sim, "action_space", None)
 
     def act(self, observations: Any) -> NDArray[np.int64]:
         """Return the action, shape (1,), for the current state of the environment.
@@ -251,6 +254,11 @@ class ScriptedPilot(ABC, Generic[AnySim]):
         if len(rows) != 1:
             raise ValueError(f"a pilot drives one environment, not {len(rows)}")
         return np.array([self.choose()], dtype=np.int64)
+
+    def action_probabilities(self, observations: Any) -> NDArray[np.float64]:
+        """Return the probabilities (1, A) of the actions: 1 for that of `act`."""
+        joint = JointActions.of(cast(Any, self.action_space))
+        return np.eye(joint.count)[joint.indexes(self.act(observations))]
 
     @abstractmethod
     def choose(self) -> int:

@@ -91,8 +91,8 @@ def test_the_exported_policy_returns_the_same_scores_and_actions(
         observations = dict(zip(leaves, arrays, strict=True)) if leaves else arrays[0]
         assert action.dtype == np.int64
         np.testing.assert_array_equal(action, policy.act(observations))
-        if policy.scores.acts_by == "q_values":
-            np.testing.assert_allclose(scores, policy.q_values(observations), atol=1e-5)
+        expected: Any = policy.scores(observations)
+        np.testing.assert_allclose(scores, expected, atol=1e-5)
 
 
 def test_the_command_writes_a_file_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

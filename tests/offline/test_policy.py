@@ -106,6 +106,21 @@ def test_a_cloned_policy_has_probabilities_and_no_values(tmp_path: Path) -> None
         policy.q_values(inner_observations())
 
 
+def test_log_probabilities_and_scores_by_hand(tmp_path: Path) -> None:
+    seen, actions = inner_observations()[:2], np.array([5, 6])
+    cloned = saved_and_loaded(tmp_path, learner_with_outputs(BC, [1e3, 1e3 + np.log(3)]))
+    np.testing.assert_allclose(cloned.log_prob(seen, actions), np.log([0.25, 0.75]), rtol=1e-4)
+    scores: Any = cloned.scores(seen)
+    np.testing.assert_allclose(scores, [[1e3, 1e3 + np.log(3)]] * 2, rtol=1e-6)
+    greedy = saved_and_loaded(tmp_path, learner_with_outputs(CQL, [1.0, 2.0]))
+    assert greedy.log_prob(seen, actions).tolist() == [-np.inf, 0]
+    scores = greedy.scores(seen)
+    assert scores.tolist() == [[1, 2]] * 2
+    filtered = learner_with_outputs(BCQ, [1.0, 2.0], np.log([10.0, 1.0]).tolist())
+    scores = saved_and_loaded(tmp_path, filtered).scores(seen)
+    assert scores.tolist() == [[1, -np.inf]] * 2
+
+
 def test_probabilities_of_huge_logits_are_finite(tmp_path: Path) -> None:
     policy = saved_and_loaded(tmp_path, learner_with_outputs(BC, [1e4, -1e4]))
     assert policy.action_probabilities(inner_observations()).tolist() == [[1, 0]] * 3

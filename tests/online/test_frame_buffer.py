@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 
 from mcaprl.errors import UsageError
+from mcaprl.frames import FrameStack, joined, stacked_space
 from mcaprl.online import Agent, Task
 from mcaprl.online.frame_buffer import FrameReplayBuffer, shifted
-from mcaprl.online.frames import FrameMemory, stacked_space
 from mcaprl.sims import Scale
 
 IMAGE = spaces.Box(0, 255, (1, 6, 6), np.uint8)
@@ -108,18 +108,19 @@ class Stacking:
     """Wrapper of a buffer that stacks the added observations, like the environments' wrapper."""
 
     def __init__(self, buffer: Any, space: spaces.Space[Any], count: int) -> None:
-        self.buffer, self.memory = buffer, FrameMemory(space, count)
+        self.buffer, self.space, self.memory = buffer, space, FrameStack(count)
         self.ended: Any = None
 
     def add(
         self, obs: Any, following: Any, action: Any, reward: Any, done: Any, infos: Any
     ) -> None:
         if self.ended is None:
-            self.memory.begin(obs)
+            self.memory.see({"": obs})
         else:
             self.memory.frames[""][self.ended] = obs[self.ended, None]
-        stack = self.memory.stacked()
-        self.buffer.add(stack, self.memory.see(following), action, reward, done, infos)
+        stack = joined(self.memory.frames[""], self.space)
+        after = joined(self.memory.see({"": following})[""], self.space)
+        self.buffer.add(stack, after, action, reward, done, infos)
         self.ended = done
 
 

@@ -15,13 +15,13 @@ from stable_baselines3 import DQN
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import PolicyError
+from mcaprl.frames import FrameStack, frame_rows, joined, stacked_frames, stacked_space
 from mcaprl.offline.algorithms.config import CQLConfig
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.agent import Agent
-from mcaprl.online.frames import FrameMemory, StackedVecEnv, joined, stacked_space
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
-from mcaprl.online.vec_env import BatchedVecEnv
+from mcaprl.online.vec_env import BatchedVecEnv, StackedVecEnv
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims.evaluation.evaluate import Scale
 from mcaprl.sims.evaluation.rollout import EpsilonGreedy, rollout
@@ -45,18 +45,30 @@ def silent(_: TrainingProgress) -> None:
 
 
 def test_stacks_end_with_the_newest_frame_and_repeat_the_first() -> None:
-    memory = FrameMemory(spaces.Box(0, 9, (2,)), 3)
-    assert memory.begin(np.array([[1, 2], [5, 6]])).tolist() == [
+    stack, space = FrameStack(3), spaces.Box(0, 9, (2,))
+    assert joined(stack.see({"": np.array([[1, 2], [5, 6]])})[""], space).tolist() == [
         [1, 2, 1, 2, 1, 2],
         [5, 6, 5, 6, 5, 6],
     ]
-    assert memory.see(np.array([[3, 4], [7, 8]])).tolist() == [
+    assert joined(stack.see({"": np.array([[3, 4], [7, 8]])})[""], space).tolist() == [
         [1, 2, 1, 2, 3, 4],
         [5, 6, 5, 6, 7, 8],
     ]
-    assert memory.ending(1, np.array([9, 9])).tolist() == [5, 6, 5, 6, 9, 9]
-    memory.begin_one(1)
-    assert memory.stacked().tolist() == [[1, 2, 1, 2, 3, 4], [7, 8, 7, 8, 7, 8]]
+    assert stack.ending(1, {"": np.array([9, 9])})[""].tolist() == [[[5, 6], [5, 6], [9, 9]]]
+    stack.begin_one(1)
+    assert joined(stack.frames[""], space).tolist() == [[1, 2, 1, 2, 3, 4], [7, 8, 7, 8, 7, 8]]
+    assert stack.see({"": np.array([[8, 9]])})[""].tolist() == [[[8, 9]] * 3]
+
+
+def test_rows_of_stacks_stay_within_their_episode() -> None:
+    """Episodes begin at the rows 0 and 4."""
+    arguments = np.array([1, 4, 6]), np.array([0, 4, 4]), np.array([2, 1, 0])
+    expected = [[0, 0, 1], [4, 4, 4], [4, 5, 6]]
+    assert frame_rows(*arguments).tolist() == expected
+    assert frame_rows(*map(torch.from_numpy, arguments)).tolist() == expected
+    frames = {"x": np.array([7, 8])}
+    assert stacked_frames(frames, 3)["x"].tolist() == [[7, 7, 7], [7, 7, 8]]
+    assert stacked_frames(frames, 1) is frames
 
 
 @pytest.mark.parametrize(

@@ -25,8 +25,7 @@ from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 
 from mcaprl.api.policies import load_policies
 from mcaprl.errors import PolicyError
-from mcaprl.online.policy import describe_run, read_policy, save_policy
-from mcaprl.online.zip_file import OWN_NAME
+from mcaprl.online.zip_file import OWN_NAME, describe_run, read_policy, save_policy
 from mcaprl.runs import BEST_NAME, policy_files
 
 
@@ -212,7 +211,7 @@ def test_unknown_networks_are_refused(tmp_path: Path) -> None:
 
 def test_observations_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     policy = read_policy(ours(tmp_path / "model.zip", dqn(), gym.make("CartPole-v1")))
-    with pytest.raises(PolicyError, match="does not accept these observations"):
+    with pytest.raises(PolicyError, match=r"expects observations \(B, 4\), got \(1, 5\)"):
         policy.act(np.zeros((1, 5), dtype=np.float32))
 
 

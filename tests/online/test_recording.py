@@ -20,11 +20,11 @@ from mcaprl.offline.algorithms.config import CQLConfig
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import FirstEpisodes
-from mcaprl.online.policy import read_policy
 from mcaprl.online.recording import behavior_probabilities, log_paths, recorded
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
 from mcaprl.online.vec_env import BatchedVecEnv
+from mcaprl.online.zip_file import read_policy
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import read_curve

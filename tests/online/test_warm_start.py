@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -266,10 +267,9 @@ def test_weights_of_other_outputs_are_refused(tmp_path: Path) -> None:
         model: Any = begun.model
 
         class Doubled:
-            name = "doubled"
-
-            def __init__(self) -> None:
-                self.network = model.q_net
+            name, frame_stack = "doubled", 1
+            head = SimpleNamespace(networks={"q": model.q_net})
+            encoder = SimpleNamespace(width=0)
 
             def q_values(self, observations: Any) -> Any:
                 return 2 * model.q_net(torch.from_numpy(observations)).detach().numpy()

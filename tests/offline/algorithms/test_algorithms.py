@@ -27,12 +27,12 @@ from mcaprl.offline.algorithms.config import (
     TrainingConfig,
 )
 from mcaprl.offline.algorithms.dqn import DQN, DoubleDQN
+from mcaprl.offline.algorithms.heads import build_head
 from mcaprl.offline.algorithms.iql import IQL
 from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import ALGORITHMS
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
-from mcaprl.offline.policy import Scores
 from mcaprl.offline.training.train import train
 from mcaprl.recorder.dataset.dataset import Dataset
 from tests.support.offline_tasks import (
@@ -75,8 +75,10 @@ def best(learner: Learner, observations: NDArray[np.float32], seed: int | None =
     """Return the action of a seed's policy for each observation; default: the first seed."""
     seed = learner.seeds[0] if seed is None else seed
     networks = {name: learner.network(name, seed) for name in learner.policy_models}
-    scores = Scores(networks, learner.acts_by, getattr(learner.config, "threshold", 0.0))
-    found: list[int] = scores(Observations(torch.from_numpy(observations))).argmax(1).tolist()
+    threshold = getattr(learner.config, "threshold", 0.0)
+    head = build_head(learner.acts_by, networks, learner.buffer.action_space, threshold)
+    scores = head.scores(Observations(torch.from_numpy(observations)))
+    found: list[int] = scores.argmax(1).tolist()
     return found
 
 

@@ -99,7 +99,7 @@ def test_metrics_have_alpha_and_checkpoints_need_it(tmp_path: Path) -> None:
     alphas = read_curve(tmp_path / "run" / "seed-0" / "metrics.csv")["alpha"]
     assert len(alphas) == 4
     assert (alphas != 1).all()
-    assert read_policy(tmp_path / "run" / "seed-0").scores.networks.keys() == {"q"}
+    assert read_policy(tmp_path / "run" / "seed-0").head.networks.keys() == {"q"}
     train(mostly_left(), CQLConfig(**short), tmp_path / "fixed", progress=lambda _: None)
     assert "alpha" not in read_curve(tmp_path / "fixed" / "seed-0" / "metrics.csv")
     other = CQLConfig(**short, target_gap=0.6)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError, UsageError
 from mcaprl.offline.estimate.evidence import EvidenceCollector, fqe_config
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -17,7 +18,7 @@ from tests.support import two_state_task as task
 CONFIG = fqe_config(task.GAMMA, 1_200, (32,))
 
 
-class Fixed:
+class Fixed(BasePolicy):
     """A policy of the two-state task with one action for each state, and values if given."""
 
     def __init__(self, actions: list[int], q: list[list[float]] | None = None) -> None:

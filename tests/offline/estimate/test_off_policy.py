@@ -12,6 +12,7 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import UsageError
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.estimate.fqe import FQE, FQEConfig, return_bounds
@@ -29,7 +30,7 @@ FAST = FQEConfig(updates=1_500, batch_size=64, target_interval=25, hidden=(32,),
 NO_MODEL = FQEConfig(updates=1, batch_size=2, target_interval=1, hidden=(2,), gamma=task.GAMMA)
 
 
-class Table:
+class Table(BasePolicy):
     """Policy of the two-state task, given by its probabilities (states, actions)."""
 
     def __init__(self, probabilities: NDArray[np.float64]) -> None:
@@ -238,7 +239,7 @@ def test_weights_that_overflow_are_refused() -> None:
         action_space=spaces.Discrete(10),
     )
 
-    class Follows:
+    class Follows(BasePolicy):
         """Policy that always takes the logged action."""
 
         def action_probabilities(self, observations: Any) -> NDArray[np.float64]:
@@ -287,7 +288,7 @@ def test_random_actions_are_uniform_over_the_allowed_ones() -> None:
 def test_a_policy_with_a_frame_stack_sees_the_frames_before() -> None:
     """The policy takes the action of the state before, which a stack of two frames contains."""
 
-    class Repeats:
+    class Repeats(BasePolicy):
         """Policy that takes action k after state k."""
 
         frame_stack = 2

@@ -14,6 +14,7 @@ import pytest
 from gymnasium import spaces
 
 import mcaprl
+from mcaprl.base_policy import BasePolicy
 from mcaprl.cli import run
 from mcaprl.errors import LogError, PolicyError, UsageError
 from mcaprl.offline.estimate.values import (
@@ -34,7 +35,7 @@ VALUES = np.array([[1.0, 3.0], [2.0, 0.0], [4.0, 4.0], [0.0, 8.0]], np.float32)
 FIELDS = ("q", "value", "advantage", "td_error", "entropy", "policy_action", "agrees")
 
 
-class Table:
+class Table(BasePolicy):
     """Policy with Q-values for an episode's four observations, with probabilities, or both."""
 
     name = "table"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +13,7 @@ import pytest
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError
 from mcaprl.sims.drawing.scene import Shape
 from mcaprl.sims.evaluation.evaluate import evaluate, improvements, normalize
@@ -21,7 +21,7 @@ from mcaprl.sims.evaluation.report import evaluation_page
 from mcaprl.sims.evaluation.rollout import EpsilonGreedy, check_fit, episode_seed, rollout
 
 
-class AlwaysLeft:
+class AlwaysLeft(BasePolicy):
     name = "left"
 
     def act(self, observations: Any) -> NDArray[Any]:
@@ -60,7 +60,7 @@ def test_random_actions_are_allowed_ones() -> None:
         assert drawn == pytest.approx(chances)
 
 
-class AlwaysOn:
+class AlwaysOn(BasePolicy):
     name = "on"
 
     def act(self, observations: Any) -> NDArray[Any]:
@@ -167,9 +167,8 @@ def test_policies_fit_environments_with_other_bounds() -> None:
     """A policy is refused if shapes or dtypes differ, but not if only bounds differ."""
     env = gym.make("CartPole-v1")
     unbounded = spaces.Box(-np.inf, np.inf, (4,), np.float32)
-    trained = SimpleNamespace(
-        name="trained", observation_space=unbounded, action_space=env.action_space
-    )
+    trained = BasePolicy()
+    trained.observation_space, trained.action_space = unbounded, env.action_space
     check_fit(trained, env)
     for other in (spaces.Box(-1, 1, (3,), np.float32), spaces.Box(-1, 1, (4,), np.float64)):
         trained.observation_space = other

@@ -1,0 +1,152 @@
+"""What all policies have in common: scripted, random and trained ones, and a user's own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, Protocol, cast
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import PolicyError, UsageError
+from mcaprl.joint_actions import JointActions
+from mcaprl.masks import allowed_actions
+
+
+class Actor(Protocol):
+    """Anything with the method of a policy that selects actions."""
+
+    def act(self, observations: Any) -> Any:
+        """Return actions (B, *shape) for observations (B, *shape) or nested dicts of them."""
+
+
+class BasePolicy:
+    """Policy for batches of B observations; a subclass has at least `act`.
+
+    Attributes:
+        name: Name in logs and tables.
+        algo: Name of the training algorithm; empty for policies that were not trained.
+        observation_space: Space of one observation; None if the policy accepts others.
+        action_space: Space of one action; None if unknown.
+        env_id: Gymnasium id of the environment in which the policy was trained; empty if unknown.
+        env_kwargs: Arguments of that environment.
+        frame_stack: Number of successive observations that determine an action.
+        action_commands: Commands of a robot that the actions stand for; None if unknown.
+        mask_from: Source of the action mask; see `mcaprl.masks`.
+        is_deterministic: Whether `act` has no randomness. If not, recordings have no
+            `behavior_prob`.
+    """
+
+    name: str = "policy"
+    algo: str = ""
+    observation_space: spaces.Space[Any] | None = None
+    action_space: spaces.Space[Any] | None = None
+    env_id: str = ""
+    env_kwargs: Mapping[str, Any] = MappingProxyType({})
+    frame_stack: int = 1
+    action_commands: Any = None
+    mask_from: str = ""
+    is_deterministic: bool = True
+
+    def begin(self) -> None:
+        """Drop what the policy stores, at the start of an episode."""
+
+    def act(self, observations: Any) -> NDArray[Any]:
+        """Return actions (B, *shape) for observations (B, *shape) or nested dicts of them."""
+        raise NotImplementedError
+
+    def log_prob(self, observations: Any, actions: NDArray[Any]) -> NDArray[np.floating[Any]]:
+        """Return the log probabilities (B,) of actions (B, *shape).
+
+        Raises:
+            PolicyError: The policy has no probabilities, or the observations have another shape.
+        """
+        chances = self.action_probabilities(observations)
+        numbers = JointActions.of(cast(Any, self.action_space)).indexes(actions)
+        with np.errstate(divide="ignore"):
+            found: NDArray[np.floating[Any]] = np.log(chances[np.arange(len(numbers)), numbers])
+        return found
+
+    def scores(self, observations: Any) -> NDArray[np.floating[Any]] | None:
+        """Return scores (B, A), of which the largest selects the action; None without scores."""
+
+    def q_values(self, observations: Any) -> NDArray[np.floating[Any]]:
+        """Return the Q-values (B, A) of all actions.
+
+        Raises:
+            PolicyError: The policy has no Q-values, or the observations have another shape.
+        """
+        raise PolicyError(f"{self.name} has no Q-values")
+
+    def action_probabilities(self, observations: Any) -> NDArray[np.floating[Any]]:
+        """Return the probabilities (B, A) of all actions: 0 or 1 if the policy is greedy.
+
+        Raises:
+            PolicyError: The policy has no probabilities, or the observations have another shape.
+        """
+        raise PolicyError(f"{self.name} has no action probabilities")
+
+
+class RandomPolicy(BasePolicy):
+    """Policy that takes each allowed action with the same probability."""
+
+    name = "random"
+
+    def __init__(self, action_space: spaces.Space[Any]) -> None:
+        """Choose among the actions of a space."""
+        self.action_space = action_space
+
+    def act(self, observations: Any) -> NDArray[Any]:
+        """Return random actions (B, *shape), drawn by the generator of the action space."""
+        mask, space = allowed_actions(observations), self.action_space
+        assert space is not None
+        if mask is None:
+            return np.stack([space.sample() for _ in range(batch_size(observations))])
+        numbering = JointActions.of(space)
+        draws = space.np_random.random(mask.shape) * mask
+        return numbering.values(draws.argmax(1))
+
+    def action_probabilities(self, observations: Any) -> NDArray[np.float64]:
+        """Return equal probabilities (B, A) of the allowed actions."""
+        allowed = allowed_actions(observations)
+        if allowed is None:
+            count = JointActions.of(cast(Any, self.action_space)).count
+            allowed = np.ones((batch_size(observations), count), bool)
+        uniform: NDArray[np.float64] = allowed / allowed.sum(axis=1, keepdims=True)
+        return uniform
+
+
+class _ForeignPolicy(BasePolicy):
+    """Policy with the members that another object has; it may be random."""
+
+    is_deterministic = False
+
+    def __init__(self, policy: object) -> None:
+        known = [name for name in dir(BasePolicy) if not name.startswith("_")]
+        own = {name: getattr(policy, name) for name in known if hasattr(policy, name)}
+        vars(self).update({"name": type(policy).__name__, **own})
+
+
+def as_policy(policy: object) -> BasePolicy:
+    """Return an object with a method `act` as a policy.
+
+    Raises:
+        UsageError: The object has no such method.
+    """
+    if isinstance(policy, BasePolicy):
+        return policy
+    if not callable(getattr(policy, "act", None)):
+        raise UsageError(
+            f"{policy!r} is not a policy: pass a name, a path, or an object with a method"
+            " act(observations) that returns a batch of actions"
+        )
+    return _ForeignPolicy(policy)
+
+
+def batch_size(observations: Any) -> int:
+    """Return the number of observations in an array or in nested dicts of arrays."""
+    while isinstance(observations, dict):
+        observations = next(iter(observations.values()))
+    return len(observations)
