@@ -10,9 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.actions import JointActions, allowed_actions
 from mcaprl.errors import PolicyError, UsageError
-from mcaprl.joint_actions import JointActions
-from mcaprl.masks import allowed_actions
 
 
 class Actor(Protocol):
@@ -34,7 +33,7 @@ class BasePolicy:
         env_kwargs: Arguments of that environment.
         frame_stack: Number of successive observations that determine an action.
         action_commands: Commands of a robot that the actions stand for; None if unknown.
-        mask_from: Source of the action mask; see `mcaprl.masks`.
+        mask_from: Source of the action mask; see `mcaprl.actions`.
         is_deterministic: Whether `act` has no randomness. If not, recordings have no
             `behavior_prob`.
     """

@@ -103,10 +103,10 @@ def export_onnx(policy: object, path: Path, *, overwrite: bool = True) -> None:
     Raises:
         MissingExtraError: onnx or onnxscript is not installed.
         OutputExistsError: The file exists and is not to be replaced, or is not a regular file.
-        PolicyError: The policy is not from an offline run, or the file cannot be written.
+        PolicyError: The actions are not finite in number, or the file cannot be written.
     """
     if not isinstance(policy, Policy) or not isinstance(policy.head, DiscreteHead):
-        raise PolicyError(f"{getattr(policy, 'name', policy)} is not a policy of train-offline")
+        raise PolicyError(f"{getattr(policy, 'name', policy)} has no scores of actions to export")
     for package in ("onnx", "onnxscript"):
         import_extra(package, "export")
     module = ExportedPolicy(policy).eval()

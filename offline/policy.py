@@ -22,13 +22,12 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from torch import Tensor
 
+from mcaprl.actions import OBSERVATION_KEY, JointActions, has_source
 from mcaprl.architecture import architecture_of
 from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
 from mcaprl.files import parse_json, read_file, write_json
 from mcaprl.frames import FrameStack, mapped
-from mcaprl.joint_actions import JointActions
-from mcaprl.masks import OBSERVATION_KEY, has_source
 from mcaprl.networks import ImageInput, Network, check_size
 from mcaprl.offline.algorithms.heads import Head, build_head
 from mcaprl.offline.algorithms.learner import Learner

@@ -12,10 +12,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from mcaprl.actions import joint_actions
 from mcaprl.architecture import SMALL_EDGE, Architecture
 from mcaprl.errors import SpaceError, UnknownNameError, UsageError
 from mcaprl.frames import is_image, parts_of_space
-from mcaprl.joint_actions import joint_actions
 from mcaprl.online.config import (
     CONFIGS,
     DoubleDQNConfig,

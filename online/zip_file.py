@@ -330,7 +330,7 @@ class ModelNetwork(nn.Module):
         """Map observations to values or logits (B, A)."""
         images = iter(observations.images)
         sizes = [box.shape for box in self._parts.values() if not is_image(box)]
-        frames = observations.vector.view(len(observations), self._frames, -1)
+        frames = torch.unflatten(observations.vector, 1, (self._frames, -1))
         vectors = iter(torch.split(frames, [int(np.prod(shape)) for shape in sizes], 2))
         inputs = {
             key: next(images).permute(0, 3, 1, 2)

@@ -19,9 +19,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mcaprl.actions import JointActions, joint_actions
 from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
 from mcaprl.frames import frame_rows
-from mcaprl.joint_actions import JointActions, joint_actions
 from mcaprl.networks import ImageInput
 from mcaprl.offline.batches.items import n_step_returns, returns_to_go
 from mcaprl.offline.batches.observations import FramesOnDisk, ObservationEncoder, Observations

@@ -20,10 +20,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mcaprl.actions import MASK_KEY, JointActions, allowed_actions, joint_actions
 from mcaprl.architecture import SMALL_EDGE
 from mcaprl.errors import SpaceError
-from mcaprl.joint_actions import JointActions, joint_actions
-from mcaprl.masks import MASK_KEY, allowed_actions
 from mcaprl.networks import ImageInput
 from mcaprl.recorder.dataset.mapped import Frames, MappedImages
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, observation_leaves

@@ -16,10 +16,10 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.actions import joint_actions
 from mcaprl.base_policy import BasePolicy, batch_size
 from mcaprl.errors import PolicyError, UsageError
 from mcaprl.frames import mapped, rows_of, stacked_frames
-from mcaprl.joint_actions import joint_actions
 from mcaprl.offline.algorithms.config import DQNConfig
 from mcaprl.offline.algorithms.losses import q_learning_target
 from mcaprl.recorder.dataset.episode import Episode

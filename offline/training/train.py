@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mcaprl.actions import has_source
 from mcaprl.errors import TrainingError, UsageError
-from mcaprl.masks import has_source
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import choose_algorithm

@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.actions import MASK_KEY, OBSERVATION_KEY, info_name
 from mcaprl.errors import SpaceError, UnknownNameError
-from mcaprl.masks import MASK_KEY, OBSERVATION_KEY, info_name
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.metadata import LogMetadata
 

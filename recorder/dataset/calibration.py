@@ -18,7 +18,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.joint_actions import joint_actions
+from mcaprl.actions import joint_actions
 from mcaprl.recorder.format.probability import is_impossible
 
 EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 0.8, 1.0)

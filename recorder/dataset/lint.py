@@ -12,8 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.joint_actions import JointActions, joint_actions
-from mcaprl.masks import MASK_KEY, allowed_actions
+from mcaprl.actions import MASK_KEY, JointActions, allowed_actions, joint_actions
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.dataset import Dataset

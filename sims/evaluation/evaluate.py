@@ -119,7 +119,7 @@ def evaluate(
         seed: Seed of the episodes.
         envs: Vector environment of `episodes` copies to use instead of `env`; only for policies
             that act on batches.
-        mask_from: Source of the mask of random actions; see `mcaprl.masks`.
+        mask_from: Source of the mask of random actions; see `mcaprl.actions`.
         on_policy: Function called with each policy's name before its first episode.
         on_episode: Function called after each episode.
     """

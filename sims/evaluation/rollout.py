@@ -18,12 +18,11 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from mcaprl.actions import allowed_actions, joint_actions, masked
 from mcaprl.base_policy import BasePolicy, RandomPolicy
 from mcaprl.errors import PolicyError
 from mcaprl.frames import mapped
-from mcaprl.joint_actions import joint_actions
 from mcaprl.limits import STEP_LIMIT
-from mcaprl.masks import allowed_actions, masked
 from mcaprl.sims import make_sim, make_sims
 
 DEFAULT_MAX_STEPS: Final = 27_000
@@ -192,7 +191,7 @@ class EpsilonGreedy:
             epsilon: Probability of a random action, 0 to 1; ignored if there is no policy.
             action_space: Space of the random actions.
             mask_from: Source of the mask of random actions if there is no policy; see
-                `mcaprl.masks`. A policy has its own source.
+                `mcaprl.actions`. A policy has its own source.
         """
         self.policy = policy = None if isinstance(policy, RandomPolicy) else policy
         self.epsilon = 1.0 if policy is None else epsilon

@@ -13,8 +13,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.actions import JointActions
 from mcaprl.base_policy import BasePolicy
-from mcaprl.joint_actions import JointActions
 from mcaprl.sims.vehicle.arguments import check_action, check_name
 from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
 

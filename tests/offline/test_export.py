@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from mcaprl.api.policies import load_policy
 from mcaprl.cli import run
 from mcaprl.offline.algorithms.config import BCConfig, BCQConfig, DQNConfig, TrainingConfig
 from mcaprl.offline.algorithms.registry import ALGORITHMS
@@ -17,6 +18,7 @@ from mcaprl.offline.export import ExportedPolicy, export_onnx
 from mcaprl.offline.policy import Policy, read_policy, save_policy
 from mcaprl.recorder.dataset.dataset import Dataset
 from tests.conftest import need
+from tests.support.paths import GOLDEN
 
 try:
     import onnxruntime
@@ -93,6 +95,22 @@ def test_the_exported_policy_returns_the_same_scores_and_actions(
         np.testing.assert_array_equal(action, policy.act(observations))
         expected: Any = policy.scores(observations)
         np.testing.assert_allclose(scores, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["online-dqn.zip", "online-camera.zip", "sb3-a2c.zip"])
+def test_policies_of_online_runs_are_exported(tmp_path: Path, name: str) -> None:
+    need(onnxruntime is not None, "onnxruntime is not installed")
+    policy = load_policy(GOLDEN / "policies" / name)
+    export_onnx(policy, tmp_path / "policy.onnx")
+    module = ExportedPolicy(policy)
+    arrays = [tensor.numpy() for tensor in module.examples(5, seed=1)]
+    session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
+    action, scores = session.run(None, dict(zip(module.input_names, arrays, strict=True)))
+    leaves = [leaf.path[0] for leaf in policy.encoder.leaves if leaf.path]
+    observations = dict(zip(leaves, arrays, strict=True)) if leaves else arrays[0]
+    np.testing.assert_array_equal(action, policy.act(observations))
+    expected: Any = policy.scores(observations)
+    np.testing.assert_allclose(scores, expected, atol=1e-5)
 
 
 def test_the_command_writes_a_file_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mcaprl.joint_actions import JointActions, joint_actions
+from mcaprl.actions import JointActions, joint_actions
 
 SHAPES = hnp.array_shapes(max_dims=2, max_side=3)
 
