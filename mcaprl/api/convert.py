@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mcaprl.api.data import Definitions, MappingFile, Paths, mapped, open_data
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import UsageError, import_extra
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.registry import target_format, write_format
+from mcaprl.recorder.source import Definitions, MappingFile, Paths, open_data, read_mapped
 from mcaprl.storage.remote import check_upload, upload_all
 
 if TYPE_CHECKING:
@@ -184,8 +184,8 @@ def _read(
 ) -> tuple[Dataset, MappingReport | None]:
     if mapping is None or reading["one_episode"] or reading["dones"]:
         return open_data(source, mapping=mapping, format=source_format, **reading), None
-    found = mapped(source, mapping, trust_code=trust_code, definitions=definitions)
-    return found.dataset, found.report
+    found = read_mapped(source, mapping, trust_code, definitions)
+    return found, found.origin.report
 
 
 def suggest_mapping(bag: Paths, *, bins: int | None = None, definitions: Definitions = ()) -> str:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mcaprl.api.data import Paths
 from mcaprl.files import check_log_name
 from mcaprl.recorder.edit.cut import filter_log, split_log
 from mcaprl.recorder.edit.join import merge_logs
 from mcaprl.recorder.edit.piece import Bounds, slice_log
 from mcaprl.recorder.edit.source import Edited
+from mcaprl.recorder.source import Paths
 
 
 def merge(logs: Paths, out: str | Path, *, shift: bool = False, overwrite: bool = False) -> Edited:

@@ -14,7 +14,6 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.api.data import Paths
 from mcaprl.api.environments import check_episode, sim_of
 from mcaprl.api.policies import as_names
 from mcaprl.api.ranges import check_port, check_positive
@@ -27,6 +26,7 @@ from mcaprl.recorder.dataset.open import find_logs, open_logs
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.display import SCENE
 from mcaprl.recorder.record.layout import LAYOUT_NAME
+from mcaprl.recorder.source import Paths
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.log_layout import attached_layout
 from mcaprl.recorder.viewer.playback import Player, Track

@@ -6,6 +6,7 @@ import glob
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TypeVar
@@ -34,6 +35,7 @@ def open_logs(
     episodes: Episodes | None = None,
     images: Storage = "auto",
     threads: int = 1,
+    weights: Sequence[float] | None = None,
 ) -> Dataset:
     """Read logs, or a selection of their columns and episodes.
 
@@ -55,22 +57,43 @@ def open_logs(
             uncompressed copy of the images, which is written once, next to the log. `auto` is
             `mapped` if the images would take more than half of the free memory, else `memory`.
         threads: Number of threads that read chunks of a file.
+        weights: Weight of each element of `data`; see `Dataset.weights`. Default: all are 1.
 
     Raises:
         LogError: A file is missing, not an MCAP file, damaged, or has no finished episode.
         SpaceError: The logs' spaces differ.
-        UsageError: A column or an episode does not exist.
+        UsageError: A column or an episode does not exist, a weight is negative or infinite, or a
+            file has two weights.
     """
     if threads < 1:
         raise UsageError(f"threads is {threads}, expected 1 or more")
     chosen = None if columns is None else tuple(columns)
     selection = Selection(columns=chosen, images=images, threads=threads)
-    paths, log_at = find_logs(data), partial(LogReader, selection=selection)
+    found = weighted_logs(data, weights)
+    # With `episodes`, each log is needed twice: for their number, and for those that are selected.
+    log_at = lru_cache(0 if episodes is None else _MAX_OPEN)(
+        partial(LogReader, selection=selection)
+    )
+
+    def read(path: Path, rows: NDArray[np.int64] | None = None) -> Dataset:
+        part = log_at(path).read(rows)
+        if columns is None and rows is None:
+            part.origin = replace(part.origin, logs=((path.absolute(), found[path]),))
+        part.weights[:] = found[path]
+        return part
+
     if episodes is None:
-        parts = _call_each(paths, lambda path: log_at(path).read())
-        return Dataset.concatenate([part for _, part in parts])
-    # Each log is needed twice: for the number of its episodes, and for those that are selected.
-    return _read_episodes(paths, lru_cache(_MAX_OPEN)(log_at), episodes)
+        every = _call_each(list(found), read)
+        return Dataset.concatenate([part for _, part in every])
+    counts = _call_each(list(found), lambda path: len(log_at(path).lengths))
+    numbers = episode_indexes(episodes, sum(count for _, count in counts))
+    parts, first = [], 0
+    for path, count in counts:
+        mine = numbers[(first <= numbers) & (numbers < first + count)]
+        if len(mine):
+            parts.append(read(path, mine - first))
+        first += count
+    return Dataset.concatenate(parts)
 
 
 def _call_each(
@@ -94,20 +117,6 @@ def _call_each(
     return results
 
 
-def _read_episodes(
-    paths: Sequence[Path], log_at: Callable[[Path], LogReader], episodes: Episodes
-) -> Dataset:
-    counted = _call_each(paths, lambda path: len(log_at(path).lengths))
-    numbers = episode_indexes(episodes, sum(count for _, count in counted))
-    parts, first = [], 0
-    for path, count in counted:
-        mine = numbers[(first <= numbers) & (numbers < first + count)]
-        if len(mine):
-            parts.append(log_at(path).read(mine - first))
-        first += count
-    return Dataset.concatenate(parts)
-
-
 def episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
     """Resolve a selection of episodes to sorted, unique indexes.
 
@@ -126,28 +135,58 @@ def episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
     return np.array(sorted(set((selected % count).tolist())), np.int64)
 
 
-def file_key(path: Path) -> str:
-    """Return the same string for all paths of a file: the URL, or the path without links."""
-    return str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
-
-
 def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
     """Resolve `data` (see `open_logs`) to files, sorted within a folder or glob.
 
     Raises:
         LogError: There are no files.
     """
-    if not isinstance(data, str | Path):
-        every = [path for part in data for path in find_logs(part)]
-        if not every:
-            raise LogError("no data: the list of files is empty")
-        # A file that is listed under several paths is read once.
-        return list({file_key(path): path for path in every}.values())
-    if is_manifest(data):
-        return listed_logs(data)
-    if is_url(data):
-        return list(find_remote(str(data)))
-    path = as_path(data)
+    return list(weighted_logs(data))
+
+
+def weighted_logs(
+    data: str | Path | Sequence[str | Path], weights: Sequence[float] | None = None
+) -> dict[Path, float]:
+    """Resolve `data` and its weights (see `open_logs`) to files with their weights.
+
+    Raises:
+        LogError: There are no files.
+        UsageError: A weight is negative or infinite, or a file has two weights.
+    """
+    names = [data] if isinstance(data, str | Path) else list(data)
+    if not names:
+        raise LogError("no data: the list of files is empty")
+    # A file that is listed under several paths is read once.
+    found: dict[str, tuple[Path, float]] = {}
+    for name, weight in zip(names, path_weights(weights, len(names)), strict=True):
+        for path in _logs_of(name):
+            key = str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
+            _, earlier = found.setdefault(key, (path, weight))
+            if earlier != weight:
+                raise UsageError(
+                    f"{key} is named twice, with weights {earlier:g} and {weight:g}; name it once"
+                )
+    return dict(found.values())
+
+
+def path_weights(weights: Sequence[float] | None, count: int) -> list[float]:
+    """Return a weight for each of `count` paths; by default, all are 1.
+
+    Raises:
+        UsageError: There is not one valid weight for each path.
+    """
+    given = [1.0] * count if weights is None else list(map(float, weights))
+    if len(given) != count or not all(0 <= weight < np.inf for weight in given):
+        raise UsageError(f"weights must be {count} numbers of at least 0, one for each path")
+    return given
+
+
+def _logs_of(name: str | Path) -> list[Path]:
+    if is_manifest(name):
+        return listed_logs(name)
+    if is_url(name):
+        return list(find_remote(str(name)))
+    path = as_path(name)
     if path.is_dir():
         found = sorted(path.glob("*.mcap"))
         if not found:
@@ -157,7 +196,7 @@ def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
         return found
     if path.exists():
         return [path]
-    found = sorted(Path(name) for name in glob.glob(str(data)))
+    found = sorted(Path(match) for match in glob.glob(str(name)))
     if not found:
-        raise LogError(f"{data}: no such file, folder or match")
+        raise LogError(f"{name}: no such file, folder or match")
     return found

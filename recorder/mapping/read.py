@@ -118,6 +118,10 @@ def _read(plan: Plan, images: Storage) -> MappedBag | None:
     report = replace(report, images=problems)
     if (commands := dataset.action_commands) is not None:
         report = replace(report, commands=commands.by_name(dataset.action_names))
+    tree = mapping.model_dump(mode="json", by_alias=True)
+    if commands is not None and None not in commands.commands:
+        tree["action"]["representatives"] = commands.to_json()["commands"]
+    dataset.origin = replace(dataset.origin, mapping=tree, report=report)
     return MappedBag(dataset, report)
 
 

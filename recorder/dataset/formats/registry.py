@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.files import check_plain, replacing, replacing_folder
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.storage.remote import is_url
 
 KINDS = ("terminated", "truncated")
@@ -181,7 +182,8 @@ def read_format(path: str | Path, form: Format, **options: Any) -> Dataset:
     except OSError as error:
         raise LogError(f"cannot read {path}: {error}") from error
     dataset: Dataset = form.module.read(source, **given)
-    dataset.sources = dataset.sources or (source,)
+    if not dataset.sources:
+        dataset.origin = Origin((source,))
     return dataset
 
 

@@ -1,24 +1,19 @@
-"""Training on logs that another process is still recording."""
+"""Reading of logs that another process is still recording."""
 
 from __future__ import annotations
 
 import time
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mcaprl.errors import LogError, NoStepsError
-from mcaprl.offline.algorithms.learner import Learner
-from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.open import find_logs, open_logs
+from mcaprl.recorder.dataset.origin import Origin
 
-CHECK_INTERVAL = 500
-"""Number of updates between two checks of the logs. After each check that finds new episodes, all
-data are packed again."""
 _POLL_S = 0.2
 
 
@@ -29,17 +24,27 @@ class GrowingLogs:
         dataset: Episodes read so far, in the order of reading; their numbers do not change.
     """
 
-    def __init__(self, data: Sequence[str | Path], *, patience_s: float = 60.0) -> None:
+    def __init__(
+        self,
+        data: str | Path | Sequence[str | Path],
+        *,
+        patience_s: float = 60.0,
+        images: Storage = "auto",
+        threads: int = 1,
+    ) -> None:
         """Wait for the first finished episode, and read all finished ones.
 
         Args:
             data: Files, folders or globs; files that appear later are read as well.
             patience_s: Maximum time to wait in seconds.
+            images: Storage of images; see `open_logs`.
+            threads: Number of threads that read chunks of a file.
 
         Raises:
             LogError: No episode was finished within `patience_s`, or a log is damaged.
         """
-        self._data = data
+        self._data = [data] if isinstance(data, str | Path) else list(data)
+        self._read = partial(open_logs, images=images, threads=threads)
         self._counts: dict[Path, int] = {}
         # End of the last episode that was read, nanoseconds.
         self._ends_ns: dict[Path, int] = {}
@@ -48,19 +53,24 @@ class GrowingLogs:
         while True:
             parts = self._read_more()
             if parts:
-                self.dataset = Dataset.concatenate(parts)
+                self.dataset = self._joined(parts)
                 return
             if time.monotonic() > give_up_s:
-                names = ", ".join(map(str, data))
+                names = ", ".join(map(str, self._data))
                 raise LogError(f"no episode was finished in {names} for {patience_s:.0f} s")
             time.sleep(_POLL_S)
 
-    def grow(self) -> bool:
-        """Read the episodes that ended since the last call; return whether there were any."""
+    def grow(self) -> Dataset:
+        """Return `dataset` after reading the episodes that ended since the last call."""
         parts = self._read_more()
         if parts:
-            self.dataset = Dataset.concatenate([self.dataset, *parts])
-        return bool(parts)
+            self.dataset = self._joined([self.dataset, *parts])
+        return self.dataset
+
+    def _joined(self, parts: list[Dataset]) -> Dataset:
+        joined = Dataset.concatenate(parts)
+        joined.origin = Origin(tuple(dict.fromkeys(joined.sources)), grow=self.grow)
+        return joined
 
     def _read_more(self) -> list[Dataset]:
         try:
@@ -99,7 +109,7 @@ class GrowingLogs:
                     raise LogError(
                         f"{path} was replaced by another log during the training: train again"
                     )
-                return open_logs(path, episodes=slice(first, None)) if len(whole) > first else None
+                return self._read(path, episodes=slice(first, None)) if len(whole) > first else None
             except NoStepsError:
                 return None
 
@@ -108,28 +118,3 @@ def _state_of(path: Path) -> tuple[int, int, int]:
     """Return inode, size and mtime, which change when a log grows or is compacted."""
     found = path.stat()
     return found.st_ino, found.st_size, found.st_mtime_ns
-
-
-def with_more_data(
-    learner: Learner, dataset: Dataset, held_out_episodes: NDArray[np.int64]
-) -> Learner:
-    """Return a learner for the grown dataset, with the weights and state of `learner`.
-
-    Args:
-        learner: Learner to continue.
-        dataset: Dataset of the learner, followed by new episodes.
-        held_out_episodes: Numbers of the held-out episodes.
-    """
-    weights = np.ones(len(dataset.episodes))
-    weights[held_out_episodes] = 0.0
-    buffer = TransitionBuffer.from_dataset(
-        dataset,
-        learner.config.packing,
-        encoder=learner.buffer.encoder,
-        reward_scale=learner.buffer.reward_scale,
-        weights=weights,
-    ).to(learner.buffer.device)
-    grown = type(learner)(learner.config, buffer, learner.seeds)
-    for seed in learner.seeds:
-        grown.load_state(seed, learner.state(seed), learner.step)
-    return grown
