@@ -311,12 +311,12 @@ def check(
 
 
 def recover(
-    file: str | Path, out: str | Path, *, keep_unfinished: bool = False, overwrite: bool = False
+    data: str | Path, out: str | Path, *, keep_unfinished: bool = False, overwrite: bool = False
 ) -> Recovery:
     """Write the valid part of a log that was cut off or damaged to a new log.
 
     Args:
-        file: MCAP file, damaged or not; it is not changed.
+        data: MCAP file, damaged or not; it is not changed.
         out: Path of the new log.
         keep_unfinished: Whether unfinished episodes are kept up to their last complete transition.
             They are marked as truncated.
@@ -327,11 +327,11 @@ def recover(
 
     Raises:
         OutputExistsError: `out` exists.
-        UsageError: `file` and `out` are the same file.
+        UsageError: `data` and `out` are the same file.
         LogError: Nothing can be kept, or `out` cannot be written.
     """
     from mcaprl.recorder.repair.recover import recover_log
 
     return recover_log(
-        file, check_log_name(out), keep_unfinished=keep_unfinished, overwrite=overwrite
+        data, check_log_name(out), keep_unfinished=keep_unfinished, overwrite=overwrite
     )

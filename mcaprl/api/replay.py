@@ -66,7 +66,7 @@ class LiveAddress:
 
 
 def replay(
-    files: Paths,
+    data: Paths,
     *,
     episode: int | None = None,
     speed: float = 1.0,
@@ -81,7 +81,7 @@ def replay(
     Several logs play side by side: all start at the same time, each with its own topic prefix.
 
     Args:
-        files: File, folder or glob of logs, or several of them.
+        data: File, folder or glob of logs, or several of them.
         episode: Index of the only episode to play; None for all.
         speed: Simulated seconds per second.
         loop: Whether the replay restarts at the end.
@@ -99,7 +99,7 @@ def replay(
     """
     check_positive(speed=speed)
     check_port(port)
-    paths = find_logs(files)
+    paths = find_logs(data)
     datasets = [open_logs(path, columns=[]) for path in paths]
     windows = []
     for path, dataset in zip(paths, datasets, strict=True):
@@ -129,7 +129,7 @@ def replay(
 
 
 def verify(
-    file: str | Path,
+    data: str | Path,
     *,
     episode: int | None = None,
     sim: str | None = None,
@@ -140,7 +140,7 @@ def verify(
     """Repeat the logged actions in the sim, and compare each step until one differs.
 
     Args:
-        file: Path of the log.
+        data: Path of the log.
         episode: Index of the only episode to compare; None for all.
         sim: Short name or Gymnasium id to use instead of the logged one.
         trust_env: Whether to import the module that the logged id names, and to pass the logged
@@ -154,7 +154,7 @@ def verify(
         LogError: The log cannot be read, or the sim fails on a logged action.
         SpaceError: The spaces of the sim and the log differ.
     """
-    path = as_path(file)
+    path = as_path(data)
     dataset = open_logs(path)
     check_episode(dataset, episode, path)
     with (
@@ -182,7 +182,7 @@ class Rendering:
 
 
 def render(
-    file: str | Path,
+    data: str | Path,
     *,
     episode: int = 0,
     speed: float = 1.0,
@@ -201,7 +201,7 @@ def render(
     renders the images.
 
     Args:
-        file: Path of the log.
+        data: Path of the log.
         episode: Index of the episode.
         speed: Simulated seconds per second of the video.
         video: Video to write: .mp4, .gif or .webp.
@@ -230,7 +230,7 @@ def render(
         raise UsageError(
             f"height is {height}, expected {_HEIGHTS_PX[0]} to {_HEIGHTS_PX[1]} pixels"
         )
-    path = as_path(file)
+    path = as_path(data)
     check_episode(open_logs(path, columns=[]), episode, path)
     movie, sheet = (None if out is None else Path(out) for out in (video, contact_sheet))
     for out, kinds in ((movie, VIDEO_KINDS), (sheet, (".png",))):
