@@ -11,16 +11,14 @@ import numpy as np
 
 from mcaprl.errors import BAG_HINT, NotMcapError, UnknownNameError, UsageError, import_extra
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.follow import GrowingLogs
 from mcaprl.recorder.dataset.formats.registry import (
     FORMATS,
-    Format,
     format_named,
     other_format,
     read_format,
 )
 from mcaprl.recorder.dataset.image_cache import STORAGES, Storage
-from mcaprl.recorder.dataset.open import Episodes, open_logs, path_weights, weighted_logs
+from mcaprl.recorder.dataset.open import Episodes, GrowingLogs, open_logs, weighted_logs
 
 Paths = str | Path | Sequence[str | Path]
 """A file, a folder or a glob of logs, or several of them."""
@@ -108,6 +106,7 @@ def open_data(
     if images not in STORAGES:
         raise UnknownNameError("storage of images", str(images), STORAGES)
     names = _names(data)
+    each = _path_weights(weights, len(names))
     selecting = {"columns": columns, "episodes": episodes, "follow": follow or None}
     reading = {"one_episode": one_episode or None, "dones": dones}
     if mapping is not None:
@@ -117,8 +116,8 @@ def open_data(
         for problem in (*dataset.origin.report.left_out, *dataset.origin.report.images):
             warnings.warn(str(problem), stacklevel=2)
         return dataset
-    forms = [_format_of(name, format) for name in names]
-    given = list(zip(names, path_weights(weights, len(names)), forms, strict=True))
+    forms = [other_format(name) if format is None else format_named(format) for name in names]
+    given = list(zip(names, each, forms, strict=True))
     others = [(name, weight, form) for name, weight, form in given if form is not None]
     if others:
         what = f"the format {others[0][-1].name}"
@@ -161,11 +160,12 @@ def _names(data: Paths) -> list[str | Path]:
     return [data] if isinstance(data, str | Path) else list(data)
 
 
-def _format_of(name: str | Path, form: str | None) -> Format | None:
-    """Return the format of another tool's dataset; None for logs."""
-    if form is not None:
-        return format_named(form)
-    return None if str(name).endswith(".mcap") else other_format(name)
+def _path_weights(weights: Sequence[float] | None, count: int) -> list[float]:
+    """Return a valid weight for each of `count` paths; by default, all are 1."""
+    given = [1.0] * count if weights is None else list(map(float, weights))
+    if len(given) != count or not all(0 <= weight < np.inf for weight in given):
+        raise UsageError(f"weights must be {count} numbers of at least 0, one for each path")
+    return given
 
 
 def read_mapped(

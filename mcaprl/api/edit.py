@@ -70,7 +70,9 @@ def split(
     return split_log(data, out, episodes=episodes, ratio=ratio, seed=seed, overwrite=overwrite)
 
 
-def filter(expression: str, data: str | Path, out: str | Path, *, overwrite: bool = False) -> Edited:
+def filter(
+    expression: str, data: str | Path, out: str | Path, *, overwrite: bool = False
+) -> Edited:
     """Copy the episodes for which an expression is true to a new log.
 
     The expression is a condition such as `"length > 100 and reason != 'crash'"`. It can use

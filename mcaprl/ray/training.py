@@ -44,7 +44,6 @@ def train_on_ray(
         McaprlError: As for a local training.
     """
     logs, workers = logs_of(dataset), _workers(workers, device)
-    identity = run_identity(dataset, config, other_data)
     texts: dict[str, None] = {}
 
     def on_news(news: TrainingProgress | str) -> None:
@@ -56,6 +55,7 @@ def train_on_ray(
     with locked_run(out, resume):
         paths = [out, *logs]
         check_machines(paths)
+        identity = run_identity(dataset, config, other_data)
         start_run(dataset, config, out, identity, seeds, resume)
         try:
             return run_tasks(

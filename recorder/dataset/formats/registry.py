@@ -78,23 +78,16 @@ def format_named(name: str) -> Format:
     return FORMATS[name]
 
 
-def recognized(path: str | Path) -> Format | None:
-    """Return the format of a file, a folder or `FORMAT:NAME`; None if no format matches."""
-    name, colon, _ = str(path).partition(":")
-    if colon and name in FORMATS:
-        return FORMATS[name]
-    if not Path(path).exists():
-        return None
-    readable = (form for form in FORMATS.values() if form.reads)
-    return next((form for form in readable if form.module.matches(Path(path))), None)
-
-
 def other_format(name: str | Path) -> Format | None:
-    """Return the format of another tool's dataset; None for logs and unknown formats."""
+    """Return the format of a file, a folder or `FORMAT:NAME`; None for logs and unknown ones."""
     path = Path(name)
     if is_url(name) or path.suffix == ".mcap" or (path.is_dir() and any(path.glob("*.mcap"))):
         return None
-    return recognized(name)
+    start, colon, _ = str(name).partition(":")
+    if colon and start in FORMATS:
+        return FORMATS[start]
+    readable = (form for form in FORMATS.values() if form.reads and path.exists())
+    return next((form for form in readable if form.module.matches(path)), None)
 
 
 def target_format(path: str | Path, name: str | None) -> Format:

@@ -20,7 +20,7 @@ from mcaprl.offline.algorithms.cql import CQL
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.training.train import CHECK_INTERVAL, train, with_more_data
 from mcaprl.progress import TrainingProgress
-from mcaprl.recorder.dataset.follow import GrowingLogs
+from mcaprl.recorder.dataset.open import GrowingLogs
 from mcaprl.runs import read_curve
 from mcaprl.sims.evaluation.rollout import EpsilonGreedy, run_episode
 from tests.support.paths import ROOT
