@@ -15,6 +15,7 @@ from mcaprl.offline.batches.items import Arrays, ItemOptions, Items
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.mapped import MappedImages
 from mcaprl.recorder.dataset.open import open_logs
+from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, Transitions
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
@@ -152,7 +153,7 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
                 columns={name: _shared(getattr(columns, name)) for name in _COLUMNS},
                 episodes=columns.episodes,
                 description=data._description,
-                sources=data.sources,
+                origin=data.origin.changed(),
             )
             self._items = Items(self._shared.dataset(), self._items.options)
         return {"paths": self._paths, "options": self._items.options, "shared": self._shared}
@@ -174,7 +175,7 @@ class _Shared(NamedTuple):
     columns: dict[str, torch.Tensor]
     episodes: tuple[EpisodeSummary, ...]
     description: LogMetadata
-    sources: tuple[Path, ...]
+    origin: Origin
 
     def dataset(self) -> Dataset:
         columns = Transitions(
@@ -183,7 +184,7 @@ class _Shared(NamedTuple):
             infos={},
             **{name: column.numpy() for name, column in self.columns.items()},
         )
-        return Dataset(columns, self.description, sources=self.sources)
+        return Dataset(columns, self.description, origin=self.origin)
 
 
 def _shared(array: Any) -> torch.Tensor:

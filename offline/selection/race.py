@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.base_policy import BasePolicy
-from mcaprl.errors import TrainingError, UnknownNameError, UsageError
+from mcaprl.errors import TrainingError, UnknownNameError, UsageError, import_extra
 from mcaprl.files import parse_json, read_file, replacing_folder, subfolder, write_json
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.registry import choose_algorithm
@@ -52,7 +52,7 @@ from mcaprl.offline.policy import Policy, read_policy
 from mcaprl.offline.selection.choice import STOPPED_EARLY, Choice, LogTraits, Rating, Tried
 from mcaprl.offline.selection.config import ALL, AUTO, AutoConfig
 from mcaprl.offline.training.metrics import OfflineSummary
-from mcaprl.offline.training.train import fingerprint, train, with_source
+from mcaprl.offline.training.train import train, with_source
 from mcaprl.offline.training.watch import SHORT_HORIZON, horizon_warning
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.lint import lint
@@ -180,16 +180,16 @@ def select(
     *,
     seeds: int | None = None,
     seed: int | None = None,
-    weights: Floats | None = None,
     resume: bool = False,
     device: str = "cpu",
-    budget_minutes: float | None = None,
     progress: ProgressCallback = lambda now: None,
 ) -> tuple[Choice, list[OfflineSummary]]:
     """Train all candidates, choose one from the log alone; return it and a summary per seed.
 
     The arguments are those of `mcaprl.offline.train` and `mcaprl.train`.
     """
+    if config.report:
+        import_extra("jinja2", "report")
     known = [one.name for one in PORTFOLIO]
     for name in config.finalists.split(","):
         if name not in (*known, ALL):
@@ -197,16 +197,17 @@ def select(
     dataset = with_source(dataset, config.mask_from)
     if len(dataset.episodes) < FOLDS:
         raise UsageError(f"--algo {AUTO} needs {FOLDS} episodes or more in the log")
-    weights = np.ones(len(dataset.episodes)) if weights is None else weights
     numbers = choose_seeds(out, seeds, seed, resume)
     parts: dict[str, Any] = {"algo": AUTO, "config": config.to_json()}
     # The estimates of all candidates are averages over the same seeds, so none can be added.
-    parts |= {"seeds": len(numbers), "seed": numbers.start, "data": fingerprint(dataset, weights)}
+    parts |= {"seeds": len(numbers), "seed": numbers.start, "data": dataset.fingerprint}
     identity, size = RunIdentity(parts), len(dataset)
     with locked_run(out, resume):
         open_run(out, identity, resume, numbers, env_id=dataset.env_id, transitions=size)
-        budget_s = math.inf if budget_minutes is None else 60 * budget_minutes
-        return _Race(dataset, config, out, numbers, weights, device, budget_s, progress).run()
+        choice, summaries = _Race(dataset, config, out, numbers, device, progress).run()
+    if config.report:
+        choice.write_report(Path(config.report), f"Choice of a policy for {dataset.env_id}")
+    return choice, summaries
 
 
 class _Pause(Exception):
@@ -222,14 +223,12 @@ class _Race:
         config: AutoConfig,
         out: Path,
         seeds: range,
-        weights: Floats,
         device: str,
-        budget_s: float,
         progress: ProgressCallback,
     ) -> None:
         self._dataset, self._config, self._out = dataset, config, out
-        self._seeds, self._weights, self._device = seeds, weights, device
-        self._began, self._budget_s = time.perf_counter(), budget_s
+        self._seeds, self._device = seeds, device
+        self._began, self._budget_s = time.perf_counter(), 60 * config.budget_minutes
         self._progress = progress
         self._in_time = True
         self._done: dict[tuple[str, int], int] = {}
@@ -348,7 +347,6 @@ class _Race:
                 folder,
                 seeds=len(seeds),
                 seed=seeds[0],
-                weights=self._weights,
                 resume=folder.exists(),
                 device=self._device,
                 progress=progress,

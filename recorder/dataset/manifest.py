@@ -72,19 +72,14 @@ def listed_logs(name: str | Path) -> list[Path]:
         LogError: The manifest cannot be read, or a file is missing or has another size.
     """
     try:
-        files = [_parsed(one) for one in parse_json(_content(name))["files"]]
+        files = [_parsed(one) for one in parse_json(read_file(as_path(name, whole=True)))["files"]]
+    except OSError as error:
+        raise LogError(f"cannot read {name}: {error.strerror or error}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise LogError(f"{name} is not a manifest of logs: {error}") from error
     if not files:
         raise LogError(f"{name} lists no files")
     return [_found(name, file) for file in files]
-
-
-def _content(name: str | Path) -> bytes:
-    try:
-        return read_file(as_path(name, whole=True))
-    except OSError as error:
-        raise LogError(f"cannot read {name}: {error.strerror or error}") from error
 
 
 def _parsed(values: dict[str, Any]) -> LogFile:
