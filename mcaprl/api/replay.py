@@ -22,11 +22,11 @@ from mcaprl.files import temporary_folder, write_json
 from mcaprl.progress import Advance, ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
-from mcaprl.recorder.dataset.open import find_logs, open_logs
+from mcaprl.recorder.dataset.open import find_logs
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.display import SCENE
 from mcaprl.recorder.record.layout import LAYOUT_NAME
-from mcaprl.recorder.source import Paths
+from mcaprl.recorder.source import Paths, open_data
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.log_layout import attached_layout
 from mcaprl.recorder.viewer.playback import Player, Track
@@ -105,7 +105,7 @@ def replay(
     check_positive(speed=speed)
     check_port(port)
     paths = find_logs(data)
-    datasets = [open_logs(path, columns=[]) for path in paths]
+    datasets = [open_data(path, columns=[]) for path in paths]
     windows = []
     for path, dataset in zip(paths, datasets, strict=True):
         check_episode(dataset, episode, path)
@@ -160,7 +160,7 @@ def verify(
         SpaceError: The spaces of the sim and the log differ.
     """
     path = as_path(data)
-    dataset = open_logs(path)
+    dataset = open_data(path)
     check_episode(dataset, episode, path)
     with (
         closing(sim_of(dataset, path, sim, trust_env=trust_env, sim_options=sim_options)) as env,
@@ -236,12 +236,12 @@ def render(
             f"height is {height}, expected {_HEIGHTS_PX[0]} to {_HEIGHTS_PX[1]} pixels"
         )
     path = as_path(data)
-    check_episode(open_logs(path, columns=[]), episode, path)
+    check_episode(open_data(path, columns=[]), episode, path)
     movie, sheet = (None if out is None else Path(out) for out in (video, contact_sheet))
     for out, kinds in ((movie, VIDEO_KINDS), (sheet, (".png",))):
         if out is not None:
             check_output(out, kinds, overwrite=overwrite)
-    dataset = open_logs(path)
+    dataset = open_data(path)
     one = dataset.episodes[episode]
     reader = McapReader(path)
     has_scene = reader.channel_of(SCENE) is not None

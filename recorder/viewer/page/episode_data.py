@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
-from mcaprl.recorder.dataset.open import open_logs
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.format.spaces import observation_leaves
@@ -44,6 +43,7 @@ from mcaprl.recorder.record.layout import (
     VALUES_TOPIC,
     is_values_topic,
 )
+from mcaprl.recorder.source import open_data
 from mcaprl.recorder.viewer.playback import Track
 from mcaprl.recorder.viewer.scene_reader import SeenFrame, SeenShape, frames_of, shapes_of
 from mcaprl.texts import encodable
@@ -237,7 +237,7 @@ class LogPage:
             LogError: The log cannot be read.
         """
         self.name = path.name
-        self.dataset = open_logs(path, columns=[])
+        self.dataset = open_data(path, columns=[])
         self._path, self._reader = path, McapReader(path)
         self._metadata = LogMetadata.from_strings(self.dataset.metadata)
         typed = [
@@ -284,7 +284,7 @@ class LogPage:
             LogError: A chunk or message is damaged.
         """
         with self._reading:
-            dataset = open_logs(self._path, episodes=number)
+            dataset = open_data(self._path, episodes=number)
             episode = dataset.episodes[0]
             start_ns, end_ns = int(episode.log_time_ns[0]), int(episode.log_time_ns[-1])
             scene = self._scene and scene_data(self._scene, start_ns, end_ns)
