@@ -83,18 +83,18 @@ def train_offline(data: tuple[str, ...], out: Path, sweep: Path | None, **reques
     if sweep is not None:
         _sweep(data, out, sweep, request)
         return
-    cluster = [request.pop(name) for name in ("ray", "workers", "address")]
+    cluster = mcaprl.ClusterOptions(*(request.pop(name) for name in ("ray", "workers", "address")))
+    cluster.check()
     options = {**bag_options(request), "follow": request.pop("follow")}
     given = {name: value for name, value in request.items() if value is not None}
-    with working("reading data"), checkpoints_kept(out):
-        from mcaprl.recorder.source import opened
+    with cluster.connected(), checkpoints_kept(out):
+        with working("reading data"):
+            from mcaprl.recorder.source import opened
 
-        given["ray"] = mcaprl.ClusterOptions(*cluster)
-        given["ray"].check()
-        dataset = opened(data, weighted=True, threads=given["threads"], **options)
-    with training_progress("updates", "loss") as progress, checkpoints_kept(out):
-        report = _after_facts(dataset, progress)
-        summaries = mcaprl.train(dataset, out, progress=report, **given)
+            dataset = opened(data, weighted=True, threads=given["threads"], **options)
+        with training_progress("updates", "loss") as progress:
+            report = _after_facts(dataset, progress)
+            summaries = mcaprl.train(dataset, out, ray=cluster, progress=report, **given)
     from mcaprl.offline.selection.choice import CHOICE_NAME, read_choice
     from mcaprl.offline.training.curves import CURVES_NAME
     from mcaprl.offline.training.metrics import describe_seeds
