@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,14 +84,17 @@ def train_offline(data: tuple[str, ...], out: Path, sweep: Path | None, **reques
     if sweep is not None:
         _sweep(data, out, sweep, request)
         return
-    cluster = mcaprl.ClusterOptions(*(request.pop(name) for name in ("ray", "workers", "address")))
-    cluster.check()
+    workers = [request.pop(name) for name in ("ray", "workers", "address")]
     options = {**bag_options(request), "follow": request.pop("follow")}
     given = {name: value for name, value in request.items() if value is not None}
-    with cluster.connected(), checkpoints_kept(out):
+    with ExitStack() as stack:
         with working("reading data"):
             from mcaprl.recorder.source import opened
 
+            cluster = mcaprl.ClusterOptions(*workers)
+            cluster.check()
+            stack.enter_context(cluster.connected())
+            stack.enter_context(checkpoints_kept(out))
             dataset = opened(data, weighted=True, threads=given["threads"], **options)
         with training_progress("updates", "loss") as progress:
             report = _after_facts(dataset, progress)

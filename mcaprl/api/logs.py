@@ -18,7 +18,7 @@ from mcaprl.recorder.dataset.calibration import Calibration, calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.source import Definitions, MappingFile, Paths, open_data, read_mapped
-from mcaprl.recorder.viewer.report import Surprise, moments_of
+from mcaprl.recorder.viewer.surprises import Surprise, moments_of
 from mcaprl.texts import size
 
 if TYPE_CHECKING:
