@@ -7,7 +7,7 @@ dueling networks or for layer normalization. The networks are those of offline l
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -21,13 +21,7 @@ from torch import Tensor, nn
 from mcaprl.architecture import ENCODERS, Architecture
 from mcaprl.frames import is_image, map_space, parts_of, parts_of_space, stack_axis
 from mcaprl.networks import Convolutions, ImageInput, Trunk, make_head
-
-
-class Parts(NamedTuple):
-    """Batch of observations in the form that `Trunk` accepts: one joined vector, and images."""
-
-    vector: Tensor
-    images: tuple[Tensor, ...]
+from mcaprl.offline.batches.observations import Observations
 
 
 class NetworkFeatures(BaseFeaturesExtractor):
@@ -61,7 +55,7 @@ class NetworkFeatures(BaseFeaturesExtractor):
         vectors = [parts[key].flatten(1) for key in self._vectors]
         first = next(iter(parts.values()))
         vector = torch.cat(vectors, 1) if vectors else first.new_empty(len(first), 0)
-        return cast(Tensor, self.trunk(Parts(vector, images)))
+        return cast(Tensor, self.trunk(Observations(vector, images)))
 
 
 class NetworkDQNPolicy(DQNPolicy):
