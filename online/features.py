@@ -7,7 +7,7 @@ dueling networks or for layer normalization. The networks are those of offline l
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -21,14 +21,8 @@ from torch import Tensor, nn
 from mcaprl.architecture import Architecture
 from mcaprl.frames import is_image, map_space, parts_of, parts_of_space, stack_axis
 from mcaprl.networks import Convolutions, ImageInput, Trunk, make_head
+from mcaprl.offline.batches.observations import Observations
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE
-
-
-class Parts(NamedTuple):
-    """Batch of observations in the form that `Trunk` accepts: one joined vector, and images."""
-
-    vector: Tensor
-    images: tuple[Tensor, ...]
 
 
 class NetworkFeatures(BaseFeaturesExtractor):
@@ -62,7 +56,7 @@ class NetworkFeatures(BaseFeaturesExtractor):
         vectors = [parts[key].flatten(1) for key in self._vectors]
         first = next(iter(parts.values()))
         vector = torch.cat(vectors, 1) if vectors else first.new_empty(len(first), 0)
-        return cast(Tensor, self.trunk(Parts(vector, images)))
+        return cast(Tensor, self.trunk(Observations(vector, images)))
 
 
 class NetworkDQNPolicy(DQNPolicy):

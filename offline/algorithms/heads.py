@@ -62,6 +62,8 @@ class DiscreteHead(Head):
         joint: Numbering of the actions: the order of the axis A.
     """
 
+    _values: Tensor
+
     def __init__(
         self,
         networks: Mapping[str, nn.Module],
@@ -76,6 +78,8 @@ class DiscreteHead(Head):
         super().__init__(networks)
         self.joint = discrete_actions(action_space)
         self.threshold = threshold
+        values = torch.from_numpy(self.joint.values(np.arange(self.joint.count)))
+        self.register_buffer("_values", values, persistent=False)
 
     @abstractmethod
     def scores(self, observations: Observations) -> Tensor:
@@ -91,16 +95,8 @@ class DiscreteHead(Head):
         return self.best(self.scores(observations))
 
     def best(self, scores: Tensor) -> Tensor:
-        """Return the actions with the largest scores, as `JointActions.values` does in NumPy."""
-        joint, numbers = self.joint, scores.argmax(1)
-        if not joint.shape:
-            return numbers + joint.first
-        elements = [
-            numbers // stride % size + int(start)
-            for stride, size, start in zip(joint.strides, joint.sizes, joint.starts, strict=True)
-        ]
-        dtype = torch.from_numpy(np.empty(0, joint.space.dtype)).dtype
-        return torch.stack(elements, 1).reshape(-1, *joint.shape).to(dtype)
+        """Return the actions (B, *shape) with the largest scores (B, A)."""
+        return self._values.index_select(0, scores.argmax(1))
 
     def log_prob(self, observations: Observations, actions: NDArray[Any]) -> Tensor:
         """Return the log probabilities (B,) of actions (B, *shape)."""

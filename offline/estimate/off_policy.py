@@ -189,8 +189,7 @@ class OffPolicyEvaluator:
         both = (self._dataset.observations, self._dataset.next_observations)
         random = RandomPolicy(self._dataset.action_space)
         pi, pi_next = map(random.action_probabilities, both)
-        if policy is None:
-            return pi, pi_next
+        policy = policy or random
         if policy.frame_stack == 1:
             own, own_next = (by_rows(policy.action_probabilities, part) for part in both)
         else:
