@@ -194,6 +194,8 @@ def select(
     for name in config.finalists.split(","):
         if name not in (*known, ALL):
             raise UnknownNameError("candidate", name, known)
+    if dataset.origin.grow is not None:
+        raise UsageError(f"--follow is not for --algo {AUTO}: omit it")
     dataset = with_source(dataset, config.mask_from)
     if len(dataset.episodes) < FOLDS:
         raise UsageError(f"--algo {AUTO} needs {FOLDS} episodes or more in the log")

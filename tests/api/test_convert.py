@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -58,6 +59,9 @@ def test_a_bag_is_opened_by_a_mapping(bag: Path, tmp_path: Path) -> None:
     assert data.rewards.tolist() == [0.5] * (STEPS - 1)
     assert data.terminated.tolist() == [False] * (STEPS - 2) + [True]
     assert data.episodes[0].policy == "operator"
+    kept = pickle.loads(pickle.dumps(data.filter(lambda episode: True)))
+    assert kept.origin.mapping["reward"] == "next(speed) - speed"
+    assert kept.origin.report.steps == STEPS - 1
     with pytest.raises(UsageError, match="are for logs, not for a mapping"):
         mcaprl.open(bag, mapping=tmp_path / "robot.yaml", columns=[])
 

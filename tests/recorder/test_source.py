@@ -115,6 +115,7 @@ def test_datasets_of_other_tools_and_urls_are_sources(tmp_path: Path) -> None:
 def test_weights_belong_to_paths_and_stay_with_episodes() -> None:
     data = mcaprl.open(["logs/a.mcap", "logs/b.mcap"], weights=[2, 0.5])
     assert data.weights.tolist() == [2, 2, 0.5, 0.5, 0.5]
+    assert data.grow() is data
     assert data.filter(lambda episode: episode.index in (1, 4)).weights.tolist() == [2, 0.5]
     first, second = data.split(0.4, seed=1)
     assert sorted([*first.weights, *second.weights]) == [0.5, 0.5, 0.5, 2, 2]

@@ -242,6 +242,14 @@ def test_other_settings_or_data_cannot_resume(data: Dataset, finished: Path) -> 
         select(data, CONFIG, finished, seeds=2)
 
 
+def test_growing_logs_are_refused(data: Dataset, tmp_path: Path) -> None:
+    data.save(tmp_path / "log.mcap")
+    growing = mcaprl.open(tmp_path / "log.mcap", follow=True)
+    with pytest.raises(UsageError, match="--follow is not for --algo auto"):
+        mcaprl.train(growing, tmp_path / "run", algo="auto")
+    assert not (tmp_path / "run").exists()
+
+
 def test_one_episode_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="needs 2 episodes"):
         select(log(1), CONFIG, tmp_path / "run")
