@@ -222,10 +222,11 @@ class _Topic:
     @cached_property
     def times_ns(self) -> NDArray[np.int64]:
         times_ns = np.empty(len(self._order), np.int64)
-        for k, (path, source) in enumerate(self._used):
+        for k, (_, source) in enumerate(self._used):
             found = source.times_ns
-            if len(found) and not -MAX_TIME_NS < found.min() <= found.max() < MAX_TIME_NS:
-                raise LogError(f"{path}: a message of {self.name} has an impossible log_time")
+            wrong = (found <= -MAX_TIME_NS) | (found >= MAX_TIME_NS)
+            if wrong.any():
+                raise LogError(f"{self.name}: message {wrong.argmax()} has an impossible log_time")
             mine = self._order[:, 2] == k
             times_ns[mine] = found[self._order[mine, 3]]
         return times_ns
