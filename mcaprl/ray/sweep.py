@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from mcaprl.errors import LogError, McaprlError, OutputExistsError, TrainingError, import_extra
-from mcaprl.files import locked_folder, parse_json, work_folder, write_json
+from mcaprl.files import locked_folder, read_json, work_folder, write_json
 from mcaprl.offline.estimate.fqe import FQEConfig
 from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
 from mcaprl.offline.policy import read_policy
@@ -58,6 +58,14 @@ class Score:
     def mean(self) -> float:
         """Mean over the seeds."""
         return float(np.mean(self.values))
+
+
+@dataclass(frozen=True)
+class _Saved:
+    """Content of a file with the scores of a trial."""
+
+    scores: tuple[Score, ...]
+    error: str
 
 
 @dataclass(frozen=True)
@@ -129,7 +137,7 @@ def _open(out: Path, identity: dict[str, Any], resume: bool) -> None:
             )
     elif not path.exists():
         raise TrainingError(f"{out} has no sweep to resume: start a new one without --resume")
-    elif (found := parse_json(path.read_bytes())) != identity:
+    elif (found := read_json(path, TrainingError, dict[str, Any])) != identity:
         names = [name for name in identity if found.get(name) != identity[name]]
         raise TrainingError(
             f"cannot resume: {path} has other {', '.join(names)}; resume with the same sweep file"
@@ -260,14 +268,15 @@ def _divided(episodes: int, fraction: float) -> tuple[list[int], list[int]]:
 
 
 def _save(folder: Path, scores: Sequence[Score], error: str) -> None:
-    content = {"scores": [asdict(one) for one in scores], "error": error}
+    content = asdict(_Saved(tuple(scores), error))
     write_json(folder.with_name(f"{folder.name}.{SCORES_NAME}"), content, TrainingError)
 
 
 def _result(trial: Trial, out: Path) -> TrialResult:
     path = out / f"{trial.name}.{SCORES_NAME}"
-    found: dict[str, Any] = {"scores": [], "error": ""}
+    found = _Saved((), "")
     with suppress(FileNotFoundError):
-        found = parse_json(path.read_bytes())
-    scores = tuple(Score(**one) for one in found["scores"])
-    return TrialResult(trial, out / trial.name, scores, found["error"])
+        found = read_json(path, TrainingError, _Saved)
+    if not all(one.values for one in found.scores):
+        raise TrainingError(f"{path} cannot be read: a score has no values")
+    return TrialResult(trial, out / trial.name, found.scores, found.error)

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import TrainingError, UnknownNameError, UsageError, import_extra
-from mcaprl.files import parse_json, read_file, replacing_folder, subfolder, write_json
+from mcaprl.files import read_json, replacing_folder, subfolder, write_json
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.estimate.evidence import (
@@ -467,13 +467,16 @@ class _Race:
         if not path.exists():
             return {}
         try:
-            stages = {}
-            for kind, stage in parse_json(read_file(path)).items():
-                ranked = sorted(stage, key=lambda name: -stage[name]["rating"]["score"])
-                stages[kind] = {name: Tried.from_json(stage[name]) for name in ranked}
-            return stages
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise TrainingError(f"cannot resume: {path} cannot be read: {error}") from error
+            found = read_json(path, TrainingError, dict[str, dict[str, Tried]])
+        except TrainingError as error:
+            raise TrainingError(f"cannot resume: {error}") from error
+        stages = {}
+        for kind, stage in found.items():
+            scores = {name: one.rating.score for name, one in stage.items() if one.rating}
+            if len(scores) < len(stage):
+                raise TrainingError(f"cannot resume: {path}: a candidate has no rating")
+            stages[kind] = {name: stage[name] for name in sorted(scores, key=lambda n: -scores[n])}
+        return stages
 
 
 def _traits(dataset: Dataset, clone: BasePolicy) -> LogTraits:

@@ -71,7 +71,7 @@ def test_json_and_mappings_are_read_like_yaml(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("tree", "message"),
     [
-        ("algos: [bc\n", "line 2: not YAML"),
+        ("algos: [bc\n", "sweep.yaml:2: not YAML"),
         ("- bc\n", "a sweep must be a mapping"),
         ("algos: []\n", "algos must be a list of algorithms"),
         ("algos: [ppq]\n", "unknown algorithm"),
