@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +24,7 @@ from mcaprl.cli.settings import SettingsCommand
 from mcaprl.cli.show import echo, print_table
 from mcaprl.errors import UsageError
 from mcaprl.page import PAGE_NAME
-from mcaprl.progress import ProgressCallback, TrainingProgress
+from mcaprl.progress import TrainingProgress
 from mcaprl.settings import Settings, flag
 from mcaprl.texts import counted
 
@@ -84,21 +83,27 @@ def train_offline(data: tuple[str, ...], out: Path, sweep: Path | None, **reques
     if sweep is not None:
         _sweep(data, out, sweep, request)
         return
-    workers = [request.pop(name) for name in ("ray", "workers", "address")]
+    cluster = [request.pop(name) for name in ("ray", "workers", "address")]
     options = {**bag_options(request), "follow": request.pop("follow")}
     given = {name: value for name, value in request.items() if value is not None}
-    with ExitStack() as stack:
-        with working("reading data"):
-            from mcaprl.recorder.source import opened
+    facts: list[str] = []
 
-            cluster = mcaprl.ClusterOptions(*workers)
-            cluster.check()
-            stack.enter_context(cluster.connected())
-            stack.enter_context(checkpoints_kept(out))
-            dataset = opened(data, weighted=True, threads=given["threads"], **options)
-        with training_progress("updates", "loss") as progress:
-            report = _after_facts(dataset, progress)
-            summaries = mcaprl.train(dataset, out, ray=cluster, progress=report, **given)
+    def read() -> mcaprl.Dataset:
+        from mcaprl.recorder.source import opened
+
+        dataset = opened(data, weighted=True, threads=given["threads"], **options)
+        facts.append(_facts(dataset))
+        return dataset
+
+    with training_progress("updates", "loss") as progress, checkpoints_kept(out):
+
+        def report(now: TrainingProgress) -> None:
+            while facts:
+                echo(facts.pop())
+            progress(now)
+
+        on_cluster = mcaprl.ClusterOptions(*cluster)
+        summaries = mcaprl.train(read, out, ray=on_cluster, progress=report, **given)
     from mcaprl.offline.selection.choice import CHOICE_NAME, read_choice
     from mcaprl.offline.training.curves import CURVES_NAME
     from mcaprl.offline.training.metrics import describe_seeds
@@ -131,19 +136,11 @@ def _sweep(data: tuple[str, ...], out: Path, plan: Path, request: dict[str, Any]
     echo(f"policies: {found.results[0].folder} and others; page and table in {out}")
 
 
-def _after_facts(dataset: mcaprl.Dataset, progress: ProgressCallback) -> ProgressCallback:
-    """Return a callback that prints facts about the data first; errors come before them."""
-    facts = [
+def _facts(dataset: mcaprl.Dataset) -> str:
+    return (
         f"learning from {counted(len(dataset.episodes), 'episode')},"
         f" {counted(len(dataset), 'transition')}, mean return {dataset.statistics.mean_return:.2f}"
-    ]
-
-    def report(now: TrainingProgress) -> None:
-        while facts:
-            echo(facts.pop())
-        progress(now)
-
-    return report
+    )
 
 
 def _print_choice(choice: Choice, report: str) -> None:

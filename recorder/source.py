@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -205,13 +205,17 @@ def changed_mapping(
     return ChangedMapping(mapping, changes)
 
 
-def opened(data: Data, *, weighted: bool = False, **options: Any) -> Dataset:
-    """Return a dataset unchanged, or open names with `open_data` and its options.
+def opened(
+    data: Data | Callable[[], Dataset], *, weighted: bool = False, **options: Any
+) -> Dataset:
+    """Return a dataset, or the result of a function, or open names by the options of `open_data`.
 
     With `weighted`, a name may end with the weight of its logs, such as `:2`.
     """
     if isinstance(data, Dataset):
         return data
+    if callable(data):
+        return data()
     names, weights = split_weights(data) if weighted else (data, None)
     return open_data(names, weights=weights, **options)
 

@@ -34,7 +34,7 @@ MAPPING_NAME = "mapping.json"
 
 
 def train(
-    data: Data,
+    data: Data | Callable[[], Dataset],
     out: str | Path,
     *,
     algo: str | None = None,
@@ -56,7 +56,8 @@ def train(
     Args:
         data: Dataset, file, folder or glob of logs, or several of them. `PATH:2` draws
             the transitions of PATH twice as often as others. Pass `mcaprl.open(...)` for bags with
-            a mapping, and with `follow` to also train on episodes that end during the training.
+            a mapping, and with `follow` to also train on episodes that end during the training; or
+            a function that returns it, which is called after the arguments are checked.
         out: Run folder to create.
         algo: `dqn`, `double-dqn`, `cql`, `bc`, `bcq` or `iql`, or `auto`, which chooses among
             them by the log. None selects `cql`; with `resume`, None selects the algorithm of

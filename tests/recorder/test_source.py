@@ -98,6 +98,14 @@ def test_the_command_accepts_weights(capsys: pytest.CaptureFixture[str]) -> None
     assert run(again) == 0
 
 
+def test_arguments_are_checked_before_the_data_are_read(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    bad = ["--follow", "--algo", "bc", "--alpha", "1", "--out", "run"]
+    assert run(["train-offline", "none.mcap", *bad]) == 2
+    assert "bc has no setting --alpha" in capsys.readouterr().err
+
+
 def test_datasets_of_other_tools_and_urls_are_sources(tmp_path: Path) -> None:
     pytest.importorskip("fsspec", reason="needs the extra remote")
     log = tmp_path / "lane.mcap"
