@@ -7,7 +7,6 @@ continues the random state of the previous episode, so it is replayed directly a
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from mcaprl.ends import STEP_LIMIT
 from mcaprl.errors import LogError, McaprlError, SpaceError
+from mcaprl.files import parse_json
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
@@ -231,7 +231,10 @@ def _stepped(
 
     After `reset`, the reward is 0 and both flags are False.
     """
-    options = json.loads(episode.summary.options) if episode.summary.options else None
+    try:
+        options = parse_json(episode.summary.options or "null")
+    except ValueError as error:
+        raise LogError(f"the reset options of the episode cannot be read: {error}") from error
     step = 0
     try:
         observation, _ = env.reset(seed=episode.seed, options=options)
