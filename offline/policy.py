@@ -41,7 +41,7 @@ from mcaprl.recorder.format.spaces import (
     space_to_json,
 )
 from mcaprl.runs import POLICY_NAME
-from mcaprl.storage.tensor_files import read_tensors, write_tensors
+from mcaprl.storage.tensor_files import check_finite, read_tensors, write_tensors
 
 FORMAT_VERSION = 2
 _WEIGHTS_NAME = "policy.safetensors"
@@ -297,9 +297,7 @@ def read_policy(folder: Path) -> Policy:
 
 
 def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) -> Policy:
-    for name, tensor in weights.items():
-        if not torch.isfinite(tensor).all():
-            raise ValueError(f"{name} is not finite")
+    check_finite(weights)
     observation_space = space_from_json(json.dumps(description.observation_space))
     action_space = space_from_json(json.dumps(description.action_space))
     mask_from = description.mask_from

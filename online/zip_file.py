@@ -16,7 +16,7 @@ import io
 import json
 import zipfile
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -35,7 +35,7 @@ from torch import Tensor, nn
 
 from mcaprl.architecture import Architecture, architecture_of
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
-from mcaprl.files import check_regular, parse_json, write_atomically
+from mcaprl.files import as_type, check_regular, parse_json, write_atomically
 from mcaprl.frames import (
     is_image,
     map_space,
@@ -58,7 +58,7 @@ from mcaprl.recorder.format.spaces import (
     space_to_json,
 )
 from mcaprl.runs import BEST_NAME
-from mcaprl.storage.tensor_files import check_widths
+from mcaprl.storage.tensor_files import check_finite, check_widths
 
 FORMAT_VERSION = 1
 OWN_NAME = "mcaprl.json"
@@ -196,6 +196,22 @@ def describe_run(
     }
 
 
+@dataclass(frozen=True)
+class _Description:
+    """Description of a policy that is needed to act."""
+
+    algo: str
+    network: str
+    observation_space: Any
+    action_space: Any
+    net_arch: Any = None
+    activation: str = ""
+    architecture: dict[str, Any] | None = None
+    frame_stack: int = 1
+    env_id: str = ""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+
+
 def read_policy(path: Path) -> Policy:
     """Read the policy in a `.zip` of this package or of plain SB3.
 
@@ -206,7 +222,8 @@ def read_policy(path: Path) -> Policy:
     try:
         if own and own.get("format_version") != FORMAT_VERSION:
             raise ValueError(f"format_version {own.get('format_version')} is not supported")
-        return _build(path, own or describe_sb3(data, weights), weights, exact=bool(own))
+        found: _Description = as_type(_Description, own or describe_sb3(data, weights), OWN_NAME)
+        return _build(path, found, weights, exact=bool(own))
     except (ValueError, TypeError, KeyError, RuntimeError, AssertionError, SpaceError) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise PolicyError(f"cannot load the policy in {path}: {reason}") from error
@@ -215,26 +232,27 @@ def read_policy(path: Path) -> Policy:
 
 
 def _build(
-    path: Path, description: dict[str, Any], weights: dict[str, Any], *, exact: bool
+    path: Path, description: _Description, weights: dict[str, Any], *, exact: bool
 ) -> Policy:
-    observation_space = space_from_json(json.dumps(description["observation_space"]))
-    action_space = space_from_json(json.dumps(description["action_space"]))
-    frames = int(description.get("frame_stack", 1))
+    observation_space = space_from_json(json.dumps(description.observation_space))
+    action_space = space_from_json(json.dumps(description.action_space))
+    frames = description.frame_stack
+    check_finite(weights)
     check_actions(action_space)
     check_elements(frames * sum(leaf.size for leaf in observation_leaves(observation_space)))
     shape = channels_first(stacked_space(observation_space, frames))
-    kind, found = description["network"], description.get("architecture")
+    kind, found = description.network, description.architecture
     if found is not None:
         network = _own_network(kind, architecture_of(found), shape, action_space, weights)
     else:
-        for widths in _layers(observation_space, frames, description["net_arch"]):
+        for widths in _layers(observation_space, frames, description.net_arch):
             check_widths(widths, weights)
         network = _policy_type(kind, shape)(
             shape,
             action_space,
             lambda _: 0.0,
-            net_arch=description["net_arch"],
-            activation_fn=_ACTIVATIONS[description["activation"]],
+            net_arch=description.net_arch,
+            activation_fn=_ACTIVATIONS[description.activation],
         )
     network.load_state_dict(weights)
     network.set_training_mode(False)
@@ -244,11 +262,11 @@ def _build(
     folder = path.resolve().parent
     return Policy(
         name=f"{folder.parent.name}/{folder.name}" if path.name == BEST_NAME else path.stem,
-        algo=description["algo"],
+        algo=description.algo,
         observation_space=observation_space if exact else None,
         action_space=action_space,
-        env_id=description.get("env_id", ""),
-        env_kwargs=description.get("env_kwargs", {}),
+        env_id=description.env_id,
+        env_kwargs=description.env_kwargs,
         frame_stack=frames,
         encoder=ModelEncoder(observation_space),
         head=build_head(

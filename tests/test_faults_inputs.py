@@ -21,6 +21,7 @@ CASES = {
     "JSON and protobuf bags": (80, 3000),
     "sweep files": (60, 2500),
     "logs": (30, 1200),
+    "logs of sims": (15, 600),
     "npz": (120, 5000),
     "HDF5": (100, 4000),
     "Minari": (50, 2000),

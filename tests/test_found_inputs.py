@@ -19,12 +19,14 @@ from mcaprl.errors import LogError, McaprlError, PolicyError, TrainingError
 from mcaprl.offline.selection.choice import read_choice
 from mcaprl.offline.training.curves import curve_panels
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.format.infos import shape_of
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import outside
 from mcaprl.recorder.mapping.suggest.likely_action import box_limits
 from mcaprl.runs import choose_seeds, read_config, saved_updates
 from tests.support.bags import numbers, write_channels
 from tests.support.damage.datasets import dataset
+from tests.support.recordings import record
 
 h5py = pytest.importorskip("h5py", reason="needs the extra interop")
 arrow = pytest.importorskip("pyarrow", reason="needs the extra tables")
@@ -71,6 +73,7 @@ def test_log_times_whose_differences_overflow(tmp_path: Path, time_ns: int) -> N
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
+        ({"env_id": 3}, "env_id must be a text"),
         ({"reward_scale": 10**400}, "reward_scale must be a number"),
         ({"frame_stack": 1e400}, "frame_stack must be a whole number"),
         ({"algo": None}, "algo must be a text"),
@@ -276,3 +279,18 @@ def test_no_rows_are_outside_of_a_space() -> None:
 def test_limits_of_commands_of_any_size() -> None:
     assert box_limits(np.array([0.0, 1e-320])) == (-1.0, 2.0)
     assert box_limits(np.array([-1.0, 1.0])) == (-1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"), [("", "Expecting value"), ("3", "must be a list"), ("[-1]", r"\(-1,\)")]
+)
+def test_shapes_of_infos(text: str, reason: str) -> None:
+    refused(f"/a: the shape of the info is damaged: .*{reason}", lambda: shape_of(text, "/a"))
+    assert shape_of("[2, 3]", "/a") == (2, 3)
+
+
+def test_a_log_at_the_end_of_time_is_not_continued(tmp_path: Path) -> None:
+    path, space = tmp_path / "log.mcap", spaces.Box(0, 1, (2,))
+    record(path, space, spaces.Discrete(2), [2], start_time_ns=2**62)
+    reason = "log.mcap cannot be appended to: its last log_time is 46116860"
+    refused(reason, lambda: record(path, space, spaces.Discrete(2), [2], append=True), LogError)

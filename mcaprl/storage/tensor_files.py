@@ -51,6 +51,17 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, description
 
 
+def check_finite(weights: Mapping[str, Tensor]) -> None:
+    """Check that all weights are finite, as those of every policy of a training are.
+
+    Raises:
+        ValueError: A weight is NaN or infinite.
+    """
+    for name, tensor in weights.items():
+        if not torch.isfinite(tensor).all():
+            raise ValueError(f"{name} is not finite")
+
+
 def check_widths(widths: Sequence[int], weights: Mapping[str, Tensor]) -> None:
     """Check that a file has enough weights for layers, before the layers are created.
 

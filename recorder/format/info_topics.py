@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.columns.cdr import ENCAPSULATION
-from mcaprl.recorder.format.infos import INFO_TOPICS, is_exact
+from mcaprl.recorder.format.infos import INFO_TOPICS, is_exact, shape_of
 from mcaprl.recorder.format.log_writer import LogWriter, Message
 from mcaprl.recorder.format.messages import TEXT_TYPE, text_message
-from mcaprl.texts import encodable
+from mcaprl.texts import encodable, shortened
 
 _TYPES = {
     **{np.dtype(f"{u}int{bits}"): f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)},
@@ -25,6 +26,7 @@ _TYPES = {
     np.dtype(np.bool_): "bool",
 }
 """ROS type of each dtype."""
+_DTYPES = {"string": np.dtype(np.str_), **{kind: dtype for dtype, kind in _TYPES.items()}}
 _ENCAPSULATION = int(ENCAPSULATION).to_bytes(4, "little")
 _CHUNK_BYTES = 2**20
 
@@ -146,10 +148,13 @@ def _channels_of(log: LogWriter) -> dict[str, tuple[int, np.dtype[Any], tuple[in
     found = {}
     for channel in log.mcap.channels.values():
         if channel.topic.startswith(INFO_TOPICS) and "info" in channel.metadata:
-            kind = log.mcap.schemas[channel.schema_id].data.decode().split()[0].partition("[")[0]
-            dtype = np.dtype(np.str_ if kind == "string" else kind)
-            shape = tuple(json.loads(channel.metadata["shape"]))
-            found[channel.metadata["info"]] = (channel.id, dtype, shape)
+            schema = log.mcap.schemas.get(channel.schema_id)
+            text = schema.data.decode(errors="replace") if schema else ""
+            kind = text.lstrip().partition(" ")[0].partition("[")[0]
+            if kind not in _DTYPES:
+                raise CorruptLogError(f"{channel.topic}: {shortened(kind, 40)!r} is not an info")
+            shape = shape_of(channel.metadata.get("shape", "[]"), channel.topic)
+            found[channel.metadata["info"]] = (channel.id, _DTYPES[kind], shape)
     return found
 
 

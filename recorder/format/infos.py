@@ -10,13 +10,13 @@ successive dots, the CRC-32 of the name is appended to the topic.
 
 from __future__ import annotations
 
-import json
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
+from mcaprl.files import as_type, parse_json
 from mcaprl.recorder.format.reading import McapReader, Topic
 
 INFO_TOPICS = "/rl/info/"
@@ -53,6 +53,21 @@ def read_infos(reader: McapReader, times_ns: NDArray[np.int64]) -> dict[str, Mas
     return found
 
 
+def shape_of(text: str, topic: str) -> tuple[int, ...]:
+    """Return the shape of an info in the metadata of its channel.
+
+    Raises:
+        CorruptLogError: The text is not a shape.
+    """
+    try:
+        shape: tuple[int, ...] = as_type(tuple[int, ...], parse_json(text), "shape")
+    except ValueError as error:
+        raise CorruptLogError(f"{topic}: the shape of the info is damaged: {error}") from error
+    if any(size < 0 for size in shape):
+        raise CorruptLogError(f"{topic}: the shape of the info is damaged: {shape}")
+    return shape
+
+
 def is_exact(stored: NDArray[Any], values: NDArray[Any]) -> bool:
     """Return whether two arrays, possibly of different dtypes, have exactly the same values."""
     kinds = {kind_of(stored.dtype), kind_of(values.dtype)}
@@ -74,7 +89,7 @@ def kind_of(dtype: np.dtype[Any]) -> str:
 def _read(
     topic: Topic, shape_text: str, times_ns: NDArray[np.int64], order: NDArray[np.int64]
 ) -> Masked:
-    shape = tuple(json.loads(shape_text))
+    shape = shape_of(shape_text, topic.name)
     values = topic.read(("data",))["data"]
     if topic.fields["data"].kind == "O":
         values = values.astype(str)

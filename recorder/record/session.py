@@ -21,6 +21,7 @@ import numpy as np
 
 from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.files import check_target, locked_file
+from mcaprl.limits import MAX_TIME_NS
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.log_writer import LogWriter
@@ -100,6 +101,8 @@ class EpisodeLog:
                 self._parts.remove_replaced()
             self.episodes = _episodes_in(self.log) if append else 0
             end_ns = self.log.mcap.end_time_ns
+            if end_ns >= MAX_TIME_NS:
+                raise LogError(f"{path} cannot be appended to: its last log_time is {end_ns} ns")
             if start_time_ns is not None and first_ns <= end_ns:
                 raise UsageError(
                     f"{path} ends at {end_ns} ns: start_time_ns {first_ns} must be later"

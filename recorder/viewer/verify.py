@@ -7,7 +7,6 @@ continues the random state of the previous episode, so it is replayed directly a
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -18,6 +17,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, McaprlError, SpaceError
+from mcaprl.files import parse_json
 from mcaprl.frames import rows_of
 from mcaprl.limits import STEP_LIMIT
 from mcaprl.problem import Problem
@@ -232,7 +232,10 @@ def _stepped(
 
     After `reset`, the reward is 0 and both flags are False.
     """
-    options = json.loads(episode.summary.options) if episode.summary.options else None
+    try:
+        options = parse_json(episode.summary.options or "null")
+    except ValueError as error:
+        raise LogError(f"the reset options of the episode cannot be read: {error}") from error
     step = 0
     try:
         observation, _ = env.reset(seed=episode.seed, options=options)

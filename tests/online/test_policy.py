@@ -165,7 +165,7 @@ def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
         ({"data": b"[]"}, "its parts have wrong types"),
         ({"policy_pth": b"PK"}, "cannot read the model|not plain tensors"),
         ({"mcaprl_json": b'{"format_version": 9}'}, "format_version 9 is not supported"),
-        ({"mcaprl_json": b'{"format_version": 1}'}, "cannot load the policy .* KeyError"),
+        ({"mcaprl_json": b'{"format_version": 1}'}, "cannot load the policy .* has no algo"),
         ({"mcaprl_json": None, "data": b"{}"}, "observation space is not a Box"),
     ],
 )

@@ -270,6 +270,23 @@ def _info_of_manifest(folder: Path) -> None:
     mcaprl.info(folder / "logs/manifest.json")
 
 
+def logs_of_sims(root: Path) -> list[Example]:
+    """Logs of a sim with scene and infos: shown, verified and continued."""
+    log = root / "log.mcap"
+    mcaprl.record("lane", log, episodes=2, max_steps=4, infos=True)
+    calls: list[Call] = [
+        lambda folder: repr(mcaprl.open(folder / "log.mcap").infos),
+        lambda folder: mcaprl.layout(folder / "log.mcap", folder / "layout.json"),
+        lambda folder: mcaprl.save_page(folder / "log.mcap", folder / "page.html"),
+        lambda folder: mcaprl.verify(folder / "log.mcap"),
+        lambda folder: mcaprl.convert(folder / "log.mcap", folder / "out.hdf5", to="hdf5"),
+        lambda folder: mcaprl.record(
+            "lane", folder / "log.mcap", episodes=1, max_steps=2, infos=True, append=True
+        ),
+    ]
+    return [Example(root, calls)]
+
+
 def _datasets(*wanted: str) -> Callable[[Path], list[Example]]:
     """Return the target of the datasets of other tools in some forms."""
 
@@ -462,6 +479,7 @@ TARGETS: dict[str, Callable[[Path], list[Example]]] = {
     "JSON and protobuf bags": json_and_protobuf_bags,
     "sweep files": sweep_files,
     "logs": logs,
+    "logs of sims": logs_of_sims,
     "npz": _datasets("npz"),
     "HDF5": _datasets("hdf5", "d3rlpy", "robomimic"),
     "Minari": _datasets("minari"),
