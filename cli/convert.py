@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from functools import partial
+from typing import Any
 
 import click
 
 import mcaprl
 from mcaprl.cli.help import Command
-from mcaprl.cli.options import PATH, json_option, mapping_options
+from mcaprl.cli.options import PATH, bag_options, bag_reader, json_option, mapping_options
 from mcaprl.cli.progress import working
 from mcaprl.cli.show import echo, print_facts, print_json, print_problems, print_wide
 from mcaprl.errors import UsageError
@@ -44,20 +45,14 @@ from mcaprl.texts import counted
 @json_option
 def convert(
     paths: tuple[str, ...],
-    mapping: Path | None,
-    trust_code: bool,
-    definitions: tuple[Path, ...],
-    source_format: str | None,
-    one_episode: bool,
-    dones: str | None,
-    to: str | None,
-    lossy: bool,
     suggest: bool,
     bins: int | None,
     dry_run: bool,
-    overwrite: bool,
-    upload: str | None,
     as_json: bool,
+    source_format: str | None,
+    one_episode: bool,
+    dones: str | None,
+    **request: Any,
 ) -> None:
     """Read SRC, and write its transitions to DST.
 
@@ -68,29 +63,21 @@ def convert(
     """
     if bins is not None and not suggest:
         raise UsageError("--bins is for --suggest: set `edges` of the mapping instead")
+    bag = bag_options(request)
     if suggest:
         with working("reading the topics"):
-            text = mcaprl.suggest_mapping(paths, bins=bins, definitions=definitions)
+            text = mcaprl.suggest_mapping(paths, bins=bins, definitions=bag["definitions"])
         click.echo(text, nl=False)
         return
     if not dry_run and len(paths) < 2:
         raise UsageError("convert needs SRC and DST, or --dry-run to write nothing")
     sources, out = (paths, None) if dry_run else (paths[:-1], paths[-1])
+    source = bag_reader(sources, bag)
+    reading: dict[str, Any] = {"format": source_format, "one_episode": one_episode, "dones": dones}
+    if any(reading.values()):
+        source = partial(mcaprl.open, sources, lossy=request["lossy"], **reading, **bag)
     with working("converting"):
-        found = mcaprl.convert(
-            sources,
-            out,
-            mapping=mapping,
-            source_format=source_format,
-            one_episode=one_episode,
-            dones=dones,
-            to=to,
-            lossy=lossy,
-            trust_code=trust_code,
-            definitions=definitions,
-            overwrite=overwrite,
-            upload=upload,
-        )
+        found = mcaprl.convert(source, out, **request)
     if as_json:
         print_json(found.to_json())
         return

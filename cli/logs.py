@@ -15,6 +15,7 @@ from mcaprl.cli.help import Command
 from mcaprl.cli.options import (
     PATH,
     bag_options,
+    bag_reader,
     env_arg_option,
     integer_option,
     json_option,
@@ -46,7 +47,8 @@ def info(
     its episodes. Rates are those of the median interval between messages.
     """
     with working("reading data"):
-        found = mcaprl.info(data, report=report, **request)
+        source = bag_reader(data, bag := bag_options(request))
+        found = mcaprl.info(source, report=report, definitions=bag["definitions"], **request)
     if as_json:
         print_json(found.to_json())
     elif hasattr(found, "topic_rows"):
@@ -83,7 +85,8 @@ def check(files: tuple[str, ...], as_json: bool, **request: Any) -> int:
     Exits with 1 if there are problems.
     """
     with working("reading data"):
-        found = mcaprl.check(files, **request)
+        source = bag_reader(files, bag_options(request))
+        found = mcaprl.check(source, **request)
     if as_json:
         print_json(found.to_json())
         return int(not found.ok)

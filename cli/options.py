@@ -76,6 +76,20 @@ def bag_options(request: dict[str, Any]) -> dict[str, Any]:
     return {name: request.pop(name) for name in ("mapping", "trust_code", "definitions")}
 
 
+def bag_reader(data: tuple[str, ...], bag: dict[str, Any]) -> Any:
+    """Return a function that reads a bag by these options; without a mapping, return `data`.
+
+    Functions that report what a mapping leaves out need no warnings of it.
+    """
+
+    def read() -> Any:
+        from mcaprl.recorder.source import read_mapped
+
+        return read_mapped(data, **bag)
+
+    return data if bag["mapping"] is None else read
+
+
 def sim_options(command: F) -> F:
     """Add the options that select the variant of a sim."""
     text = "Observation that the sim returns: state, depth, ..."

@@ -24,6 +24,8 @@ Paths = str | Path | Sequence[str | Path]
 """A file, a folder or a glob of logs, or several of them."""
 Data = Dataset | Paths
 """A dataset, or paths of logs."""
+Source = Data | Callable[[], Dataset]
+"""Data, or a function that opens them, which is called after other arguments are checked."""
 
 
 class ChangedMapping(NamedTuple):
@@ -205,9 +207,7 @@ def changed_mapping(
     return ChangedMapping(mapping, changes)
 
 
-def opened(
-    data: Data | Callable[[], Dataset], *, weighted: bool = False, **options: Any
-) -> Dataset:
+def opened(data: Source, *, weighted: bool = False, **options: Any) -> Dataset:
     """Return a dataset, or the result of a function, or open names by the options of `open_data`.
 
     With `weighted`, a name may end with the weight of its logs, such as `:2`.

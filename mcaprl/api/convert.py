@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ from mcaprl.errors import UsageError, import_extra
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.registry import target_format, write_format
-from mcaprl.recorder.source import Definitions, MappingFile, Paths, open_data, read_mapped
+from mcaprl.recorder.source import Definitions, Paths, Source, opened
 from mcaprl.storage.remote import check_upload, upload_all
 
 if TYPE_CHECKING:
@@ -111,44 +110,28 @@ class Conversion:
 
 
 def convert(
-    data: Paths,
+    data: Source,
     out: str | Path | None,
     *,
-    mapping: MappingFile | None = None,
-    source_format: str | None = None,
-    one_episode: bool = False,
-    dones: str | None = None,
     to: str | None = None,
     lossy: bool = False,
-    trust_code: bool = False,
-    definitions: Definitions = (),
     overwrite: bool = False,
     upload: str | None = None,
 ) -> Conversion:
     """Read logs, a bag, or a dataset of another tool, and write a log or a dataset.
 
     Args:
-        data: Logs or a dataset of another tool; with a mapping: MCAP files, rosbag2 folders and
-            databases, or ROS 1 bags.
+        data: Logs or a dataset of another tool; for bags and other options, what
+            `mcaprl.open(..., mapping=...)` returns, or a function that returns it.
         out: Path of the log or dataset; None to write nothing.
-        mapping: Mapping file, or its keys and values; see docs/bags.md.
-        source_format: Name of the format of `data`; default: detected from the path.
-        one_episode: Whether flat arrays of another tool are one episode if nothing marks where an
-            episode ends; see `open`.
-        dones: Kind of the ends in flat arrays of another tool that no array distinguishes:
-            `terminated` or `truncated`; see `open`.
         to: Name of the format to write; default: a log if `out` ends with .mcap, otherwise the
             format with the suffix of `out`.
         lossy: Whether data that the format, or a log, cannot store may be dropped or converted.
-        trust_code: Whether the mapping may name a Python function, which is imported.
-        definitions: Files and folders with definitions of ROS types that a bag lacks; see
-            docs/bags.md.
         overwrite: Whether an existing file or folder is replaced.
         upload: URL to which the written file is copied when it is complete.
 
     Raises:
-        UsageError: The format to write is not clear, or the mapping does not fit the bag. In the
-            second case, the message names file, line and key.
+        UsageError: The format to write is not clear.
         LogError: The source cannot be read, it has no episode, or `out` cannot be written.
         SpaceError: The format cannot hold a space or dtype, and `lossy` is not set.
         OutputExistsError: `out` exists.
@@ -162,8 +145,7 @@ def convert(
         check_upload(upload, overwrite=overwrite)
         if out is None or (form is not None and not form.suffix):
             raise UsageError("upload copies one file: choose a file, not a folder, as the output")
-    reading = {"one_episode": one_episode, "dones": dones, "lossy": lossy}
-    dataset, report = _read(data, mapping, source_format, trust_code, definitions, reading)
+    dataset = opened(data, lossy=lossy)
     lost: list[str] = []
     if out is not None and form is not None:
         lost = write_format(dataset, out, form, lossy=lossy, overwrite=overwrite)
@@ -171,21 +153,7 @@ def convert(
         dataset.save(out, overwrite=overwrite)
     if upload is not None and out is not None:
         upload_all([Path(out)], upload)
-    return Conversion(dataset, report, None if out is None else Path(out), lost)
-
-
-def _read(
-    source: Paths,
-    mapping: MappingFile | None,
-    source_format: str | None,
-    trust_code: bool,
-    definitions: Definitions,
-    reading: Mapping[str, Any],
-) -> tuple[Dataset, MappingReport | None]:
-    if mapping is None or reading["one_episode"] or reading["dones"]:
-        return open_data(source, mapping=mapping, format=source_format, **reading), None
-    found = read_mapped(source, mapping, trust_code, definitions)
-    return found, found.origin.report
+    return Conversion(dataset, dataset.origin.report, None if out is None else Path(out), lost)
 
 
 def suggest_mapping(data: Paths, *, bins: int | None = None, definitions: Definitions = ()) -> str:

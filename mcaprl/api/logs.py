@@ -17,7 +17,7 @@ from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import Calibration, calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
-from mcaprl.recorder.source import Definitions, MappingFile, Paths, open_data, read_mapped
+from mcaprl.recorder.source import Definitions, Source, open_data, opened
 from mcaprl.recorder.viewer.surprises import Surprise, moments_of
 from mcaprl.texts import size
 
@@ -80,7 +80,7 @@ class LogInfo:
     def title(self) -> str:
         """Path of the first log, and the number of other logs."""
         more = f" and {len(self.sources) - 1} more" if len(self.sources) > 1 else ""
-        return f"{self.sources[0]}{more}"
+        return f"{self.sources[0]}{more}" if self.sources else self.env_id or "arrays"
 
     def to_json(self) -> dict[str, Any]:
         """Return what `info --json` prints."""
@@ -116,12 +116,10 @@ class LogInfo:
 
 
 def info(
-    data: Paths,
+    data: Source,
     *,
     report: str | Path | None = None,
     threads: int = 1,
-    mapping: MappingFile | None = None,
-    trust_code: bool = False,
     definitions: Definitions = (),
 ) -> LogInfo | Any:
     """Return facts about logs, and their problems; or about another robot's bag.
@@ -133,11 +131,10 @@ def info(
 
     Args:
         data: File, folder, glob or URL of logs, or several of them; or a dataset of another tool;
-            or MCAP files, rosbag2 folders and databases, ROS 1 bags, and folders of these.
+            or MCAP files, rosbag2 folders and databases, ROS 1 bags, and folders of these; or what
+            `mcaprl.open(..., mapping=...)` returns for a bag, or a function that returns it.
         report: Output folder of the HTML report, an image and JSON.
         threads: Number of threads that decompress chunks.
-        mapping: Mapping that describes a bag; see `open`.
-        trust_code: Whether the mapping may name a Python function.
         definitions: Files and folders with definitions of ROS types that a bag lacks; see
             docs/bags.md.
 
@@ -150,22 +147,17 @@ def info(
     if report is not None:
         import_extra("matplotlib", "report")
         import_extra("jinja2", "report")
-    noted: list[Problem] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        if mapping is None:
-            contents = _dataset_or_bag(data, threads, definitions)
-        else:
-            contents = read_mapped(data, mapping, trust_code, definitions)
-            noted = contents.origin.report.problems()
+        contents = _dataset_or_bag(data, threads, definitions)
     warned = [str(warning.message) for warning in caught]
     if isinstance(contents, BagInfo):
         if report is not None:
             raise UsageError("a report of a bag needs a mapping: pass --mapping FILE")
         return replace(contents, problems=[*warned, *contents.problems])
-    paths = contents.sources
-    are_logs = mapping is None and all(path.suffix == ".mcap" for path in paths)
-    found = _describe(contents, paths, [*warned, *map(str, noted)], are_logs=are_logs)
+    if contents.origin.report is not None:
+        warned = list(dict.fromkeys([*warned, *map(str, contents.origin.report.problems())]))
+    found = _describe(contents, warned)
     if report is not None:
         from mcaprl.recorder.viewer.report import dataset_page
 
@@ -175,7 +167,9 @@ def info(
     return found
 
 
-def _dataset_or_bag(data: Paths, threads: int, definitions: Definitions) -> Dataset | BagInfo:
+def _dataset_or_bag(data: Source, threads: int, definitions: Definitions) -> Dataset | BagInfo:
+    if isinstance(data, Dataset) or callable(data):
+        return opened(data)
     try:
         return open_data(data, threads=threads)
     except NoEpisodesError:
@@ -187,12 +181,10 @@ def _dataset_or_bag(data: Paths, threads: int, definitions: Definitions) -> Data
         return found
 
 
-def _describe(
-    dataset: Dataset, paths: Sequence[Path], warned: Sequence[str], *, are_logs: bool
-) -> LogInfo:
+def _describe(dataset: Dataset, warned: Sequence[str]) -> LogInfo:
     statistics, findings = dataset.statistics, lint(dataset)
     return LogInfo(
-        sources=tuple(paths),
+        sources=dataset.sources,
         env_id=dataset.env_id,
         episodes=statistics.episodes,
         steps=statistics.steps,
@@ -210,12 +202,16 @@ def _describe(
         behavior_estimated=dataset.has_estimated_probs,
         policies=sorted({episode.policy for episode in dataset.episodes if episode.policy}),
         ends=dict(statistics.ends),
-        size_bytes=sum(size_of(path) for path in paths),
+        size_bytes=sum(map(size_of, dataset.sources)),
         storage=dataset.storage,
         problems=[*warned, *(str(one) for one in findings if one.severity == "problem")],
         findings=findings,
-        moments=[moment for path in paths for moment in moments_of(path)] if are_logs else [],
+        moments=[moment for path in _logs(dataset) for moment in moments_of(path)],
     )
+
+
+def _logs(dataset: Dataset) -> tuple[Path, ...]:
+    return dataset.sources if dataset.origin.logs else ()
 
 
 def _counts(counts: dict[str, int]) -> str:
@@ -254,39 +250,29 @@ class CheckResult:
         return {"ok": self.ok, "problems": [problem.to_json() for problem in self.problems]}
 
 
-def check(
-    data: Paths,
-    *,
-    threads: int = 1,
-    mapping: MappingFile | None = None,
-    trust_code: bool = False,
-    definitions: Definitions = (),
-) -> CheckResult:
+def check(data: Source, *, threads: int = 1) -> CheckResult:
     """Read logs completely; validate structure, CRCs, indexes, episodes and metadata.
 
     Without a mapping, all messages of another robot's bag are decoded; topics and messages that
-    cannot be decoded are problems. With a mapping, the bag is read by the mapping. The function
-    then also reports defects that affect many steps: missing or outdated values, commands that are
-    far from every named action, and episodes that are too short.
+    cannot be decoded are problems. Of what `mcaprl.open(..., mapping=...)` returns, the function
+    reports defects that affect many steps: missing or outdated values, commands that are far from
+    every named action, and episodes that are too short.
 
     Args:
         data: File, folder or glob of logs or bags, or several of them. A path without logs and
-            bags is reported as a problem.
+            bags is reported as a problem. Or the dataset of a bag, or a function that returns it.
         threads: Number of threads that decompress chunks.
-        mapping: Mapping that describes a bag; see `open`.
-        trust_code: Whether the mapping may name a Python function.
-        definitions: Files and folders with definitions of ROS types that a bag lacks; see
-            docs/bags.md.
 
     Raises:
-        UsageError: `data` is empty, `threads` is below 1, or the mapping does not fit the bag.
-        LogError: A bag that is read by a mapping cannot be read.
+        UsageError: `data` is empty or a dataset without a mapping, or `threads` is below 1.
     """
     from mcaprl.recorder.repair.check import check_log
 
     check_least(1, threads=threads)
-    if mapping is not None:
-        read = read_mapped(data, mapping, trust_code, definitions)
+    if isinstance(data, Dataset) or callable(data):
+        read = opened(data)
+        if read.origin.report is None:
+            raise UsageError("check reads files: pass the paths of the logs, not a dataset")
         return CheckResult(read.sources, (), tuple(read.origin.report.problems()))
     names: Sequence[str | Path] = [data] if isinstance(data, str | Path) else data
     if not names:

@@ -17,7 +17,7 @@ from mcaprl.files import write_json
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.layout import LAYOUT_NAME
-from mcaprl.recorder.source import Data, open_data, opened
+from mcaprl.recorder.source import Source, open_data, opened
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.live_stream import DEFAULT_SPEED
 from mcaprl.runs import check_kind, choose_seeds, run_to_resume
@@ -34,7 +34,7 @@ MAPPING_NAME = "mapping.json"
 
 
 def train(
-    data: Data | Callable[[], Dataset],
+    data: Source,
     out: str | Path,
     *,
     algo: str | None = None,

@@ -68,15 +68,16 @@ def test_a_bag_is_opened_by_a_mapping(bag: Path, tmp_path: Path) -> None:
 
 def test_a_converted_bag_is_an_equal_log(bag: Path, tmp_path: Path) -> None:
     out = tmp_path / "robot.mcap"
-    found = mcaprl.convert(bag, out, mapping=tmp_path / "robot.yaml")
+    data = mcaprl.open(bag, mapping=tmp_path / "robot.yaml")
+    found = mcaprl.convert(data, out)
     assert mcaprl.open(out).fingerprint == found.dataset.fingerprint
     assert not mcaprl.check(out).problems
     with pytest.raises(OutputExistsError):
-        mcaprl.convert(bag, out, mapping=tmp_path / "robot.yaml")
+        mcaprl.convert(lambda: pytest.fail("read too early"), out)
     with pytest.raises(UsageError, match=r"x.mcap has the suffix of logs: .* for --to npz"):
         mcaprl.convert(out, tmp_path / "x.mcap", to="npz")
     with pytest.raises(UsageError, match="the format is not clear from the name"):
-        mcaprl.convert(bag, tmp_path / "robot.unknown", mapping=tmp_path / "robot.yaml")
+        mcaprl.convert(data, tmp_path / "robot.unknown")
 
 
 def test_every_form_of_bag_gives_the_same_log(bag: Path, tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def test_the_suggested_mapping_uses_frequent_topics(native: Path, tmp_path: Path
     bag = native.with_name("ros2")
     bag = bag if bag.exists() else make(native, "ros2")
     (tmp_path / "suggested.yaml").write_text(mcaprl.suggest_mapping(bag))
-    found = mcaprl.convert(bag, None, mapping=tmp_path / "suggested.yaml")
+    found = mcaprl.convert(mcaprl.open(bag, mapping=tmp_path / "suggested.yaml"), None)
     assert found.report is not None
     observed = found.dataset.observation_names
     # The messages contain the position of a joint by its name, and an empty array of velocities.

@@ -155,6 +155,16 @@ def test_only_unchanged_logs_can_be_read_again_by_other_processes(tmp_path: Path
             logs_of(changed)
 
 
+def test_info_and_check_of_datasets() -> None:
+    data = mcaprl.open("logs")
+    found = mcaprl.info(data)
+    assert found.to_json() == mcaprl.info("logs").to_json()
+    part = data.filter(lambda episode: episode.index < 2)
+    assert (mcaprl.info(part).episodes, mcaprl.info(part).title) == (2, "logs/a.mcap and 2 more")
+    with pytest.raises(UsageError, match="check reads files: pass the paths of the logs"):
+        mcaprl.check(data)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

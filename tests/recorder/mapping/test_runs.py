@@ -468,7 +468,7 @@ def test_a_converted_log_has_the_times_of_the_bag(tmp_path: Path) -> None:
     opened = mcaprl.open(bag, mapping=mapping)
     logs = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
     for log in logs:
-        mcaprl.convert(bag, log, mapping=mapping)
+        mcaprl.convert(opened, log)
         times = [episode.log_time_ns.tolist() for episode in mcaprl.open(log).episodes]
         assert times == [episode.log_time_ns.tolist() for episode in opened.episodes]
         assert times[0][0] == 0

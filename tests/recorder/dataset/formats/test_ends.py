@@ -168,7 +168,8 @@ def test_flags_without_any_end_are_refused_unless_it_is_one_episode(tmp_path: Pa
         mcaprl.open(path, one_episode=True)
     log = tmp_path / "one.mcap"
     path = _write(tmp_path / "their.npz", {"terminals": none}, has_next=True)
-    assert mcaprl.convert(path, log, one_episode=True).dataset.episode_lengths.tolist() == [7]
+    converted = mcaprl.convert(mcaprl.open(path, one_episode=True), log)
+    assert converted.dataset.episode_lengths.tolist() == [7]
     with pytest.raises(UsageError, match="for datasets of other tools"):
         mcaprl.open(log, one_episode=True)
 

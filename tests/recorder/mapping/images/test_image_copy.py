@@ -233,7 +233,7 @@ def test_a_damaged_image_is_left_out_in_the_copy_as_in_memory(tmp_path: Path) ->
             (tmp_path / "bag.mcap.camera.images").stat().st_mtime_ns if images == "mapped" else 0
         )
     assert times[1] == times[2]
-    (problem,) = mcaprl.check(bag, mapping=mapping()).problems
+    (problem,) = mcaprl.check(found).problems
     assert "2 images cannot be decoded, the first is message 4 at" in problem.what
 
 

@@ -300,7 +300,7 @@ def holds(bag: Path, folder: Path, **options: Any) -> tuple[Mapping | None, Any]
     mapping, _ = load_mapping(path)
     assert mapping.observation
     try:
-        found = mcaprl.convert(bag, None, mapping=path)
+        found = mcaprl.convert(mcaprl.open(bag, mapping=path), None)
     except McaprlError:
         (warning,) = [each for each in warned if "the suggested mapping" in each]
         assert re.search(r"/\w+", warning)
