@@ -124,7 +124,7 @@ def export(run: str | PathLike[str], out: str | Path, *, overwrite: bool = False
     `action` and `scores`.
 
     Args:
-        run: Run folder, or folder of one seed.
+        run: Run folder, folder of one seed, or `.zip` file of Stable-Baselines3.
         out: ONNX file to write.
         overwrite: Whether an existing file is replaced.
 
