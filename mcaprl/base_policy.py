@@ -118,18 +118,22 @@ class RandomPolicy(BasePolicy):
 
 
 class _ForeignPolicy(BasePolicy):
-    """Policy with the members that another object has; it may be random."""
+    """Policy with the members that another object has."""
 
-    is_deterministic = False
-
-    def __init__(self, policy: object) -> None:
+    def __init__(self, policy: object, is_deterministic: bool) -> None:
         known = [name for name in dir(BasePolicy) if not name.startswith("_")]
         own = {name: getattr(policy, name) for name in known if hasattr(policy, name)}
-        vars(self).update({"name": type(policy).__name__, **own})
+        vars(self).update(
+            {"name": type(policy).__name__, "is_deterministic": is_deterministic, **own}
+        )
 
 
-def as_policy(policy: object) -> BasePolicy:
+def as_policy(policy: object, *, is_deterministic: bool = True) -> BasePolicy:
     """Return an object with a method `act` as a policy.
+
+    Args:
+        policy: Policy, or object with some of its members.
+        is_deterministic: Value of this attribute if the object has none.
 
     Raises:
         UsageError: The object has no such method.
@@ -141,7 +145,7 @@ def as_policy(policy: object) -> BasePolicy:
             f"{policy!r} is not a policy: pass a name, a path, or an object with a method"
             " act(observations) that returns a batch of actions"
         )
-    return _ForeignPolicy(policy)
+    return _ForeignPolicy(policy, is_deterministic)
 
 
 def batch_size(observations: Any) -> int:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from torch import Tensor
 
-from mcaprl.actions import OBSERVATION_KEY, JointActions, has_source
+from mcaprl.actions import OBSERVATION_KEY, has_source, joint_actions
 from mcaprl.architecture import architecture_of
 from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
@@ -31,10 +31,10 @@ from mcaprl.frames import FrameStack, mapped
 from mcaprl.networks import ImageInput, Network, check_size
 from mcaprl.offline.algorithms.heads import Head, build_head
 from mcaprl.offline.algorithms.learner import Learner
-from mcaprl.offline.batches.buffer import discrete_actions
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
 from mcaprl.recorder.format.action_commands import ActionCommands
 from mcaprl.recorder.format.spaces import (
+    check_actions,
     check_elements,
     observation_leaves,
     space_from_json,
@@ -303,7 +303,9 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
     mask_from = description.mask_from
     if mask_from and not has_source(observation_space):
         raise ValueError(f"mask_from {mask_from!r} does not fit {observation_space}")
-    encoder = ObservationEncoder(observation_space, discrete_actions(action_space).count)
+    check_actions(action_space)
+    joint = joint_actions(action_space)
+    encoder = ObservationEncoder(observation_space, joint.count if joint else 0)
     encoder.shift = weights.pop("observation.shift").numpy()
     encoder.scale = weights.pop("observation.scale").numpy()
     if not (encoder.scale > 0).all():
@@ -336,8 +338,8 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
         head=head.eval(),
         reward_scale=description.reward_scale,
         action_commands=None
-        if commands is None
-        else ActionCommands.from_json(commands, JointActions.of(action_space).count),
+        if commands is None or joint is None
+        else ActionCommands.from_json(commands, joint.count),
         mask_from=mask_from,
     )
 

@@ -328,6 +328,7 @@ class ModelEncoder(ObservationEncoder):
     """
 
     is_image = staticmethod(is_image)
+    layout = ""
 
     def __init__(self, space: spaces.Space[Any]) -> None:
         """Create the encoder for a space of observations."""
@@ -362,7 +363,7 @@ class ModelNetwork(nn.Module):
         frames = torch.unflatten(observations.vector, 1, (self._frames, -1))
         vectors = iter(torch.split(frames, [int(np.prod(shape)) for shape in sizes], 2))
         inputs = {
-            key: next(images).permute(0, 3, 1, 2)
+            key: next(images).permute(0, 3, 1, 2).contiguous()
             if is_image(box)
             else torch.cat(torch.unflatten(next(vectors), 2, box.shape or (1,)).unbind(1), -1)
             for key, box in self._parts.items()

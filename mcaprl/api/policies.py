@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import cached_property
-from os import PathLike, fspath
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -70,9 +70,11 @@ def as_names(policies: Names) -> list[str]:
     >>> as_names("random"), as_names(["pilot", Path("runs/cql")])
     (['random'], ['pilot', 'runs/cql'])
     """
-    if isinstance(policies, str | PathLike):
-        return [fspath(policies)]
-    return [fspath(one) for one in policies]
+    return [_name(policies)] if isinstance(policies, str | PathLike) else list(map(_name, policies))
+
+
+def _name(path: str | PathLike[str]) -> str:
+    return str(path.folder if isinstance(path, Run) else path)
 
 
 def by_name(policies: Any) -> dict[str, str | BasePolicy]:
@@ -84,13 +86,13 @@ def by_name(policies: Any) -> dict[str, str | BasePolicy]:
     >>> by_name("runs/cql"), list(by_name([RandomPolicy(None), RandomPolicy(None), "pilot"]))
     ({'runs/cql': 'runs/cql'}, ['random-2', 'random-3', 'pilot'])
     """
-    several = isinstance(policies, Sequence) and not isinstance(policies, str | PathLike)
+    is_one = isinstance(policies, str | PathLike) or hasattr(policies, "act")
     found: dict[str, str | BasePolicy] = {}
-    for one in policies if several else [policies]:
+    for one in [policies] if is_one or not isinstance(policies, Iterable) else policies:
         if isinstance(one, str | PathLike):
-            found[fspath(one)] = fspath(one)
+            found[_name(one)] = _name(one)
             continue
-        policy = as_policy(one)
+        policy = as_policy(one, is_deterministic=False)
         names = itertools.chain([policy.name], (f"{policy.name}-{n}" for n in itertools.count(2)))
         found[next(name for name in names if name not in {*found, *SCRIPTED})] = policy
     return found
@@ -122,7 +124,7 @@ def export(run: str | PathLike[str], out: str | Path, *, overwrite: bool = False
     `action` and `scores`.
 
     Args:
-        run: Run folder, or folder of one seed.
+        run: Run folder, folder of one seed, or `.zip` file of Stable-Baselines3.
         out: ONNX file to write.
         overwrite: Whether an existing file is replaced.
 

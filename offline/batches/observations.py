@@ -144,6 +144,9 @@ class ObservationEncoder:
         scale: (V,) float32, divisor of the shifted vector.
     """
 
+    layout = "C"
+    """Layout in memory of the arrays of images; empty for any."""
+
     def __init__(self, space: spaces.Space[Any], n_actions: int, mask_key: str = MASK_KEY) -> None:
         """Create the encoder, without normalization.
 
@@ -214,7 +217,9 @@ class ObservationEncoder:
         for leaf in self.leaves:
             _check_shape(leaf, observations)
         images = [
-            _tensor(_channels_last(leaf.of(observations), leaf), np.uint8).reshape(-1, *image.shape)
+            _tensor(_channels_last(leaf.of(observations), leaf), np.uint8, self.layout).reshape(
+                -1, *image.shape
+            )
             for leaf, image in zip(self.images, self.image_inputs, strict=True)
         ]
         vector = _tensor(self._vector(observations), np.float32)
@@ -307,8 +312,10 @@ def _numbers(values: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
     )
 
 
-def _tensor(array: Any, dtype: Any) -> Tensor:
-    return torch.from_numpy(np.require(array, dtype, ["C", "W"]))
+def _tensor(array: Any, dtype: Any, layout: str = "C") -> Tensor:
+    # Tensors have no negative strides.
+    layout = layout or "C" * (min(np.asarray(array).strides, default=0) < 0)
+    return torch.from_numpy(np.require(array, dtype, ["W", *layout]))
 
 
 def _check_shape(leaf: Leaf, observations: Any) -> None:

@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.base_policy import BasePolicy
+from mcaprl.base_policy import Actor, as_policy
 from mcaprl.sims.evaluation.rollout import (
     EpisodeResult,
     EpsilonGreedy,
@@ -96,7 +96,7 @@ class PolicyScore:
 
 def evaluate(
     env: gym.Env[Any, Any],
-    policies: Sequence[BasePolicy | None],
+    policies: Sequence[Actor | None],
     *,
     name: str,
     episodes: int,
@@ -125,7 +125,7 @@ def evaluate(
     """
     results = []
     for policy in policies:
-        on_policy(name if policy is None or len(policies) == 1 else policy.name)
+        on_policy(name if policy is None or len(policies) == 1 else as_policy(policy).name)
         results.append(
             greedy_episodes(
                 env,
@@ -142,7 +142,7 @@ def evaluate(
 
 def greedy_episodes(
     env: gym.Env[Any, Any],
-    policy: BasePolicy | None,
+    policy: Actor | None,
     *,
     episodes: int,
     seed: int,
@@ -152,13 +152,14 @@ def greedy_episodes(
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> list[EpisodeResult]:
     """Run episodes of one policy greedily; arguments as for `evaluate` and `rollout`."""
-    if envs is not None and policy is not None and not policy.mask_from:
+    behavior = EpsilonGreedy(policy, 0.0, env.action_space, mask_from)
+    if envs is not None and behavior.policy is not None and not behavior.mask_from:
         numbers = range(first_episode, first_episode + episodes)
         seeds = [episode_seed(seed, episode) for episode in numbers]
-        return batch_rollout(envs, policy, seeds, on_episode)
+        return batch_rollout(envs, behavior.policy, seeds, on_episode)
     return rollout(
         env,
-        EpsilonGreedy(policy, 0.0, env.action_space, mask_from),
+        behavior,
         seed=seed,
         episodes=episodes,
         first_episode=first_episode,

@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from mcaprl.actions import allowed_actions, joint_actions, masked
-from mcaprl.base_policy import BasePolicy, RandomPolicy
+from mcaprl.base_policy import Actor, BasePolicy, RandomPolicy, as_policy
 from mcaprl.errors import PolicyError
 from mcaprl.frames import mapped
 from mcaprl.limits import STEP_LIMIT
@@ -179,7 +179,7 @@ class EpsilonGreedy:
 
     def __init__(
         self,
-        policy: BasePolicy | None,
+        policy: Actor | None,
         epsilon: float,
         action_space: spaces.Space[Any],
         mask_from: str = "",
@@ -193,12 +193,13 @@ class EpsilonGreedy:
             mask_from: Source of the mask of random actions if there is no policy; see
                 `mcaprl.actions`. A policy has its own source.
         """
-        self.policy = policy = None if isinstance(policy, RandomPolicy) else policy
-        self.epsilon = 1.0 if policy is None else epsilon
-        self.name = "random" if policy is None else policy.name
+        is_random = policy is None or isinstance(policy, RandomPolicy)
+        self.policy = None if is_random else as_policy(policy)
+        self.epsilon = epsilon if self.policy else 1.0
+        self.name = self.policy.name if self.policy else "random"
         self._space = action_space
         self._joint = joint_actions(action_space)
-        self.mask_from = mask_from if policy is None else policy.mask_from
+        self.mask_from = self.policy.mask_from if self.policy else mask_from
         self.begin(0)
 
     def begin(self, seed: int) -> None:
@@ -341,7 +342,7 @@ def rollout(
 
 def batch_rollout(
     envs: gym.vector.VectorEnv[Any, Any, Any],
-    policy: BasePolicy,
+    policy: Actor,
     seeds: Sequence[int],
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> list[EpisodeResult]:

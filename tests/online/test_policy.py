@@ -103,6 +103,7 @@ def test_images_are_transposed_for_the_network(tmp_path: Path, channel_first: bo
     exact = read_policy(ours(tmp_path / "ours.zip", model, env))
     np.testing.assert_array_equal(exact.act(observations), expected)
     assert exact.observation_space == env.observation_space
+    np.testing.assert_array_equal(exact.act(observations[::-1]), expected[::-1])
     model.save(tmp_path / "sb3.zip")
     np.testing.assert_array_equal(read_policy(tmp_path / "sb3.zip").act(observations), expected)
 

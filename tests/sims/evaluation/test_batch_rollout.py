@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mcaprl.base_policy import BasePolicy
 from mcaprl.sims import make_sim, make_sims
 from mcaprl.sims.evaluation.evaluate import evaluate
 from mcaprl.sims.evaluation.rollout import EpsilonGreedy, batch_rollout, run_episode
 
 
-class Swaying(BasePolicy):
+class Swaying:
     """Policy that uses only the first number of each row, so that batching has no effect."""
 
     name = "swaying"

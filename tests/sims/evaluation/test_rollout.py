@@ -21,7 +21,7 @@ from mcaprl.sims.evaluation.report import evaluation_page
 from mcaprl.sims.evaluation.rollout import EpsilonGreedy, check_fit, episode_seed, rollout
 
 
-class AlwaysLeft(BasePolicy):
+class AlwaysLeft:
     name = "left"
 
     def act(self, observations: Any) -> NDArray[Any]:
@@ -60,7 +60,7 @@ def test_random_actions_are_allowed_ones() -> None:
         assert drawn == pytest.approx(chances)
 
 
-class AlwaysOn(BasePolicy):
+class AlwaysOn:
     name = "on"
 
     def act(self, observations: Any) -> NDArray[Any]:

@@ -111,7 +111,7 @@ def mapping_files(root: Path) -> list[Example]:
 
 
 def _convert_mapped(folder: Path) -> None:
-    found = mcaprl.convert(folder / "bag", None, mapping=folder / "mapping.yaml")
+    found = mcaprl.convert(mcaprl.open(folder / "bag", mapping=folder / "mapping.yaml"), None)
     assert len(found.dataset) == len(found.dataset.rewards)
     for part in (found.to_json(), found.first_table(), found.run_table()):
         json.dumps(part)
@@ -309,7 +309,7 @@ def _open_foreign(folder: Path, name: str, form: str) -> None:
     found = mcaprl.open(folder / name, format=form)
     assert len(found) == len(found.rewards) == found.episode_lengths.sum()
     assert len(repr(found.statistics)) > 0
-    mcaprl.convert(folder / name, folder / "out.mcap", source_format=form, overwrite=True)
+    mcaprl.convert(found, folder / "out.mcap", overwrite=True)
     mcaprl.info(folder / "out.mcap")
 
 
