@@ -263,7 +263,7 @@ def changed_mcap(data: bytes, chance: random.Random) -> bytes:
 
     reader = make_reader(io.BytesIO(data))
     found: list[tuple[Any, Any, Any]] = list(reader.iter_messages(log_time_order=False))
-    records = list(reader.iter_metadata())
+    records = [*reader.iter_metadata(), *reader.iter_attachments()]
     schemas = list({each[0].id: each[0] for each in found if each[0] is not None}.values())
     channels = list({each[1].id: each[1] for each in found}.values())
     messages = [each[2] for each in found]
@@ -293,6 +293,7 @@ def _changed_field(value: Any, chance: random.Random) -> Any:
 
 
 def _written(profile: str, found: list[tuple[Any, Any, Any]], records: Any, dropped: Any) -> bytes:
+    from mcap.records import Metadata
     from mcap.writer import CompressionType, Writer
 
     out = io.BytesIO()
@@ -301,7 +302,12 @@ def _written(profile: str, found: list[tuple[Any, Any, Any]], records: Any, drop
     schemas: dict[int, int] = {0: 0}
     channels: dict[int, int] = {}
     for record in records:
-        writer.add_metadata(record.name, record.metadata)
+        if isinstance(record, Metadata):
+            writer.add_metadata(record.name, record.metadata)
+        else:
+            writer.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
     for schema, channel, message in found:
         if schema is not None and schema.id not in schemas:
             schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import json
 import shutil
+import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +24,7 @@ from mcaprl.offline.selection.choice import read_choice
 from mcaprl.ray.sweep_file import read_plan
 from mcaprl.recorder.dataset.manifest import LogFile, write_manifest
 from tests.offline.estimate.test_off_policy import log
+from tests.recorder.bags.test_definition_files import write_database
 from tests.support.bags import write_rosbag1, write_rosbag2
 from tests.support.damage.datasets import dataset, write_all
 from tests.support.damage.faults import write_log
@@ -174,6 +176,45 @@ def ros2_bags(root: Path) -> list[Example]:
         calls = [*READ_BAG, _convert_mapped]
         examples.append(Example(folder, calls, "bag/*"))
     return examples
+
+
+DEFINITIONS = {
+    "msg/Robot.msg": """\
+# A robot
+uint8 MODE=3
+float64 x
+acme_msgs/Motor[2] motors
+float32[<=4] speeds [1.0, 2.0]
+string<=5 name "x"
+""",
+    "msg/Motor.idl": """\
+module acme_msgs { module msg {
+  typedef float float__2[2];
+  @verbatim (language="comment", text="A motor")
+  struct Motor { @default (value=0.5) double q; float__2 pose; };
+}; };
+""",
+    "srv/Set.srv": "bool on\n---\nbool ok\n",
+}
+
+
+def definition_files(root: Path) -> list[Example]:
+    """Definitions of the types of a bag without definitions."""
+    rows = [struct.pack("<d4d2I", k, *[0.5] * 4, 0, 1) + b"\0" for k in range(3)]
+    write_database(root / "old.db3", [("/robot", "acme_msgs/msg/Robot", rows)])
+    for name, text in DEFINITIONS.items():
+        path = root / "acme_msgs" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return [Example(root, [_info_with_definitions, _draft_with_definitions], "acme_msgs/*/*")]
+
+
+def _info_with_definitions(folder: Path) -> None:
+    mcaprl.info(folder / "old.db3", definitions=[folder / "acme_msgs"])
+
+
+def _draft_with_definitions(folder: Path) -> None:
+    mcaprl.suggest_mapping(folder / "old.db3", definitions=[folder / "acme_msgs"])
 
 
 def ros1_bags(root: Path) -> list[Example]:
@@ -475,6 +516,7 @@ TARGETS: dict[str, Callable[[Path], list[Example]]] = {
     "mapping files": mapping_files,
     "expressions": expressions,
     "ROS 2 bags": ros2_bags,
+    "definition files": definition_files,
     "ROS 1 bags": ros1_bags,
     "JSON and protobuf bags": json_and_protobuf_bags,
     "sweep files": sweep_files,
