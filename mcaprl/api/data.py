@@ -13,7 +13,7 @@ from mcaprl.recorder.dataset.image_cache import STORAGES, Storage
 from mcaprl.recorder.dataset.open import Episodes, open_logs
 
 if TYPE_CHECKING:
-    from mcaprl.recorder.dataset.formats.registry import Format
+    from mcaprl.recorder.dataset.format_registry import Format
     from mcaprl.recorder.mapping.read import MappedBag
 
 Paths = str | Path | Sequence[str | Path]
@@ -107,12 +107,13 @@ def open_data(
                 data, columns=columns, episodes=episodes, images=images, threads=threads
             )
         except NotMcapError as error:
-            from mcaprl.recorder.dataset.formats.registry import FORMATS
+            from mcaprl.recorder.dataset.format_registry import every_format
 
             if BAG_HINT in str(error):
                 raise
             raise NotMcapError(
-                f"{error}, nor is it a dataset of one of the formats {', '.join(FORMATS)}"
+                f"{error}, nor is it a dataset of one of the formats"
+                f" {', '.join(form.name for form in every_format())}"
             ) from error
     if columns is not None or episodes is not None:
         what = f"the format {other.name}" if other is not None else "a mapping"
@@ -122,7 +123,7 @@ def open_data(
             raise UsageError(
                 f"mapped images are for logs and bags, not for the format {other.name}"
             )
-        from mcaprl.recorder.dataset.formats.registry import read_format
+        from mcaprl.recorder.dataset.format_registry import read_format
 
         one = _only(data)
         if one is None:
@@ -147,7 +148,7 @@ def _other_format(data: Paths, name: str | None) -> Format | None:
     one = _only(data)
     if name is None and (one is None or str(one).endswith(".mcap")):
         return None
-    from mcaprl.recorder.dataset.formats.registry import format_named, other_format
+    from mcaprl.recorder.dataset.format_registry import format_named, other_format
 
     if name is not None:
         return format_named(name)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.formats.registry import other_format, read_format
+from mcaprl.recorder.dataset.format_registry import other_format, read_format
 from mcaprl.recorder.dataset.open import file_key, find_logs, open_logs
 
 Item = TypeVar("Item")

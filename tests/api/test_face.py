@@ -22,7 +22,7 @@ from tests.support.paths import GOLDEN
 
 ROOT = Path(__file__).parent.parent.parent
 PACKAGES = ("api", "device", "offline", "online", "recorder", "sims")
-CLASSES = ("Dataset", "Episode", "OpenBag", "RecordMcap", "RecordVecMcap")
+CLASSES = ("Dataset", "Episode", "Format", "OpenBag", "RecordMcap", "RecordVecMcap")
 FUNCTIONS = {
     "train-offline": ("train", "sweep"),
     "train-online": ("train_online",),

@@ -95,10 +95,11 @@ def test_the_command_accepts_weights(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_datasets_of_other_tools_and_urls_are_sources(tmp_path: Path) -> None:
     pytest.importorskip("fsspec", reason="needs the extra remote")
+    pytest.importorskip("pyarrow", reason="needs the extra tables")
     log = tmp_path / "lane.mcap"
     mcaprl.record("lane", log, episodes=2)
-    mcaprl.convert(log, tmp_path / "lane.npz")
-    names = [str(tmp_path / "lane.npz"), f"file://{log}:2"]
+    mcaprl.convert(log, tmp_path / "lane", to="parquet")
+    names = [str(tmp_path / "lane"), f"file://{log}:2"]
     data, weights = open_weighted(names)
     assert len(data.episodes) == 4
     assert weights.tolist() == [1.0, 1.0, 2.0, 2.0]
