@@ -68,8 +68,10 @@ class Format:
         name: Name in `--to` and `--from`.
         about: Description of the format, for lists of formats.
         suffix: Suffix of the file names, such as `.npz`; empty if the format is a folder.
-        keeps: Facts that the format has a place for: names of `FACTS`. Writing states the others
-            that a dataset has.
+        keeps: Data beside the transitions that the format has a place for; default: all of
+            `spaces`, `times`, `environment`, `names of actions`, `behavior_prob`, `policy names`,
+            `seeds and reset options`, `end reasons`, `infos`, `infos of final observations` and
+            `final observations after a termination`. Writing lists the others that a dataset has.
     """
 
     name: ClassVar[str]
@@ -130,6 +132,9 @@ class Format:
         if "infos" in lost:
             lost = [name for name in lost if name != "infos of final observations"]
         return [f"{self.name} has no place for {', '.join(lost)}: a log keeps them"] if lost else []
+
+
+Format.__module__ = "mcaprl"  # the path in messages and documentation
 
 
 def module_of(tool: str) -> Any:
