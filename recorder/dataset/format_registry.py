@@ -249,22 +249,17 @@ def format_named(name: str) -> Format:
     return found
 
 
-def recognized(path: str | Path) -> Format | None:
-    """Return the format of a file, a folder or `FORMAT:NAME`; None if no format matches."""
-    prefix, colon, _ = str(path).partition(":")
-    exists = Path(path).exists()
-    for form in every_format():
-        if (colon and form.name == prefix) or (exists and form.matches(Path(path))):
-            return form
-    return None
-
-
 def other_format(name: str | Path) -> Format | None:
-    """Return the format of another tool's dataset; None for logs and unknown formats."""
+    """Return the format of a file, a folder or `FORMAT:NAME`; None for logs and unknown ones."""
     path = Path(name)
     if is_url(name) or path.suffix == ".mcap" or (path.is_dir() and any(path.glob("*.mcap"))):
         return None
-    return recognized(name)
+    prefix, colon, _ = str(name).partition(":")
+    exists = path.exists()
+    for form in every_format():
+        if (colon and form.name == prefix) or (exists and form.matches(path)):
+            return form
+    return None
 
 
 def target_format(path: str | Path, name: str | None) -> Format:
