@@ -11,8 +11,8 @@ import numpy as np
 
 from mcaprl.errors import BAG_HINT, NotMcapError, UnknownNameError, UsageError, import_extra
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.formats.registry import (
-    FORMATS,
+from mcaprl.recorder.dataset.format_registry import (
+    every_format,
     format_named,
     other_format,
     read_format,
@@ -143,7 +143,8 @@ def open_data(
             if BAG_HINT in str(error):
                 raise
             raise NotMcapError(
-                f"{error}, nor is it a dataset of one of the formats {', '.join(FORMATS)}"
+                f"{error}, nor is it a dataset of one of the formats"
+                f" {', '.join(form.name for form in every_format())}"
             ) from error
     for name, weight, form in others:
         part = read_format(name, form, lossy=lossy, **reading)

@@ -12,7 +12,7 @@ from mcaprl.api.ranges import check_least
 from mcaprl.errors import UsageError, import_extra
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.formats.registry import target_format, write_format
+from mcaprl.recorder.dataset.format_registry import target_format, write_format
 from mcaprl.recorder.source import Definitions, Paths, Source, opened
 from mcaprl.storage.remote import check_upload, upload_all
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from importlib.metadata import entry_points
 from typing import Final
 
 from mcaprl.architecture import Architecture, NetworkSettings
+from mcaprl.entry_points import installed
 from mcaprl.offline.batches.packing import Packing
 
 ENTRY_POINT_GROUP: Final = "mcaprl.algorithms"
@@ -201,7 +201,7 @@ def default_configs() -> dict[str, TrainingConfig]:
     Raises:
         UsageError: An entry point is broken.
     """
-    if not entry_points(group=ENTRY_POINT_GROUP):
+    if not installed(ENTRY_POINT_GROUP):
         return {name: config_type() for name, config_type in CONFIGS.items()}
     from mcaprl.offline.algorithms.registry import all_algorithms  # This module imports torch.
 

@@ -7,8 +7,8 @@ the algorithm's name to its `Learner` subclass, `module:Class`.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from importlib.metadata import EntryPoint, entry_points
 
+from mcaprl.entry_points import installed, load
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.offline.algorithms.bc import BC
 from mcaprl.offline.algorithms.bcq import BCQ
@@ -30,7 +30,8 @@ def all_algorithms() -> dict[str, type[Learner]]:
     Raises:
         UsageError: An entry point is broken.
     """
-    return ALGORITHMS | {name: _load(entry) for name, entry in _entry_points().items()}
+    entries = installed(ENTRY_POINT_GROUP)
+    return ALGORITHMS | {name: load(entry, Learner, ALGORITHMS) for name, entry in entries.items()}
 
 
 def choose_algorithm(
@@ -49,10 +50,10 @@ def choose_algorithm(
     if isinstance(algo, str):
         if algo in ALGORITHMS:
             return ALGORITHMS[algo], ALGORITHMS[algo].config_type()
-        entries = _entry_points()
+        entries = installed(ENTRY_POINT_GROUP)
         if algo not in entries:
             raise UnknownNameError("algorithm", algo, [*ALGORITHMS, *entries, *others])
-        learner = _load(entries[algo])
+        learner = load(entries[algo], Learner, ALGORITHMS)
         return learner, learner.config_type()
     algorithms = ALGORITHMS
     if not any(type(algo) is learner.config_type for learner in algorithms.values()):
@@ -62,30 +63,3 @@ def choose_algorithm(
             return learner, algo
     known = ", ".join(learner.config_type.__name__ for learner in algorithms.values())
     raise UsageError(f"no algorithm has a config of type {type(algo).__name__}; known: {known}")
-
-
-def _entry_points() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP)}
-
-
-def _load(entry: EntryPoint) -> type[Learner]:
-    """Import the algorithm of an entry point, and check it."""
-    try:
-        found = entry.load()
-    except Exception as error:  # Importing a module can raise any exception.
-        raise _broken(entry, f"{type(error).__name__}: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, Learner)):
-        raise _broken(entry, "it is not a subclass of Learner")
-    if found.name != entry.name:
-        raise _broken(entry, f"its algorithm is named {found.name!r}")
-    if entry.name in ALGORITHMS:
-        raise _broken(entry, "a built-in algorithm has this name")
-    return found
-
-
-def _broken(entry: EntryPoint, reason: str) -> UsageError:
-    package = entry.dist.name if entry.dist else "unknown"
-    return UsageError(
-        f"entry point {entry.name!r} ({entry.value}) of package {package} in group"
-        f" {ENTRY_POINT_GROUP} is broken: {reason}; fix or uninstall the package"
-    )

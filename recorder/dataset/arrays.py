@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from typing import Any
@@ -208,4 +209,5 @@ def last_steps(
 
 def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:
     """Return the bytes of each row. Bytes of equal NaN values compare as equal, unlike floats."""
-    return np.frombuffer(array.tobytes(), np.uint8).reshape(len(array), -1)
+    rows = np.ascontiguousarray(array).reshape(len(array), math.prod(array.shape[1:]))
+    return rows.view(np.uint8)

@@ -5,6 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+from mcaprl.recorder.dataset.format_registry import (
+    FORMATS,
+    module_of,
+    read_format,
+    write_format,
+)
+
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
@@ -231,9 +238,7 @@ class Conversions:
             SpaceError: d3rlpy cannot hold a space.
             MissingExtraError: d3rlpy is not installed.
         """
-        from mcaprl.recorder.dataset.formats.d3rlpy import to_mdp_dataset
-
-        return to_mdp_dataset(cast("Dataset", self))
+        return module_of("d3rlpy").to_mdp_dataset(self)
 
     @staticmethod
     def from_d3rlpy(buffer: Any) -> Dataset:
@@ -244,9 +249,8 @@ class Conversions:
             LogError: There are no transitions.
             UsageError: `buffer` is not a replay buffer of d3rlpy.
         """
-        from mcaprl.recorder.dataset.formats.d3rlpy import from_buffer
-
-        return from_buffer(buffer)
+        found: Dataset = module_of("d3rlpy").from_buffer(buffer)
+        return found
 
     def to_sb3(self, *, device: str = "cpu", buffer_class: Any = None, **options: Any) -> Any:
         """Return a Stable-Baselines3 `ReplayBuffer` or `DictReplayBuffer` with all transitions.
@@ -266,10 +270,8 @@ class Conversions:
             UsageError: `buffer_size` is too small, or `n_envs` is not 1.
             MissingExtraError: Stable-Baselines3 is not installed.
         """
-        from mcaprl.recorder.dataset.formats.sb3 import to_buffer
-
-        dataset = cast("Dataset", self)
-        return to_buffer(dataset, device=device, buffer_class=buffer_class, **options)
+        convert = module_of("sb3").to_buffer
+        return convert(self, device=device, buffer_class=buffer_class, **options)
 
     @staticmethod
     def from_sb3(
@@ -301,22 +303,16 @@ class Conversions:
             LogError: The buffer is empty, or has lost information and `lossy` is not set.
             UsageError: `buffer` is not a replay buffer of SB3.
         """
-        from mcaprl.recorder.dataset.formats.sb3 import from_buffer
-
-        return from_buffer(
-            buffer, channels_last=channels_last, scaled_actions=scaled_actions, lossy=lossy
-        )
+        options = {"channels_last": channels_last, "scaled_actions": scaled_actions}
+        found: Dataset = module_of("sb3").from_buffer(buffer, lossy=lossy, **options)
+        return found
 
     def _written(
         self, name: str, path: str | Path, *, lossy: bool, overwrite: bool, **options: Any
     ) -> list[str]:
-        from mcaprl.recorder.dataset.formats.registry import format_named, write_format
-
-        dataset, form = cast("Dataset", self), format_named(name)
+        dataset, form = cast("Dataset", self), FORMATS[name]
         return write_format(dataset, path, form, lossy=lossy, overwrite=overwrite, **options)
 
 
 def _read(name: str, path: str | Path, **options: Any) -> Dataset:
-    from mcaprl.recorder.dataset.formats.registry import format_named, read_format
-
-    return read_format(path, format_named(name), **options)
+    return read_format(path, FORMATS[name], **options)

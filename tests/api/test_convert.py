@@ -179,7 +179,7 @@ def test_a_killed_conversion_leaves_nothing_under_the_final_name(
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 9
     assert not out.exists()
     mcaprl.convert(log, out, to=form)
-    assert mcaprl.open(out).fingerprint == mcaprl.open(log).fingerprint
+    assert mcaprl.open(out).frames.tolist() == mcaprl.open(log).frames.tolist()
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["lane.mcap", target])
 
 

@@ -22,7 +22,23 @@ from tests.support.paths import GOLDEN
 
 ROOT = Path(__file__).parent.parent.parent
 PACKAGES = ("api", "device", "offline", "online", "recorder", "sims")
-CLASSES = ("ClusterOptions", "Dataset", "Episode", "OpenBag", "RecordMcap", "RecordVecMcap")
+CLASSES = (
+    "ClusterOptions",
+    "Dataset",
+    "Episode",
+    "Format",
+    "OpenBag",
+    "RecordMcap",
+    "RecordVecMcap",
+)
+    "ClusterOptions",
+    "Dataset",
+    "Episode",
+    "Format",
+    "OpenBag",
+    "RecordMcap",
+    "RecordVecMcap",
+)
 FUNCTIONS = {
     "train-offline": ("train", "sweep", "open", "ClusterOptions"),
     "annotate": ("annotate", "open"),

@@ -65,7 +65,6 @@ def dataset_of(
     metadata: LogMetadata,
     where: object,
     *,
-    is_foreign: bool = False,
     has_rewards: bool = True,
 ) -> Dataset:
     """Return a dataset of these episodes.
@@ -74,13 +73,13 @@ def dataset_of(
     Otherwise, the data has no times: the log_times start at 0 and increase by the step duration in
     the metadata.
 
+    Rewards and actions must be finite, and discrete values in their space. A log may contain other
+    values, which `lint` reports.
+
     Args:
         episodes: Episodes in order; episodes without a transition are left out.
         metadata: Spaces and description of the data.
         where: Name of the source, for errors.
-        is_foreign: Whether another tool wrote the data. Then, all rewards and actions must be
-            finite, and discrete values must be in their space. A log may contain other values,
-            which `lint` reports, so they are accepted in data that this package wrote.
         has_rewards: Whether the source has rewards; otherwise, they are NaN.
 
     Raises:
@@ -94,8 +93,7 @@ def dataset_of(
     for index, episode in kept:
         place = _place(where, index, episode)
         _check_times_and_probabilities(episode, place)
-        if is_foreign:
-            _check_values(episode, metadata, place, has_rewards=has_rewards)
+        _check_values(episode, metadata, place, has_rewards=has_rewards)
     return _joined([episode for _, episode in kept], metadata, where)
 
 
@@ -152,7 +150,7 @@ def _check_times_and_probabilities(episode: EpisodeArrays, place: str) -> None:
 def _check_values(
     episode: EpisodeArrays, metadata: LogMetadata, place: str, *, has_rewards: bool
 ) -> None:
-    """Check the values of another tool; see `dataset_of`."""
+    """Check values; see `dataset_of`."""
     first = episode.first_row or 0
     actions = numbers(f"{place}: actions", episode.actions)
     check_finite(f"{place}: actions", actions, first_row=first)

@@ -6,9 +6,7 @@ step is not a transition: it only contains the next observation of the step befo
 episode that was not terminated is stored with one additional step, which contains the final
 observation, a zero action and a zero reward.
 
-Images have their channels first, other tensors are vectors, and a Dict is a list of arrays. The
-group `mcaprl` of the file contains the data that d3rlpy's format cannot store; d3rlpy does not read
-this group.
+Images have their channels first, other tensors are vectors, and a Dict is a list of arrays.
 
 d3rlpy 1 wrote flat arrays, in which `episode_terminals` marks the last step of each episode. They
 are read as d3rlpy 2 reads them.
@@ -32,20 +30,20 @@ from mcaprl.recorder.dataset.arrays import action_space_of, box_of
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats import hdf5_nodes as nodes
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
-from mcaprl.recorder.dataset.formats.d3rlpy_own import read_own, stored_rows, write_own
 from mcaprl.recorder.dataset.formats.ends import Kind
 from mcaprl.recorder.dataset.formats.flat import NAMES, FlatOptions, flat_dataset, unread_note
-from mcaprl.recorder.dataset.formats.infos import infos_of, stored_infos
-from mcaprl.recorder.dataset.formats.npz import OWN
 from mcaprl.recorder.dataset.values import exactly, flags, numbers
 from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
 from mcaprl.recorder.format.spaces import (
     MIN_IMAGE_EDGE,
+    Leaf,
     action_leaf,
     observation_leaves,
 )
 
 VERSION = "2.1"
+_OWN = "mcaprl"
+"""Group that earlier versions of this package wrote; it is not read."""
 _KEYS = ("observations", "actions", "rewards", "terminated")
 
 
@@ -121,20 +119,16 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     Args:
         dataset: Episodes to write.
         path: New file.
-        lossy: Whether to write actions of a space that d3rlpy does not support, and to leave out
-            infos that cannot be stored.
+        lossy: Whether to write actions of a space that d3rlpy does not support.
 
     Returns:
-        One sentence for each info that was left out, and one for an unsupported action space.
+        One sentence for each thing that is stored in another way.
 
     Raises:
-        SpaceError: d3rlpy does not support the action space, or an info cannot be stored, and
-            `lossy` is not set.
+        SpaceError: d3rlpy does not support the action space, and `lossy` is not set.
         MissingExtraError: h5py is not installed.
     """
-    infos, lost = stored_infos(infos_of(dataset))
-    if lost and not lossy:
-        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the dataset")
+    lost = []
     try:
         _check_action_space(dataset.action_space)
     except SpaceError as error:
@@ -143,6 +137,13 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
                 f"{error}; pass --lossy (lossy=True in Python) to write the actions unchanged"
             ) from error
         lost.append(f"{error}; the actions are written unchanged")
+    leaves = observation_leaves(dataset.observation_space)
+    if isinstance(dataset.observation_space, spaces.Dict):
+        keys = ", ".join("/".join(leaf.path) for leaf in leaves)
+        lost.append(f"the keys {keys} of the observations become numbers")
+    for leaf in leaves:
+        if len(leaf.shape) > 1 and leaf.dtype != np.uint8:
+            lost.append(f"{leaf.name} of shape {leaf.shape} becomes a vector")
     with nodes.created(path) as file:
         for index, part in enumerate(_episodes_of(dataset)):
             for name, values in part.items():
@@ -156,7 +157,6 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
         file["columns"] = list(_KEYS)
         file["num_episodes"] = len(dataset.episode_lengths)
         file["version"] = VERSION
-        write_own(file.create_group(OWN), dataset, infos)
     return lost
 
 
@@ -192,9 +192,8 @@ def read(path: Path, *, one_episode: bool = False, dones: Kind | None = None) ->
         ]
         for index, episode in enumerate(episodes):
             _check_arrays(episode, f"{path}: episode {index}")
-        own = read_own(file, episodes, path) if nodes.has(file, OWN) else None
-        unread = [] if own else _unread(file, count)
-    found = own or _dataset_of(episodes, None, path)
+        unread = _unread(file, count)
+    found = _dataset_of(episodes, None, path)
     if unread:
         warnings.warn(f"{path}: {unread_note(unread)}", stacklevel=4)
     return found
@@ -232,7 +231,7 @@ def _unread(file: Any, count: int) -> list[str]:
 
     def is_known(name: str) -> bool:
         found = known.fullmatch(name)
-        return name in ("columns", OWN) or (found is not None and int(found[2]) < count)
+        return name in ("columns", _OWN) or (found is not None and int(found[2]) < count)
 
     names = nodes.names_in(file)
     return [name for name in names if not is_known(name) and nodes.has_rows(file, name)]
@@ -253,13 +252,23 @@ def _episodes_of(dataset: Dataset) -> Iterator[dict[str, Any]]:
         terminated = bool(dataset.terminated[steps.stop - 1])
         rows = slice(frames.start, frames.stop - terminated)
         more = ((0, 0 if terminated else 1), (0, 0))
-        found = [stored_rows(leaf, np.asarray(leaf.of(dataset.frames)[rows])) for leaf in leaves]
+        found = [_stored_rows(leaf, np.asarray(leaf.of(dataset.frames)[rows])) for leaf in leaves]
         yield {
             "observations": found[0] if len(found) == 1 else found,
             "actions": np.pad(actions[steps], more),
             "rewards": np.pad(dataset.rewards[steps, None], more),
             "terminated": terminated,
         }
+
+
+def _stored_rows(leaf: Leaf, values: NDArray[Any]) -> NDArray[Any]:
+    """Return rows (N, *shape) as d3rlpy stores them: images (N, C, H, W), or vectors (N, size)."""
+    if leaf.dtype == np.uint8 and len(leaf.shape) == 3 and sorted(leaf.shape)[1] >= MIN_IMAGE_EDGE:
+        is_first = leaf.shape[0] == min(leaf.shape)
+        return values if is_first else np.moveaxis(values, -1, 1)
+    if leaf.encoding is not None:
+        return values[:, None]
+    return values.reshape(len(values), leaf.size)
 
 
 def _joined(observations: Sequence[Any]) -> Any:
@@ -304,7 +313,7 @@ def _dataset_of(
             truncated=not terminated,
         )
         found.append(arrays)
-    return dataset_of(found, metadata, where, is_foreign=True)
+    return dataset_of(found, metadata, where)
 
 
 def _frames(episode: Mapping[str, Any]) -> Any:

@@ -22,7 +22,8 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.texts import counted, printable
 
 COLUMNS = ("observations", "actions", "rewards", "next_observations", "behavior_probs")
-NAMES = frozenset((*COLUMNS, *MEANINGS))
+FINALS, TIMES, INFOS = "final_observations", "log_time_ns", "infos"
+NAMES = frozenset((*COLUMNS, *MEANINGS, FINALS, TIMES))
 """Names of the arrays that are read."""
 _REQUIRED = ("observations", "actions", "rewards")
 _TERMINATED = "terminals or terminations or terminated (or another name of docs/formats.md)"
@@ -51,15 +52,17 @@ def flat_dataset(
 ) -> Dataset:
     """Return a dataset of flat arrays.
 
-    If there are no next observations, the observation of a terminal transition is repeated as its
-    next observation. The last transition of any other episode is left out, because its next
-    observation is unknown.
+    If there are neither next nor final observations, the observation of a terminal transition is
+    repeated as its next observation. The last transition of any other episode is left out, because
+    its next observation is unknown.
 
     Args:
-        found: Arrays of N rows by the names in `NAMES`. The observations may be nested dicts.
+        found: Arrays by the names in `NAMES`: N rows, but E for the final observations of the
+            episodes, and N + E for the times. The observations may be nested dicts.
         where: Name of the source, for errors and warnings.
         infos: Arrays by dotted name. An array of N rows is read as an info of the N observations;
-            the final observations have no infos. Other arrays are named in a warning.
+            the final observations have no infos. An array of N + E rows has infos of all
+            observations, if there are final ones. Other arrays are named in a warning.
         options: What the user says about the arrays.
         unread: Names of other arrays of the source, for a warning.
 
@@ -93,26 +96,34 @@ def flat_dataset(
     try:
         steps = _Steps(columns, ends_of(columns, count, dones=options.dones))
         steps.check_ends(options)
-        rows = {name: values for name, values in (infos or {}).items() if _is_info(values, count)}
-        unread += [f"infos/{name}" for name in infos or {} if name not in rows]
+        counts = (count, steps.frame_count)
+        rows = {name: values for name, values in (infos or {}).items() if _is_info(values, counts)}
+        unread += [f"{INFOS}/{name}" for name in infos or {} if name not in rows]
+        unread += steps.unread()
         episodes = list(steps.episodes(rows))
     except (LogError, SpaceError, UsageError) as error:
         raise type(error)(f"{where}: {error}") from error
     for note in (*steps.notes(), *_unread(unread)):
         warnings.warn(f"{where}: {note}", stacklevel=4)
     description = _described(columns, where)
-    return dataset_of(episodes, description, where, is_foreign=True)
+    return dataset_of(episodes, description, where)
 
 
 class _Steps:
-    """Columns of N transitions, divided into episodes."""
+    """Columns of N transitions, divided into E episodes.
+
+    Attributes:
+        frame_count: Number of observations, N + E; N if final observations are unknown.
+    """
 
     def __init__(self, columns: Mapping[str, Any], ends: Ends) -> None:
         self._columns, self._ends = columns, ends
         self._count = len(columns["rewards"])
         self._next = columns.get("next_observations")
-        # With next observations, a row is a transition in every format.
-        self._is_rlds = ends.is_rlds and self._next is None
+        self._finals = columns.get(FINALS) if self._next is None else None
+        # With next or final observations, a row is a transition in every format.
+        self._has_finals = self._next is not None or self._finals is not None
+        self._is_rlds = ends.is_rlds and not self._has_finals
         self._check_lengths()
         self._last = ends.last.copy()
         self._breaks = np.zeros(self._count, np.bool_)
@@ -124,6 +135,30 @@ class _Steps:
         self._last[-1:] = True
         stops = (np.flatnonzero(self._last) + 1).tolist()
         self._spans = list(zip([0, *stops[:-1]], stops, strict=True))
+        if self._next is not None:
+            self._finals = rows_of_tree(self._next, np.array(stops) - 1)
+        elif self._finals is not None:
+            some = rows_of_tree(columns["observations"], slice(len(stops)))
+            self._finals = _like(some, self._finals, FINALS)
+        self.frame_count = self._count + (len(stops) if self._has_finals else 0)
+        self._times = self._times_ns(columns.get(TIMES))
+
+    def unread(self) -> list[str]:
+        """Return the names of the columns that are not used."""
+        has_times, has_both = self._times is not None, self._next is not None
+        return [
+            name
+            for name, is_used in ((TIMES, has_times), (FINALS, not has_both))
+            if name in self._columns and not is_used
+        ]
+
+    def _times_ns(self, times: Any) -> NDArray[np.int64] | None:
+        """Return the times of all observations; None if there is no whole number for each."""
+        if not isinstance(times, np.ndarray) or times.dtype.kind not in "iu":
+            return None
+        if not self._has_finals or times.shape != (self.frame_count,):
+            return None
+        return exactly(TIMES, times, np.dtype(np.int64))
 
     def check_ends(self, options: FlatOptions) -> None:
         """Check that something says where episodes end, or that the user does.
@@ -149,15 +184,15 @@ class _Steps:
         """Yield the episodes; see `flat_dataset`."""
         actions, rewards = self._columns["actions"], self._columns["rewards"]
         observations, probs = self._columns["observations"], self._columns.get("behavior_probs")
-        for start, stop in self._spans:
+        for index, (start, stop) in enumerate(self._spans):
             last = stop - self._is_left_out(stop - 1)
             steps, frames = slice(start, last), np.arange(start, last + 1)
-            if self._next is None:
+            if self._finals is None:
                 rows = rows_of_tree(observations, np.minimum(frames, stop - 1))
             else:
-                final = rows_of_tree(self._next, slice(stop - 1, stop))
+                final = rows_of_tree(self._finals, slice(index, index + 1))
                 rows = joined_trees([rows_of_tree(observations, slice(start, stop)), final])
-            info_stop = min(last + 1, stop)
+            frames += index
             yield EpisodeArrays(
                 observations=rows,
                 actions=actions[steps],
@@ -165,7 +200,16 @@ class _Steps:
                 terminated=bool(self._ends.terminated[stop - 1]),
                 truncated=bool(self._ends.truncated[stop - 1]),
                 behavior_probs=None if probs is None else probs[steps],
-                infos=_info_rows(infos, start, info_stop, len(frames)),
+                times_ns=None if self._times is None else self._times[frames],
+                infos={
+                    name: _info(
+                        values[frames]
+                        if len(values) > self._count
+                        else values[start : min(last + 1, stop)],
+                        len(frames),
+                    )
+                    for name, values in infos.items()
+                },
                 first_row=start,
             )
 
@@ -173,13 +217,15 @@ class _Steps:
         """Yield what the user has to know."""
         yield from self._ends.notes
         lasts = np.array([stop - 1 for _, stop in self._spans])
-        if not self._ends.has_truncations and (self._next is None or self._is_shifted(lasts)):
+        is_unclear = self._is_shifted(lasts) if self._next is not None else self._finals is None
+        if not self._ends.has_truncations and is_unclear:
             yield (
                 "there are no timeouts (or truncations): if a time limit ended an episode, nothing"
                 " marks that end, and a transition leads from there into the next episode"
             )
         if self._next is not None:
             yield from self._wrong_next(lasts)
+        if self._has_finals:
             return
         dropped = sum(self._is_left_out(row) for row in lasts.tolist())
         repeated = len(lasts) - dropped
@@ -207,7 +253,7 @@ class _Steps:
 
     def _is_left_out(self, row: int) -> bool:
         """Return whether the last row of an episode is not a transition."""
-        return self._next is None and (self._is_rlds or not self._ends.terminated[row])
+        return not self._has_finals and (self._is_rlds or not self._ends.terminated[row])
 
     def _is_shifted(self, lasts: NDArray[np.int64]) -> bool:
         """Return whether next observations are those of the following row, even at all ends."""
@@ -267,7 +313,11 @@ def _one_column(name: str, values: Any, where: object) -> Any:
     try:
         if isinstance(values, Mapping):
             return {key: _one_column(f"{name}/{key}", values[key], where) for key in values}
-        array = numbers(name, values) if name.split("/")[0] in COLUMNS else np.asarray(values)
+        array = (
+            numbers(name, values)
+            if name.split("/")[0] in (*COLUMNS, FINALS)
+            else np.asarray(values)
+        )
     except SpaceError as error:
         raise SpaceError(f"{where}: {error}") from error
     is_flat = name in MEANINGS or name in ("rewards", "behavior_probs")
@@ -301,17 +351,14 @@ def _leaves(tree: Any) -> list[NDArray[Any]]:
     return [array for _, array in sorted(named_leaves("", tree), key=lambda found: found[0])]
 
 
-def _is_info(values: NDArray[Any], count: int) -> bool:
-    return values.ndim > 0 and len(values) == count and values.dtype.kind in "biufU"
+def _is_info(values: NDArray[Any], counts: Sequence[int]) -> bool:
+    return values.ndim > 0 and len(values) in counts and values.dtype.kind in "biufU"
 
 
-def _info_rows(infos: Mapping[str, NDArray[Any]], first: int, last: int, count: int) -> Any:
-    """Return the rows [first, last) of each info; append masked rows up to `count` rows."""
-    is_missing = np.arange(count) >= last - first
-    return {
-        name: masked(np.resize(values[first:last], (count, *values.shape[1:])), is_missing)
-        for name, values in infos.items()
-    }
+def _info(values: NDArray[Any], count: int) -> Any:
+    """Append masked rows to an info, up to `count` rows."""
+    is_missing = np.arange(count) >= len(values)
+    return masked(np.resize(values, (count, *values.shape[1:])), is_missing)
 
 
 def _unread(names: Sequence[str]) -> list[str]:

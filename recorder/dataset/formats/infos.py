@@ -2,50 +2,26 @@
 
 In a row for which the environment returned no info, a float is stored as NaN, and a string as the
 empty string. If integers or flags have such rows, all their values are stored as floats, with NaN
-in these rows. The dtype and the rows without an info are also stored, so that infos are read back
-unchanged.
+in these rows.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.recorder.dataset.dataset import Dataset
-
+NO_NAME = r"[/\0\ud800-\udfff]"
+"""Pattern of the characters that names in archives and HDF5 files do not have."""
 # Floats cannot represent larger integers exactly.
 _MAX_EXACT = 2**53
 
 
-class StoredInfo(NamedTuple):
-    """An info with a value in each of F rows.
-
-    Attributes:
-        values: (F, *shape) numbers, flags or strings.
-        is_missing: (F,) bool; whether the environment returned no info for the row.
-        dtype: Data type of the info.
-    """
-
-    values: NDArray[Any]
-    is_missing: NDArray[np.bool_]
-    dtype: np.dtype[Any]
-
-    def rows(self, rows: Any) -> StoredInfo:
-        """Return this info with only the given rows."""
-        return self._replace(values=self.values[rows], is_missing=self.is_missing[rows])
-
-
-def infos_of(dataset: Dataset) -> Mapping[str, Any]:
-    """Return masked arrays (F, *shape) by dotted name, one row for each observation."""
-    return dataset.infos
-
-
-def stored_infos(infos: Mapping[str, Any]) -> tuple[dict[str, StoredInfo], list[str]]:
-    """Return the infos to store by name, and one sentence for each info that is left out."""
+def stored_infos(infos: Mapping[str, Any]) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    """Return the values (F, *shape) to store by name, and a sentence for each info left out."""
     found, lost = {}, []
     for name, values in infos.items():
         stored = _stored(values)
@@ -56,25 +32,19 @@ def stored_infos(infos: Mapping[str, Any]) -> tuple[dict[str, StoredInfo], list[
     return found, lost
 
 
-def masked(
-    values: NDArray[Any], is_missing: NDArray[np.bool_], dtype: np.dtype[Any] | None = None
-) -> np.ma.MaskedArray[Any, Any]:
-    """Return an info as the environment returned it. This is the inverse of `stored_infos`.
+def missing_rows(values: Any) -> NDArray[np.bool_]:
+    """Return flags (F,): whether the environment returned no info for the row."""
+    mask = np.ma.getmaskarray(values)
+    found = np.zeros(len(mask), bool)
+    if mask.size:
+        found[:] = mask.reshape(len(mask), -1).any(axis=1)
+    return found
 
-    Args:
-        values: (F, *shape) stored values.
-        is_missing: (F,) bool; whether the row has no info.
-        dtype: Data type of the info; default: the dtype of the values.
-    """
-    dtype = values.dtype if dtype is None else dtype
+
+def masked(values: NDArray[Any], is_missing: NDArray[np.bool_]) -> np.ma.MaskedArray[Any, Any]:
+    """Return an info (F, *shape) whose rows are masked where `is_missing` (F,) is set."""
     mask = np.broadcast_to(is_missing.reshape(-1, *[1] * (values.ndim - 1)), values.shape)
-    if dtype.kind == "U" and values.dtype.kind == "U":
-        # A description may declare texts of any length.
-        dtype = values.dtype
-    if values.dtype.kind == "f" and dtype.kind != "f":
-        values = np.where(mask, 0, values)
-    with np.errstate(all="ignore"):
-        return np.ma.MaskedArray(values.astype(dtype), mask.copy())
+    return np.ma.MaskedArray(values, mask.copy())
 
 
 def info_type(text: str) -> np.dtype[Any]:
@@ -104,7 +74,7 @@ def nested_names(names: Iterable[str]) -> tuple[dict[str, tuple[str, ...]], list
     for name in sorted(every):
         parts = tuple(name.split("."))
         is_group = any(other.startswith(f"{name}.") for other in every)
-        if is_group or not all(parts) or re.search(r"[/\0\ud800-\udfff]", name):
+        if is_group or not all(parts) or re.search(NO_NAME, name):
             reason = "its name is not valid in HDF5"
             if is_group:
                 reason = f"another name starts with '{name}.'"
@@ -114,28 +84,22 @@ def nested_names(names: Iterable[str]) -> tuple[dict[str, tuple[str, ...]], list
     return found, lost
 
 
-def _stored(values: Any) -> StoredInfo | str:
-    """Return the info to store, or the reason why it cannot be stored."""
-    data = np.ma.getdata(values)
-    mask = np.ma.getmaskarray(values)
-    is_missing = np.zeros(len(data), bool)
-    if mask.size:
-        is_missing[:] = mask.reshape(len(data), -1).any(axis=1)
+def _stored(values: Any) -> NDArray[Any] | str:
+    """Return the values to store, or the reason why they cannot be stored."""
+    data, mask, is_missing = np.ma.getdata(values), np.ma.getmaskarray(values), missing_rows(values)
     if data.dtype.kind not in "biufU":
         return f"values of dtype {data.dtype} cannot be stored"
     if data.dtype.kind == "U":
         if any(re.search(r"[\0\ud800-\udfff]", text) for text in data[~is_missing].ravel()):
             return "a text is not UTF-8"
-        filled = np.where(mask, "", data)
-    elif not is_missing.any():
-        filled = data
-    elif data.dtype.kind == "f":
-        filled = np.where(mask, np.nan, data).astype(data.dtype)
-    elif data.dtype.kind in "iu" and _is_large(data[~is_missing]):
+        return np.where(mask, "", data)
+    if not is_missing.any():
+        return data
+    if data.dtype.kind == "f":
+        return np.where(mask, np.nan, data).astype(data.dtype)
+    if data.dtype.kind in "iu" and _is_large(data[~is_missing]):
         return "some rows are missing, and the integers are too large for floats"
-    else:
-        filled = np.where(mask, np.nan, data.astype(np.float64))
-    return StoredInfo(filled, is_missing, data.dtype)
+    return np.where(mask, np.nan, data.astype(np.float64))
 
 
 def _is_large(values: NDArray[Any]) -> bool:

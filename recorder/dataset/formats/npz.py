@@ -1,21 +1,19 @@
-"""NumPy archives, written by this package (a whole dataset) or by other tools.
+"""NumPy archives, written by this package or by other tools.
 
-An archive of this package has these arrays, for E episodes with N transitions:
+`write` writes these arrays, for E episodes with N transitions:
 
     observations              (N, *shape); or arrays `observations/KEY` for the keys of a Dict
     final_observations        (E, *shape), named in the same way
     actions, rewards, terminations, truncations, behavior_probs    (N,) or (N, *shape)
     episode_lengths           (E,)
-    log_time_ns               (N + E,)
-    infos/NAME                (N + E, *shape); `missing_infos/NAME` marks the rows without the info
-    mcaprl                    JSON text: metadata, summaries and the names of the observations
+    log_time_ns               (N + E,), if the data has times
+    infos/NAME                (N + E, *shape)
 
-Other archives have the arrays of `flat.NAMES`. Pickled objects are never loaded.
+`read` reads the arrays of `flat.NAMES`. Pickled objects are never loaded.
 """
 
 from __future__ import annotations
 
-import json
 import re
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -26,30 +24,17 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, SpaceError
-from mcaprl.files import parse_json
+from mcaprl.errors import SpaceError
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
+from mcaprl.recorder.dataset.formats.columns import episode_slices
 from mcaprl.recorder.dataset.formats.ends import Kind
-from mcaprl.recorder.dataset.formats.flat import NAMES, FlatOptions, flat_dataset
-from mcaprl.recorder.dataset.formats.infos import (
-    StoredInfo,
-    info_type,
-    infos_of,
-    masked,
-    stored_infos,
-)
+from mcaprl.recorder.dataset.formats.flat import FINALS, INFOS, NAMES, FlatOptions, flat_dataset
+from mcaprl.recorder.dataset.formats.hdf5_nodes import with_names_for_hdf5
+from mcaprl.recorder.dataset.formats.infos import NO_NAME, stored_infos
 from mcaprl.recorder.dataset.formats.npz_archive import Archive
-from mcaprl.recorder.dataset.values import flags
-from mcaprl.recorder.format.messages import MAX_SEED
-from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.spaces import Leaf, leaves_of, nest
+from mcaprl.recorder.format.metadata import NO_TIMES
+from mcaprl.recorder.format.spaces import leaves_of
 
-OWN = "mcaprl"
-SUMMARY = ("reason", "policy", "epsilon", "seed", "options")
-_OBSERVATIONS, _FINALS = "observations", "final_observations"
-INFOS, MISSING = "infos", "missing_infos"
-_PLAIN = re.compile(r"[A-Za-z0-9_.-]+")
 _BLOCK_ROWS = 1024
 
 
@@ -64,42 +49,42 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     Args:
         dataset: Episodes to write.
         path: New file.
-        lossy: Whether infos that are neither numbers nor texts are left out.
+        lossy: Whether keys are renamed, and infos left out, that an archive cannot store.
 
     Returns:
-        One sentence for each info that was left out.
+        One sentence for each of these.
 
     Raises:
-        SpaceError: An info cannot be stored, and `lossy` is not set.
+        SpaceError: A key or an info cannot be stored, and `lossy` is not set.
     """
-    infos, lost = stored_infos(infos_of(dataset))
+    infos, lost = stored_infos(dataset.infos)
+    for name in [name for name in infos if re.search(NO_NAME, name)]:
+        lost.append(f"the info '{name}' is left out, because its name is not valid in an archive")
+        del infos[name]
+    space, renamed = with_names_for_hdf5(dataset.observation_space)
+    lost += [f"the key '{key}' is renamed, because an archive cannot store it" for key in renamed]
     if lost and not lossy:
         raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the rest")
-    leaves = leaves_of(dataset.observation_space)
-    names = [array_name(leaf) for leaf in leaves]
-    slices = episode_slices(dataset)
-    finals = np.array([frames.stop - 1 for _, frames in slices])
+    finals = np.array([frames.stop - 1 for _, frames in episode_slices(dataset)])
     with zipfile.ZipFile(path, "w") as archive:
-        for leaf, name in zip(leaves, names, strict=True):
-            column = leaf.of(dataset.frames)
-            _put(archive, _OBSERVATIONS + name, column, dataset.frame_of_step)
-            _put(archive, _FINALS + name, column, finals)
-        for name, values in (
-            ("actions", dataset.actions),
-            ("rewards", dataset.rewards),
-            ("terminations", dataset.terminated),
-            ("truncations", dataset.truncated),
-            ("behavior_probs", dataset.behavior_probs),
-            ("episode_lengths", dataset.episode_lengths),
-            ("log_time_ns", np.concatenate([e.log_time_ns for e in dataset.episodes])),
-            (OWN, np.array(description_text(dataset, names, arrays_of(infos)))),
-        ):
+        leaves = leaves_of(dataset.observation_space)
+        for leaf, named in zip(leaves, leaves_of(space), strict=True):
+            column, name = leaf.of(dataset.frames), "".join(f"/{key}" for key in named.path)
+            _put(archive, f"observations{name}", column, dataset.frame_of_step)
+            _put(archive, FINALS + name, column, finals)
+        arrays = {
+            "actions": dataset.actions,
+            "rewards": dataset.rewards,
+            "terminations": dataset.terminated,
+            "truncations": dataset.truncated,
+            "behavior_probs": dataset.behavior_probs,
+            "episode_lengths": dataset.episode_lengths,
+        }
+        if dataset.metadata.get("times") != NO_TIMES:
+            arrays["log_time_ns"] = np.concatenate([e.log_time_ns for e in dataset.episodes])
+        arrays |= {f"{INFOS}/{name}": values for name, values in infos.items()}
+        for name, values in arrays.items():
             _put_rows(archive, name, values.dtype, values.shape, [values])
-        for number, (name, info) in enumerate(infos.items()):
-            array = _info_name(name, number)
-            _put_rows(archive, INFOS + array, info.values.dtype, info.values.shape, [info.values])
-            missing = info.is_missing
-            _put_rows(archive, MISSING + array, missing.dtype, missing.shape, [missing])
     return lost
 
 
@@ -117,8 +102,6 @@ def read(path: Path, *, one_episode: bool = False, dones: Kind | None = None) ->
         UsageError: The options contradict the arrays.
     """
     with Archive.opened(path) as archive:
-        if OWN in archive.names:
-            return _own(archive, path)
         taken = [name for name in archive.names if name.split("/")[0] in (*NAMES, INFOS)]
         found = _nested({name: archive[name] for name in taken})
         unread = [name for name in archive.names if name not in taken and archive.is_array(name)]
@@ -141,145 +124,6 @@ def _dotted(tree: Mapping[str, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
             yield from ((f"{name}.{rest}", values) for rest, values in _dotted(part))
         else:
             yield name, part
-
-
-def array_name(leaf: Leaf) -> str:
-    """Return the suffix that follows `observations` in the name of a leaf's array.
-
-    If a key has characters other than letters, digits, `.`, `_` and `-`, the suffix contains the
-    leaf's name in the log.
-    """
-    if all(_PLAIN.fullmatch(key) for key in leaf.path):
-        return "".join(f"/{key}" for key in leaf.path)
-    return f":{leaf.name}"
-
-
-def arrays_of(infos: Mapping[str, StoredInfo]) -> dict[str, list[str]]:
-    """Return, for each info, its dtype and the suffix that follows `infos` in the array's name."""
-    return {
-        name: [_info_name(name, number), info.dtype.str]
-        for number, (name, info) in enumerate(infos.items())
-    }
-
-
-def description_text(
-    dataset: Dataset, names: Iterable[str], infos: Mapping[str, Iterable[str]] | None = None
-) -> str:
-    """Return JSON with the metadata, the summaries and the names of the arrays.
-
-    Args:
-        dataset: Dataset to describe.
-        names: For each leaf, the suffix that follows `observations` in the array's name.
-        infos: For each info, the suffix that follows `infos` in the array's name, and the dtype;
-            default: no infos.
-    """
-    summaries = [
-        {name: getattr(episode.summary, name) for name in SUMMARY} for episode in dataset.episodes
-    ]
-    return json.dumps(
-        {
-            "metadata": dataset.metadata,
-            "episodes": summaries,
-            _OBSERVATIONS: list(names),
-            INFOS: {name: list(found) for name, found in (infos or {}).items()},
-        }
-    )
-
-
-def parse_description(text: str, where: object) -> tuple[LogMetadata, list[dict[str, Any]], Any]:
-    """Parse the text of `description_text`: metadata, fields of each summary, and array names.
-
-    Raises:
-        LogError: The text is damaged.
-    """
-    try:
-        found = parse_json(text)
-        metadata = LogMetadata.from_strings(found["metadata"])
-        summaries = [_summary(part) for part in found["episodes"]]
-        return metadata, summaries, list(map(str, found[_OBSERVATIONS]))
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise LogError(f"{where}: the array {OWN} is damaged: {error}") from error
-
-
-def _summary(part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a summary.
-
-    Raises:
-        ValueError: A value cannot be stored in a log.
-    """
-    seed = None if part["seed"] is None else int(part["seed"])
-    if seed is not None and not 0 <= seed <= MAX_SEED:
-        raise ValueError(f"seed {seed}")
-    texts = {name: str(part[name]) for name in ("reason", "policy", "options")}
-    return {**texts, "epsilon": float(part["epsilon"]), "seed": seed}
-
-
-def parse_infos(text: str, where: object) -> dict[str, tuple[str, np.dtype[Any]]]:
-    """Parse the descriptions of the infos in the text of `description_text`.
-
-    Returns:
-        For each info, the suffix that follows `infos` in the array's name, and the dtype.
-
-    Raises:
-        LogError: The text is damaged.
-    """
-    try:
-        found = parse_json(text).get(INFOS, {})
-        return {name: (str(array), info_type(str(dtype))) for name, (array, dtype) in found.items()}
-    except (ValueError, TypeError, AttributeError) as error:
-        raise LogError(f"{where}: the array {OWN} is damaged: {error}") from error
-
-
-def _own(arrays: Archive, path: Path) -> Dataset:
-    text = str(arrays[OWN])
-    metadata, summaries, names = parse_description(text, path)
-    described = parse_infos(text, path)
-    leaves = leaves_of(metadata.observation_space)
-    try:
-        lengths = [int(length) for length in arrays["episode_lengths"].tolist()]
-        columns = [(arrays[_OBSERVATIONS + name], arrays[_FINALS + name]) for name in names]
-        infos = {
-            name: masked(arrays[INFOS + array], arrays[MISSING + array].astype(bool), dtype)
-            for name, (array, dtype) in described.items()
-        }
-        steps: dict[str, Any] = {
-            name: arrays[name] for name in ("actions", "rewards", "behavior_probs")
-        }
-        ends = {
-            name: flags(f"{path}: {name}", arrays[name]) for name in ("terminations", "truncations")
-        }
-        times_ns = arrays["log_time_ns"]
-        rows = [len(values) for values in (*steps.values(), *ends.values())]
-        if min(lengths) < 1 or {*rows} != {sum(lengths)}:
-            raise ValueError(f"columns of {rows} rows, and episodes of {sum(lengths)}")
-        episodes, first = [], 0
-        for index, (length, summary) in enumerate(zip(lengths, summaries, strict=True)):
-            taken, frames = (
-                slice(first, first + length),
-                slice(first + index, first + index + length + 1),
-            )
-            parts = [
-                np.concatenate([rows[taken], finals[index : index + 1]]) for rows, finals in columns
-            ]
-            last = first + length - 1
-            episode = EpisodeArrays(
-                observations=nest(leaves, parts),
-                terminated=bool(ends["terminations"][last]),
-                truncated=bool(ends["truncations"][last]),
-                times_ns=times_ns[frames],
-                infos={name: values[frames] for name, values in infos.items()},
-                summary=summary,
-                **{name: values[taken] for name, values in steps.items()},
-            )
-            episodes.append(episode)
-            first += length
-        return dataset_of(episodes, metadata, path)
-    except (KeyError, ValueError, TypeError, IndexError, AssertionError) as error:
-        raise LogError(f"{path}: an array is missing or too short: {error}") from error
-
-
-def _info_name(name: str, number: int) -> str:
-    return f"/{name}" if _PLAIN.fullmatch(name) else f":{number}"
 
 
 def _nested(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:

@@ -255,7 +255,7 @@ class _Table:
             values[~is_missing] = rows
         except (AttributeError, KeyError, TypeError, ValueError, arrow.ArrowException) as error:
             raise LogError(f"{self._path}: {column} is damaged: {error}") from error
-        return masked(values, is_missing, dtype)
+        return masked(values, is_missing)
 
     def summaries(self) -> tuple[EpisodeSummary, ...]:
         """Return the rows of the table of episodes.

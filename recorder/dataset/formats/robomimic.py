@@ -67,7 +67,7 @@ def read_demos(file: Any, path: Path) -> Dataset:
         metadata = description_of("", episodes[0].observations, actions, None, None)
     except (SpaceError, ValueError) as error:
         raise SpaceError(f"{path}: {error}") from error
-    return dataset_of(episodes, metadata, path, is_foreign=True)
+    return dataset_of(episodes, metadata, path)
 
 
 def _demo(group: Any, where: str, notes: dict[str, None]) -> EpisodeArrays:

@@ -90,8 +90,8 @@ def test_an_installed_algorithm_trains(tmp_path: Path, monkeypatch: pytest.Monke
         ("smoothed-bc = no_such_module:Smoothed", "ModuleNotFoundError: No module named"),
         ("smoothed-bc = smoothed_bc_package:Missing", "AttributeError: "),
         ("smoothed-bc = smoothed_bc_package:SmoothedConfig", "it is not a subclass of Learner"),
-        ("other = smoothed_bc_package:Smoothed", "its algorithm is named 'smoothed-bc'"),
-        ("cql = mcaprl.offline.algorithms.cql:CQL", "a built-in algorithm has this name"),
+        ("other = smoothed_bc_package:Smoothed", "its name is 'smoothed-bc'"),
+        ("cql = mcaprl.offline.algorithms.cql:CQL", "the name is built in"),
     ],
 )
 def test_a_broken_entry_point_is_one_line_that_names_it(

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 import mcaprl
 from mcaprl.errors import LogError, SpaceError, UsageError
+from mcaprl.recorder.dataset.format_registry import target_format, write_format
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
-from mcaprl.recorder.dataset.formats.registry import target_format, write_format
 from mcaprl.recorder.format.metadata import LogMetadata
 from tests.support.recordings import MIXED_SPACE, record
 

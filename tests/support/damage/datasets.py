@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,12 +40,6 @@ def write_all(folder: Path) -> dict[str, tuple[str, Path]]:
     ):
         mcaprl.convert(_log(data, folder), folder / name, to=form)
         found[form] = form, folder / name
-    shutil.copytree(folder / "own-v0", folder / "theirs-v0")
-    _edit_json(folder / "theirs-v0/data/metadata.json", lambda found: found.pop("mcaprl"))
-    found["minari of others"] = "minari", folder / "theirs-v0"
-    shutil.copytree(folder / "lerobot", folder / "their_lerobot")
-    shutil.rmtree(folder / "their_lerobot/meta/mcaprl")
-    found["lerobot of others"] = "lerobot", folder / "their_lerobot"
     flat: dict[str, Any] = {
         "observations": data.observations,
         "actions": data.actions.astype(np.int32),
@@ -80,9 +71,3 @@ def _log(data: Dataset, folder: Path) -> Path:
     path = folder / "log.mcap"
     data.save(path, overwrite=True)
     return path
-
-
-def _edit_json(path: Path, change: Callable[[Any], Any]) -> None:
-    found = json.loads(path.read_text())
-    change(found)
-    path.write_text(json.dumps(found))

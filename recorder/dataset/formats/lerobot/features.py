@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from typing import Any
@@ -37,8 +37,6 @@ FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 DATA_PATH = f"data/{FILE}.parquet"
 VIDEO_PATH = f"videos/{{video_key}}/{FILE}.mp4"
 EPISODES_PATH = f"meta/episodes/{FILE}.parquet"
-OWN = "meta/mcaprl"
-"""Folder for data that LeRobot's format cannot store."""
 _HEIGHT_WIDTH_CHANNELS = ("height", "width", "channels")
 
 
@@ -187,6 +185,34 @@ def observation_names(leaves: Sequence[Leaf]) -> list[str]:
             candidate, number = f"{name}_{number}", number + 1
         found.append(candidate)
     return found
+
+
+def info_features(infos: Mapping[str, Any], frames: NDArray[np.int64]) -> dict[str, Feature]:
+    """Return a feature for each numeric info that is present at every step, by the info's name.
+
+    Args:
+        infos: Mapping[str, Any] of the dataset.
+        frames: Indexes (N,) of the rows with the infos that the steps returned.
+    """
+    found: dict[str, Feature] = {}
+    taken = {PROBABILITY}
+    for name, values in infos.items():
+        shape = values.shape[1:] or (1,)
+        is_number = values.dtype.kind in "biuf" and values.dtype != np.uint64
+        if not is_number or len(shape) > MAX_DIMENSIONS or not _present(values)[frames].all():
+            continue
+        plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", name)
+        feature = INFO + re.sub("image", "img", plain, flags=re.IGNORECASE)
+        if feature not in taken:
+            taken.add(feature)
+            found[name] = Feature(feature, str(values.dtype), shape)
+    return found
+
+
+def _present(values: Any) -> NDArray[np.bool_]:
+    """Return flags (F,): whether the info is present in each row."""
+    mask: NDArray[np.bool_] = np.ma.getmaskarray(values).reshape(len(values), -1)
+    return np.logical_not(mask.all(axis=1))
 
 
 def image_file(values: NDArray[Any]) -> bytes:

@@ -1,19 +1,28 @@
-"""Reading of LeRobot datasets, version 3.0, written by LeRobot or by this package."""
+"""Reading of LeRobot datasets, version 3.0, which have no final observations."""
 
 from __future__ import annotations
 
+import json
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, import_extra
+from mcaprl.errors import LogError, SpaceError, import_extra
+from mcaprl.recorder.dataset.arrays import action_space_of, box_of
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.dataset.formats.flat import unread_note
 from mcaprl.recorder.dataset.formats.lerobot import features
+from mcaprl.recorder.dataset.formats.lerobot.features import Feature
 from mcaprl.recorder.dataset.formats.lerobot.files import Files
-from mcaprl.recorder.dataset.formats.lerobot.foreign import foreign_dataset
-from mcaprl.recorder.dataset.formats.lerobot.own import Own, read_own
-from mcaprl.recorder.format.spaces import action_leaf, leaves_of, nest
+from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.texts import counted
 
 # Types of the errors that invalid values in damaged files cause.
 _DAMAGED = (
@@ -26,6 +35,29 @@ _DAMAGED = (
     RecursionError,
     OSError,
 )
+# LeRobot uses the same tolerance. In episodes of more than half an hour, the rounding error of the
+# 32-bit timestamps exceeds this tolerance.
+_TIME_TOLERANCE_S = 1e-4
+_OBSERVATION = "observation"
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Rows of a dataset that become an episode of T transitions.
+
+    Attributes:
+        frames: Indexes (T + 1,) of the rows with the episode's observations.
+        steps: Rows with the episode's transitions.
+        terminated: Whether the last transition led to a terminal state.
+        truncated: Whether the episode was truncated.
+        source: Index of the episode of LeRobot that contains these rows.
+    """
+
+    frames: NDArray[np.int64]
+    steps: slice
+    terminated: bool
+    truncated: bool
+    source: int
 
 
 def read(path: Path) -> Dataset:
@@ -47,45 +79,242 @@ def read(path: Path) -> Dataset:
     """
     arrow = import_extra("pyarrow", "tables")
     try:
-        files = Files(path)
-        own = read_own(path, files.lengths)
-        if own is not None and {*own.features, features.ACTION} <= set(files.features):
-            return _own_dataset(files, own)
-        return foreign_dataset(files)
+        return _dataset_of(Files(path))
     except (*_DAMAGED, arrow.ArrowException) as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise LogError(f"{path} is a damaged LeRobot dataset: {reason}") from error
 
 
-def _own_dataset(files: Files, own: Own) -> Dataset:
-    """Return the dataset that the writer of this package wrote."""
-    leaves = leaves_of(own.metadata.observation_space)
-    action = action_leaf(own.metadata.action_space)
-    columns = []
-    for leaf, name in zip(leaves, own.features, strict=True):
-        values = files.values(files.features[name])
-        # In a video, a gray image has three equal channels: use the first channel.
-        shown = values[..., 0] if leaf.encoding == "mono8" else values
-        columns.append(shown.reshape(len(values), *leaf.shape))
+def _dataset_of(files: Files) -> Dataset:
+    """Convert a dataset that has no final observations; warn about the missing data.
+
+    Raises:
+        LogError: There is no observation or no action.
+        SpaceError: A log cannot hold a feature.
+    """
+    values, parts, labels = _observations(files)
     steps = files.steps()
-    actions = steps[features.ACTION].reshape(-1, *action.shape)
+    if features.ACTION not in steps:
+        raise LogError(f"{files.path} has no feature '{features.ACTION}'")
+    _warn_of_steps(files, steps)
+    if unread := files.unread():
+        _warn(files, unread_note(unread))
+    actions, action_space = _values_and_space(steps[features.ACTION], is_action=True)
+    is_single = len(parts) == 1
+    metadata = LogMetadata(
+        next(iter(parts.values())) if is_single else spaces.Dict(list(parts.items())),
+        action_space,
+        observation_names=labels if is_single else (),
+        step_duration_ns=_step_ns(files),
+    )
+    rewards = steps.get(features.REWARD, np.full((len(actions), 1), np.nan))
     probabilities = steps.get(features.PROBABILITY)
-    infos, episodes = own.infos.items(), []
-    for index, (start, stop) in enumerate(files.ranges()):
-        parts = [
-            np.concatenate([column[start:stop], own.finals[leaf.name][index : index + 1]])
-            for leaf, column in zip(leaves, columns, strict=True)
-        ]
+    times, infos = _times_ns(files), _infos(files)
+    episodes = []
+    for part in _parts(files, steps):
+        observations = {key: array[part.frames] for key, array in values.items()}
         episode = EpisodeArrays(
-            observations=nest(leaves, parts),
-            actions=actions[start:stop],
-            rewards=steps[features.REWARD][start:stop, 0],
-            terminated=bool(steps[features.DONE][stop - 1, 0]),
-            truncated=bool(steps[features.TRUNCATED][stop - 1, 0]),
-            behavior_probs=None if probabilities is None else probabilities[start:stop, 0],
-            times_ns=own.times_ns[index],
-            infos={name: values[start + index : stop + index + 1] for name, values in infos},
-            summary=own.summaries[index],
+            observations=next(iter(observations.values())) if is_single else observations,
+            actions=actions[part.steps],
+            rewards=rewards[part.steps, 0],
+            terminated=part.terminated,
+            truncated=part.truncated,
+            behavior_probs=None if probabilities is None else probabilities[part.steps, 0],
+            times_ns=_frame_times(times, part, metadata.step_duration_ns),
+            infos={name: _info_rows(array[part.steps]) for name, array in infos.items()},
+            summary={"options": _options(files, part.source)},
         )
         episodes.append(episode)
-    return dataset_of(episodes, own.metadata, files.path)
+    return dataset_of(
+        episodes,
+        metadata,
+        files.path,
+        has_rewards=features.REWARD in steps,
+    )
+
+
+def _observations(
+    files: Files,
+) -> tuple[dict[str, NDArray[Any]], dict[str, spaces.Space[Any]], tuple[str, ...]]:
+    """Return values and spaces by observation key, and the element names of the first key."""
+    values, parts, labels = {}, {}, []
+    for key, feature in _observed(files).items():
+        values[key], parts[key] = _values_and_space(files.values(feature))
+        labels.append(_labels(feature))
+    return values, parts, labels[0]
+
+
+def _observed(files: Files) -> dict[str, Feature]:
+    """Return the features of the observation by key."""
+    found: dict[str, Feature] = {}
+    for name, feature in files.features.items():
+        if not name.startswith(_OBSERVATION) or not _is_kept(files, feature):
+            continue
+        full = name.removeprefix(_OBSERVATION).strip(".") or "state"
+        short = name.removeprefix(features.IMAGES)
+        key = short if short != name and short not in found else full
+        if key in found:
+            raise SpaceError(f"{files.path}: two observations have the name '{key}'")
+        found[key] = feature
+    if not found:
+        raise LogError(f"{files.path} has no feature '{_OBSERVATION}...' that can be read")
+    return found
+
+
+def _infos(files: Files) -> dict[str, NDArray[Any]]:
+    """Return the infos: the values (N, *shape) of each feature that becomes one, by name."""
+    taken = {*features.STEPS, *features.DEFAULTS}
+    found = {}
+    for name, feature in files.features.items():
+        is_other = name not in taken and not name.startswith(_OBSERVATION)
+        if is_other and _is_kept(files, feature, images=False):
+            found[name.removeprefix(features.INFO)] = files.values(feature)
+    return found
+
+
+def _is_kept(files: Files, feature: Feature, *, images: bool = True) -> bool:
+    """Return whether a feature has numbers or images that can be read; warn if not.
+
+    Depth videos cannot be read, because LeRobot compresses them in its own way.
+    """
+    is_video_of_depth = feature.is_depth and feature.dtype == "video"
+    if images and feature.is_image and not is_video_of_depth:
+        return True
+    if not feature.is_image and feature.is_numeric:
+        return True
+    kind = f"depth {feature.dtype}" if feature.is_depth else feature.dtype
+    _warn(files, f"the feature '{feature.name}' of type {kind} is left out")
+    return False
+
+
+def _warn_of_steps(files: Files, steps: Mapping[str, Any]) -> None:
+    if features.REWARD not in steps:
+        _warn(files, f"there is no feature '{features.REWARD}': all rewards are NaN")
+    if features.DONE in steps and features.TRUNCATED not in steps:
+        _warn(
+            files,
+            f"'{features.DONE}' may also mean truncation, because there is no feature"
+            f" '{features.TRUNCATED}'; it is read as termination",
+        )
+
+
+def _parts(files: Files, steps: Mapping[str, NDArray[Any]]) -> list[_Part]:
+    """Divide the rows into episodes; `next.done` or `next.truncated` ends an episode."""
+    none = np.zeros((sum(files.lengths), 1), bool)
+    done = steps.get(features.DONE, none)[:, 0]
+    truncated = steps.get(features.TRUNCATED, none)[:, 0]
+    found: list[_Part] = []
+    repeated = dropped = 0
+    for source, start, stop, is_last in _stretches(files, done | truncated):
+        frames = np.arange(start, stop + 1)
+        flags = bool(done[stop - 1]), bool(truncated[stop - 1])
+        if is_last and flags[0]:
+            frames[-1] = stop - 1
+            repeated += 1
+        elif is_last:
+            frames, flags = frames[:-1], (False, True)
+            dropped += 1
+        if len(frames) > 1:
+            found.append(_Part(frames, slice(start, start + len(frames) - 1), *flags, source))
+    _warn_of_ends(files, repeated, dropped)
+    return found
+
+
+def _stretches(files: Files, ends: NDArray[np.bool_]) -> Iterator[tuple[int, int, int, bool]]:
+    """Divide LeRobot's episodes after each row in which `ends` (N,) is true.
+
+    For each part, yield the index of LeRobot's episode, the first row, the last row + 1, and
+    whether the part is the last one of this episode.
+    """
+    for source, (start, stop) in enumerate(files.ranges()):
+        inner = (start + 1 + np.flatnonzero(ends[start : stop - 1])).tolist()
+        for first, last in zip([start, *inner], [*inner, stop], strict=True):
+            yield source, first, last, last == stop
+
+
+def _warn_of_ends(files: Files, repeated: int, dropped: int) -> None:
+    if repeated:
+        _warn(
+            files,
+            "the final observation is not stored for"
+            f" {counted(repeated, 'terminated episode')}; the last observation is repeated instead",
+        )
+    if dropped:
+        _warn(
+            files,
+            "the observation after the last action is not stored for"
+            f" {counted(dropped, 'other episode')}; such an episode is read as truncated,"
+            " without its last action",
+        )
+
+
+def _step_ns(files: Files) -> int:
+    return round(1e9 / files.fps)
+
+
+def _times_ns(files: Files) -> NDArray[np.int64]:
+    """Return the time (N,) of each frame, nanoseconds.
+
+    Each episode starts two step durations after the last frame of the previous episode.
+    """
+    seconds = files.times_s()
+    numbers = np.concatenate([np.arange(length) for length in files.lengths])
+    regular = numbers / files.fps
+    tolerance = np.maximum(_TIME_TOLERANCE_S, np.spacing(np.float32(regular)))
+    is_regular = np.abs(seconds - regular) <= tolerance
+    step_ns = _step_ns(files)
+    times = np.where(is_regular, numbers * step_ns, np.round(seconds * 1e9)).astype(np.int64)
+    lengths = times[files.stops - 1] + 2 * step_ns
+    found: NDArray[np.int64] = times + np.repeat(np.cumsum(lengths) - lengths, files.lengths)
+    return found
+
+
+def _frame_times(times: NDArray[np.int64], part: _Part, step_ns: int) -> NDArray[np.int64]:
+    """Return the times (T + 1,) of the frames of an episode."""
+    found = times[part.frames]
+    if part.frames[-1] == part.frames[-2]:
+        found[-1] += step_ns
+    return found
+
+
+def _options(files: Files, episode: int) -> str:
+    """Return an episode's tasks as JSON of reset options; empty if the episode has no tasks."""
+    tasks = list(files.episodes[episode].get("tasks") or ())
+    if not tasks:
+        return ""
+    return json.dumps({"task": tasks[0]} if len(tasks) == 1 else {"tasks": tasks})
+
+
+def _values_and_space(
+    values: NDArray[Any], *, is_action: bool = False
+) -> tuple[NDArray[Any], spaces.Space[Any]]:
+    """Convert values (N, *shape) to a dtype that a space can have; return values and space."""
+    if values.dtype.kind == "b":
+        return values.astype(np.int8), spaces.MultiBinary(list(values.shape[1:]))
+    is_index = values.shape[1:] == (1,) and values.dtype.kind in "iu" and (values >= 0).all()
+    if is_action and is_index:
+        scalars = values[:, 0].astype(np.int64)
+        return scalars, action_space_of(scalars)
+    return values, box_of(values)
+
+
+def _labels(feature: Feature) -> tuple[str, ...]:
+    """Return the names of a vector's elements, from a list or from a dict with one list."""
+    names = feature.names
+    if isinstance(names, dict) and len(names) == 1:
+        names = next(iter(names.values()))
+    is_vector = isinstance(names, list) and not feature.is_image
+    return tuple(map(str, names)) if is_vector and (len(names),) == feature.shape else ()
+
+
+def _info_rows(values: NDArray[Any]) -> Any:
+    """Convert values of T steps to an info with T + 1 rows. The row of the reset is masked."""
+    plain = values[:, 0] if values.shape[1:] == (1,) else values
+    rows = np.concatenate([np.zeros((1, *plain.shape[1:]), plain.dtype), plain])
+    mask = np.zeros(rows.shape, bool)
+    mask[0] = True
+    return np.ma.MaskedArray(rows, mask)
+
+
+def _warn(files: Files, text: str) -> None:
+    warnings.warn(f"{files.path}: {text}", stacklevel=2)

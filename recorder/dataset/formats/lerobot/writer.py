@@ -1,7 +1,6 @@
 """Writing of LeRobot datasets, version 3.0.
 
-Each transition is a row. LeRobot's format cannot store final observations, recorded times and
-episode summaries. They are written to the folder `meta/mcaprl`, which LeRobot does not read.
+Each transition is a row. LeRobot has no place for the observation after the last action.
 """
 
 from __future__ import annotations
@@ -25,8 +24,6 @@ from mcaprl.recorder.dataset.formats.lerobot.features import (
     VIDEO_PATH,
     Feature,
 )
-from mcaprl.recorder.dataset.formats.lerobot.infos import info_features, infos_of
-from mcaprl.recorder.dataset.formats.lerobot.own import write_own
 from mcaprl.recorder.dataset.formats.lerobot.statistics import Stats, describe, pooled, sampled
 from mcaprl.recorder.dataset.formats.lerobot.tables import (
     CHUNK_FILES,
@@ -39,6 +36,7 @@ from mcaprl.recorder.dataset.formats.lerobot.tables import (
 from mcaprl.recorder.dataset.formats.lerobot.video import VideoWriter
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of
+from mcaprl.texts import counted
 
 VERSION = "v3.0"
 MAX_VIDEO_BYTES = 200 << 20
@@ -67,7 +65,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, video: bool = Fa
     for index in range(len(dataset.episode_lengths)):
         writer.add_episode(index)
     writer.finish()
-    return lost
+    return lost + writer.notes()
 
 
 def frames_per_second(step_duration_ns: int) -> int | float:
@@ -137,7 +135,7 @@ class _Writer:
             features.feature_of(name, leaf, () if leaf.path else labels, video=video)
             for name, leaf in named
         ]
-        self._infos = info_features(infos_of(dataset), dataset.frame_of_step + 1)
+        self._infos = features.info_features(dataset.infos, dataset.frame_of_step + 1)
         others = [*self._infos.values(), *features.default_features()]
         self._features = [*self._observations, *_step_features(dataset), *others]
         self._slices = episode_slices(dataset)
@@ -190,7 +188,22 @@ class _Writer:
         }
         plain = {name: _plain(found) for name, found in stats.items()}
         write_json(self._path / "meta/stats.json", plain)
-        write_own(self._path, self._dataset, self._observations)
+
+    def notes(self) -> list[str]:
+        """Return a sentence for each thing that LeRobot has no place for."""
+        found, infos = [], self._dataset.infos.keys() - self._infos.keys()
+        if infos:
+            found.append(
+                f"not written: the infos {', '.join(sorted(infos))}; LeRobot has a place for"
+                " numbers of every step"
+            )
+        lasts = np.cumsum(self._dataset.episode_lengths) - 1
+        if cut := int((~self._dataset.terminated[lasts]).sum()):
+            found.append(
+                "not written: the observation after the last action; mcaprl reads"
+                f" {counted(cut, 'episode')} that did not terminate without the last transition"
+            )
+        return found
 
     def _values(
         self, index: int, steps: slice, frames: slice, task_index: int
@@ -214,7 +227,7 @@ class _Writer:
         for leaf, feature in zip(self._leaves, self._observations, strict=True):
             given[feature.name] = np.asarray(leaf.of(self._dataset.frames)[rows])
         for name, feature in self._infos.items():
-            given[feature.name] = infos_of(self._dataset)[name][frames.start + 1 : frames.stop].data
+            given[feature.name] = self._dataset.infos[name][frames.start + 1 : frames.stop].data
         for feature in self._features:
             values = given[feature.name]
             if feature.dtype == "video":

@@ -26,13 +26,6 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import action_leaf, leaves_of
 
 DATA, FILE, MAIN = "data", "metadata.json", "main_data.hdf5"
-OWN = "mcaprl"
-"""Key in Minari's metadata and in each episode.
-
-Under this key, the writer stores the data that Minari's format cannot store.
-"""
-MISSING = "missing_infos"
-"""Subgroup of an episode's group `OWN`: for each info, an array that marks its missing rows."""
 # Minari version in the metadata of written datasets: the oldest one that reads images without JPEG,
 # because Minari refuses datasets of a version that is newer than its own.
 _MINARI_VERSION = "0.5.4"
@@ -63,7 +56,6 @@ class Description:
         form: `hdf5`, `arrow` or `parquet`.
         is_jpeg: Whether large images are stored as JPEG.
         episodes: Number of episodes.
-        is_own: Whether the writer of this package wrote the dataset.
         lost: One sentence for each part of the spaces that is left out or changed.
     """
 
@@ -73,7 +65,6 @@ class Description:
     form: str
     is_jpeg: bool
     episodes: int
-    is_own: bool
     lost: tuple[str, ...] = ()
 
 
@@ -162,17 +153,15 @@ def read_description(path: Path, *, lossy: bool = False) -> Description:
             versions={"minari": str(raw.get("minari_version", ""))},
             about={name: raw[name] for name in _ABOUT if raw.get(name) is not None},
         )
-        own = _own_metadata(raw, metadata)
     except (SpaceError, LogError) as error:
         raise type(error)(f"{path}: {error}") from error
     return Description(
-        metadata=own or metadata,
+        metadata=metadata,
         keys=observation.keys,
         action_keys=action.keys,
         form=str(raw.get("data_format", "hdf5")),
         is_jpeg=bool(raw.get("jpeg_encoding", True)),
         episodes=raw["total_episodes"],
-        is_own=own is not None,
         lost=(*observation.lost, *action.lost),
     )
 
@@ -196,7 +185,6 @@ def description_text(
         "action_space": space_to_text(metadata.action_space),
         "dataset_id": dataset_id,
         "minari_version": _MINARI_VERSION,
-        OWN: metadata.to_strings(),
         **{name: metadata.about[name] for name in _ABOUT if name in metadata.about},
     }
     if metadata.policy:
@@ -231,22 +219,6 @@ def _registered(env_id: str) -> gym.Env[Any, Any]:
         raise SpaceError(
             f"{FILE} describes no spaces, and '{env_id}' cannot be made: {error}"
         ) from error
-
-
-def _own_metadata(raw: dict[str, Any], found: LogMetadata) -> LogMetadata | None:
-    """Return the metadata that this package's writer stored under the key `OWN`.
-
-    If it is missing, or if its spaces differ from the spaces of `found`, return None.
-    """
-    strings = raw.get(OWN)
-    if not isinstance(strings, dict):
-        return None
-    own = LogMetadata.from_strings(strings)
-    same = (own.observation_space, own.action_space) == (
-        found.observation_space,
-        found.action_space,
-    )
-    return own if same else None
 
 
 def _env_of(raw: dict[str, Any]) -> tuple[str, dict[str, Any]]:

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import warnings
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, import_extra
-from mcaprl.files import parse_json
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats import hdf5_nodes as hdf5
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.dataset.formats.flat import unread_note
-from mcaprl.recorder.dataset.formats.infos import info_type, masked
+from mcaprl.recorder.dataset.formats.infos import masked
 from mcaprl.recorder.dataset.formats.minari import arrow_nodes as arrow
 from mcaprl.recorder.dataset.formats.minari.description import (
     MAIN,
-    MISSING,
-    OWN,
     Description,
     data_folder,
     read_description,
@@ -41,9 +37,8 @@ from mcaprl.recorder.format.messages import MAX_SEED
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of, nest
 
 _FLAGS = ("terminations", "truncations")
-_KNOWN = ("observations", "actions", "rewards", *_FLAGS, "infos", "id", OWN)
-"""Members of an episode that are read."""
-_OWN_TEXTS = ("reason", "policy", "options")
+_KNOWN = ("observations", "actions", "rewards", *_FLAGS, "infos", "id", "mcaprl")
+"""Members of an episode that are read, or that earlier versions of this package wrote."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +50,6 @@ class _Stored:
         steps: Arrays of T rows: `actions`, `rewards`, `terminations` and `truncations`.
         infos: Arrays by dotted name.
         attributes: `seed`, `options` and others.
-        own: Arrays that only the writer of this package stores: `behavior_probs` and `log_time_ns`.
-        missing: Flags (T + 1,) of the rows without an info, and the dtype of this info. The keys
-            are the dotted names of the infos.
         unread: Names of other arrays.
     """
 
@@ -65,8 +57,6 @@ class _Stored:
     steps: Mapping[str, NDArray[Any]]
     infos: Mapping[str, NDArray[Any]]
     attributes: Mapping[str, Any]
-    own: Mapping[str, Any] = field(default_factory=dict)
-    missing: Mapping[str, tuple[NDArray[np.bool_], np.dtype[Any]]] = field(default_factory=dict)
     unread: Sequence[str] = ()
 
 
@@ -92,7 +82,7 @@ def read(path: Path, *, lossy: bool = False) -> Dataset:
         episodes = [reader.episode(index, part) for index, part in enumerate(stored)]
     episodes = reader.with_equal_infos(episodes)
     reader.warn()
-    return dataset_of(episodes, description.metadata, path, is_foreign=not description.is_own)
+    return dataset_of(episodes, description.metadata, path)
 
 
 class _Reader:
@@ -140,8 +130,6 @@ class _Reader:
             rewards=steps["rewards"],
             terminated=ends[0],
             truncated=ends[1],
-            behavior_probs=stored.own.get("behavior_probs"),
-            times_ns=stored.own.get("log_time_ns"),
             infos=self._infos(stored, count),
             summary=_summary(stored.attributes, where),
         )
@@ -202,13 +190,7 @@ class _Reader:
                 continue
             first = count + 1 - len(values)
             rows = np.concatenate([np.zeros((first, *values.shape[1:]), values.dtype), values])
-            is_missing, dtype = stored.missing.get(name, (np.arange(count + 1) < first, rows.dtype))
-            if len(is_missing) == len(rows):
-                # The string dtype of `rows` has the length of the longest string.
-                dtype = rows.dtype if rows.dtype.kind == "U" else dtype
-                found[name] = masked(rows, is_missing.astype(bool), dtype)
-            else:
-                self._odd_infos.add(name)
+            found[name] = masked(rows, np.arange(count + 1) < first)
         return found
 
     def _images(self, leaf: Leaf, values: Any, where: str) -> NDArray[np.uint8]:
@@ -237,12 +219,10 @@ def _column(values: NDArray[Any]) -> NDArray[Any]:
 
 def _summary(attributes: Mapping[str, Any], where: str) -> dict[str, Any]:
     try:
-        own = parse_json(str(attributes.get(OWN, "{}")))
-        summary: dict[str, Any] = {name: str(own[name]) for name in _OWN_TEXTS if name in own}
-        summary["epsilon"] = float(own.get("epsilon", math.nan))
+        summary: dict[str, Any] = {}
         if attributes.get("seed") is not None:
             summary["seed"] = _seed(int(attributes["seed"]))
-        if "options" not in summary and attributes.get("options"):
+        if attributes.get("options"):
             summary["options"] = json.dumps(attributes["options"])
         return summary
     except (ValueError, TypeError, AttributeError) as error:
@@ -260,7 +240,6 @@ def _in_hdf5(folder: Path, description: Description) -> Generator[_Stored]:
         more = [name for name in hdf5.names_in(file) if not _is_episode(name, description)]
         for index in range(description.episodes):
             group = hdf5.group_in(file, f"episode_{index}")
-            own = hdf5.group_in(group, OWN) if hdf5.has(group, OWN) else None
             infos = hdf5.group_in(group, "infos") if hdf5.has(group, "infos") else None
             yield _Stored(
                 observations=[
@@ -274,12 +253,6 @@ def _in_hdf5(folder: Path, description: Description) -> Generator[_Stored]:
                 },
                 infos={} if infos is None else dict(hdf5.arrays_below(infos)),
                 attributes=hdf5.attributes_of(group),
-                own={}
-                if own is None
-                else {
-                    name: hdf5.array_in(own, name) for name in hdf5.names_in(own) if name != MISSING
-                },
-                missing=_missing(own),
                 unread=[
                     *more,
                     *(
@@ -304,19 +277,6 @@ def _is_episode(name: str, description: Description) -> bool:
     """Return whether a group of the file is one of the episodes that the description counts."""
     number = name.removeprefix("episode_")
     return number.isdecimal() and int(number) < description.episodes
-
-
-def _missing(own: Any) -> dict[str, tuple[NDArray[np.bool_], np.dtype[Any]]]:
-    if own is None or not hdf5.has(own, MISSING):
-        return {}
-    group = hdf5.group_in(own, MISSING)
-    try:
-        return {
-            name: (rows, info_type(str(group[name.replace(".", "/")].attrs.get("dtype"))))
-            for name, rows in hdf5.arrays_below(group)
-        }
-    except ValueError as error:
-        raise LogError(f"{hdf5.source()}: {own.name}/{MISSING} is damaged: {error}") from error
 
 
 def _in_arrow(folder: Path, description: Description) -> Generator[_Stored]:

@@ -1,13 +1,10 @@
 """Writing of Minari datasets in their HDF5 form, without Minari.
 
-Images are stored without loss, not as JPEG. Minari's format cannot store times, probabilities and
-some fields of the episode summaries. They are written to the attribute `mcaprl` and the group
-`mcaprl` of each episode, which Minari does not read.
+Images are stored without loss, not as JPEG.
 """
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -26,18 +23,11 @@ from mcaprl.recorder.dataset.formats.hdf5_nodes import (
     stop_if_full,
     with_names_for_hdf5,
 )
-from mcaprl.recorder.dataset.formats.infos import (
-    StoredInfo,
-    infos_of,
-    nested_names,
-    stored_infos,
-)
+from mcaprl.recorder.dataset.formats.infos import missing_rows, nested_names, stored_infos
 from mcaprl.recorder.dataset.formats.minari.description import (
     DATA,
     FILE,
     MAIN,
-    MISSING,
-    OWN,
     description_text,
 )
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
@@ -67,7 +57,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
     metadata = LogMetadata.from_strings(dataset.metadata)
     space, renamed = with_names_for_hdf5(dataset.observation_space)
     lost = [f"the key '{key}' is renamed, because it is not a valid HDF5 name" for key in renamed]
-    infos, lost_infos = stored_infos(infos_of(dataset))
+    infos, lost_infos = stored_infos(dataset.infos)
     info_names, lost_names = nested_names(infos)
     lost += [*_lost_options(dataset), *lost_infos, *lost_names]
     if lost and not lossy:
@@ -80,8 +70,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
     with created(data / MAIN, track_order=True) as file:
         for index, (steps, frames) in enumerate(episode_slices(dataset)):
             group = file.create_group(f"episode_{index}")
-            episode = dataset.episodes[index]
-            _put_attributes(group, index, episode.summary)
+            _put_attributes(group, index, dataset.episodes[index].summary)
             for leaf, key, column in zip(leaves, keys, columns, strict=True):
                 values = np.asarray(column[frames])
                 name = "/".join(("observations", *key))
@@ -94,11 +83,8 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
             _put(group, "truncations", dataset.truncated[steps])
             group.create_group("infos")
             for name, parts in info_names.items():
-                _put_info(group, "/".join(parts), infos[name].rows(frames))
-            own = group.require_group(OWN)
-            own["log_time_ns"] = episode.log_time_ns
-            if not np.isnan(episode.behavior_probs).all():
-                own["behavior_probs"] = episode.behavior_probs
+                if not missing_rows(dataset.infos[name][frames]).all():
+                    _put_info(group, "/".join(parts), infos[name][frames])
             stop_if_full(file)
     counts = {
         "total_episodes": len(dataset.episode_lengths),
@@ -120,24 +106,15 @@ def _put(group: Any, name: str, values: NDArray[Any], **settings: Any) -> None:
     )
 
 
-def _put_info(group: Any, name: str, info: StoredInfo) -> None:
-    """Write an info and the flags of its missing rows. If all rows are missing, write nothing."""
-    if info.is_missing.all():
-        return
-    is_text = info.values.dtype.kind == "U"
-    values = info.values.astype(object) if is_text else info.values
+def _put_info(group: Any, name: str, values: NDArray[Any]) -> None:
+    is_text = values.dtype.kind == "U"
     group.create_dataset(
         f"infos/{name}",
-        data=values,
+        data=values.astype(object) if is_text else values,
         dtype=import_extra("h5py", EXTRA).string_dtype() if is_text else None,
         chunks=True if values.size else None,
         maxshape=(None, *values.shape[1:]) if values.size else None,
     )
-    # Integers and flags that are missing in any row are stored as floats in all episodes, so the
-    # original dtype is stored too.
-    if info.is_missing.any() or info.values.dtype != info.dtype:
-        _put(group, f"{OWN}/{MISSING}/{name}", info.is_missing)
-        group[f"{OWN}/{MISSING}/{name}"].attrs["dtype"] = info.dtype.str
 
 
 def _put_attributes(group: Any, index: int, summary: EpisodeSummary) -> None:
@@ -148,8 +125,6 @@ def _put_attributes(group: Any, index: int, summary: EpisodeSummary) -> None:
     for name, value in _flat_options(summary.options).items():
         if _is_attribute(name, value):
             group.attrs[f"options/{name}"] = value
-    own = {name: getattr(summary, name) for name in ("reason", "policy", "epsilon", "options")}
-    group.attrs[OWN] = json.dumps(own)
 
 
 def _lost_options(dataset: Dataset) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 
 import mcaprl
 from mcaprl import Dataset
@@ -20,6 +19,7 @@ from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.format.metadata import LogMetadata
 from tests.recorder.dataset.formats.minari_sets import Cameras
 from tests.support.strategies import transitions
+from tests.support.transitions import is_plain, same_transitions
 
 
 def _two_episodes() -> Dataset:
@@ -27,18 +27,19 @@ def _two_episodes() -> Dataset:
     space = spaces.Dict(
         {"pose": spaces.Dict({"x": spaces.Box(-9, 9, (2,), np.float32)}), "a b": spaces.Discrete(5)}
     )
-    metadata = LogMetadata(space, spaces.Discrete(3), env_id="Toy-v0", policy="pid", seed="4")
+    metadata = LogMetadata(space, spaces.Discrete(4), env_id="Toy-v0", policy="pid", seed="4")
     first = EpisodeArrays(
         observations={
             "pose": {"x": np.array([[0, 1], [2, 3], [4, 5]], np.float32)},
             "a b": np.array([0, 1, 4]),
         },
         actions=np.array([2, 0]),
-        rewards=np.array([0.1, -np.inf]),
+        rewards=np.array([0.1, -1]),
         terminated=True,
         truncated=True,
         behavior_probs=np.array([0.5, np.nan], np.float32),
         times_ns=np.array([10, 20, 35]),
+        infos={"lap": np.ma.MaskedArray([7, 8, 9])},
         summary={"reason": "crash", "seed": 2**63 - 1, "policy": "pid", "options": "{}"},
     )
     second = EpisodeArrays(
@@ -48,22 +49,23 @@ def _two_episodes() -> Dataset:
         terminated=False,
         truncated=False,
         times_ns=np.array([40, 41]),
+        infos={"lap": np.ma.MaskedArray([0, 1])},
     )
     return dataset_of([first, second], metadata, "test")
 
 
-def _same(found: Dataset, data: Dataset) -> None:
-    assert found.fingerprint == data.fingerprint
-    assert found.metadata == data.metadata
-    assert [repr(e.summary) for e in found.episodes] == [repr(e.summary) for e in data.episodes]
-    for one, other in zip(found.episodes, data.episodes, strict=True):
-        assert one.log_time_ns.tolist() == other.log_time_ns.tolist()
-
-
-def test_a_dataset_is_read_back_unchanged(tmp_path: Path) -> None:
+def test_what_an_archive_has_no_place_for_is_said(tmp_path: Path) -> None:
     data = _two_episodes()
-    assert data.to_npz(tmp_path / "toy.npz") == []
-    _same(Dataset.from_npz(tmp_path / "toy.npz"), data)
+    assert data.to_npz(tmp_path / "toy.npz") == [
+        "npz has no place for spaces, environment, policy names, seeds and reset options,"
+        " end reasons: a log keeps them"
+    ]
+    found = Dataset.from_npz(tmp_path / "toy.npz")
+    same_transitions(found, data)
+    assert found.action_space == spaces.Discrete(3)
+    assert found.infos["lap"].tolist() == [7, 8, 9, 0, 1]
+    times = [episode.log_time_ns.tolist() for episode in found.episodes]
+    assert times == [[10, 20, 35], [40, 41]]
     assert mcaprl.open(tmp_path / "toy.npz").sources == (tmp_path / "toy.npz",)
 
 
@@ -72,20 +74,21 @@ def test_numpy_reads_the_arrays_by_their_usual_names(tmp_path: Path) -> None:
     with np.load(tmp_path / "toy.npz", allow_pickle=False) as arrays:
         assert arrays["observations/pose/x"].tolist() == [[0, 1], [2, 3], [1, 1]]
         assert arrays["final_observations/pose/x"].tolist() == [[4, 5], [1, 1]]
-        assert arrays["observations:observation_a_b"].tolist() == [0, 1, 3]
+        assert arrays["observations/a b"].tolist() == [0, 1, 3]
         assert arrays["actions"].tolist() == [2, 0, 1]
         assert arrays["terminations"].tolist() == [False, True, False]
         assert arrays["episode_lengths"].tolist() == [2, 1]
-        assert json.loads(str(arrays["mcaprl"]))["episodes"][0]["reason"] == "crash"
+        assert arrays["infos/lap"].tolist() == [7, 8, 9, 0, 1]
 
 
 @settings(max_examples=40)
 @given(given_arrays=transitions())
-def test_any_dataset_comes_back(given_arrays: dict[str, Any]) -> None:
+def test_any_transitions_come_back(given_arrays: dict[str, Any]) -> None:
     data = Dataset.from_arrays(**given_arrays)
+    assume(is_plain(data))
     with TemporaryDirectory() as folder:
-        data.to_npz(f"{folder}/any.npz")
-        _same(mcaprl.open(f"{folder}/any.npz"), data)
+        data.to_npz(f"{folder}/any.npz", lossy=True)
+        same_transitions(mcaprl.open(f"{folder}/any.npz"), data)
 
 
 def test_images_are_read_from_disk_block_by_block(tmp_path: Path) -> None:
@@ -98,7 +101,7 @@ def test_images_are_read_from_disk_block_by_block(tmp_path: Path) -> None:
     log = mcaprl.open(tmp_path / "log.mcap", images="mapped")
     assert "on disk" in log.storage
     log.to_npz(tmp_path / "log.npz")
-    _same(mcaprl.open(tmp_path / "log.npz"), log)
+    same_transitions(mcaprl.open(tmp_path / "log.npz"), log)
     # Writing the same data again creates a file with the same bytes.
     log.to_npz(tmp_path / "again.npz")
     assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "log.npz").read_bytes()
@@ -212,11 +215,7 @@ def test_damaged_archives_give_one_clear_line(tmp_path: Path) -> None:
         np.save(file, np.zeros(3))
     fails("not a readable .npz file: File is not a zip file")
     np.savez(path, **{**arrays, "episode_lengths": arrays["episode_lengths"][:1]})
-    fails("an array is missing or too short")
-    np.savez(path, **{name: values for name, values in arrays.items() if name != "log_time_ns"})
-    fails("an array is missing or too short: 'log_time_ns'")
-    np.savez(path, **{**arrays, "mcaprl": np.array('{"metadata": 1}')})
-    fails("the array mcaprl is damaged")
+    fails("episode_lengths")
     with zipfile.ZipFile(path, "w") as archive_file:
         # The header declares an array of 8 PB, but the file has only a few bytes.
         header = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000000,), }"

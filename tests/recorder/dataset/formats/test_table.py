@@ -18,6 +18,7 @@ from gymnasium import spaces
 import mcaprl
 from mcaprl import Dataset
 from mcaprl.errors import SpaceError
+from mcaprl.recorder.dataset.format_registry import FACTS, FORMATS
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.format.metadata import LogMetadata
 
@@ -28,6 +29,8 @@ _PAGE = Path(__file__).parents[4] / "docs" / "formats.md"
 _BEGIN, _END = "<!-- kept -->\n", "<!-- /kept -->\n"
 _VECTOR = spaces.Box(-9, 9, (2,), np.float32)
 _LENGTHS = (3, 2)
+_KEPT = [0, 1, -2, -1]
+"""Transitions beside the last one of the truncated episode, which has a separate row."""
 _START_NS = 1_700_000_000 * 10**9
 
 _Trip = Callable[[Dataset, Path, bool], Dataset]
@@ -122,12 +125,24 @@ def _same_arrays(first: Any, second: Any) -> bool:
 
 
 def _observations(before: Dataset, after: Dataset) -> bool:
-    same = before.observation_space == after.observation_space
-    return same and _same_arrays(before.frames, after.frames)
+    return _same_arrays(_tree(before.observations, _KEPT), _tree(after.observations, _KEPT))
+
+
+def _tree(values: Any, rows: list[int]) -> Any:
+    if isinstance(values, dict):
+        return {key: _tree(part, rows) for key, part in values.items()}
+    return values[rows]
 
 
 def _actions(before: Dataset, after: Dataset) -> bool:
-    return before.action_space == after.action_space and _same_arrays(before.actions, after.actions)
+    return _same_arrays(_tree(before.actions, _KEPT), _tree(after.actions, _KEPT))
+
+
+def _spaces(before: Dataset, after: Dataset) -> bool:
+    return (before.observation_space, before.action_space) == (
+        after.observation_space,
+        after.action_space,
+    )
 
 
 def _summaries(*names: str) -> Callable[[Dataset, Dataset], bool]:
@@ -150,8 +165,23 @@ def _finals(number: int) -> Callable[[Dataset, Dataset], bool]:
 
 
 def _ends(before: Dataset, after: Dataset) -> bool:
-    names = ("terminated", "truncated")
-    return all(np.array_equal(getattr(before, name), getattr(after, name)) for name in names)
+    def of(data: Dataset) -> list[Any]:
+        lasts = np.cumsum(data.episode_lengths) - 1
+        return [data.terminated[lasts].tolist(), data.truncated[lasts].tolist()]
+
+    return of(before) == of(after)
+
+
+def _last_transition(before: Dataset, after: Dataset) -> bool:
+    return before.episode_lengths[0] == after.episode_lengths[0] and _finals(0)(before, after)
+
+
+def _infos(rows: list[int]) -> Callable[[Dataset, Dataset], bool]:
+    def of(data: Dataset) -> Any:
+        speed = data.infos.get("speed")
+        return None if speed is None else speed.filled(np.nan)[rows].tolist()
+
+    return lambda before, after: of(before) == of(after)
 
 
 _IMAGE = spaces.Box(0, 255, (32, 36, 3), np.uint8)
@@ -179,41 +209,35 @@ _ASPECTS: dict[str, tuple[Dataset, Callable[[Dataset, Dataset], bool]]] = {
     "MultiDiscrete actions": (_made(action=spaces.MultiDiscrete([2, 3])), _actions),
     "rewards, float64": (
         _made(rewards=[np.full(length, 0.1) for length in _LENGTHS]),
-        lambda before, after: _same_arrays(before.rewards, after.rewards),
+        lambda before, after: _same_arrays(
+            _tree(before.rewards, _KEPT), _tree(after.rewards, _KEPT)
+        ),
     ),
-    "terminated and truncated": (_made(), _ends),
-    "final observation, truncated": (_made(), _finals(0)),
+    "ends: terminated, truncated": (_made(), _ends),
+    "last transition, truncated": (_made(), _last_transition),
     "final observation, terminated": (_made(), _finals(1)),
+    "infos": (_made(infos=_INFOS), _infos([1, 2, -2])),
+    "infos of final observations": (_made(infos=_INFOS), _infos([-1])),
+    "times": (_made(), _summaries("start_time_ns")),
+    "spaces": (_made(), _spaces),
+    "env id": (_made(), lambda before, after: before.env_id == after.env_id),
+    "names of actions": (
+        _made(),
+        lambda before, after: before.action_meanings == after.action_meanings,
+    ),
     "behavior_prob": (
         _made(behavior_probs=[np.full(length, 0.25) for length in _LENGTHS]),
-        lambda before, after: _same_arrays(before.behavior_probs, after.behavior_probs),
-    ),
-    "log_times": (_made(), _summaries("start_time_ns", "end_time_ns")),
-    "seeds and reset options": (_made(summary=_SUMMARIES), _summaries("seed", "options")),
-    "reasons and policies": (_made(summary=_SUMMARIES), _summaries("reason", "policy")),
-    "infos": (
-        _made(infos=_INFOS),
-        lambda before, after: (
-            {k: v.tolist() for k, v in before.infos.items()}
-            == {k: v.tolist() for k, v in after.infos.items()}
+        lambda before, after: _same_arrays(
+            _tree(before.behavior_probs, _KEPT), _tree(after.behavior_probs, _KEPT)
         ),
     ),
-    "environment and action names": (
-        _made(),
-        lambda before, after: (
-            (before.env_id, before.action_meanings) == (after.env_id, after.action_meanings)
-        ),
-    ),
+    "policy names": (_made(summary=_SUMMARIES), _summaries("policy")),
+    "seeds": (_made(summary=_SUMMARIES), _summaries("seed")),
+    "reset options": (_made(summary=_SUMMARIES), _summaries("options")),
+    "end reasons": (_made(summary=_SUMMARIES), _summaries("reason")),
 }
 
-_FACTS = (
-    "behavior_prob",
-    "log_times",
-    "seeds and reset options",
-    "reasons and policies",
-    "infos",
-    "environment and action names",
-)
+_FACTS = list(_ASPECTS)[list(_ASPECTS).index("last transition, truncated") :]
 """Aspects that are reported as `lost`, not as `changed`, if they differ after the conversion."""
 
 
@@ -252,3 +276,21 @@ def test_the_table_of_the_docs_is_what_conversions_give(tmp_path: Path) -> None:
     if os.environ.get("MCAPRL_WRITE_TABLE"):
         _PAGE.write_text(page[:begin] + table + page[end:])
     assert page[begin:end] == table
+
+
+def test_the_facts_that_formats_declare_are_those_of_the_table() -> None:
+    facts = {
+        "final observation, terminated": "final observations after a termination",
+        "env id": "environment",
+        "seeds": "seeds and reset options",
+        "reset options": "seeds and reset options",
+    }
+    table = _PAGE.read_text().partition(_BEGIN)[2].partition(_END)[0]
+    rows = [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
+    columns = {"lerobot": 3, "minari": 2, "parquet": 4, "npz": 5, "hdf5": 6, "d3rlpy": 7}
+    kept: dict[str, set[str]] = {name: set() for name in columns}
+    for row in rows:
+        for name, column in columns.items():
+            if (fact := facts.get(row[0], row[0])) in FACTS and row[column] == "kept":
+                kept[name].add(fact)
+    assert kept == {name: set(form.keeps) for name, form in FORMATS.items()}
