@@ -31,14 +31,6 @@ CLASSES = (
     "RecordMcap",
     "RecordVecMcap",
 )
-    "ClusterOptions",
-    "Dataset",
-    "Episode",
-    "Format",
-    "OpenBag",
-    "RecordMcap",
-    "RecordVecMcap",
-)
 FUNCTIONS = {
     "train-offline": ("train", "sweep", "open", "ClusterOptions"),
     "annotate": ("annotate", "open"),

@@ -110,8 +110,9 @@ def test_datasets_of_other_tools_and_urls_are_sources(tmp_path: Path) -> None:
     pytest.importorskip("fsspec", reason="needs the extra remote")
     log = tmp_path / "lane.mcap"
     mcaprl.record("lane", log, episodes=2)
-    mcaprl.convert(log, tmp_path / "lane.npz")
-    names = [str(tmp_path / "lane.npz"), f"file://{log}:2"]
+    pytest.importorskip("pyarrow", reason="needs the extra tables")
+    mcaprl.convert(log, tmp_path / "lane", to="parquet")
+    names = [str(tmp_path / "lane"), f"file://{log}:2"]
     data = read(names)
     assert len(data.episodes) == 4
     # Logs come first.
