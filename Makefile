@@ -22,7 +22,7 @@ help:
 	@echo "make demo             record a car, train on its log offline, evaluate, and write the replay"
 	@echo "make test             run the tests; with CI=true, also those that take minutes"
 	@echo "make newest           run the core tests with the newest version of every dependency (for a schedule)"
-	@echo "make faults           run the fault tests at full size: kills, damaged files, failed writes"
+	@echo "make faults           run the fault tests at full size: kills, damaged files, changed inputs, failed writes"
 	@echo "make fuzz             fuzz the reader for ten minutes"
 	@echo "make sanitize         test the C code with AddressSanitizer and UndefinedBehaviorSanitizer (needs gcc)"
 	@echo "make check            check format, lint, words, types, import contracts and the size of the code"
@@ -58,7 +58,7 @@ newest:
 faults: $(VENV)/.dev
 	rm -f $(VENV)/fault-figures
 	MCAPRL_FAULTS=large MCAPRL_FAULT_FIGURES=$(VENV)/fault-figures OMP_NUM_THREADS=1 \
-	  $(BIN)/pytest -q -s tests/recorder/repair/test_faults_*.py tests/ray/test_record.py tests/online/test_kills.py
+	  $(BIN)/pytest -q -s tests/recorder/repair/test_faults_*.py tests/test_faults_inputs.py tests/ray/test_record.py tests/online/test_kills.py
 	$(BIN)/python -m tests.support.damage.fault_table $(VENV)/fault-figures docs/reliability.md
 
 fuzz: $(VENV)/.fuzz

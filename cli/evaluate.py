@@ -13,6 +13,7 @@ import mcaprl
 from mcaprl.cli.completion import Name, policies, sims
 from mcaprl.cli.help import Command
 from mcaprl.cli.options import (
+    bag_options,
     integer_option,
     json_option,
     keys_option,
@@ -126,9 +127,11 @@ def evaluate(
     if data is not None and sim is None:
         _refuse_unused(given, [name for name in others if name not in _OF_DATA], "sim")
         # Compare with None, because 0 is a valid value of these options.
-        given = {name: others[name] for name in _OF_DATA if others[name] is not None}
+        bag = bag_options(others)
+        given = {name: others[name] for name in _OF_DATA if others.get(name) is not None}
         with working("reading data") as bar:
-            estimates = mcaprl.estimate(policies, data, seed=seed, progress=bar, **given)
+            source = data if bag["mapping"] is None else mcaprl.open(data, **bag)
+            estimates = mcaprl.estimate(policies, source, seed=seed, progress=bar, **given)
         print_json(estimates.to_json()) if as_json else _print_estimates(estimates)
     elif sim is not None and data is None:
         _refuse_unused(given, _OF_DATA, "data")

@@ -101,7 +101,6 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "train-offline": {
         "Run": ("out", "algo", "seeds", "seed", "threads", "device", "resume"),
         "Data": ("follow", "other_data"),
-        "Choice by --algo auto": ("budget_minutes", "report"),
         **_BAGS,
     },
     "evaluate": {

@@ -14,6 +14,7 @@ from mcaprl.cli.exit_codes import WITH_LOSSES
 from mcaprl.cli.help import Command
 from mcaprl.cli.options import (
     PATH,
+    bag_options,
     env_arg_option,
     integer_option,
     json_option,
@@ -157,10 +158,12 @@ def layout(source: str, out: Path, **request: Any) -> None:
 @mapping_options
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="File to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-def annotate(file: Path, out: Path, **request: Any) -> None:
+def annotate(file: str, out: Path, **request: Any) -> None:
     """Copy LOG and add a policy's values or the scene of the sim to each step."""
+    bag = bag_options(request)
     with working("reading the log") as bar:
-        found = mcaprl.annotate(file, out, progress=bar, **request)
+        data = file if bag["mapping"] is None else mcaprl.open(file, **bag)
+        found = mcaprl.annotate(data, out, progress=bar, **request)
     for name, topic in found.topics.items():
         echo(f"{out}: {topic} has the values of {name} for {counted(found.steps, 'step')}")
     if found.scene is not None:

@@ -38,7 +38,7 @@ def mapping_options(command: F, *, has_strict: bool = True) -> F:
     @functools.wraps(command)
     def with_mapping(*args: Any, strict_mapping: bool = False, **request: Any) -> Any:
         if strict_mapping:
-            from mcaprl.api.data import changed_mapping
+            from mcaprl.recorder.source import changed_mapping
 
             request["mapping"] = changed_mapping(request["mapping"], {"strict": True})
         return command(*args, **request)
@@ -69,6 +69,11 @@ def mapping_options(command: F, *, has_strict: bool = True) -> F:
     )
     found = definitions(code(cast(F, with_mapping)))
     return mapping(strict(found) if has_strict else found)
+
+
+def bag_options(request: dict[str, Any]) -> dict[str, Any]:
+    """Remove the options of `mapping_options` from a request, and return them."""
+    return {name: request.pop(name) for name in ("mapping", "trust_code", "definitions")}
 
 
 def sim_options(command: F) -> F:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,12 +12,20 @@ from click.core import ParameterSource
 import mcaprl
 from mcaprl.cli.completion import Name
 from mcaprl.cli.help import Command
-from mcaprl.cli.options import PATH, integer_option, mapping_options, ray_options, seed_options
+from mcaprl.cli.options import (
+    PATH,
+    bag_options,
+    integer_option,
+    mapping_options,
+    ray_options,
+    seed_options,
+)
 from mcaprl.cli.progress import checkpoints_kept, hint, training_progress, working
 from mcaprl.cli.settings import SettingsCommand
 from mcaprl.cli.show import echo, print_table
 from mcaprl.errors import UsageError
 from mcaprl.page import PAGE_NAME
+from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.settings import Settings, flag
 from mcaprl.texts import counted
 
@@ -55,12 +64,6 @@ def _configs() -> dict[str, Settings]:
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--follow", is_flag=True, help="Use episodes added to DATA during training.")
 @click.option("--other-data", is_flag=True, help="With --resume: allow other DATA than in the run.")
-@click.option("--budget-minutes", type=float, help="Wall time after which no update is started.")
-@click.option(
-    "--report",
-    type=click.Path(path_type=Path),
-    help="Output folder of the HTML page on the choice.",
-)
 @mapping_options
 @ray_options
 @click.option(
@@ -78,18 +81,30 @@ def train_offline(data: tuple[str, ...], out: Path, sweep: Path | None, **reques
     Omitted settings have the algorithm's defaults. With --resume, they have the values of the run;
     a larger number of --updates continues a finished run.
     """
-    given = {name: value for name, value in request.items() if value is not None}
     if sweep is not None:
         _sweep(data, out, sweep, request)
         return
-    with training_progress("updates", "loss") as progress, checkpoints_kept(out):
-        summaries = mcaprl.train(data, out, on_data=_print_data, progress=progress, **given)
+    workers = [request.pop(name) for name in ("ray", "workers", "address")]
+    options = {**bag_options(request), "follow": request.pop("follow")}
+    given = {name: value for name, value in request.items() if value is not None}
+    with ExitStack() as stack:
+        with working("reading data"):
+            from mcaprl.recorder.source import opened
+
+            cluster = mcaprl.ClusterOptions(*workers)
+            cluster.check()
+            stack.enter_context(cluster.connected())
+            stack.enter_context(checkpoints_kept(out))
+            dataset = opened(data, weighted=True, threads=given["threads"], **options)
+        with training_progress("updates", "loss") as progress:
+            report = _after_facts(dataset, progress)
+            summaries = mcaprl.train(dataset, out, ray=cluster, progress=report, **given)
     from mcaprl.offline.selection.choice import CHOICE_NAME, read_choice
     from mcaprl.offline.training.curves import CURVES_NAME
     from mcaprl.offline.training.metrics import describe_seeds
 
     if (out / CHOICE_NAME).exists():
-        _print_choice(read_choice(out), given.get("report"))
+        _print_choice(read_choice(out), given.get("report", ""))
     else:
         for line in describe_seeds(summaries):
             echo(line)
@@ -116,22 +131,30 @@ def _sweep(data: tuple[str, ...], out: Path, plan: Path, request: dict[str, Any]
     echo(f"policies: {found.results[0].folder} and others; page and table in {out}")
 
 
-def _print_data(algo: str, dataset: mcaprl.Dataset) -> None:
-    echo(
-        f"{algo} learns from {counted(len(dataset.episodes), 'episode')},"
+def _after_facts(dataset: mcaprl.Dataset, progress: ProgressCallback) -> ProgressCallback:
+    """Return a callback that prints facts about the data first; errors come before them."""
+    facts = [
+        f"learning from {counted(len(dataset.episodes), 'episode')},"
         f" {counted(len(dataset), 'transition')}, mean return {dataset.statistics.mean_return:.2f}"
-    )
+    ]
+
+    def report(now: TrainingProgress) -> None:
+        while facts:
+            echo(facts.pop())
+        progress(now)
+
+    return report
 
 
-def _print_choice(choice: Choice, report: Path | None) -> None:
+def _print_choice(choice: Choice, report: str) -> None:
     from mcaprl.offline.selection.choice import COLUMNS
 
     title = f"{choice.chosen}, chosen by the log"
     print_table(title, list(COLUMNS), [list(row) for row in choice.rows])
     for text in (choice.reason, choice.confidence, *choice.advice):
         echo(text)
-    if report is not None:
-        echo(f"report: {report / PAGE_NAME}")
+    if report:
+        echo(f"report: {Path(report) / PAGE_NAME}")
 
 
 @click.command(cls=Command)

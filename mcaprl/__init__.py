@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from mcaprl.api.annotate import annotate
     from mcaprl.api.behavior import estimate_behavior
     from mcaprl.api.browse import browse, save_page
+    from mcaprl.api.cluster import ClusterOptions
     from mcaprl.api.convert import convert, suggest_mapping
-    from mcaprl.api.data import open_data as open
     from mcaprl.api.edit import filter, merge, slice, split
     from mcaprl.api.estimate import estimate
     from mcaprl.api.evaluate import evaluate
@@ -44,9 +44,11 @@ if TYPE_CHECKING:
     from mcaprl.recorder.dataset.episode import Episode
     from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
     from mcaprl.recorder.record.wrapper import RecordMcap
+    from mcaprl.recorder.source import open_data as open
     from mcaprl.sims import make_sim
 
 __all__ = [
+    "ClusterOptions",
     "Dataset",
     "Episode",
     "LogError",
@@ -103,9 +105,10 @@ __getattr__ = lazy_attributes(
     }
     | {
         "mcaprl.api.behavior": ["estimate_behavior"],
+        "mcaprl.api.cluster": ["ClusterOptions"],
         "mcaprl.api.browse": ["browse", "save_page"],
         "mcaprl.api.convert": ["convert", "suggest_mapping"],
-        "mcaprl.api.data": ["open_data as open"],
+        "mcaprl.recorder.source": ["open_data as open"],
         "mcaprl.api.edit": ["filter", "merge", "slice", "split"],
         "mcaprl.api.logs": ["check", "info", "recover"],
         "mcaprl.api.policies": ["Run", "export", "load_policy"],

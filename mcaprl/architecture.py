@@ -1,6 +1,7 @@
 """Architecture of networks, and the settings that select it. Importing this module loads no torch.
 
-Two encoders of images are available, which `ENCODERS` describes. `nature` has the convolutions of
+Two encoders of images are available, which `ENCODERS` describes; images that are too small for them
+have the convolutions of `SMALL`. `nature` has the convolutions of
 "Human-level control through deep reinforcement learning" (https://doi.org/10.1038/nature14236).
 `compact` first averages squares of pixels, so that the image's shorter edge has about 42 pixels; it
 has two small convolutions. A gradient step with `compact` takes a fraction of the time of a step
@@ -10,7 +11,7 @@ with `nature`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from mcaprl.settings import Settings
@@ -53,6 +54,10 @@ ENCODERS: Final[dict[str, Encoder]] = {
     "nature": Encoder((32, 64, 64), ((8, 4), (4, 2), (3, 1))),
     "compact": Encoder((16, 32), ((4, 4), (3, 2)), edge=42),
 }
+SMALL: Final = Encoder((16, 32), ((3, 1), (3, 2)))
+"""Encoder of images with an edge of fewer than `SMALL_EDGE` pixels, such as grids of cells."""
+SMALL_EDGE: Final = 36
+"""Smallest edge in pixels for which the output of all convolutions in `ENCODERS` is not empty."""
 
 
 def choose_encoder(name: str, widths: Sequence[int], channels: Iterable[int]) -> str:
@@ -84,7 +89,7 @@ class Architecture:
             (https://arxiv.org/abs/1607.06450).
         dueling: Whether outputs are the sum of a value and of advantages with mean 0, computed by
             separate last hidden layers (https://arxiv.org/abs/1511.06581).
-        encoder: Key of `ENCODERS`.
+        encoder: Key of `ENCODERS`, for images that are not small.
     """
 
     hidden: tuple[int, ...]
@@ -93,14 +98,17 @@ class Architecture:
     dueling: bool = False
     encoder: str = "nature"
 
-    @property
-    def all_channels(self) -> tuple[int, ...]:
-        """Output channels of the convolutions."""
-        return self.channels or ENCODERS[self.encoder].channels
+    def encoder_of(self, image_shape: Sequence[int]) -> Encoder:
+        """Return the encoder for an image (height, width, ...), with its output channels."""
+        is_small = min(image_shape[:2]) < SMALL_EDGE
+        encoder = SMALL if is_small else ENCODERS[self.encoder]
+        channels = self.channels[: len(encoder.kernels)] or encoder.channels
+        return replace(encoder, channels=channels)
 
     def features(self, image_shape: Sequence[int]) -> int:
         """Return the number of features of the convolutions for an image (height, width, ...)."""
-        return ENCODERS[self.encoder].pixels(image_shape) * self.all_channels[-1]
+        encoder = self.encoder_of(image_shape)
+        return encoder.pixels(image_shape) * encoder.channels[-1]
 
 
 def architecture_of(found: Mapping[str, Any]) -> Architecture:

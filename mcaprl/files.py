@@ -3,8 +3,9 @@
 A file is written in a hidden work folder beside its target. This folder, `.NAME.part`, is locked
 while its writer runs. When the file is complete and synced to disk, it replaces the target
 atomically. If the writer is killed, the target has either its old or its new content. The next
-writer in the same folder removes the work folder. `mcaprl.storage.locks` has the locks, and
-`mcaprl.storage.work_folders` the work folders; other modules import both from here.
+writer in the same folder removes the work folder. `mcaprl.storage.locks` has the locks,
+`mcaprl.storage.work_folders` the work folders, and `mcaprl.storage.documents` the readers of JSON
+and YAML; other modules import them from here.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from mcaprl.errors import LogError, McaprlError, OutputExistsError, UsageError
+from mcaprl.storage.documents import as_type, parse_json, read_json, read_yaml
 from mcaprl.storage.locks import (
     OpenFolder,
     check_plain,
@@ -50,6 +52,7 @@ from mcaprl.storage.work_folders import (
 
 __all__ = [
     "TemporaryFolder",
+    "as_type",
     "check_log_name",
     "check_plain",
     "check_regular",
@@ -66,6 +69,8 @@ __all__ = [
     "open_own",
     "parse_json",
     "read_file",
+    "read_json",
+    "read_yaml",
     "remove_leftover",
     "replacing",
     "replacing_folder",
@@ -81,7 +86,6 @@ __all__ = [
     "write_json",
 ]
 
-_MAX_JSON_DEPTH = 100
 _DIGITS = re.compile(r"\d+")
 
 
@@ -375,29 +379,6 @@ def size_of(path: Path) -> int:
     if not path.is_dir():
         return path.stat().st_size
     return sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
-
-
-def parse_json(text: str | bytes) -> Any:
-    """Parse JSON; refuse texts that are nested more deeply than the files of this package.
-
-    Raises:
-        ValueError: The text is not JSON, or is nested too deeply.
-    """
-    too_deep = f"JSON is nested more than {_MAX_JSON_DEPTH} levels deep"
-    try:
-        found = json.loads(text)
-    except RecursionError as error:
-        raise ValueError(too_deep) from error
-    # Each level takes two brackets, so most texts are too short to be nested too deeply.
-    if len(text) <= 2 * _MAX_JSON_DEPTH:
-        return found
-    level = [found] if isinstance(found, dict | list) else []
-    for _ in range(_MAX_JSON_DEPTH):
-        inner = [part.values() if isinstance(part, dict) else part for part in level]
-        level = [part for parts in inner for part in parts if isinstance(part, dict | list)]
-        if not level:
-            return found
-    raise ValueError(too_deep)
 
 
 def json_text(value: Any) -> str:

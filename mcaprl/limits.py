@@ -19,12 +19,16 @@ MAX_FIXED_MESSAGES: Final = 1_000
 MAX_MESSAGES_PER_BYTE: Final = 16
 """Nested messages for each byte of a message, beyond 64: empty messages take memory, but no bytes
 of the file."""
+MAX_TIME_NS: Final = 2**62
+"""Time of a message in nanoseconds, until the year 2116: differences of times fit into 64 bits."""
 MAX_DEFINITION_BYTES: Final = 2**20
 """Size of the definition of a message type as text: parsing takes seconds per MiB."""
 MAX_DEFINITION_FILES: Final = 100_000
 """Files and folders that are searched for definitions of message types."""
 MAX_METADATA_BYTES: Final = 2**21
-"""Size of a bag's `metadata.yaml`: parsing YAML takes seconds per 100 kB."""
+"""Size of a YAML file, such as a bag's `metadata.yaml`: parsing takes seconds per 100 kB."""
+MAX_DOCUMENT_VALUES: Final = 100_000
+"""Values in a YAML file, with all aliases: a few hundred bytes can declare any number."""
 MAX_METADATA_DEPTH: Final = 20
 """Levels of nested values in a bag's `metadata.yaml`."""
 MAX_CHUNK_BYTES: Final = 2**28

@@ -165,14 +165,14 @@ class Convolutions(nn.Module):
     def __init__(self, image: ImageInput, architecture: Architecture) -> None:
         """Build the convolutions for an image input."""
         super().__init__()
-        encoder = ENCODERS[architecture.encoder]
+        encoder = architecture.encoder_of(image.shape)
         self._pool = encoder.pool(image.shape)
         # These buffers are not persistent, because the normalization is saved separately.
         self.register_buffer("shift", self._shift_of(image), persistent=False)
         self.register_buffer("scale", torch.tensor(image.scale), persistent=False)
         layers: list[nn.Module] = []
         depth = image.shape[2]
-        for width, (kernel, stride) in zip(architecture.all_channels, encoder.kernels, strict=True):
+        for width, (kernel, stride) in zip(encoder.channels, encoder.kernels, strict=True):
             layers += [nn.Conv2d(depth, width, kernel_size=kernel, stride=stride), nn.ReLU()]
             depth = width
         self.layers = nn.Sequential(*layers, nn.Flatten())
@@ -247,8 +247,8 @@ def check_size(
     """
     if architecture.encoder not in ENCODERS:
         raise ValueError(f"encoder {architecture.encoder!r} is not supported")
-    if images:
-        check_widths(architecture.all_channels, weights)
+    for image in images:
+        check_widths(architecture.encoder_of(image.shape).channels, weights)
     widths = [architecture.features(image.shape) for image in images]
     for width in [*widths, *([vector_width] if vector_width else [])]:
         check_widths([width, *architecture.hidden, n_outputs], weights)

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import csv
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import OutputExistsError, TrainingError, UsageError
+from mcaprl.errors import OutputExistsError, PolicyError, TrainingError, UsageError
 from mcaprl.files import (
+    as_type,
     check_regular,
     is_leftover,
     locked_folder,
-    parse_json,
-    read_file,
+    read_json,
     remove_leftover,
     subfolder,
     target_of,
@@ -44,6 +44,7 @@ POLICY_NAME = "policy.json"
 BEST_NAME = "best_model.zip"
 _NUMERICAL = ("torch", "numpy", "stable-baselines3")
 """Packages whose version may change the numbers of a training."""
+_MAX_SEEDS = 10_000
 Curve = dict[str, NDArray[np.float64]]
 """Columns of a `metrics.csv` or `curve.csv` by name."""
 
@@ -263,6 +264,24 @@ def seed_folder(run: Path, seed: int) -> Path:
         return subfolder(folder)
 
 
+@dataclass(frozen=True)
+class _Config:
+    """Types of what is read of a `config.json`; each kind of run has some of these."""
+
+    algo: str = ""
+    config: dict[str, Any] = field(default_factory=dict)
+    seeds: int = 1
+    seed: int = 0
+    sim: str = ""
+    sim_options: dict[str, Any] = field(default_factory=dict)
+    max_steps: int | None = None
+    env_id: str = ""
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.seeds <= _MAX_SEEDS and 0 <= self.seed < 2**63):
+            raise ValueError(f"a run cannot have {self.seeds} seeds from {self.seed}")
+
+
 def run_to_resume(folder: Path) -> dict[str, Any]:
     """Return the config of a run, or an empty dict if the run ended before writing its config.
 
@@ -286,11 +305,12 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     path = folder / CONFIG_NAME
     try:
-        found = parse_json(read_file(path))
-    except (OSError, ValueError) as error:
+        found: dict[str, Any] = read_json(path, TrainingError, dict[str, Any])
+        as_type(_Config, found, str(path))
+    except ValueError as error:
         raise TrainingError(f"cannot resume: {path} cannot be read: {error}") from error
-    if not isinstance(found, dict):
-        raise TrainingError(f"cannot resume: {path} is not a JSON object")
+    except (FileNotFoundError, TrainingError) as error:
+        raise TrainingError(f"cannot resume: {error}") from error
     return found
 
 
@@ -354,6 +374,13 @@ def _seed_folders(run: Path) -> dict[int, Path]:
     }
 
 
+@dataclass(frozen=True)
+class _Saved:
+    """What `saved_updates` reads of a `policy.json`."""
+
+    updates: int
+
+
 def saved_updates(run: Path, seeds: int) -> int:
     """Return the number of updates that all saved policies of a run have.
 
@@ -364,7 +391,8 @@ def saved_updates(run: Path, seeds: int) -> int:
     files = policy_files(run)
     if len(files) < seeds:
         return 0
-    return min(int(parse_json(read_file(file))["updates"]) for file in files)
+    found: list[_Saved] = [read_json(file, PolicyError, _Saved) for file in files]
+    return min(one.updates for one in found)
 
 
 def read_curve(path: Path) -> Curve:
@@ -382,9 +410,19 @@ def read_curve(path: Path) -> Curve:
         raise TrainingError(f"cannot read the curve in {path}: {error}") from error
 
 
-def read_curves(run: Path, name: str) -> list[Curve]:
-    """Read `metrics.csv` or `curve.csv` of each seed that has this file."""
-    return [read_curve(path) for path in sorted(run.glob(f"seed-*/{name}"))]
+def read_curves(run: Path, name: str, columns: Iterable[str] = ()) -> list[Curve]:
+    """Read `metrics.csv` or `curve.csv` of each seed that has this file.
+
+    Raises:
+        TrainingError: A file cannot be read, lacks one of `columns`, or has other columns than
+            that of the first seed.
+    """
+    curves = {path: read_curve(path) for path in sorted(run.glob(f"seed-*/{name}"))}
+    for path, curve in curves.items():
+        needed = {*columns, *next(iter(curves.values()))}
+        if missing := sorted(needed - curve.keys()):
+            raise TrainingError(f"cannot read the curve in {path}: it has no {missing[0]}")
+    return list(curves.values())
 
 
 def _leftovers(folder: Path) -> list[Path] | None:

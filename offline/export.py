@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from mcaprl.errors import PolicyError, import_extra
 from mcaprl.files import replacing
 from mcaprl.offline.algorithms.heads import DiscreteHead
-from mcaprl.offline.batches.observations import Observations, codes_of
+from mcaprl.offline.batches.observations import Observations, codes_of, has_channels_first
 from mcaprl.offline.policy import Policy
 from mcaprl.recorder.format.spaces import space_to_json
 
@@ -80,7 +80,7 @@ class ExportedPolicy(nn.Module):
         encoder, rows = self.encoder, inputs[0].shape[0]
         n_images = len(encoder.images)
         shaped = zip(inputs[:n_images], encoder.image_inputs, strict=True)
-        images = tuple(image.reshape(-1, *wanted.shape) for image, wanted in shaped)
+        images = tuple(_channels_last(image).reshape(-1, *wanted.shape) for image, wanted in shaped)
         numbers = inputs[n_images : n_images + len(encoder.numbers)]
         parts = [
             _numbers(part, space) for part, (_, space) in zip(numbers, encoder.numbers, strict=True)
@@ -91,6 +91,10 @@ class ExportedPolicy(nn.Module):
             allowed = inputs[-1].bool()
             mask = allowed | ~allowed.any(1, keepdim=True)
         return Observations((vector - self.shift) / self.scale, images, mask)
+
+
+def _channels_last(images: Tensor) -> Tensor:
+    return images.permute(0, 2, 3, 1) if has_channels_first(images.shape[1:]) else images
 
 
 def export_onnx(policy: object, path: Path, *, overwrite: bool = True) -> None:

@@ -26,7 +26,7 @@ from mcaprl.actions import OBSERVATION_KEY, has_source, joint_actions
 from mcaprl.architecture import architecture_of
 from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
-from mcaprl.files import parse_json, read_file, write_json
+from mcaprl.files import as_type, parse_json, read_file, write_json
 from mcaprl.frames import FrameStack, mapped
 from mcaprl.networks import ImageInput, Network, check_size
 from mcaprl.offline.algorithms.heads import Head, build_head
@@ -254,6 +254,26 @@ def save_policy(
     write_json(folder / POLICY_NAME, description, TrainingError)
 
 
+@dataclass(frozen=True)
+class _Description:
+    """Content of `policy.json` that is needed to act."""
+
+    format_version: int
+    algo: str
+    acts_by: str
+    threshold: float
+    architecture: dict[str, Any]
+    outputs: dict[str, list[int]]
+    frame_stack: int
+    env_id: str
+    env_kwargs: dict[str, Any]
+    observation_space: Any
+    action_space: Any
+    action_commands: Any = None
+    mask_from: str = ""
+    reward_scale: float = 1.0
+
+
 def read_policy(folder: Path) -> Policy:
     """Read the policy of one seed's folder.
 
@@ -261,9 +281,10 @@ def read_policy(folder: Path) -> Policy:
         PolicyError: A file is missing or broken.
     """
     try:
-        description = parse_json(read_file(folder / POLICY_NAME))
-        if description["format_version"] != FORMAT_VERSION:
-            raise ValueError(f"format_version {description['format_version']} is not supported")
+        found = parse_json(read_file(folder / POLICY_NAME))
+        description: _Description = as_type(_Description, found, POLICY_NAME)
+        if description.format_version != FORMAT_VERSION:
+            raise ValueError(f"format_version {description.format_version} is not supported")
         return _build(folder, description, read_tensors(folder / _WEIGHTS_NAME)[0])
     except FileNotFoundError as error:
         raise PolicyError(
@@ -275,10 +296,13 @@ def read_policy(folder: Path) -> Policy:
         raise PolicyError(f"cannot load the policy in {folder}: {reason}") from error
 
 
-def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]) -> Policy:
-    observation_space = space_from_json(json.dumps(description["observation_space"]))
-    action_space = space_from_json(json.dumps(description["action_space"]))
-    mask_from = str(description.get("mask_from", ""))
+def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) -> Policy:
+    for name, tensor in weights.items():
+        if not torch.isfinite(tensor).all():
+            raise ValueError(f"{name} is not finite")
+    observation_space = space_from_json(json.dumps(description.observation_space))
+    action_space = space_from_json(json.dumps(description.action_space))
+    mask_from = description.mask_from
     if mask_from and not has_source(observation_space):
         raise ValueError(f"mask_from {mask_from!r} does not fit {observation_space}")
     check_actions(action_space)
@@ -286,34 +310,35 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
     encoder = ObservationEncoder(observation_space, joint.count if joint else 0)
     encoder.shift = weights.pop("observation.shift").numpy()
     encoder.scale = weights.pop("observation.scale").numpy()
-    stack, shape = int(description["frame_stack"]), description["architecture"]
+    if not (encoder.scale > 0).all():
+        raise ValueError("observation.scale is not positive")
+    stack, shape = description.frame_stack, description.architecture
     check_elements(stack * sum(leaf.size for leaf in observation_leaves(observation_space)))
     architecture = architecture_of(shape)
     encoder.image_inputs = [
         _image_input(image, number, weights) for number, image in enumerate(encoder.image_inputs)
     ]
     images = [image.stacked(stack) for image in encoder.image_inputs]
-    for outputs in description["outputs"].values():
+    for outputs in description.outputs.values():
         check_size(architecture, encoder.width * stack, images, math.prod(outputs), weights)
     networks = {
         name: Network(encoder.width * stack, images, tuple(outputs), architecture)
-        for name, outputs in description["outputs"].items()
+        for name, outputs in description.outputs.items()
     }
-    threshold = float(description["threshold"])
-    head = build_head(description["acts_by"], networks, action_space, threshold)
+    head = build_head(description.acts_by, networks, action_space, description.threshold)
     head.networks.load_state_dict(weights)
-    commands = description.get("action_commands")
+    commands = description.action_commands
     return Policy(
         name=f"{folder.resolve().parent.name}/{folder.resolve().name}",
-        algo=description["algo"],
+        algo=description.algo,
         observation_space=observation_space,
         action_space=action_space,
-        env_id=description["env_id"],
-        env_kwargs=description["env_kwargs"],
+        env_id=description.env_id,
+        env_kwargs=description.env_kwargs,
         frame_stack=stack,
         encoder=encoder,
         head=head.eval(),
-        reward_scale=float(description.get("reward_scale", 1.0)),
+        reward_scale=description.reward_scale,
         action_commands=None
         if commands is None or joint is None
         else ActionCommands.from_json(commands, joint.count),

@@ -21,13 +21,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.errors import TrainingError
 from mcaprl.files import subfolder, write_atomically
-from mcaprl.frames import is_image, parts_of, parts_of_space
+from mcaprl.frames import parts_of, parts_of_space
 from mcaprl.online.algorithms import make_model, own_architecture
 from mcaprl.online.checkpoint import load_checkpoint, save_checkpoint
 from mcaprl.online.config import DQNConfig
 from mcaprl.online.curves import CurvePoint, write_curve
 from mcaprl.online.evaluation import Evaluation, FirstEpisodes
-from mcaprl.online.features import normalize_images
+from mcaprl.online.features import channels_first, inputs_of, normalize_images
 from mcaprl.online.live import LiveTraining
 from mcaprl.online.recording import ActionDescriber, recorded
 from mcaprl.online.task import Task
@@ -329,11 +329,13 @@ def center_images(model: BaseAlgorithm, task: Task, seed: int) -> None:
         seen = [envs.reset(seed=seed)[0]]
         while len(seen) * task.config.envs < CENTERING_STEPS:
             seen.append(envs.step(envs.action_space.sample())[0])
-    frames = {
-        key: np.concatenate([parts_of(each)[key] for each in seen])
-        for key, space in parts_of_space(envs.single_observation_space).items()
-        if is_image(space)
-    }
+    space = envs.single_observation_space
+    vectors = inputs_of(channels_first(space))[0]
+    frames = {}
+    for key, part in parts_of_space(space).items():
+        if key not in vectors:
+            images = np.concatenate([parts_of(each)[key] for each in seen])
+            frames[key] = np.moveaxis(images, 1, -1) if channels_first(part) == part else images
     if frames:
         normalize_images(model.policy, frames, task.config.frame_stack)
 

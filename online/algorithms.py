@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.actions import joint_actions
-from mcaprl.architecture import Architecture
+from mcaprl.architecture import SMALL_EDGE, Architecture
 from mcaprl.errors import SpaceError, UnknownNameError, UsageError
 from mcaprl.frames import is_image, parts_of_space
 from mcaprl.online.config import (
@@ -146,7 +146,11 @@ def own_architecture(config: OnlineConfig, space: spaces.Space[Any]) -> Architec
     images = inputs_of(channels_first(space))[1]
     architecture = config.architecture_for(image.shape[2] // config.frame_stack for image in images)
     adapts_images = images and (config.center_images or architecture.encoder != "nature")
-    if adapts_images or architecture != Architecture(config.hidden, encoder=architecture.encoder):
+    if (
+        adapts_images
+        or _has_small_images(space)
+        or architecture != Architecture(config.hidden, encoder=architecture.encoder)
+    ):
         return architecture
     return None
 
@@ -167,6 +171,12 @@ def _arguments(config: OnlineConfig, space: spaces.Space[Any]) -> dict[str, Any]
             extra["pools"] = pools_of(channels_first(space), architecture)
         arguments |= {"replay_buffer_class": FrameReplayBuffer, "replay_buffer_kwargs": extra}
     return arguments
+
+
+def _has_small_images(space: spaces.Space[Any]) -> bool:
+    """Return whether SB3's own networks refuse images of the space."""
+    parts = parts_of_space(channels_first(space)).values()
+    return any(is_image(part) and min(part.shape[1:]) < SMALL_EDGE for part in parts)
 
 
 def _has_images(space: spaces.Space[Any]) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import TrainingError
 from mcaprl.figures import BACKGROUND, COLORS, INK, PALE, new_figure, save_png
-from mcaprl.files import read_file, write_atomically
+from mcaprl.files import read_json, write_atomically
 from mcaprl.runs import CURVE_NAME, Curve, read_curves
 
 IMAGE_NAME = "curve.png"
@@ -70,6 +69,20 @@ class RunCurve:
     finals: tuple[float, ...]
 
 
+@dataclass(frozen=True)
+class _Final:
+    """Entry of a seed in `scores.json`."""
+
+    score: float | None
+
+
+@dataclass(frozen=True)
+class _Finals:
+    """What `read_run` reads of `scores.json`."""
+
+    seeds: dict[str, _Final]
+
+
 def write_curve(path: Path, points: Sequence[CurvePoint]) -> None:
     """Replace a `curve.csv` with all points so far."""
     text = io.StringIO()
@@ -85,7 +98,7 @@ def read_run(folder: Path) -> RunCurve:
     Raises:
         TrainingError: The run has no curves, or they cannot be read.
     """
-    seeds = tuple(read_curves(folder, CURVE_NAME))
+    seeds = tuple(read_curves(folder, CURVE_NAME, ["step", *VALUES]))
     if not seeds:
         raise TrainingError(f"{folder} has no curves: no seed-K/{CURVE_NAME}")
     return RunCurve(folder.name, seeds, _final_scores(folder / SCORES_NAME))
@@ -131,11 +144,8 @@ def curve_figure(runs: Sequence[RunCurve], title: str, value: str | None = None)
 def _final_scores(path: Path) -> tuple[float, ...]:
     if not path.exists():
         return ()
-    try:
-        seeds = json.loads(read_file(path))["seeds"].values()
-        return tuple(seed["score"] for seed in seeds if seed["score"] is not None)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise TrainingError(f"cannot read the scores in {path}: {error}") from error
+    found: _Finals = read_json(path, TrainingError, _Finals)
+    return tuple(seed.score for seed in found.seeds.values() if seed.score is not None)
 
 
 def _has_finals(runs: Sequence[RunCurve], value: str) -> bool:

@@ -18,10 +18,11 @@ from stable_baselines3.common.vec_env import VecTransposeImage
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import Tensor, nn
 
-from mcaprl.architecture import ENCODERS, Architecture
+from mcaprl.architecture import Architecture
 from mcaprl.frames import is_image, map_space, parts_of, parts_of_space, stack_axis
 from mcaprl.networks import Convolutions, ImageInput, Trunk, make_head
 from mcaprl.offline.batches.observations import Observations
+from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE
 
 
 class NetworkFeatures(BaseFeaturesExtractor):
@@ -94,10 +95,13 @@ def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:
 
 
 def inputs_of(space: spaces.Space[Any]) -> tuple[list[str], list[ImageInput]]:
-    """Return the keys of the vectors, and an `ImageInput` for each channels-first image."""
+    """Return the keys of the vectors, and an `ImageInput` for each channels-first image.
+
+    What SB3 takes for images of fewer than `MIN_IMAGE_EDGE` pixels are vectors.
+    """
     vectors, images = [], []
     for key, part in parts_of_space(space).items():
-        if is_image(part):
+        if is_image(part) and min(part.shape[1:]) >= MIN_IMAGE_EDGE:
             channels, height, width = part.shape
             images.append(ImageInput((height, width, channels)))
         else:
@@ -109,8 +113,10 @@ def pools_of(space: spaces.Space[Any], architecture: Architecture) -> dict[str, 
     """Return the network's average-pooling factor for the images of each key."""
     vectors, images = inputs_of(space)
     keys = [key for key in parts_of_space(space) if key not in vectors]
-    encoder = ENCODERS[architecture.encoder]
-    return {key: encoder.pool(image.shape) for key, image in zip(keys, images, strict=True)}
+    return {
+        key: architecture.encoder_of(image.shape).pool(image.shape)
+        for key, image in zip(keys, images, strict=True)
+    }
 
 
 def normalize_images(

@@ -17,7 +17,7 @@ from mcaprl.online.presets import find_preset, settings_for
 from mcaprl.runs import CONFIG_NAME, RunIdentity, check_kind, read_config, run_to_resume
 from mcaprl.settings import check_settings, settings_from_json
 from mcaprl.sims import make_sims
-from mcaprl.sims.evaluation.limits import make_limited, make_limited_sims
+from mcaprl.sims.evaluation.rollout import make_limited, make_limited_sims
 
 DEFAULT_ALGO = "double-dqn"
 _MODE = AutoresetMode.SAME_STEP.value
@@ -34,7 +34,7 @@ class Task:
         sim_options: Arguments of the environment.
         max_steps: Steps after which an episode is truncated, in training and evaluation. None
             selects the environment's own limit; evaluations of environments without one then have
-            the limit of `mcaprl.sims.evaluation.limits`.
+            the limit of `mcaprl.sims.evaluation.rollout`.
     """
 
     algo: str

@@ -45,7 +45,7 @@ from mcaprl.runs import (
     writing,
 )
 from mcaprl.sims.evaluation.evaluate import Scale, evaluate
-from mcaprl.sims.evaluation.limits import warn_of_cuts
+from mcaprl.sims.evaluation.rollout import warn_of_cuts
 
 _SEEDS = 2**32
 """Number of seeds that Stable-Baselines3 accepts."""

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import io
 import json
-import pickle
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
@@ -125,18 +124,30 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any], dict[str, Te
             most = _MAX_EXPANSION * path.stat().st_size
             weights_file = io.BytesIO(_read(archive, _WEIGHTS_NAME, most))
             _check_size(weights_file, most)
-            weights = torch.load(weights_file, map_location="cpu", weights_only=True)
+            weights = _load_weights(weights_file)
     except FileNotFoundError as error:
         raise PolicyError(f"{path} does not exist") from error
     except KeyError as error:
         raise PolicyError(f"{path} is not a model of Stable-Baselines3: {error.args[0]}") from error
     except (OSError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile) as error:
         raise PolicyError(f"cannot read the model in {path}: {error}") from error
-    except pickle.UnpicklingError as error:
+    except _NotWeightsError as error:
         raise PolicyError(f"cannot load {path}: its weights are not plain tensors") from error
     if not (isinstance(own, dict) and isinstance(data, dict) and _are_weights(weights)):
         raise PolicyError(f"{path} is not a model of Stable-Baselines3: its parts have wrong types")
     return own, data, weights
+
+
+class _NotWeightsError(Exception):
+    """The weights are not a file of plain tensors."""
+
+
+def _load_weights(file: io.BytesIO) -> Any:
+    try:
+        return torch.load(file, map_location="cpu", weights_only=True)
+    # PyTorch raises any exception for damaged files.
+    except Exception as error:
+        raise _NotWeightsError from error
 
 
 def save_policy(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -> None:

@@ -41,10 +41,9 @@ __getattr__ = lazy_attributes(
     {
         "mcaprl.recorder.bags.bag": ("open_bag",),
         "mcaprl.recorder.columns.cdr": ("clear_types",),
-        "mcaprl.recorder.columns.checksum": ("crc32",),
         "mcaprl.recorder.columns.chunks": ("ChunkHeader", "Compressors", "chunk_header"),
         "mcaprl.recorder.columns.reader": ("McapReader",),
-        "mcaprl.recorder.columns.records": ("map_file",),
+        "mcaprl.recorder.columns.records": ("crc32", "map_file"),
         "mcaprl.recorder.dataset.log_reader": ("LogReader",),
         "mcaprl.recorder.format.schema": ("message_dtype", "step_schema"),
         "mcaprl.recorder.format.topics": ("EPISODE_TOPIC", "STEP_TOPIC"),

@@ -119,5 +119,5 @@ def ray_cluster() -> Iterator[None]:
 def small_chunks() -> Iterator[None]:
     """Prevent writers from merging small chunks on close, as if they had been killed."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mcaprl.recorder.columns.compact._MIN_CHUNKS_SAVED", 10**9)
+        patch.setattr("mcaprl.recorder.columns.output._MIN_CHUNKS_SAVED", 10**9)
         yield

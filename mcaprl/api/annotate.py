@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mcaprl.api.data import Definitions, MappingFile, open_data
 from mcaprl.api.environments import sim_of
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
 from mcaprl.api.ranges import check_fraction
@@ -16,7 +15,7 @@ from mcaprl.errors import UsageError
 from mcaprl.files import check_log_name, check_target, temporary_folder
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.open import open_logs
+from mcaprl.recorder.source import open_data
 from mcaprl.recorder.viewer.annotate import annotated_copy, values_topics
 from mcaprl.recorder.viewer.verify import Verification
 from mcaprl.storage.remote import as_path
@@ -41,7 +40,7 @@ class Annotation:
 
 
 def annotate(
-    file: str | Path,
+    data: str | Path | Dataset,
     out: str | Path,
     *,
     policy: Names = (),
@@ -52,17 +51,13 @@ def annotate(
     trust_env: bool = False,
     sim_options: Mapping[str, Any] | None = None,
     overwrite: bool = False,
-    mapping: MappingFile | None = None,
-    trust_code: bool = False,
-    definitions: Definitions = (),
     progress: ProgressBar = no_progress,
 ) -> Annotation:
     """Copy a log, and add values of policies or the scene of the sim to each step.
 
-    With a mapping, `file` is a bag, which is first converted to a log as by `convert`.
-
     Args:
-        file: Path of the log.
+        data: Path of the log; or a dataset that `open` read from a bag by a mapping, which is first
+            saved as a log.
         out: Path of the copy.
         policy: Path of a trained run, or several paths.
         gamma: Discount of the TD errors; None for the discount of the run.
@@ -73,10 +68,6 @@ def annotate(
             arguments to environments other than the sims of `SIMS`.
         sim_options: With `scene`, arguments of the environment that replace the logged ones.
         overwrite: Whether an existing file is replaced.
-        mapping: Mapping that describes a bag; see `open`.
-        trust_code: Whether the mapping may name a Python function.
-        definitions: Files and folders with definitions of ROS types that a bag lacks; see
-            docs/bags.md.
         progress: Function that opens a progress bar.
 
     Raises:
@@ -88,21 +79,21 @@ def annotate(
         OutputExistsError: `out` exists.
     """
     check_fraction(gamma=gamma)
-    path, names, added = as_path(file, whole=True), as_names(policy), None
+    names, added = as_names(policy), None
     check_log_name(out)
     if not names and not scene:
         raise UsageError("annotate needs --policy POLICY, --scene, or both")
-    if mapping is not None:
+    if isinstance(data, Dataset):
         if scene:
             raise UsageError("the scene of a bag cannot be added: there is no sim to step")
-        dataset = open_data(path, mapping=mapping, trust_code=trust_code, definitions=definitions)
         check_target(Path(out), overwrite=overwrite)
         with temporary_folder() as folder:
             log = folder / "converted.mcap"
-            dataset.save(log)
+            data.save(log)
             options: Any = {"gamma": gamma, "overwrite": overwrite, "progress": progress}
             return annotate(log, out, policy=policy, **options)
-    dataset = open_logs(path)
+    path = as_path(data, whole=True)
+    dataset = open_data(path)
     found = values_topics(list(policy_names(names).values()))
     topics = dict(zip(dict.fromkeys(names), found.values(), strict=True))
     with annotated_copy(path, Path(out), overwrite=overwrite) as copy:

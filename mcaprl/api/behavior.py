@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mcaprl.api.data import Data, Definitions, MappingFile, opened
 from mcaprl.api.ranges import check_least
 from mcaprl.api.train import torch_threads
 from mcaprl.progress import ProgressBar, no_progress
+from mcaprl.recorder.source import Data, opened
 
 if TYPE_CHECKING:
     from mcaprl.offline.estimate.behavior import BehaviorEstimate
@@ -20,9 +20,6 @@ def estimate_behavior(
     updates: int = 2_000,
     seed: int = 0,
     threads: int = 1,
-    mapping: MappingFile | None = None,
-    trust_code: bool = False,
-    definitions: Definitions = (),
     progress: ProgressBar = no_progress,
 ) -> BehaviorEstimate:
     """Estimate the probability of each logged action under the policy that took it.
@@ -39,10 +36,6 @@ def estimate_behavior(
         updates: Number of gradient steps for each fold.
         seed: Seed of the folds and of the networks.
         threads: Number of threads of PyTorch and of the reader.
-        mapping: Mapping that describes a bag; see `open`.
-        trust_code: Whether the mapping may name a Python function.
-        definitions: Files and folders with definitions of ROS types that a bag lacks; see
-            docs/bags.md.
         progress: Function that opens a progress bar.
 
     Returns:
@@ -57,9 +50,7 @@ def estimate_behavior(
 
     check_least(1, updates=updates, threads=threads)
     check_least(2, folds=folds)
-    dataset = opened(
-        data, mapping=mapping, trust_code=trust_code, definitions=definitions, threads=threads
-    )
+    dataset = opened(data, threads=threads)
     text = f"estimating behavior_prob in {folds} folds"
     with torch_threads(threads), progress(text, folds * updates) as advance:
         return behavior.estimate_behavior(

@@ -15,15 +15,14 @@ from mcaprl.api.ranges import check_port, check_positive
 from mcaprl.errors import ReportError, UnknownNameError
 from mcaprl.files import check_target, replacing
 from mcaprl.recorder.viewer.page.episode_data import LogPage
-from mcaprl.recorder.viewer.page.html import page_html
-from mcaprl.recorder.viewer.page.server import PageServer
+from mcaprl.recorder.viewer.page.server import PageServer, page_html
 from mcaprl.storage.remote import as_path
 
 _KINDS = (".html", ".htm")
 
 
 def browse(
-    file: str | Path,
+    data: str | Path,
     *,
     episode: int = 0,
     speed: float = 1.0,
@@ -36,7 +35,7 @@ def browse(
     """Serve a page with a log's episodes on 127.0.0.1 until `stop` is set or Ctrl-C is pressed.
 
     Args:
-        file: Path of the log.
+        data: Path of the log.
         episode: Index of the episode that the page shows first.
         speed: Initial playback speed, simulated seconds per second.
         loop: Whether an episode restarts at its end.
@@ -51,7 +50,7 @@ def browse(
     """
     check_positive(speed=speed)
     check_port(port)
-    page = _page(file, episode)
+    page = _page(data, episode)
     with closing(PageServer(page, port=port, first=episode, speed=speed, loop=loop)) as server:
         on_open(server.url)
         if show and _has_display():
@@ -61,7 +60,7 @@ def browse(
 
 
 def save_page(
-    file: str | Path,
+    data: str | Path,
     page: str | Path,
     *,
     episode: int = 0,
@@ -72,7 +71,7 @@ def save_page(
     """Save an episode as one HTML file, which a browser shows without a server or a network.
 
     Args:
-        file: Path of the log.
+        data: Path of the log.
         page: File to write: .html.
         episode: Index of the episode.
         speed: Initial playback speed, simulated seconds per second.
@@ -93,7 +92,7 @@ def save_page(
     if out.suffix not in _KINDS:
         raise UnknownNameError("kind of output", out.suffix or out.name, _KINDS)
     check_target(out, overwrite=overwrite)
-    log = _page(file, episode)
+    log = _page(data, episode)
     index = log.index(only=episode, first=episode, speed=speed, loop=loop)
     html = page_html(index, log.episode(episode)).encode()
     with replacing(out, ReportError, overwrite=overwrite) as unfinished:
@@ -101,8 +100,8 @@ def save_page(
     return len(html)
 
 
-def _page(file: str | Path, episode: int) -> LogPage:
-    path = as_path(file)
+def _page(data: str | Path, episode: int) -> LogPage:
+    path = as_path(data)
     page = LogPage(path)
     check_episode(page.dataset, episode, path)
     return page

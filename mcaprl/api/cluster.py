@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,17 +13,18 @@ from mcaprl.settings import flag
 
 @dataclass(frozen=True)
 class ClusterOptions:
-    """Cluster and workers of a command.
+    """Cluster and workers of a function that can run on Ray.
 
     Attributes:
-        ray: Whether the command runs on Ray.
-        workers: Number of workers; None for the number of CPUs of the cluster.
+        ray: Whether it runs on Ray.
+        workers: Number of workers; None for the number of CPUs of the cluster, or with `cuda` its
+            number of GPUs.
         address: Address of the cluster; None for RAY_ADDRESS, or else a local cluster.
     """
 
-    ray: bool
-    workers: int | None
-    address: str | None
+    ray: bool = True
+    workers: int | None = None
+    address: str | None = None
 
     def check(self, **others: int | None) -> None:
         """Check that numbers are at least 1, and that cluster options are given only with `ray`.
@@ -38,7 +39,13 @@ class ClusterOptions:
                 raise UsageError(f"{flag(name)} requires --ray")
 
     def connected(self) -> AbstractContextManager[Any]:
-        """Return a context that connects to the cluster; its errors are those of `ray.cluster`."""
+        """Return a context that connects to the cluster, if any; see `ray.cluster`."""
+        if not self.ray:
+            return nullcontext()
         from mcaprl.ray.cluster import cluster
 
         return cluster(self.address, workers=self.workers)
+
+
+# Reprs and pickles contain this public import path.
+ClusterOptions.__module__ = "mcaprl"

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mcaprl.api.data import Definitions, MappingFile, Paths, mapped, open_data
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import UsageError, import_extra
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.registry import target_format, write_format
+from mcaprl.recorder.source import Definitions, MappingFile, Paths, open_data, read_mapped
 from mcaprl.storage.remote import check_upload, upload_all
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ class Conversion:
 
 
 def convert(
-    source: Paths,
+    data: Paths,
     out: str | Path | None,
     *,
     mapping: MappingFile | None = None,
@@ -128,11 +128,11 @@ def convert(
     """Read logs, a bag, or a dataset of another tool, and write a log or a dataset.
 
     Args:
-        source: Logs or a dataset of another tool; with a mapping: MCAP files, rosbag2 folders and
+        data: Logs or a dataset of another tool; with a mapping: MCAP files, rosbag2 folders and
             databases, or ROS 1 bags.
         out: Path of the log or dataset; None to write nothing.
         mapping: Mapping file, or its keys and values; see docs/bags.md.
-        source_format: Name of the format of `source`; default: detected from the path.
+        source_format: Name of the format of `data`; default: detected from the path.
         one_episode: Whether flat arrays of another tool are one episode if nothing marks where an
             episode ends; see `open`.
         dones: Kind of the ends in flat arrays of another tool that no array distinguishes:
@@ -163,7 +163,7 @@ def convert(
         if out is None or (form is not None and not form.suffix):
             raise UsageError("upload copies one file: choose a file, not a folder, as the output")
     reading = {"one_episode": one_episode, "dones": dones, "lossy": lossy}
-    dataset, report = _read(source, mapping, source_format, trust_code, definitions, reading)
+    dataset, report = _read(data, mapping, source_format, trust_code, definitions, reading)
     lost: list[str] = []
     if out is not None and form is not None:
         lost = write_format(dataset, out, form, lossy=lossy, overwrite=overwrite)
@@ -184,18 +184,18 @@ def _read(
 ) -> tuple[Dataset, MappingReport | None]:
     if mapping is None or reading["one_episode"] or reading["dones"]:
         return open_data(source, mapping=mapping, format=source_format, **reading), None
-    found = mapped(source, mapping, trust_code=trust_code, definitions=definitions)
-    return found.dataset, found.report
+    found = read_mapped(source, mapping, trust_code, definitions)
+    return found, found.origin.report
 
 
-def suggest_mapping(bag: Paths, *, bins: int | None = None, definitions: Definitions = ()) -> str:
+def suggest_mapping(data: Paths, *, bins: int | None = None, definitions: Definitions = ()) -> str:
     """Return a commented draft of a mapping file, based on the topics and messages of a bag.
 
     The draft is tried: quantities that prevent all episodes become comments. A warning, which is
     also a comment of the draft, says if there is no command, or still no episode.
 
     Args:
-        bag: MCAP files, rosbag2 folders and databases, ROS 1 bags, or folders of these.
+        data: MCAP files, rosbag2 folders and databases, ROS 1 bags, or folders of these.
         bins: Number of bins of each element of a continuous command, with similar numbers of
             commands in each bin; default: a Box action with limits from the commands.
         definitions: Files and folders with definitions of ROS types that the bag lacks; see
@@ -214,7 +214,7 @@ def suggest_mapping(bag: Paths, *, bins: int | None = None, definitions: Definit
 
     if bins is not None:
         check_least(2, bins=bins)
-    with closing(open_bag(bag, definitions=definitions)) as found:
+    with closing(open_bag(data, definitions=definitions)) as found:
         return suggested(found, bins)
 
 

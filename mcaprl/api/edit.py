@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mcaprl.api.data import Paths
 from mcaprl.files import check_log_name
-from mcaprl.recorder.edit.cut import filter_log, split_log
 from mcaprl.recorder.edit.join import merge_logs
-from mcaprl.recorder.edit.piece import Bounds, slice_log
+from mcaprl.recorder.edit.piece import Bounds, filter_log, slice_log, split_log
 from mcaprl.recorder.edit.source import Edited
+from mcaprl.recorder.source import Paths
 
 
-def merge(logs: Paths, out: str | Path, *, shift: bool = False, overwrite: bool = False) -> Edited:
+def merge(data: Paths, out: str | Path, *, shift: bool = False, overwrite: bool = False) -> Edited:
     """Join logs into one log.
 
     The episodes of the new log are in the order of their times. The logs must be finished, and have
@@ -22,7 +21,7 @@ def merge(logs: Paths, out: str | Path, *, shift: bool = False, overwrite: bool 
     contain a message with the same time and bytes, it is written once.
 
     Args:
-        logs: Two or more logs: files, folders or globs.
+        data: Two or more logs: files, folders or globs.
         out: Path of the new log.
         shift: Whether to delay a log whose episodes overlap in time with episodes of earlier logs.
             The log then begins after the earlier logs end. The timestamps inside its messages are
@@ -36,11 +35,11 @@ def merge(logs: Paths, out: str | Path, *, shift: bool = False, overwrite: bool 
         LogError: A log cannot be read. Or the environment, names or step duration differ. Or
             episodes of two logs overlap in time, and `shift` is not set.
     """
-    return merge_logs(logs, check_log_name(out), shift=shift, overwrite=overwrite)
+    return merge_logs(data, check_log_name(out), shift=shift, overwrite=overwrite)
 
 
 def split(
-    log: str | Path,
+    data: str | Path,
     out: str | Path,
     *,
     episodes: int | None = None,
@@ -55,7 +54,7 @@ def split(
     them.
 
     Args:
-        log: Path of the log.
+        data: Path of the log.
         out: New folder of the logs, which are named `NAME-00000.mcap`, `NAME-00001.mcap` and so on.
         episodes: Number of episodes of each new log; the last one may have fewer.
         ratio: Relative number of episodes of each new log, such as (8, 1, 1).
@@ -67,10 +66,12 @@ def split(
         OutputExistsError: `out` exists.
         LogError: The log cannot be read, is not finished, or has no episodes.
     """
-    return split_log(log, out, episodes=episodes, ratio=ratio, seed=seed, overwrite=overwrite)
+    return split_log(data, out, episodes=episodes, ratio=ratio, seed=seed, overwrite=overwrite)
 
 
-def filter(expression: str, log: str | Path, out: str | Path, *, overwrite: bool = False) -> Edited:
+def filter(
+    expression: str, data: str | Path, out: str | Path, *, overwrite: bool = False
+) -> Edited:
     """Copy the episodes for which an expression is true to a new log.
 
     The expression is a condition such as `"length > 100 and reason != 'crash'"`. It can use
@@ -81,7 +82,7 @@ def filter(expression: str, log: str | Path, out: str | Path, *, overwrite: bool
 
     Args:
         expression: Condition on an episode.
-        log: Path of the log.
+        data: Path of the log.
         out: Path of the new log.
         overwrite: Whether an existing file is replaced.
 
@@ -91,11 +92,11 @@ def filter(expression: str, log: str | Path, out: str | Path, *, overwrite: bool
         NoEpisodesError: The expression is true for no episode.
         LogError: The log cannot be read, or is not finished.
     """
-    return filter_log(expression, log, check_log_name(out), overwrite=overwrite)
+    return filter_log(expression, data, check_log_name(out), overwrite=overwrite)
 
 
 def slice(
-    log: str | Path,
+    data: str | Path,
     out: str | Path,
     *,
     steps: Bounds | None = None,
@@ -109,7 +110,7 @@ def slice(
     truncated with the reason `interrupted`.
 
     Args:
-        log: Path of the log; with `time`, any finished MCAP file.
+        data: Path of the log; with `time`, any finished MCAP file.
         out: Path of the new log.
         steps: Half-open range (start, stop) of transitions, counted from 0 over all episodes. A
             bound of None is the start or end of the log.
@@ -123,4 +124,4 @@ def slice(
         NoEpisodesError: The range has no complete transition.
         LogError: The log cannot be read, or is not finished.
     """
-    return slice_log(log, check_log_name(out), steps=steps, time=time, overwrite=overwrite)
+    return slice_log(data, check_log_name(out), steps=steps, time=time, overwrite=overwrite)

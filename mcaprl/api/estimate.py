@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from mcaprl.api.behavior import estimate_behavior as estimate_of_behavior
-from mcaprl.api.data import Data, Definitions, MappingFile, named, opened
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
 from mcaprl.api.ranges import check_fraction, check_least
 from mcaprl.api.train import torch_threads
 from mcaprl.base_policy import BasePolicy, RandomPolicy
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.calibration import Calibration, calibration
+from mcaprl.recorder.source import Data, named, opened
 from mcaprl.texts import counted
 
 if TYPE_CHECKING:
@@ -77,9 +77,6 @@ def estimate(
     estimate_behavior: bool = False,
     seed: int = 1_000_000,
     threads: int = 1,
-    mapping: MappingFile | None = None,
-    trust_code: bool = False,
-    definitions: Definitions = (),
     progress: ProgressBar = no_progress,
 ) -> LogEstimates:
     """Estimate the discounted returns of policies from logs, with each estimator.
@@ -96,10 +93,6 @@ def estimate(
             from the actions. Otherwise, the logged probabilities are used.
         seed: Seed of the model and of the resampling.
         threads: Number of threads of PyTorch and of the reader.
-        mapping: Mapping that describes a bag; see `open`.
-        trust_code: Whether the mapping may name a Python function.
-        definitions: Files and folders with definitions of ROS types that a bag lacks; see
-            docs/bags.md.
         progress: Function that opens a progress bar.
 
     Raises:
@@ -114,9 +107,7 @@ def estimate(
     check_fraction(gamma=gamma, epsilon=epsilon)
     check_least(1, updates=updates, threads=threads)
     check_least(0, seed=seed)
-    dataset = opened(
-        data, mapping=mapping, trust_code=trust_code, definitions=definitions, threads=threads
-    )
+    dataset = opened(data, threads=threads)
     found = _policies(as_names(policies), dataset)
     behavior = None
     if estimate_behavior:

@@ -23,9 +23,9 @@ from mcaprl.errors import ReportError, UsageError, import_extra
 from mcaprl.files import check_log_name, check_target, check_writable, write_json
 from mcaprl.page import Figure
 from mcaprl.progress import ProgressBar, no_progress
-from mcaprl.recorder.dataset.open import find_logs, open_logs
 from mcaprl.recorder.format.metadata import same_env
 from mcaprl.recorder.record.wrapper import RecordMcap
+from mcaprl.recorder.source import Data, named, opened
 from mcaprl.sims import make_sims
 from mcaprl.sims.evaluation.evaluate import (
     Improvement,
@@ -36,8 +36,8 @@ from mcaprl.sims.evaluation.evaluate import (
     score_of,
 )
 from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
-from mcaprl.sims.evaluation.limits import StepLimit, make_limited, warn_of_cuts
 from mcaprl.sims.evaluation.pilots import has_pilot
+from mcaprl.sims.evaluation.rollout import StepLimit, make_limited, warn_of_cuts
 from mcaprl.sims.evaluation.statistics import mean_interval
 
 RESULT_NAME = "evaluation.json"
@@ -103,7 +103,7 @@ def evaluate(
     rules: str | None = None,
     sim_options: Mapping[str, Any] | None = None,
     trust_env: bool = False,
-    behavior: str | None = None,
+    behavior: Data | None = None,
     record: str | Path | None = None,
     keys: Sequence[str] | None = None,
     report: str | Path | None = None,
@@ -133,7 +133,7 @@ def evaluate(
             the arguments with which `policies` were trained in it.
         trust_env: Whether the arguments of the training may be passed to environments other than
             the sims of `SIMS`.
-        behavior: Logs of the sim that the policies are compared with.
+        behavior: Dataset or logs of the sim that the policies are compared with.
         record: Output log of the episodes of `policies`.
         keys: Keys of the parts of a Dict or Tuple observation that `record` contains; default: all.
         report: Output folder of the HTML report, images and JSON.
@@ -258,23 +258,23 @@ def _set_policy(recorder: RecordMcap | None, name: str) -> None:
         recorder.policy = name
 
 
-def _behavior(data: str, env: gym.Env[Any, Any], record: Path | None) -> LoggedReturns:
+def _behavior(data: Data, env: gym.Env[Any, Any], record: Path | None) -> LoggedReturns:
     """Compute statistics of the returns in logs.
 
     Raises:
         UsageError: A log was recorded in another environment, or is the output log `record`.
     """
-    if record is not None and record.resolve() in [path.resolve() for path in find_logs(data)]:
-        raise UsageError(f"{record} is in --behavior {data}: record the episodes elsewhere")
-    dataset = open_logs(data)
+    dataset, name = opened(data), named(data)
+    if record is not None and record.resolve() in [path.resolve() for path in dataset.sources]:
+        raise UsageError(f"{record} is in --behavior {name}: record the episodes elsewhere")
     env_id = env.spec.id if env.spec else ""
     if not same_env(dataset.env_id, env_id):
         raise UsageError(
-            f"--behavior {data} was recorded in {dataset.env_id or 'unknown'}, not in {env_id}"
+            f"--behavior {name} was recorded in {dataset.env_id or 'unknown'}, not in {env_id}"
         )
     returns = dataset.statistics.returns
     interval = mean_interval(returns[None])
-    return LoggedReturns(data, len(returns), float(returns.mean()), interval)
+    return LoggedReturns(name, len(returns), float(returns.mean()), interval)
 
 
 def _write_report(

@@ -14,8 +14,7 @@ from mcaprl.errors import ClusterError
 from mcaprl.progress import Advance
 from mcaprl.sims import make_sims
 from mcaprl.sims.evaluation.evaluate import greedy_episodes
-from mcaprl.sims.evaluation.limits import make_limited
-from mcaprl.sims.evaluation.rollout import EpisodeResult
+from mcaprl.sims.evaluation.rollout import EpisodeResult, make_limited
 
 # Number of episodes that a worker runs as one task. The number of workers has no effect on the
 # parts, and thus on the results.

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mcaprl.api.bags import BagInfo, bag_info, logs_or_bags
-from mcaprl.api.data import Definitions, MappingFile, Paths, mapped, open_data
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import LogError, NoEpisodesError, ReportError, UsageError, import_extra
 from mcaprl.files import check_log_name, size_of, write_json
@@ -18,6 +17,7 @@ from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import Calibration, calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
+from mcaprl.recorder.source import Definitions, MappingFile, Paths, open_data, read_mapped
 from mcaprl.recorder.viewer.surprises import Surprise, moments_of
 from mcaprl.texts import size
 
@@ -156,8 +156,8 @@ def info(
         if mapping is None:
             contents = _dataset_or_bag(data, threads, definitions)
         else:
-            contents, result = mapped(data, mapping, trust_code=trust_code, definitions=definitions)
-            noted = result.problems()
+            contents = read_mapped(data, mapping, trust_code, definitions)
+            noted = contents.origin.report.problems()
     warned = [str(warning.message) for warning in caught]
     if isinstance(contents, BagInfo):
         if report is not None:
@@ -286,8 +286,8 @@ def check(
 
     check_least(1, threads=threads)
     if mapping is not None:
-        found_bag, report = mapped(data, mapping, trust_code=trust_code, definitions=definitions)
-        return CheckResult(found_bag.sources, (), tuple(report.problems()))
+        read = read_mapped(data, mapping, trust_code, definitions)
+        return CheckResult(read.sources, (), tuple(read.origin.report.problems()))
     names: Sequence[str | Path] = [data] if isinstance(data, str | Path) else data
     if not names:
         raise UsageError("no data: the list of files is empty")
@@ -311,12 +311,12 @@ def check(
 
 
 def recover(
-    file: str | Path, out: str | Path, *, keep_unfinished: bool = False, overwrite: bool = False
+    data: str | Path, out: str | Path, *, keep_unfinished: bool = False, overwrite: bool = False
 ) -> Recovery:
     """Write the valid part of a log that was cut off or damaged to a new log.
 
     Args:
-        file: MCAP file, damaged or not; it is not changed.
+        data: MCAP file, damaged or not; it is not changed.
         out: Path of the new log.
         keep_unfinished: Whether unfinished episodes are kept up to their last complete transition.
             They are marked as truncated.
@@ -327,11 +327,11 @@ def recover(
 
     Raises:
         OutputExistsError: `out` exists.
-        UsageError: `file` and `out` are the same file.
+        UsageError: `data` and `out` are the same file.
         LogError: Nothing can be kept, or `out` cannot be written.
     """
     from mcaprl.recorder.repair.recover import recover_log
 
     return recover_log(
-        file, check_log_name(out), keep_unfinished=keep_unfinished, overwrite=overwrite
+        data, check_log_name(out), keep_unfinished=keep_unfinished, overwrite=overwrite
     )

@@ -24,8 +24,7 @@ from mcaprl.files import check_log_name
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.manifest import MANIFEST_NAME
 from mcaprl.settings import flag
-from mcaprl.sims.evaluation.limits import warn_of_cuts
-from mcaprl.sims.evaluation.rollout import EpisodeResult
+from mcaprl.sims.evaluation.rollout import EpisodeResult, warn_of_cuts
 from mcaprl.storage.remote import check_upload, upload_all
 
 

@@ -15,8 +15,13 @@ from mcaprl.api.policies import policies_of, policy_names
 from mcaprl.base_policy import BasePolicy
 from mcaprl.files import work_folder
 from mcaprl.recorder.record.wrapper import RecordMcap
-from mcaprl.sims.evaluation.limits import make_limited, make_or_borrow
-from mcaprl.sims.evaluation.rollout import EpisodeResult, EpsilonGreedy, rollout
+from mcaprl.sims.evaluation.rollout import (
+    EpisodeResult,
+    EpsilonGreedy,
+    make_limited,
+    make_or_borrow,
+    rollout,
+)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.api.data import Paths
 from mcaprl.api.environments import check_episode, sim_of
 from mcaprl.api.policies import as_names
 from mcaprl.api.ranges import check_port, check_positive
@@ -23,15 +22,21 @@ from mcaprl.files import temporary_folder, write_json
 from mcaprl.progress import Advance, ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
-from mcaprl.recorder.dataset.open import find_logs, open_logs
+from mcaprl.recorder.dataset.open import find_logs
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.display import SCENE
 from mcaprl.recorder.record.layout import LAYOUT_NAME
+from mcaprl.recorder.source import Paths, open_data
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.log_layout import attached_layout
 from mcaprl.recorder.viewer.playback import Player, Track
-from mcaprl.recorder.viewer.player_server import MAX_SPEED, MIN_SPEED, LiveServer
-from mcaprl.recorder.viewer.prefix import prefixes_of, side_by_side
+from mcaprl.recorder.viewer.player_server import (
+    MAX_SPEED,
+    MIN_SPEED,
+    LiveServer,
+    prefixes_of,
+    side_by_side,
+)
 from mcaprl.recorder.viewer.scene_reader import SeenStep, moments_of_episode
 from mcaprl.recorder.viewer.verify import Comparison, Verification
 from mcaprl.recorder.viewer.verify import verify as verify_dataset
@@ -66,7 +71,7 @@ class LiveAddress:
 
 
 def replay(
-    files: Paths,
+    data: Paths,
     *,
     episode: int | None = None,
     speed: float = 1.0,
@@ -81,7 +86,7 @@ def replay(
     Several logs play side by side: all start at the same time, each with its own topic prefix.
 
     Args:
-        files: File, folder or glob of logs, or several of them.
+        data: File, folder or glob of logs, or several of them.
         episode: Index of the only episode to play; None for all.
         speed: Simulated seconds per second.
         loop: Whether the replay restarts at the end.
@@ -99,8 +104,8 @@ def replay(
     """
     check_positive(speed=speed)
     check_port(port)
-    paths = find_logs(files)
-    datasets = [open_logs(path, columns=[]) for path in paths]
+    paths = find_logs(data)
+    datasets = [open_data(path, columns=[]) for path in paths]
     windows = []
     for path, dataset in zip(paths, datasets, strict=True):
         check_episode(dataset, episode, path)
@@ -129,7 +134,7 @@ def replay(
 
 
 def verify(
-    file: str | Path,
+    data: str | Path,
     *,
     episode: int | None = None,
     sim: str | None = None,
@@ -140,7 +145,7 @@ def verify(
     """Repeat the logged actions in the sim, and compare each step until one differs.
 
     Args:
-        file: Path of the log.
+        data: Path of the log.
         episode: Index of the only episode to compare; None for all.
         sim: Short name or Gymnasium id to use instead of the logged one.
         trust_env: Whether to import the module that the logged id names, and to pass the logged
@@ -154,8 +159,8 @@ def verify(
         LogError: The log cannot be read, or the sim fails on a logged action.
         SpaceError: The spaces of the sim and the log differ.
     """
-    path = as_path(file)
-    dataset = open_logs(path)
+    path = as_path(data)
+    dataset = open_data(path)
     check_episode(dataset, episode, path)
     with (
         closing(sim_of(dataset, path, sim, trust_env=trust_env, sim_options=sim_options)) as env,
@@ -182,7 +187,7 @@ class Rendering:
 
 
 def render(
-    file: str | Path,
+    data: str | Path,
     *,
     episode: int = 0,
     speed: float = 1.0,
@@ -201,7 +206,7 @@ def render(
     renders the images.
 
     Args:
-        file: Path of the log.
+        data: Path of the log.
         episode: Index of the episode.
         speed: Simulated seconds per second of the video.
         video: Video to write: .mp4, .gif or .webp.
@@ -230,13 +235,13 @@ def render(
         raise UsageError(
             f"height is {height}, expected {_HEIGHTS_PX[0]} to {_HEIGHTS_PX[1]} pixels"
         )
-    path = as_path(file)
-    check_episode(open_logs(path, columns=[]), episode, path)
+    path = as_path(data)
+    check_episode(open_data(path, columns=[]), episode, path)
     movie, sheet = (None if out is None else Path(out) for out in (video, contact_sheet))
     for out, kinds in ((movie, VIDEO_KINDS), (sheet, (".png",))):
         if out is not None:
             check_output(out, kinds, overwrite=overwrite)
-    dataset = open_logs(path)
+    dataset = open_data(path)
     one = dataset.episodes[episode]
     reader = McapReader(path)
     has_scene = reader.channel_of(SCENE) is not None

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mcaprl.api.cluster import ClusterOptions
-from mcaprl.api.policies import Names, as_names
 from mcaprl.errors import MissingExtraError
 from mcaprl.progress import ProgressBar, no_progress
+from mcaprl.recorder.source import Data
 
 if TYPE_CHECKING:
     from mcaprl.page import Table
@@ -35,7 +35,7 @@ class Sweep:
 
 
 def sweep(
-    data: Names,
+    data: Data,
     out: str | Path,
     plan: str | Path | Mapping[str, Any],
     *,
@@ -80,7 +80,7 @@ def sweep(
         on_cluster.connected(),
     ):
         results = sweep_on_ray(
-            as_names(data),
+            data,
             wanted,
             folder.absolute(),
             workers=workers,

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mcaprl.api.cluster import ClusterOptions
-from mcaprl.api.data import MAPPING_NAME, Data, Definitions, MappingFile, mapping_tree, open_data
 from mcaprl.api.environments import all_options
 from mcaprl.api.policies import Run, as_names, is_policy, load_policies
 from mcaprl.api.ranges import check_least, check_port, check_positive
 from mcaprl.api.replay import LiveAddress
-from mcaprl.errors import MissingExtraError, TrainingError, UsageError, import_extra
+from mcaprl.errors import MissingExtraError, TrainingError, UsageError
 from mcaprl.files import write_json
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.open import open_logs
 from mcaprl.recorder.record.layout import LAYOUT_NAME
+from mcaprl.recorder.source import Data, open_data, opened
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.live_stream import DEFAULT_SPEED
 from mcaprl.runs import check_kind, choose_seeds, run_to_resume
@@ -29,6 +28,9 @@ if TYPE_CHECKING:
     from mcaprl.offline.policy import Policy
     from mcaprl.offline.training.metrics import OfflineSummary
     from mcaprl.online.train import OnlineSummary
+
+MAPPING_NAME = "mapping.json"
+"""Name of the file in a run folder that contains a copy of the mapping used for training."""
 
 
 def train(
@@ -41,28 +43,20 @@ def train(
     threads: int = 1,
     device: str = "cpu",
     resume: bool = False,
-    follow: bool = False,
     other_data: bool = False,
-    mapping: MappingFile | None = None,
-    trust_code: bool = False,
-    definitions: Definitions = (),
-    budget_minutes: float | None = None,
-    report: str | Path | None = None,
-    ray: bool = False,
-    workers: int | None = None,
-    address: str | None = None,
-    on_data: Callable[[str, Dataset], None] = lambda algo, dataset: None,
+    ray: bool | ClusterOptions = False,
     progress: ProgressCallback = lambda now: None,
     **settings: Any,
 ) -> Run[OfflineSummary]:
     """Train a policy offline; the same seed, data and machine produce the same weights.
 
-    The run folder contains the policy, checkpoints and metrics of each seed, and `curves.png` if
-    matplotlib is installed.
+    The run folder contains the policy, checkpoints and metrics of each seed, the mapping of a bag,
+    and `curves.png` if matplotlib is installed.
 
     Args:
         data: Dataset, file, folder or glob of logs, or several of them. `PATH:2` draws
-            the transitions of PATH twice as often as others.
+            the transitions of PATH twice as often as others. Pass `mcaprl.open(...)` for bags with
+            a mapping, and with `follow` to also train on episodes that end during the training.
         out: Run folder to create.
         algo: `dqn`, `double-dqn`, `cql`, `bc`, `bcq` or `iql`, or `auto`, which chooses among
             them by the log. None selects `cql`; with `resume`, None selects the algorithm of
@@ -75,26 +69,13 @@ def train(
         device: `cpu` or `cuda`.
         resume: Whether training continues from the checkpoints in `out`. A number of `updates`
             above that of the run continues the run to this number, also if it has finished.
-        follow: Whether to also train on episodes that another process adds to the logs during the
-            training.
         other_data: Whether `resume` accepts checkpoints trained on other data.
-        mapping: Mapping that describes a bag; see `open`. The mapping is copied to `out`. With a
-            mapping, paths cannot have weights such as `:2`.
-        trust_code: Whether the mapping may name a Python function.
-        definitions: Files and folders with definitions of ROS types that a bag lacks; see
-            docs/bags.md.
-        budget_minutes: Wall time of `auto`, minutes; None for no bound.
-        report: Output folder of the HTML page on the choice of `auto`.
-        ray: Whether Ray workers train, each of them one seed after the other. The result is that of
-            one process. All workers must see the logs and `out`.
-        workers: Number of Ray workers; default: number of CPUs of the cluster, or with `cuda` its
-            number of GPUs.
-        address: Address of a Ray cluster, `HOST:PORT` or `auto`; default: RAY_ADDRESS, else a
-            local cluster for this call.
-        on_data: Function called with the algorithm and the dataset before the first update.
+        ray: Whether Ray workers train, each of them one seed after the other; or the workers and
+            the cluster. The result is that of one process. All workers must see the logs and `out`.
         progress: Function called with each row of metrics.
         **settings: Settings of the algorithm. Missing settings have the algorithm's defaults; with
-            `resume`, they have the values of the run.
+            `resume`, they have the values of the run. Settings of `auto` are also its wall time
+            `budget_minutes`, and `report`, the output folder of an HTML page on the choice.
 
     Returns:
         The list of the summaries of all seeds, which also has the `folder` and the `policy`.
@@ -112,17 +93,15 @@ def train(
     """
     from mcaprl.offline.algorithms.registry import choose_algorithm
     from mcaprl.offline.batches.buffer import discrete_actions
-    from mcaprl.offline.batches.sources import open_weighted
     from mcaprl.offline.selection.config import AUTO, AutoConfig
     from mcaprl.offline.selection.race import select
     from mcaprl.offline.training.curves import draw_curves
-    from mcaprl.offline.training.follow import GrowingLogs
     from mcaprl.offline.training.train import train as train_dataset
 
     check_least(1, seeds=seeds, threads=threads)
     check_least(0, seed=seed)
-    on_cluster = ClusterOptions(ray, workers, address)
-    on_cluster.check()
+    cluster = ray if isinstance(ray, ClusterOptions) else ClusterOptions(ray)
+    cluster.check()
     out = Path(out)
     if resume:
         earlier = run_to_resume(out)
@@ -139,99 +118,28 @@ def train(
     defaults = AutoConfig() if algo == AUTO else choose_algorithm(algo, [AUTO])[1]
     check_settings(algo, defaults, settings)
     config = type(defaults)(**settings)
-    _check_choice(algo, budget_minutes, report, follow, other_data)
-    if ray and (follow or mapping is not None or isinstance(data, Dataset) or algo == AUTO):
-        raise UsageError(
-            "--ray trains one algorithm on the paths of logs, without --follow and --mapping"
-        )
-    with on_cluster.connected() if ray else nullcontext(), torch_threads(threads):
-        growing, weights = None, None
-        if mapping is not None and not isinstance(data, Dataset):
-            if follow:
-                raise UsageError("follow is for logs; a bag with a mapping cannot be followed")
-            dataset = open_data(
-                as_names(data), mapping=mapping, trust_code=trust_code, definitions=definitions
-            )
-        elif isinstance(data, Dataset):
-            if follow:
-                raise UsageError("follow needs the paths of logs, not a dataset")
-            dataset = data
-        elif follow:
-            growing = GrowingLogs(as_names(data))
-            dataset = growing.dataset
-        else:
-            dataset, weights = open_weighted(as_names(data), threads=threads)
+    if algo == AUTO and (other_data or cluster.ray):
+        raise UsageError(f"{'--other-data' if other_data else '--ray'} is not for --algo {algo}")
+    request: dict[str, Any] = {"resume": resume, "device": device, "progress": progress}
+    with cluster.connected(), torch_threads(threads):
+        dataset = opened(data, weighted=True, threads=threads)
         discrete_actions(dataset.action_space)
-        on_data(algo, dataset)
-        request: dict[str, Any] = {
-            "seeds": len(numbers),
-            "seed": numbers.start,
-            "weights": weights,
-            "resume": resume,
-            "device": device,
-            "progress": progress,
-        }
-        if ray:
+        if cluster.ray:
             from mcaprl.ray.training import train_on_ray
 
-            assert weights is not None
-            assert not isinstance(data, Dataset)
-            summaries = train_on_ray(
-                as_names(data),
-                dataset,
-                weights,
-                config,
-                out.absolute(),  # because workers have other working directories
-                seeds=numbers,
-                resume=resume,
-                other_data=other_data,
-                threads=threads,
-                device=device,
-                workers=workers,
-                progress=progress,
-            )
-        elif isinstance(config, AutoConfig):
-            choice, summaries = select(
-                dataset, config, out, budget_minutes=budget_minutes, **request
-            )
-            if report is not None:
-                choice.write_report(Path(report), f"Choice of a policy for {dataset.env_id}")
+            request |= {"other_data": other_data, "threads": threads, "workers": cluster.workers}
+            summaries = train_on_ray(dataset, config, out.absolute(), seeds=numbers, **request)
         else:
-            # With `follow`, the data may differ, because the logs have grown since the checkpoints.
-            request |= {"other_data": other_data or follow, "follow": growing}
-            summaries = train_dataset(dataset, config, out, **request)
-    if mapping is not None:
-        tree = mapping_tree(mapping)
-        commands = dataset.action_commands
-        if commands is not None and None not in commands.commands:
-            tree["action"]["representatives"] = commands.to_json()["commands"]
-        write_json(out / MAPPING_NAME, tree, TrainingError)
+            request |= {"seeds": len(numbers), "seed": numbers.start}
+            if isinstance(config, AutoConfig):
+                summaries = select(dataset, config, out, **request)[1]
+            else:
+                summaries = train_dataset(dataset, config, out, other_data=other_data, **request)
+    if dataset.origin.mapping is not None:
+        write_json(out / MAPPING_NAME, dataset.origin.mapping, TrainingError)
     with suppress(MissingExtraError):
         draw_curves(out)
     return Run(out, summaries)
-
-
-def _check_choice(
-    algo: str,
-    budget_minutes: float | None,
-    report: str | Path | None,
-    follow: bool,
-    other_data: bool,
-) -> None:
-    """Check the arguments that only `auto` accepts, and those that `auto` does not accept."""
-    is_auto = algo == "auto"
-    if budget_minutes is not None:
-        check_positive(budget_minutes=budget_minutes)
-    for name, is_given, fits in (
-        ("budget_minutes", budget_minutes is not None, is_auto),
-        ("report", report is not None, is_auto),
-        ("follow", follow, not is_auto),
-        ("other_data", other_data, not is_auto),
-    ):
-        if is_given and not fits:
-            raise UsageError(f"{flag(name)} is not for --algo {algo}: omit it")
-    if report is not None:
-        import_extra("jinja2", "report")
 
 
 def train_online(
@@ -412,7 +320,7 @@ def _experience(sources: list[str]) -> tuple[Dataset | None, list[Policy] | None
     if len(policies) > 1:
         raise UsageError(f"pass at most one policy to start from, not {' and '.join(policies)}")
     logs = [source for source in sources if source not in policies]
-    return open_logs(logs) if logs else None, load_policies(policies[0]) if policies else None
+    return open_data(logs) if logs else None, load_policies(policies[0]) if policies else None
 
 
 @contextmanager

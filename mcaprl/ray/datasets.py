@@ -12,6 +12,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader
 from mcaprl.recorder.dataset.open import Episodes, find_logs
 from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.source import Data, logs_of
 
 if TYPE_CHECKING:
     import ray.data
@@ -21,7 +22,7 @@ _BLOCK_BYTES = 128 << 20
 
 
 def read(
-    paths: str | Path | Sequence[str | Path],
+    data: Data,
     *,
     columns: Sequence[str] | None = None,
     episodes: Episodes | None = None,
@@ -40,8 +41,8 @@ def read(
     columns that later steps use, and check all CRCs.
 
     Args:
-        paths: A file, a folder of `.mcap` files, its `manifest.json`, a glob, a URL, or a sequence
-            of these. All workers must see local paths.
+        data: A file, a folder of `.mcap` files, its `manifest.json`, a glob, a URL, or a sequence
+            of these; or a dataset that `open` read from logs. All workers must see local paths.
         columns: Names of the columns to read; default: all.
         episodes: Index, slice or indexes of the episodes to read, counted over all logs; default:
             all. The column `episode` has these indexes.
@@ -60,19 +61,18 @@ def read(
         MissingExtraError: Ray is not installed.
     """
     connect(address)
-    data = import_extra("ray.data", "ray")
+    ray_data = import_extra("ray.data", "ray")
     from mcaprl.ray.source import LogSource
 
-    logs = [path if path.is_absolute() else path.absolute() for path in find_logs(paths)]
     source = LogSource(
-        logs,
+        list(logs_of(data)),
         columns,
         episodes,
         blocks=options.pop("override_num_blocks", None),
         least=2 * cpus(),
-        most_bytes=data.DataContext.get_current().target_max_block_size or _BLOCK_BYTES,
+        most_bytes=ray_data.DataContext.get_current().target_max_block_size or _BLOCK_BYTES,
     )
-    rows: ray.data.Dataset = data.read_datasource(
+    rows: ray.data.Dataset = ray_data.read_datasource(
         source, override_num_blocks=len(source.groups), **options
     )
     return rows
@@ -82,7 +82,7 @@ def write(
     rows: ray.data.Dataset,
     folder: str | Path,
     *,
-    like: Dataset | str | Path | Sequence[str | Path] | None = None,
+    like: Data | None = None,
     compression: str = "zstd",
     **options: Any,
 ) -> Path | str:
@@ -122,7 +122,7 @@ def write(
     return sink.manifest
 
 
-def _described(like: Dataset | str | Path | Sequence[str | Path]) -> LogMetadata:
+def _described(like: Data) -> LogMetadata:
     if isinstance(like, Dataset):
         return like._description
     return LogReader(find_logs(like)[0]).description

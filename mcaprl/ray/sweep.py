@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 
 from mcaprl.errors import LogError, McaprlError, OutputExistsError, TrainingError, import_extra
-from mcaprl.files import locked_folder, parse_json, work_folder, write_json
-from mcaprl.offline.batches.sources import open_weighted, weighted_logs
+from mcaprl.files import locked_folder, read_json, work_folder, write_json
 from mcaprl.offline.estimate.fqe import FQEConfig
 from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
 from mcaprl.offline.policy import read_policy
@@ -32,6 +31,7 @@ from mcaprl.ray.sweep_file import SweepPlan, Trial
 from mcaprl.ray.tasks import MOST_DEATHS, check_machine, check_machines
 from mcaprl.recorder.dataset.log_reader import LogReader
 from mcaprl.recorder.format.metadata import installed_versions
+from mcaprl.recorder.source import Data, logs_of, open_data
 from mcaprl.runs import saved_updates
 
 PLAN_NAME, SCORES_NAME = "sweep.json", "scores.json"
@@ -61,6 +61,14 @@ class Score:
 
 
 @dataclass(frozen=True)
+class _Saved:
+    """Content of a file with the scores of a trial."""
+
+    scores: tuple[Score, ...]
+    error: str
+
+
+@dataclass(frozen=True)
 class TrialResult:
     """Outcome of a trial.
 
@@ -86,7 +94,7 @@ class TrialResult:
 
 
 def sweep_on_ray(
-    data: Sequence[str],
+    data: Data,
     plan: SweepPlan,
     out: Path,
     *,
@@ -99,19 +107,18 @@ def sweep_on_ray(
     The arguments and errors are those of `mcaprl.sweep`; `advance` is called after each trial.
     """
     tune = import_extra("ray.tune", "ray")
-    logs = weighted_logs(data)
+    logs = logs_of(data, weighted=True)
     identity = {
         "trials": [[one.name, one.algo, one.config.to_json()] for one in plan.trials],
         "seeds": [plan.seed, plan.seeds],
         "score": asdict(plan.score),
-        "data": [[path.name, LogReader(path).checksum, weight] for path, weight in logs],
+        "data": [[path.name, LogReader(path).checksum, weight] for path, weight in logs.items()],
     }
     with locked_folder(out, TrainingError):
-        check_machines([out, *(path for path, _ in logs)])
+        check_machines([out, *logs])
         _open(out, json.loads(json.dumps(identity)), resume)
-        names = [f"{path}:{weight!r}" for path, weight in logs]
         with work_folder(out / "tune") as folder:
-            run = partial(_try, names, plan, out, installed_versions())
+            run = partial(_try, logs, plan, out, installed_versions())
             errors = _run(tune, run, plan, folder, workers, advance)
         for error in errors:
             raise TrainingError(f"{out}: {str(error).strip().splitlines()[-1]}")
@@ -130,7 +137,7 @@ def _open(out: Path, identity: dict[str, Any], resume: bool) -> None:
             )
     elif not path.exists():
         raise TrainingError(f"{out} has no sweep to resume: start a new one without --resume")
-    elif (found := parse_json(path.read_bytes())) != identity:
+    elif (found := read_json(path, TrainingError, dict[str, Any])) != identity:
         names = [name for name in identity if found.get(name) != identity[name]]
         raise TrainingError(
             f"cannot resume: {path} has other {', '.join(names)}; resume with the same sweep file"
@@ -180,7 +187,7 @@ def _run(
 
 
 def _try(
-    data: Sequence[str],
+    logs: dict[Path, float],
     plan: SweepPlan,
     out: Path,
     versions: dict[str, str],
@@ -190,18 +197,18 @@ def _try(
     trial = plan.trials[chosen["number"]]
     try:
         check_machine(versions, [out])
-        _train(data, plan, trial, out)
+        _train(logs, plan, trial, out)
     except McaprlError as error:
         # A failed trial does not end the sweep: other settings may work.
         _save(out / trial.name, _result(trial, out).scores, str(error))
 
 
-def _train(data: Sequence[str], plan: SweepPlan, trial: Trial, out: Path) -> None:
+def _train(logs: dict[Path, float], plan: SweepPlan, trial: Trial, out: Path) -> None:
     from ray import tune
 
     folder = out / trial.name
-    dataset, weights = open_weighted(data)
-    learned, kept = _divided(len(weights), plan.score.fraction)
+    dataset = open_data([str(path) for path in logs], weights=list(logs.values()))
+    learned, kept = _divided(len(dataset.weights), plan.score.fraction)
     evaluator = OffPolicyEvaluator(
         dataset._take(kept),
         FQEConfig(gamma=plan.score.gamma, updates=plan.score.updates),
@@ -234,7 +241,6 @@ def _train(data: Sequence[str], plan: SweepPlan, trial: Trial, out: Path) -> Non
         folder,
         seeds=plan.seeds,
         seed=plan.seed,
-        weights=weights[learned],
         resume=folder.exists(),
         progress=progress,
     )
@@ -262,14 +268,15 @@ def _divided(episodes: int, fraction: float) -> tuple[list[int], list[int]]:
 
 
 def _save(folder: Path, scores: Sequence[Score], error: str) -> None:
-    content = {"scores": [asdict(one) for one in scores], "error": error}
+    content = asdict(_Saved(tuple(scores), error))
     write_json(folder.with_name(f"{folder.name}.{SCORES_NAME}"), content, TrainingError)
 
 
 def _result(trial: Trial, out: Path) -> TrialResult:
     path = out / f"{trial.name}.{SCORES_NAME}"
-    found: dict[str, Any] = {"scores": [], "error": ""}
+    found = _Saved((), "")
     with suppress(FileNotFoundError):
-        found = parse_json(path.read_bytes())
-    scores = tuple(Score(**one) for one in found["scores"])
-    return TrialResult(trial, out / trial.name, scores, found["error"])
+        found = read_json(path, TrainingError, _Saved)
+    if not all(one.values for one in found.scores):
+        raise TrainingError(f"{path} cannot be read: a score has no values")
+    return TrialResult(trial, out / trial.name, found.scores, found.error)

@@ -26,8 +26,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from mcaprl.errors import UsageError, import_extra
-from mcaprl.files import read_file
+from mcaprl.errors import UsageError
+from mcaprl.files import read_yaml
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.settings import check_settings
@@ -92,25 +92,13 @@ def read_plan(source: str | Path | Mapping[str, Any]) -> SweepPlan:
         UsageError: The file cannot be read, or has an unknown key or a wrong value.
         MissingExtraError: The packages of the extra `ray` are not installed.
     """
-    where, tree = ("the sweep", source) if isinstance(source, Mapping) else _load(Path(source))
+    where, tree = "the sweep", source
+    if not isinstance(source, Mapping):
+        where, tree = str(source), read_yaml(Path(source), "ray")
     try:
         return _plan(tree)
     except UsageError as error:
         raise UsageError(f"{where}: {error}") from error
-
-
-def _load(path: Path) -> tuple[str, object]:
-    yaml = import_extra("ruamel.yaml", "ray")
-    try:
-        # YAML 1.2 reads JSON, too.
-        text = read_file(path).decode()
-        return str(path), yaml.YAML(typ="safe", pure=True).load(text)
-    except (OSError, UnicodeError) as error:
-        raise UsageError(f"{path}: cannot be read: {error}") from error
-    except yaml.YAMLError as error:
-        line = getattr(getattr(error, "problem_mark", None), "line", None)
-        place = str(path) if line is None else f"{path}, line {line + 1}"
-        raise UsageError(f"{place}: not YAML: {getattr(error, 'problem', error)}") from error
 
 
 def _plan(tree: object) -> SweepPlan:
@@ -196,7 +184,7 @@ def _typed(name: str, value: Any, default: Any) -> Any:
         return value
     wanted = {"int": "a whole number", "float": "a number", "bool": "true or false"}
     text = wanted.get(kind.__name__, "a list of whole numbers" if kind is tuple else "text")
-    raise UsageError(f"{name} must be {text}, got {json.dumps(value, default=str)}")
+    raise UsageError(f"{name} must be {text}, got {json.dumps(value, default=str, skipkeys=True)}")
 
 
 def _scoring(tree: object) -> Scoring:

@@ -6,30 +6,24 @@ If a worker is killed, another one continues its seed from the last checkpoint.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mcaprl.errors import ClusterError
 from mcaprl.offline.algorithms.config import TrainingConfig
-from mcaprl.offline.batches.sources import open_weighted, weighted_logs
 from mcaprl.offline.training.metrics import OfflineSummary
-from mcaprl.offline.training.train import run_identity, start_run, train_seeds, with_source
+from mcaprl.offline.training.train import run_identity, start_run, train_seeds
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.ray.cluster import cpus
 from mcaprl.ray.tasks import Send, WorkerDiedError, check_machines, run_tasks
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.source import logs_of, open_data
 from mcaprl.runs import RunIdentity, locked_run
 from mcaprl.texts import counted
 
 
 def train_on_ray(
-    data: Sequence[str],
     dataset: Dataset,
-    weights: NDArray[np.float64],
     config: TrainingConfig,
     out: Path,
     *,
@@ -41,17 +35,15 @@ def train_on_ray(
     workers: int | None,
     progress: ProgressCallback,
 ) -> list[OfflineSummary]:
-    """Train on the workers, which read `data` again; it has been read as `dataset` and `weights`.
+    """Train on the workers, which read the logs of the dataset again.
 
     Raises:
+        UsageError: The dataset is not that of whole logs.
         ClusterError: The cluster has fewer processors, a machine has other versions or does not
             see a path, or workers died repeatedly.
         McaprlError: As for a local training.
     """
-    workers = _workers(workers, device)
-    dataset = with_source(dataset, config.mask_from)
-    identity = run_identity(dataset, config, weights, other_data)
-    logs = weighted_logs(data)
+    logs, workers = logs_of(dataset), _workers(workers, device)
     texts: dict[str, None] = {}
 
     def on_news(news: TrainingProgress | str) -> None:
@@ -61,13 +53,13 @@ def train_on_ray(
             progress(news)
 
     with locked_run(out, resume):
-        paths = [out, *(path for path, _ in logs)]
+        paths = [out, *logs]
         check_machines(paths)
+        identity = run_identity(dataset, config, other_data)
         start_run(dataset, config, out, identity, seeds, resume)
-        names = [f"{path}:{weight!r}" for path, weight in logs]
         try:
             return run_tasks(
-                partial(_train_seed, names, config, out, identity, threads, device),
+                partial(_train_seed, logs, config, out, identity, threads, device),
                 seeds,
                 workers=workers,
                 gpus=int(device == "cuda"),
@@ -85,7 +77,7 @@ def train_on_ray(
 
 
 def _train_seed(
-    data: list[str],
+    logs: dict[Path, float],
     config: TrainingConfig,
     out: Path,
     identity: RunIdentity,
@@ -101,14 +93,14 @@ def _train_seed(
     seeds = range(seed, seed + 1)
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: send(0, str(message))
-        dataset, weights = open_weighted(data, threads=threads)
+        names = [str(path) for path in logs]
+        dataset = open_data(names, weights=list(logs.values()), threads=threads)
         (summary,) = train_seeds(
             dataset,
             config,
             out,
             identity,
             seeds,
-            weights=weights,
             device=device,
             report=lambda now: send(now.done, now),
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,12 +13,12 @@ from mcaprl.errors import UsageError
 from mcaprl.offline.batches.items import Arrays, ItemOptions, Items
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.mapped import MappedImages
-from mcaprl.recorder.dataset.open import open_logs
+from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, Transitions
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.source import Data, opened
 
-Paths = str | Path | Sequence[str | Path]
 _COLUMNS = ("log_time_ns", *STEP_COLUMNS)
 Tensors = dict[str, Any]
 """Tensors by name; observations of a Dict space are dicts of tensors."""
@@ -54,7 +53,7 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
 
     def __init__(
         self,
-        data: Dataset | Paths,
+        data: Data,
         *,
         n_steps: int = 1,
         gamma: float = 1.0,
@@ -78,9 +77,8 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
             LogError: A log cannot be read.
         """
         options = ItemOptions(n_steps, gamma, frame_stack, length, stride)
-        self._paths = None if isinstance(data, Dataset) else data
         self._shared: _Shared | None = None
-        self._items = Items(data if isinstance(data, Dataset) else open_logs(data), options)
+        self._items = Items(opened(data), options)
 
     @property
     def data(self) -> Dataset:
@@ -133,17 +131,18 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
         """Return what a worker process needs: paths, or tensors in shared memory.
 
         Raises:
-            UsageError: The images are on disk, and the dataset was not made from paths.
+            UsageError: The images are on disk, and the dataset is not that of whole logs.
         """
         data = self._items.dataset
         columns = data._transitions
         if any(isinstance(leaf, MappedImages) for leaf in columns.frames):
-            if self._paths is None:
+            if not data.origin.logs:
                 raise UsageError(
                     "images on disk cannot be sent to another process: make the TransitionDataset"
                     " from the paths of the logs, or use the start method fork"
                 )
-            return {"paths": self._paths, "options": self._items.options}
+            paths = [path for path, _ in data.origin.logs]
+            return {"paths": paths, "options": self._items.options}
         if self._shared is None:
             # From now on, this process uses the shared memory, too. If this process had no
             # reference to the memory, PyTorch would free it before a worker has opened it.
@@ -152,16 +151,16 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
                 columns={name: _shared(getattr(columns, name)) for name in _COLUMNS},
                 episodes=columns.episodes,
                 description=data._description,
-                sources=data.sources,
+                origin=data.origin.changed(),
             )
             self._items = Items(self._shared.dataset(), self._items.options)
-        return {"paths": self._paths, "options": self._items.options, "shared": self._shared}
+        return {"options": self._items.options, "shared": self._shared}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore the dataset in a worker process."""
-        self._paths, self._shared = state["paths"], state.get("shared")
+        self._shared = state.get("shared")
         if self._shared is None:
-            data = open_logs(state["paths"], images="mapped")
+            data = opened(state["paths"], images="mapped")
         else:
             data = self._shared.dataset()
         self._items = Items(data, state["options"])
@@ -174,7 +173,7 @@ class _Shared(NamedTuple):
     columns: dict[str, torch.Tensor]
     episodes: tuple[EpisodeSummary, ...]
     description: LogMetadata
-    sources: tuple[Path, ...]
+    origin: Origin
 
     def dataset(self) -> Dataset:
         columns = Transitions(
@@ -183,7 +182,7 @@ class _Shared(NamedTuple):
             infos={},
             **{name: column.numpy() for name, column in self.columns.items()},
         )
-        return Dataset(columns, self.description, sources=self.sources)
+        return Dataset(columns, self.description, origin=self.origin)
 
 
 def _shared(array: Any) -> torch.Tensor:

@@ -1,7 +1,8 @@
 """Encoding of an environment's observations as network inputs: a vector, images, an action mask.
 
 Everything that is not an image, at any depth of a Dict space, becomes part of one float32 vector:
-discrete values are one-hot encoded, and uint8 numbers are divided by 255. Images stay uint8.
+discrete values are one-hot encoded, and uint8 numbers are divided by 255. Images stay uint8; those
+with their channels first are transposed.
 
 The top-level key `action_mask` of a Dict space, with one flag per action, is not an input: the mask
 marks the allowed actions, as in PettingZoo. Logs contain it as part of the observation.
@@ -20,13 +21,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.actions import MASK_KEY, JointActions, allowed_actions, joint_actions
+from mcaprl.architecture import SMALL_EDGE
 from mcaprl.errors import SpaceError
 from mcaprl.networks import ImageInput
 from mcaprl.recorder.dataset.mapped import Frames, MappedImages
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, observation_leaves
-
-MIN_CONVOLUTION_EDGE = 36
-"""Smallest image edge in pixels for which the output of the convolutions is not empty."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +164,7 @@ class ObservationEncoder:
         self.numbers = [(leaf, part) for leaf, part in kinds if not self.is_image(part)]
         if not kinds:
             raise SpaceError(f"the observation contains only {MASK_KEY}")
-        self.image_inputs = [ImageInput((*leaf.shape, 1)[:3]) for leaf in self.images]
+        self.image_inputs = [ImageInput(_image_shape(leaf.shape)) for leaf in self.images]
         widths = [_width(part) for _, part in self.numbers]
         self.width = sum(widths)
         bytes_ = [
@@ -176,22 +175,10 @@ class ObservationEncoder:
 
     @staticmethod
     def is_image(space: spaces.Space[Any]) -> bool:
-        """Return whether a space has uint8 images (height, width) or (height, width, channels).
-
-        Raises:
-            SpaceError: The convolutions do not support the shape of the images.
-        """
+        """Return whether a space has uint8 images: (height, width), with or without channels."""
         if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
             return False
-        shape = space.shape
-        if len(shape) == 3 and shape[0] < MIN_IMAGE_EDGE <= min(shape[1:]):
-            raise SpaceError(f"images need shape (height, width, channels), got {shape}: transpose")
-        if len(shape) not in (2, 3) or min(shape[:2]) < MIN_IMAGE_EDGE:
-            return False
-        if min(shape[:2]) < MIN_CONVOLUTION_EDGE:
-            least = f"{MIN_CONVOLUTION_EDGE}x{MIN_CONVOLUTION_EDGE}"
-            raise SpaceError(f"image observations need at least {least} pixels, got {shape}")
-        return True
+        return len(space.shape) in (2, 3) and min(_image_shape(space.shape)[:2]) >= MIN_IMAGE_EDGE
 
     def arranged(self, observations: Any) -> Any:
         """Return observations (B, ...) of an environment in the form of `space`."""
@@ -215,7 +202,7 @@ class ObservationEncoder:
     def center_images(self, observations: Any) -> None:
         """Normalize all images to mean 0 and standard deviation 1 over these observations."""
         self.image_inputs = [
-            image.normalized_to(leaf.of(observations))
+            image.normalized_to(_channels_last(leaf.of(observations), leaf))
             for image, leaf in zip(self.image_inputs, self.images, strict=True)
         ]
 
@@ -230,7 +217,9 @@ class ObservationEncoder:
         for leaf in self.leaves:
             _check_shape(leaf, observations)
         images = [
-            _tensor(leaf.of(observations), np.uint8, self.layout).reshape(-1, *image.shape)
+            _tensor(_channels_last(leaf.of(observations), leaf), np.uint8, self.layout).reshape(
+                -1, *image.shape
+            )
             for leaf, image in zip(self.images, self.image_inputs, strict=True)
         ]
         vector = _tensor(self._vector(observations), np.float32)
@@ -271,6 +260,29 @@ class ObservationEncoder:
     def _allowed(self, observations: Any) -> Tensor | None:
         allowed = None if self.mask is None else allowed_actions(observations)
         return None if allowed is None else torch.from_numpy(allowed)
+
+
+def has_channels_first(shape: tuple[int, ...]) -> bool:
+    """Return whether images of this shape are (channels, height, width).
+
+    >>> has_channels_first((4, 84, 84)), has_channels_first((84, 84, 4))
+    (True, False)
+    """
+    if len(shape) != 3:
+        return False
+    channels, edge = shape[0], min(shape[1:])
+    # The second rule is for stacks of frames; a grid of cells with many channels has similar sizes.
+    return channels < MIN_IMAGE_EDGE <= edge or (channels < SMALL_EDGE and 2 * channels <= edge)
+
+
+def _image_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the shape of images as the network receives them: (height, width, channels)."""
+    return (*shape[1:], shape[0]) if has_channels_first(shape) else (*shape, 1)[:3]
+
+
+def _channels_last(images: Any, leaf: Leaf) -> Any:
+    """Return images (B, *shape) of a leaf with their channels last; those on disk have them so."""
+    return np.moveaxis(images, 1, -1) if has_channels_first(leaf.shape) else images
 
 
 def codes_of(space: spaces.Space[Any]) -> JointActions | None:

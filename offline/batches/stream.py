@@ -15,7 +15,6 @@ from mcaprl import limits
 from mcaprl.errors import LogError, UsageError
 from mcaprl.offline.batches.items import Arrays, ItemOptions, Items
 from mcaprl.offline.batches.loading import (
-    Paths,
     Tensors,
     joined_arrays,
     tensors_of,
@@ -23,6 +22,7 @@ from mcaprl.offline.batches.loading import (
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 from mcaprl.recorder.dataset.open import find_logs
+from mcaprl.recorder.source import Data
 
 # Approximate number of parts in a block. With several parts, a block mixes distant episodes.
 _PARTS_PER_BLOCK = 8
@@ -66,7 +66,7 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
 
     def __init__(
         self,
-        data: Dataset | Paths,
+        data: Data,
         *,
         batch_size: int = 256,
         buffer: int = 100_000,
@@ -222,7 +222,7 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
 class _Source:
     """Episodes of logs, or of a dataset in memory."""
 
-    def __init__(self, data: Dataset | Paths) -> None:
+    def __init__(self, data: Data) -> None:
         self._data = data if isinstance(data, Dataset) else None
         self._paths = [] if isinstance(data, Dataset) else find_logs(data)
         self._logs: dict[int, LogReader] = {}

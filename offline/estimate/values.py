@@ -5,7 +5,6 @@ T is the number of steps of an episode, A the number of actions, B the number of
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from mcaprl.actions import joint_actions
 from mcaprl.base_policy import BasePolicy, batch_size
 from mcaprl.errors import PolicyError, UsageError
+from mcaprl.files import read_json
 from mcaprl.frames import mapped, rows_of, stacked_frames
 from mcaprl.offline.algorithms.config import DQNConfig
 from mcaprl.offline.algorithms.losses import q_learning_target
@@ -140,10 +140,9 @@ def by_rows(function: Callable[[Any], NDArray[Any]], observations: Any) -> NDArr
 def gamma_of_run(path: Path) -> float:
     """Return the discount of a run or of its seed folder; DQN's default if there is none."""
     for folder in (path, path.parent):
-        config = folder / CONFIG_NAME
-        if config.is_file():
-            try:
-                return float(json.loads(config.read_text())["config"]["gamma"])
-            except (ValueError, KeyError, TypeError):
-                break
+        if (folder / CONFIG_NAME).is_file():
+            match read_json(folder / CONFIG_NAME, PolicyError, dict[str, Any]):
+                case {"config": {"gamma": int(gamma) | float(gamma)}} if 0 <= gamma <= 1:
+                    return float(gamma)
+            break
     return DQNConfig().gamma

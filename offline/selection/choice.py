@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcaprl.errors import TrainingError
-from mcaprl.files import parse_json, read_file, write_json
+from mcaprl.files import read_json, write_json
 from mcaprl.offline.estimate.off_policy import LEAST_SAMPLE_SIZE
 from mcaprl.page import Section, Table, write_page
 from mcaprl.texts import counted
@@ -119,12 +119,6 @@ class Tried:
     weighted: tuple[float, float] | None = None
     outcome: str = ""
 
-    @classmethod
-    def from_json(cls, found: dict[str, Any]) -> Tried:
-        """Return the candidate of a file."""
-        rating = found["rating"]
-        return cls(**_tuples({**found, "rating": rating and Rating(**_tuples(rating))}))
-
     def row(self, name: str) -> tuple[str, ...]:
         """Return the row of the table of candidates."""
         rating, weighted = self.rating, "-"
@@ -210,21 +204,11 @@ def read_choice(run: Path) -> Choice:
     Raises:
         TrainingError: The run has no such file, or the file is broken.
     """
-    path = run / CHOICE_NAME
     try:
-        found = parse_json(read_file(path))
-        traits = LogTraits(**_tuples(found["traits"]))
-        tried = {name: Tried.from_json(one) for name, one in found["tried"].items()}
-        return Choice(**_tuples({**found, "traits": traits, "tried": tried}))
+        found: Choice = read_json(run / CHOICE_NAME, TrainingError, Choice)
     except FileNotFoundError as error:
         raise TrainingError(f"{run} has no {CHOICE_NAME}: is it a run of --algo auto?") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise TrainingError(f"{path} cannot be read: {error}") from error
-
-
-def _tuples(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return attributes from JSON, which has lists for tuples."""
-    return {name: tuple(one) if isinstance(one, list) else one for name, one in found.items()}
+    return found
 
 
 def _words(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 from mcaprl.offline.algorithms.config import BootstrapConfig
 
@@ -27,13 +29,24 @@ class AutoConfig(BootstrapConfig):
     """fraction of the updates after which the candidates are first compared"""
     model_updates: int = 2_000
     """gradient updates of each model that evaluates the candidates"""
+    budget_minutes: float = math.inf
+    """wall time after which no update is started, minutes"""
+    report: str | Path = ""
+    """output folder of the HTML page on the choice"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
         super().__post_init__()
         self._require_positive("survivors", "model_updates")
+        self._require("budget_minutes", self.budget_minutes > 0, "above 0")
         self._require("frame_stack", self.frame_stack == 1, f"1 for {AUTO}")
         self._require("short_fraction", 0 < self.short_fraction <= 1, "within (0, 1]")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the settings that a resumed run must have; its time and report may differ."""
+        found = super().to_json()
+        del found["budget_minutes"], found["report"]
+        return found
 
     @property
     def short_updates(self) -> int:

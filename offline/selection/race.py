@@ -35,8 +35,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.base_policy import BasePolicy
-from mcaprl.errors import TrainingError, UnknownNameError, UsageError
-from mcaprl.files import parse_json, read_file, replacing_folder, subfolder, write_json
+from mcaprl.errors import TrainingError, UnknownNameError, UsageError, import_extra
+from mcaprl.files import read_json, replacing_folder, subfolder, write_json
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.estimate.evidence import (
@@ -52,7 +52,7 @@ from mcaprl.offline.policy import Policy, read_policy
 from mcaprl.offline.selection.choice import STOPPED_EARLY, Choice, LogTraits, Rating, Tried
 from mcaprl.offline.selection.config import ALL, AUTO, AutoConfig
 from mcaprl.offline.training.metrics import OfflineSummary
-from mcaprl.offline.training.train import fingerprint, train, with_source
+from mcaprl.offline.training.train import train, with_source
 from mcaprl.offline.training.watch import SHORT_HORIZON, horizon_warning
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.lint import lint
@@ -180,33 +180,36 @@ def select(
     *,
     seeds: int | None = None,
     seed: int | None = None,
-    weights: Floats | None = None,
     resume: bool = False,
     device: str = "cpu",
-    budget_minutes: float | None = None,
     progress: ProgressCallback = lambda now: None,
 ) -> tuple[Choice, list[OfflineSummary]]:
     """Train all candidates, choose one from the log alone; return it and a summary per seed.
 
     The arguments are those of `mcaprl.offline.train` and `mcaprl.train`.
     """
+    if config.report:
+        import_extra("jinja2", "report")
     known = [one.name for one in PORTFOLIO]
     for name in config.finalists.split(","):
         if name not in (*known, ALL):
             raise UnknownNameError("candidate", name, known)
+    if dataset.origin.grow is not None:
+        raise UsageError(f"--follow is not for --algo {AUTO}: omit it")
     dataset = with_source(dataset, config.mask_from)
     if len(dataset.episodes) < FOLDS:
         raise UsageError(f"--algo {AUTO} needs {FOLDS} episodes or more in the log")
-    weights = np.ones(len(dataset.episodes)) if weights is None else weights
     numbers = choose_seeds(out, seeds, seed, resume)
     parts: dict[str, Any] = {"algo": AUTO, "config": config.to_json()}
     # The estimates of all candidates are averages over the same seeds, so none can be added.
-    parts |= {"seeds": len(numbers), "seed": numbers.start, "data": fingerprint(dataset, weights)}
+    parts |= {"seeds": len(numbers), "seed": numbers.start, "data": dataset.fingerprint}
     identity, size = RunIdentity(parts), len(dataset)
     with locked_run(out, resume):
         open_run(out, identity, resume, numbers, env_id=dataset.env_id, transitions=size)
-        budget_s = math.inf if budget_minutes is None else 60 * budget_minutes
-        return _Race(dataset, config, out, numbers, weights, device, budget_s, progress).run()
+        choice, summaries = _Race(dataset, config, out, numbers, device, progress).run()
+    if config.report:
+        choice.write_report(Path(config.report), f"Choice of a policy for {dataset.env_id}")
+    return choice, summaries
 
 
 class _Pause(Exception):
@@ -222,14 +225,12 @@ class _Race:
         config: AutoConfig,
         out: Path,
         seeds: range,
-        weights: Floats,
         device: str,
-        budget_s: float,
         progress: ProgressCallback,
     ) -> None:
         self._dataset, self._config, self._out = dataset, config, out
-        self._seeds, self._weights, self._device = seeds, weights, device
-        self._began, self._budget_s = time.perf_counter(), budget_s
+        self._seeds, self._device = seeds, device
+        self._began, self._budget_s = time.perf_counter(), 60 * config.budget_minutes
         self._progress = progress
         self._in_time = True
         self._done: dict[tuple[str, int], int] = {}
@@ -348,7 +349,6 @@ class _Race:
                 folder,
                 seeds=len(seeds),
                 seed=seeds[0],
-                weights=self._weights,
                 resume=folder.exists(),
                 device=self._device,
                 progress=progress,
@@ -467,13 +467,16 @@ class _Race:
         if not path.exists():
             return {}
         try:
-            stages = {}
-            for kind, stage in parse_json(read_file(path)).items():
-                ranked = sorted(stage, key=lambda name: -stage[name]["rating"]["score"])
-                stages[kind] = {name: Tried.from_json(stage[name]) for name in ranked}
-            return stages
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise TrainingError(f"cannot resume: {path} cannot be read: {error}") from error
+            found = read_json(path, TrainingError, dict[str, dict[str, Tried]])
+        except TrainingError as error:
+            raise TrainingError(f"cannot resume: {error}") from error
+        stages = {}
+        for kind, stage in found.items():
+            scores = {name: one.rating.score for name, one in stage.items() if one.rating}
+            if len(scores) < len(stage):
+                raise TrainingError(f"cannot resume: {path}: a candidate has no rating")
+            stages[kind] = {name: stage[name] for name in sorted(scores, key=lambda n: -scores[n])}
+        return stages
 
 
 def _traits(dataset: Dataset, clone: BasePolicy) -> LogTraits:

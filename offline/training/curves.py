@@ -34,7 +34,7 @@ def draw_curves(folder: Path) -> Path:
 
 def curve_panels(folder: Path) -> list[Panel]:
     """Return a panel for each term of the loss."""
-    curves = read_curves(folder, METRICS_NAME)
+    curves = read_curves(folder, METRICS_NAME, ["update"])
     names = [name for name in curves[0] if name not in _NOT_DRAWN] if curves else []
     return [
         Panel(name.replace("_", " "), partial(_draw, curves=curves, name=name), (4, 2.4))

@@ -5,20 +5,19 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 import warnings
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.actions import has_source
-from mcaprl.errors import TrainingError, UsageError
+from mcaprl.errors import TrainingError
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import choose_algorithm
@@ -26,7 +25,6 @@ from mcaprl.offline.batches.buffer import TransitionBuffer, choose_device
 from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.policy import read_policy, save_policy
 from mcaprl.offline.training.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
-from mcaprl.offline.training.follow import CHECK_INTERVAL, GrowingLogs, with_more_data
 from mcaprl.offline.training.metrics import MetricsWriter, OfflineSummary
 from mcaprl.offline.training.watch import (
     HeldOut,
@@ -51,6 +49,10 @@ from mcaprl.runs import (
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
+CHECK_INTERVAL: Final = 500
+"""Number of updates between two checks of logs that grow. After each check that finds new episodes,
+all data are packed again."""
+
 
 def train(
     dataset: Dataset,
@@ -59,29 +61,25 @@ def train(
     *,
     seeds: int | None = None,
     seed: int | None = None,
-    weights: NDArray[np.float64] | None = None,
     resume: bool = False,
     other_data: bool = False,
-    follow: GrowingLogs | None = None,
     device: str = "cpu",
     progress: ProgressCallback | None = None,
 ) -> list[OfflineSummary]:
     """Train on a dataset; the same seed, data and machine produce the same weights.
 
     Args:
-        dataset: Dataset with discrete actions.
+        dataset: Dataset with discrete actions. If `mcaprl.open` follows its logs, episodes that end
+            during the training are added.
         algo: Name such as `cql`, for default settings, or a config such as `CQLConfig(alpha=0.5)`.
         out: Folder of the run; it must be empty or not exist.
         seeds: Number of networks to train in parallel; they are independent of each other. None
             selects 1; with `resume`, that of the run.
         seed: Seed of the first network; network k uses seed + k. None selects 0; with `resume`,
             that of the run.
-        weights: (E,) relative sampling weight of each transition of an episode; default: all equal.
         resume: Whether to resume from the checkpoints in `out`. Seeds without a checkpoint
             start from update 0. With more updates than the run has, it is continued to this number.
         other_data: Whether to accept checkpoints trained on other data when resuming.
-        follow: Growing logs from which `dataset` was read; episodes finished during training
-            are added.
         device: Device of the data, the networks and the updates, `cpu` or `cuda`.
         progress: Callback for each row of metrics; None shows a bar if stderr is a terminal.
 
@@ -101,13 +99,9 @@ def train(
     numbers = choose_seeds(folder, seeds, seed, resume)
     choose_device(device)
     _, config = choose_algorithm(algo)
-    dataset = with_source(dataset, config.mask_from)
-    weights = np.ones(len(dataset.episodes)) if weights is None else weights
-    identity = run_identity(dataset, config, weights, other_data)
+    identity = run_identity(dataset, config, other_data)
     with locked_run(folder, resume):
-        run = _prepared(
-            dataset, config, folder, identity, weights, device, reuses=resume, follow=follow
-        )
+        run = _prepared(dataset, config, folder, identity, device, reuses=resume)
         start_run(dataset, config, folder, identity, numbers, resume)
         with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
             return run.train(config, numbers, report)
@@ -120,7 +114,6 @@ def train_seeds(
     identity: RunIdentity,
     seeds: range,
     *,
-    weights: NDArray[np.float64],
     device: str,
     report: ProgressCallback,
 ) -> list[OfflineSummary]:
@@ -131,25 +124,15 @@ def train_seeds(
     Raises:
         SpaceError, TrainingError, UsageError: As for `train`.
     """
-    dataset = with_source(dataset, config.mask_from)
-    run = _prepared(dataset, config, folder, identity, weights, device, reuses=True)
+    run = _prepared(dataset, config, folder, identity, device, reuses=True)
     return run.train(config, seeds, report)
 
 
-def run_identity(
-    dataset: Dataset, config: TrainingConfig, weights: NDArray[np.float64], other_data: bool
-) -> RunIdentity:
-    """Return the identity of the run of a dataset with the weights (E,) of its episodes.
-
-    Raises:
-        UsageError: The weights are not valid.
-    """
-    n_episodes = len(dataset.episodes)
-    if weights.shape != (n_episodes,) or not np.isfinite(weights).all() or (weights < 0).any():
-        raise UsageError(f"weights must be {n_episodes} numbers of at least 0, one per episode")
-    data = fingerprint(dataset, weights)
+def run_identity(dataset: Dataset, config: TrainingConfig, other_data: bool) -> RunIdentity:
+    """Return the identity of the run of a dataset, which may differ if its logs are followed."""
+    data = with_source(dataset, config.mask_from).fingerprint
     parts = {"algo": choose_algorithm(config)[0].name, "config": config.to_json(), "data": data}
-    return RunIdentity(parts, other_data, longer=True)
+    return RunIdentity(parts, other_data or dataset.origin.grow is not None, longer=True)
 
 
 def start_run(
@@ -184,15 +167,14 @@ def _prepared(
     config: TrainingConfig,
     folder: Path,
     identity: RunIdentity,
-    weights: NDArray[np.float64],
     device: str,
     *,
     reuses: bool,
-    follow: GrowingLogs | None = None,
 ) -> _Run:
     """Pack the data of a run; with other data and `reuses`, in the scales of its policies."""
-    held_out = choose_held_out(len(weights), config.held_out)
-    drawn = np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights)
+    source, dataset = dataset, with_source(dataset, config.mask_from)
+    held_out = choose_held_out(len(dataset.weights), config.held_out)
+    drawn = np.where(np.isin(np.arange(len(dataset.weights)), held_out), 0.0, dataset.weights)
     reuses = reuses and identity.other_data
     encoder, reward_scale = earlier_scales(folder) if reuses else (None, None)
     buffer = TransitionBuffer.from_dataset(
@@ -201,7 +183,7 @@ def _prepared(
     gamma = buffer.packing.gamma
     validation = HeldOut(dataset, buffer, held_out, gamma) if len(held_out) else None
     limit = largest_return(dataset, gamma)
-    return _Run(folder, identity, dataset, buffer, validation, limit, held_out, follow)
+    return _Run(folder, identity, source, buffer, validation, limit, held_out)
 
 
 @dataclass(frozen=True)
@@ -211,12 +193,11 @@ class _Run:
     Attributes:
         folder: Folder of the run.
         identity: Algorithm, settings and data of the run.
-        dataset: Training data, including held-out episodes.
+        dataset: Training data, including held-out episodes, without the masks of `mask_from`.
         buffer: The same data as tensors.
         held_out: Transitions for validation, if any.
         limit: Upper bound on the absolute value of a return.
         held_out_episodes: Numbers of the held-out episodes.
-        follow: Growing logs from which the data were read, if any.
     """
 
     folder: Path
@@ -226,7 +207,6 @@ class _Run:
     held_out: HeldOut | None
     limit: float
     held_out_episodes: NDArray[np.int64]
-    follow: GrowingLogs | None
 
     def train(
         self, config: TrainingConfig, seeds: range, report: ProgressCallback
@@ -290,7 +270,7 @@ class _Run:
         if self.held_out is not None:
             validated = self.held_out.terms(learner)
             values = [mine | held for mine, held in zip(values, validated, strict=True)]
-        if self.follow is not None:
+        if self.dataset.origin.grow is not None:
             size = {"transitions": float(len(learner.buffer))}
             values = [mine | size for mine in values]
         rate = config.learning_rate_at(learner.step - 1)
@@ -305,9 +285,12 @@ class _Run:
 
         If there are any, return a new learner.
         """
-        if self.follow is None or learner.step % CHECK_INTERVAL or not self.follow.grow():
+        if self.dataset.origin.grow is None or learner.step % CHECK_INTERVAL:
             return learner
-        grown = with_source(self.follow.dataset, learner.config.mask_from)
+        grown = self.dataset.grow()
+        if len(grown) == len(learner.buffer):
+            return learner
+        grown = with_source(grown, learner.config.mask_from)
         return with_more_data(learner, grown, self.held_out_episodes)
 
     def _save(self, learner: Learner) -> None:
@@ -354,8 +337,26 @@ def earlier_scales(folder: Path) -> tuple[ObservationEncoder | None, float | Non
     return policy.encoder, policy.reward_scale
 
 
-def fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
-    """Return a hash of the data. The hash includes the weights if they are not all equal."""
-    if len(set(weights.tolist())) < 2:
-        return dataset.fingerprint
-    return hashlib.sha256(dataset.fingerprint.encode() + weights.tobytes()).hexdigest()
+def with_more_data(
+    learner: Learner, dataset: Dataset, held_out_episodes: NDArray[np.int64]
+) -> Learner:
+    """Return a learner for the grown dataset, with the weights and state of `learner`.
+
+    Args:
+        learner: Learner to continue.
+        dataset: Dataset of the learner, followed by new episodes.
+        held_out_episodes: Numbers of the held-out episodes.
+    """
+    weights = dataset.weights.copy()
+    weights[held_out_episodes] = 0.0
+    buffer = TransitionBuffer.from_dataset(
+        dataset,
+        learner.config.packing,
+        encoder=learner.buffer.encoder,
+        reward_scale=learner.buffer.reward_scale,
+        weights=weights,
+    ).to(learner.buffer.device)
+    grown = type(learner)(learner.config, buffer, learner.seeds)
+    for seed in learner.seeds:
+        grown.load_state(seed, learner.state(seed), learner.step)
+    return grown

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, UnknownNameError, UsageError
+from mcaprl.limits import MAX_TIME_NS
 from mcaprl.recorder.bags.decoders import MessageDecoder, decoder_of, merged
 from mcaprl.recorder.bags.definition_files import DefinitionFiles
 from mcaprl.recorder.bags.files import find_bags, open_recordings
@@ -220,12 +221,14 @@ class _Topic:
 
     @cached_property
     def times_ns(self) -> NDArray[np.int64]:
-        if len(self._used) == 1:
-            return self._used[0][1].times_ns
         times_ns = np.empty(len(self._order), np.int64)
         for k, (_, source) in enumerate(self._used):
+            found = source.times_ns
+            wrong = (found <= -MAX_TIME_NS) | (found >= MAX_TIME_NS)
+            if wrong.any():
+                raise LogError(f"{self.name}: message {wrong.argmax()} has an impossible log_time")
             mine = self._order[:, 2] == k
-            times_ns[mine] = source.times_ns[self._order[mine, 3]]
+            times_ns[mine] = found[self._order[mine, 3]]
         return times_ns
 
     @cached_property

@@ -80,8 +80,10 @@ class _McapTopic:
 
     @cached_property
     def times_ns(self) -> NDArray[np.int64]:
-        parts = [part.index["log_time"].astype(np.int64) for part in self._ranges]
-        return np.concatenate(parts) if parts else np.empty(0, np.int64)
+        parts = [part.index["log_time"] for part in self._ranges]
+        # Unsigned times above the signed ones must not become negative.
+        found = np.concatenate(parts) if parts else np.empty(0, np.uint64)
+        return np.minimum(found, np.uint64(np.iinfo(np.int64).max)).astype(np.int64)
 
     @property
     def positions(self) -> NDArray[np.int64]:

@@ -11,7 +11,6 @@ from mcap.records import ChunkIndex, Statistics
 from numpy.typing import NDArray
 
 from mcaprl.problem import Problem
-from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.chunks import chunk_header
 from mcaprl.recorder.columns.message_rows import (
     INDEX_ENTRY,
@@ -23,7 +22,13 @@ from mcaprl.recorder.columns.message_rows import (
     windows,
 )
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import MAGIC, contents_of, is_intact_attachment, parse_record
+from mcaprl.recorder.columns.records import (
+    MAGIC,
+    contents_of,
+    crc32,
+    is_intact_attachment,
+    parse_record,
+)
 
 
 def place(reader: McapReader, chunk: ChunkIndex) -> str:

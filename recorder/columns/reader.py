@@ -31,14 +31,14 @@ from mcap.records import (
 from numpy.typing import NDArray
 
 from mcaprl.errors import BAG_HINT, CorruptLogError, LogError, NotMcapError
-from mcaprl.recorder.columns.checksum import crc32
-from mcaprl.recorder.columns.chunk_indexes import (
+from mcaprl.recorder.columns.chunks import (
     ChunkIndexes,
+    Scratch,
+    chunk_header,
+    chunk_records,
     indexes_of_one,
     parse_chunk_index,
 )
-from mcaprl.recorder.columns.chunks import Scratch, chunk_header, chunk_records
-from mcaprl.recorder.columns.file_map import release
 from mcaprl.recorder.columns.message_rows import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
@@ -54,11 +54,13 @@ from mcaprl.recorder.columns.records import (
     ChunkContents,
     UnindexedMessages,
     contents_of,
+    crc32,
     footer_of,
     is_intact_attachment,
     map_unchanged,
     parse_record,
     records_of,
+    release,
     start_of_summary,
 )
 from mcaprl.storage.remote import RemotePath, as_path

@@ -19,12 +19,12 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns.checksum import crc32
-from mcaprl.recorder.columns.chunk_indexes import parse_chunk_index
+from mcaprl.recorder.columns.chunks import parse_chunk_index
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 from mcaprl.recorder.columns.records import (
     MAGIC,
     RECORD_HEADER,
+    crc32,
     footer_of,
     parse_record,
     records_of,

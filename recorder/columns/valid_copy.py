@@ -1,4 +1,4 @@
-"""Copies of MCAP files: valid records of a damaged file, or selected messages of a valid file."""
+"""Copy of the valid records of a damaged MCAP file."""
 
 from __future__ import annotations
 
@@ -7,18 +7,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Metadata, Schema
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns.append import written_state
-from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.chunks import Scratch, chunk_header, chunk_records
-from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, RECORD_HEADER_BYTES
-from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import MAGIC, contents_of, map_file, only, parse_record
+from mcaprl.recorder.columns.message_rows import RECORD_HEADER_BYTES
+from mcaprl.recorder.columns.records import contents_of, crc32, map_file, only, parse_record
 from mcaprl.recorder.columns.salvage import Damage, ValidRecord, intact_summary, valid_records
 from mcaprl.recorder.columns.writer import COMPRESSIONS, McapWriter
 from mcaprl.texts import counted
@@ -28,8 +24,6 @@ _UNCHUNKED_BYTES = 2**20
 
 RestoreMetadata = Callable[[list[Metadata], Iterable[Channel]], list[Metadata]]
 """Function that corrects the metadata records of a damaged file, given its channels."""
-
-DROP, KEEP = 0, 1
 
 
 def recover_file(
@@ -59,51 +53,6 @@ def recover_file(
         # Also write the channels that have no messages.
         for channel_id in topics.channels:
             topics.announce(channel_id, writer)
-
-
-@contextmanager
-def copy_messages(
-    reader: McapReader,
-    target: Path,
-    actions_of: Callable[[ChunkIndex, Channel, NDArray[Any]], NDArray[np.uint8]],
-    edit: Callable[[Channel, memoryview, int], None],
-) -> Iterator[McapWriter]:
-    """Write selected messages of a valid file, sorted by the start times of their chunks.
-
-    Args:
-        reader: Reader of the file; all its messages are in chunks.
-        target: Path of the new file; an existing one is replaced.
-        actions_of: Function of the message index of one channel in one chunk. It returns an action
-            for each message: `DROP`, `KEEP`, or a larger number, which is passed to `edit`.
-        edit: Function that changes a message in place. Its arguments are the channel, the bytes of
-            the chunk from the start of the message's payload, and the action.
-
-    Yields:
-        The writer, for more messages.
-    """
-    with writer_like(reader.view, reader.records(len(MAGIC)), target) as writer:
-        top_level = written_state(reader.path).top_level
-        for record in sorted(top_level, key=lambda record: not isinstance(record, Metadata)):
-            writer.announce(record)
-        for chunk in sorted(reader.chunks, key=lambda chunk: chunk.message_start_time):
-            records = reader.chunk_records(chunk)
-            indexes = contents_of(records).indexes
-            actions = {
-                id_: actions_of(chunk, reader.channels[id_], index)
-                for id_, index in indexes.items()
-            }
-            if any((action != KEEP).any() for action in actions.values()):
-                masks = {id_: action != DROP for id_, action in actions.items()}
-                kept = {id_: indexes[id_][mask] for id_, mask in masks.items() if mask.any()}
-                records, indexes = only(records, kept)
-                for id_, index in indexes.items():
-                    left = actions[id_][masks[id_]]
-                    for row in np.flatnonzero(left != KEEP).tolist():
-                        data = records[int(index["offset"][row]) + MESSAGE_HEADER.itemsize :]
-                        edit(reader.channels[id_], data, int(left[row]))
-            if indexes:
-                writer.write_records(records, indexes)
-        yield writer
 
 
 @contextmanager

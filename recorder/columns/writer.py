@@ -21,20 +21,18 @@ from numpy.typing import NDArray
 from mcaprl._version import __version__
 from mcaprl.errors import LogError, UnknownNameError
 from mcaprl.files import remove_leftover
-from mcaprl.recorder.columns.append import TopLevelRecord, WrittenState, written_state
 from mcaprl.recorder.columns.chunks import (
     LONG_MESSAGE_BYTES,
     RARE_MESSAGE_BYTES,
     TEXT_BYTES,
     Compressors,
 )
-from mcaprl.recorder.columns.compact import SMALL_CHUNK_BYTES, compact
 from mcaprl.recorder.columns.file_lock import copy_start, create, release, reopen, replaced
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, adjacent_offsets, message_record
-from mcaprl.recorder.columns.output import OutputFile
+from mcaprl.recorder.columns.output import SMALL_CHUNK_BYTES, OutputFile, compact
 from mcaprl.recorder.columns.records import MAGIC
 from mcaprl.recorder.columns.signals import HoldSignals
-from mcaprl.recorder.columns.summary import Summary
+from mcaprl.recorder.columns.summary import Summary, TopLevelRecord, WrittenState, written_state
 
 COMPRESSIONS = ("zstd", "lz4", "none")
 

@@ -18,6 +18,7 @@ from mcaprl.recorder.dataset.action_mask import with_mask
 from mcaprl.recorder.dataset.conversions import Conversions
 from mcaprl.recorder.dataset.episode import Episode, shapes
 from mcaprl.recorder.dataset.mapped import MappedImages, blocks_of, rows_of
+from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.recorder.dataset.statistics import Statistics, describe_columns
 from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, TransitionBatch, Transitions
 from mcaprl.recorder.format.action_commands import ActionCommands
@@ -34,17 +35,26 @@ class Dataset(Conversions):
     """Transitions of whole episodes, from logs or from arrays.
 
     Attributes:
-        sources: Files that the data was read from; empty for arrays.
+        origin: Files that the data was read from, and the mapping and its report.
+        weights: (E,) weight of each episode in training: a transition of weight 2 is drawn twice as
+            often as one of weight 1. Statistics and estimates do not use the weights, and `save`
+            does not write them.
     """
 
     def __init__(
-        self, transitions: Transitions, description: LogMetadata, *, sources: tuple[Path, ...] = ()
+        self,
+        transitions: Transitions,
+        description: LogMetadata,
+        *,
+        origin: Origin = Origin(),  # noqa: B008  (frozen)
+        weights: NDArray[np.float64] | None = None,
     ) -> None:
         """Create a dataset; use `mcaprl.open` or `Dataset.from_arrays` instead."""
         self._transitions = transitions
         self._description = description
         self._leaves = description.leaves
-        self.sources = sources
+        self.origin = origin
+        self.weights = np.ones(len(transitions.episodes)) if weights is None else weights
 
     @classmethod
     def from_arrays(
@@ -82,10 +92,13 @@ class Dataset(Conversions):
                 registered, else Discrete up to the largest integer action, or an unbounded Box.
 
         Raises:
-            SpaceError: Lengths or shapes do not agree with each other or with the spaces.
+            SpaceError: Lengths or shapes do not agree with each other or with the spaces, or an
+                action is not finite.
         """
         from mcaprl.recorder.dataset.arrays import columns_of_arrays, description_of
+        from mcaprl.recorder.dataset.values import check_finite, numbers
 
+        check_finite("actions", numbers("actions", actions))
         description = description_of(env_id, observations, actions, observation_space, action_space)
         steps = (actions, rewards, terminated, truncated, behavior_probs)
         columns = dict(zip(STEP_COLUMNS, steps, strict=True))
@@ -117,8 +130,14 @@ class Dataset(Conversions):
         return cls(
             Transitions.concatenate([part._transitions for part in parts]),
             LogMetadata.common([part._description for part in parts]),
-            sources=tuple(path for part in parts for path in part.sources),
+            origin=Origin.common([part.origin for part in parts]),
+            weights=np.concatenate([part.weights for part in parts]),
         )
+
+    @property
+    def sources(self) -> tuple[Path, ...]:
+        """Files that the data was read from; empty for arrays."""
+        return self.origin.sources
 
     @cached_property
     def metadata(self) -> dict[str, str]:
@@ -281,7 +300,10 @@ class Dataset(Conversions):
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of the spaces and transitions, independent of file names and compression."""
+        """SHA-256 of the spaces and transitions, independent of file names and compression.
+
+        Weights are included if they are not all equal.
+        """
         columns = self._transitions
         digest = hashlib.sha256(space_to_json(self.observation_space).encode())
         digest.update(space_to_json(self.action_space).encode())
@@ -289,7 +311,10 @@ class Dataset(Conversions):
         for array in (*columns.frames, *steps, columns.lengths):
             for block in blocks_of(array):
                 digest.update(block.data)
-        return digest.hexdigest()
+        found = digest.hexdigest()
+        if len(set(self.weights.tolist())) > 1:
+            return hashlib.sha256(found.encode() + self.weights.tobytes()).hexdigest()
+        return found
 
     @cached_property
     def statistics(self) -> Statistics:
@@ -315,11 +340,8 @@ class Dataset(Conversions):
         if column.shape != (len(self),):
             raise SpaceError(f"probs has shape {column.shape}, expected {(len(self),)}")
         mark = ESTIMATED if estimated else ""
-        return Dataset(
-            dataclasses.replace(self._transitions, behavior_probs=column),
-            dataclasses.replace(self._description, behavior_prob=mark),
-            sources=self.sources,
-        )
+        columns = dataclasses.replace(self._transitions, behavior_probs=column)
+        return self._changed(columns, dataclasses.replace(self._description, behavior_prob=mark))
 
     def with_rewards(self, rewards: Any) -> Dataset:
         """Return the same transitions with other rewards; the returns of the episodes are theirs.
@@ -347,11 +369,21 @@ class Dataset(Conversions):
             one._replace(total_reward=total)
             for one, total in zip(columns.episodes, totals, strict=True)
         )
-        return Dataset(
-            dataclasses.replace(columns, rewards=column, episodes=episodes),
-            self._description,
-            sources=self.sources,
-        )
+        return self._changed(dataclasses.replace(columns, rewards=column, episodes=episodes))
+
+    def with_weights(self, weights: Any) -> Dataset:
+        """Return the same transitions with other weights in training; see `weights`.
+
+        Args:
+            weights: (E,) weight of each episode, at least 0.
+
+        Raises:
+            UsageError: There is not one valid weight for each episode.
+        """
+        found, count = np.asarray(weights, np.float64), len(self.episode_lengths)
+        if found.shape != (count,) or not np.isfinite(found).all() or (found < 0).any():
+            raise UsageError(f"weights must be {count} numbers of at least 0, one per episode")
+        return self._changed(self._transitions, weights=found)
 
     def with_action_mask(self, source: str) -> Dataset:
         """Return the same transitions with the flags of the allowed actions in the observations.
@@ -368,8 +400,18 @@ class Dataset(Conversions):
                 a frame in which an action was chosen has none.
             UnknownNameError: There is no such info or part.
         """
-        columns, description = with_mask(self._transitions, self._description, source)
-        return Dataset(columns, description, sources=self.sources)
+        return self._changed(*with_mask(self._transitions, self._description, source))
+
+    def grow(self) -> Dataset:
+        """Return the dataset with the episodes that have ended since it was read.
+
+        A dataset that was not opened with `follow`, or that was changed, is returned as it is.
+
+        Raises:
+            LogError: A log was replaced, or is damaged.
+        """
+        grown: Dataset = self if self.origin.grow is None else self.origin.grow()
+        return grown
 
     def batch(self, steps: NDArray[np.integer[Any]]) -> TransitionBatch:
         """Copy the transitions with indexes (B,), reading images from disk if needed.
@@ -479,7 +521,20 @@ class Dataset(Conversions):
         )
 
     def _take(self, chosen: Sequence[int]) -> Dataset:
-        return Dataset(self._transitions.take(chosen), self._description, sources=self.sources)
+        return self._changed(self._transitions.take(chosen), weights=self.weights[list(chosen)])
+
+    def _changed(
+        self,
+        transitions: Transitions,
+        description: LogMetadata | None = None,
+        weights: NDArray[np.float64] | None = None,
+    ) -> Dataset:
+        return Dataset(
+            transitions,
+            description or self._description,
+            origin=self.origin.changed(),
+            weights=self.weights if weights is None else weights,
+        )
 
     def _frames(self, rows: Any) -> Any:
         return nest(self._leaves, [rows_of(frames, rows) for frames in self._transitions.frames])

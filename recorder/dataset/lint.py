@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.actions import MASK_KEY, allowed_actions
+from mcaprl.actions import MASK_KEY, JointActions, allowed_actions, joint_actions
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -88,28 +88,29 @@ def _impossible_actions(dataset: Dataset) -> Iterator[Problem]:
 
 
 def _masked_actions(dataset: Dataset) -> Iterator[Problem]:
-    space = dataset.action_space
+    joint = joint_actions(dataset.action_space)
     masks = [leaf for leaf in _leaves(dataset) if leaf.path == (MASK_KEY,)]
-    if not isinstance(space, spaces.Discrete) or not masks or masks[0].shape != (space.n,):
+    if joint is None or not masks or masks[0].shape != (joint.count,):
         return
-    forbidden = [_is_forbidden(space, episode) for episode in dataset.episodes]
+    forbidden = [_is_forbidden(joint, episode) for episode in dataset.episodes]
     count = sum(int(one.sum()) for one in forbidden)
     if count:
         yield Problem(
             f"{_count(count, 'action')} that the log's own {MASK_KEY} forbids",
-            _places(dataset, functools.partial(_is_forbidden, space)),
+            _places(dataset, functools.partial(_is_forbidden, joint)),
             "training rejects the dataset",
         )
 
 
-def _is_forbidden(space: spaces.Discrete, episode: Episode) -> NDArray[np.bool_]:
+def _is_forbidden(joint: JointActions, episode: Episode) -> NDArray[np.bool_]:
     """Mark the actions (T,) in their space that the mask of their observation forbids."""
     allowed = allowed_actions(episode.observations)
     assert allowed is not None, "the observations have a mask"
-    chosen = np.asarray(episode.actions) - space.start
-    inside = (chosen >= 0) & (chosen < space.n)
-    taken: NDArray[np.bool_] = allowed[np.arange(len(chosen)), np.where(inside, chosen, 0)]
-    return inside & ~taken
+    inside = joint.contain(episode.actions)
+    forbidden = np.zeros(len(inside), bool)
+    chosen = joint.indexes(np.asarray(episode.actions)[inside])
+    forbidden[inside] = ~allowed[np.flatnonzero(inside), chosen]
+    return forbidden
 
 
 def _constant(dataset: Dataset) -> Iterator[Problem]:

@@ -32,6 +32,7 @@ from mcaprl.recorder.dataset.foreign import inferred_metadata, observation_field
 from mcaprl.recorder.dataset.image_cache import Storage, fingerprint
 from mcaprl.recorder.dataset.images import read_images
 from mcaprl.recorder.dataset.mapped import Frames
+from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.recorder.dataset.transitions import Transitions, ranges
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.infos import read_infos
@@ -236,7 +237,7 @@ class LogReader:
             metadata = replace(
                 metadata, observation_space=restricted(metadata.observation_space, leaves)
             )
-        return Dataset(transitions, metadata, sources=(self.path,))
+        return Dataset(transitions, metadata, origin=Origin((self.path,)))
 
     def _frames(self, leaf: Leaf, columns: Columns) -> Frames:
         if leaf.encoding is None:

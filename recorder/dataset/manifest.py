@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from mcaprl.errors import LogError
-from mcaprl.files import fresh_folder, parse_json, read_file, write_json
+from mcaprl.files import as_type, fresh_folder, parse_json, read_file, write_json
 from mcaprl.storage.remote import RemotePath, as_path, is_url
 
 MANIFEST_NAME = "manifest.json"
@@ -37,6 +36,13 @@ class LogFile:
     episodes: int
     steps: int
     size_bytes: int
+
+
+@dataclass(frozen=True)
+class _Manifest:
+    """What is read of a manifest."""
+
+    files: list[LogFile]
 
 
 def unfinished_folder(folder: Path) -> Path:
@@ -72,27 +78,22 @@ def listed_logs(name: str | Path) -> list[Path]:
         LogError: The manifest cannot be read, or a file is missing or has another size.
     """
     try:
-        files = [_parsed(one) for one in parse_json(_content(name))["files"]]
-    except (KeyError, TypeError, ValueError) as error:
+        files = as_type(_Manifest, parse_json(read_file(as_path(name, whole=True)))).files
+        for file in files:
+            _check_name(file.name)
+    except OSError as error:
+        raise LogError(f"cannot read {name}: {error.strerror or error}") from error
+    except ValueError as error:
         raise LogError(f"{name} is not a manifest of logs: {error}") from error
     if not files:
         raise LogError(f"{name} lists no files")
     return [_found(name, file) for file in files]
 
 
-def _content(name: str | Path) -> bytes:
-    try:
-        return read_file(as_path(name, whole=True))
-    except OSError as error:
-        raise LogError(f"cannot read {name}: {error.strerror or error}") from error
-
-
-def _parsed(values: dict[str, Any]) -> LogFile:
-    name = str(values["name"])
+def _check_name(name: str) -> None:
     # The manifest may come from an untrusted source, so it must not name files outside its folder.
     if name != PurePosixPath(name).name or not name.endswith(".mcap") or "\\" in name:
         raise ValueError(f"{name!r} is not the name of a log in its folder")
-    return LogFile(name, *(int(values[key]) for key in ("episodes", "steps", "size_bytes")))
 
 
 def _found(manifest: str | Path, file: LogFile) -> Path:

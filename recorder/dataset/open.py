@@ -1,11 +1,13 @@
-"""Opening of one or more logs as a Dataset."""
+"""Reading of one or more logs as a Dataset, also while another process is recording them."""
 
 from __future__ import annotations
 
 import glob
 import os
+import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TypeVar
@@ -13,16 +15,18 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import BAG_HINT, LogError, NoEpisodesError, UsageError
+from mcaprl.errors import BAG_HINT, LogError, NoEpisodesError, NoStepsError, UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 from mcaprl.recorder.dataset.manifest import is_manifest, listed_logs
+from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.storage.remote import RemotePath, as_path, find_remote, is_url
 from mcaprl.texts import counted
 
 # Largest number of logs open at the same time; the system limits the open files of a process.
 _MAX_OPEN = 64
+_POLL_S = 0.2
 Result = TypeVar("Result")
 Episodes = int | slice | Sequence[int]
 
@@ -34,43 +38,45 @@ def open_logs(
     episodes: Episodes | None = None,
     images: Storage = "auto",
     threads: int = 1,
+    weights: Sequence[float] | None = None,
 ) -> Dataset:
-    """Read logs, or a selection of their columns and episodes.
-
-    The CRCs of all chunks that are read are checked. If a log was cut off or is still being
-    written, its finished episodes are read, with a warning. If there are several logs, logs without
-    a finished episode are skipped, with a warning.
-
-    Args:
-        data: A file, a folder of `.mcap` files, its `manifest.json`, a glob, a URL, or a sequence
-            of these. The logs must have the same spaces; their episodes are concatenated in the
-            order of the files.
-        columns: Keys to read from a Dict observation space, for example `joints/q` for a nested
-            key. The dataset's observation space contains only these keys. An empty sequence reads
-            no observations. Actions, rewards and end flags are always read. Default: all keys.
-        episodes: Index, slice or indexes of the episodes to read, counted over all logs and
-            returned in the logs' order. Default: all episodes.
-        images: Storage of image observations: `memory`, `mapped` or `auto`. `mapped` leaves images
-            on disk and reads them when they are indexed. For a compressed log, `mapped` needs an
-            uncompressed copy of the images, which is written once, next to the log. `auto` is
-            `mapped` if the images would take more than half of the free memory, else `memory`.
-        threads: Number of threads that read chunks of a file.
-
-    Raises:
-        LogError: A file is missing, not an MCAP file, damaged, or has no finished episode.
-        SpaceError: The logs' spaces differ.
-        UsageError: A column or an episode does not exist.
-    """
+    """Read logs, or a selection of their columns and episodes; see `mcaprl.open`."""
     if threads < 1:
         raise UsageError(f"threads is {threads}, expected 1 or more")
     chosen = None if columns is None else tuple(columns)
     selection = Selection(columns=chosen, images=images, threads=threads)
-    paths, log_at = find_logs(data), partial(LogReader, selection=selection)
-    if episodes is None:
-        parts = _call_each(paths, lambda path: log_at(path).read())
-        return Dataset.concatenate([part for _, part in parts])
-    # Each log is needed twice: for the number of its episodes, and for those that are selected.
-    return _read_episodes(paths, lru_cache(_MAX_OPEN)(log_at), episodes)
+    found = weighted_logs(data, weights)
+    # With `episodes`, each log is needed twice: for their number, and for those that are selected.
+    log_at = lru_cache(0 if episodes is None else _MAX_OPEN)(
+        partial(LogReader, selection=selection)
+    )
+    wanted = dict.fromkeys(found) if episodes is None else _selected(found, log_at, episodes)
+
+    def read(path: Path) -> Dataset:
+        rows = wanted[path]
+        part = log_at(path).read(rows)
+        if columns is None and rows is None:
+            part.origin = replace(part.origin, logs=((path.absolute(), found[path]),))
+        part.weights[:] = found[path]
+        return part
+
+    return Dataset.concatenate([part for _, part in _call_each(list(wanted), read)])
+
+
+def _selected(
+    paths: Iterable[Path], log_at: Callable[[Path], LogReader], episodes: Episodes
+) -> dict[Path, NDArray[np.int64] | None]:
+    """Return the indexes of the selected episodes in each log that has some."""
+    counts = dict(_call_each(list(paths), lambda path: len(log_at(path).lengths)))
+    numbers = episode_indexes(episodes, sum(counts.values()))
+    selected: dict[Path, NDArray[np.int64] | None] = {}
+    first = 0
+    for path, count in counts.items():
+        mine = numbers[(first <= numbers) & (numbers < first + count)]
+        if len(mine):
+            selected[path] = mine - first
+        first += count
+    return selected
 
 
 def _call_each(
@@ -94,20 +100,6 @@ def _call_each(
     return results
 
 
-def _read_episodes(
-    paths: Sequence[Path], log_at: Callable[[Path], LogReader], episodes: Episodes
-) -> Dataset:
-    counted = _call_each(paths, lambda path: len(log_at(path).lengths))
-    numbers = episode_indexes(episodes, sum(count for _, count in counted))
-    parts, first = [], 0
-    for path, count in counted:
-        mine = numbers[(first <= numbers) & (numbers < first + count)]
-        if len(mine):
-            parts.append(log_at(path).read(mine - first))
-        first += count
-    return Dataset.concatenate(parts)
-
-
 def episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
     """Resolve a selection of episodes to sorted, unique indexes.
 
@@ -126,28 +118,47 @@ def episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
     return np.array(sorted(set((selected % count).tolist())), np.int64)
 
 
-def file_key(path: Path) -> str:
-    """Return the same string for all paths of a file: the URL, or the path without links."""
-    return str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
-
-
 def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
     """Resolve `data` (see `open_logs`) to files, sorted within a folder or glob.
 
     Raises:
         LogError: There are no files.
     """
-    if not isinstance(data, str | Path):
-        every = [path for part in data for path in find_logs(part)]
-        if not every:
-            raise LogError("no data: the list of files is empty")
-        # A file that is listed under several paths is read once.
-        return list({file_key(path): path for path in every}.values())
-    if is_manifest(data):
-        return listed_logs(data)
-    if is_url(data):
-        return list(find_remote(str(data)))
-    path = as_path(data)
+    return list(weighted_logs(data))
+
+
+def weighted_logs(
+    data: str | Path | Sequence[str | Path], weights: Sequence[float] | None = None
+) -> dict[Path, float]:
+    """Resolve `data` and its weights (see `open_logs`) to files with their weights.
+
+    Raises:
+        LogError: There are no files.
+        UsageError: A file has two weights.
+    """
+    names = [data] if isinstance(data, str | Path) else list(data)
+    weights = [1.0] * len(names) if weights is None else weights
+    if not names:
+        raise LogError("no data: the list of files is empty")
+    # A file that is listed under several paths is read once.
+    found: dict[str, tuple[Path, float]] = {}
+    for name, weight in zip(names, weights, strict=True):
+        for path in _logs_of(name):
+            key = str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
+            _, earlier = found.setdefault(key, (path, weight))
+            if earlier != weight:
+                raise UsageError(
+                    f"{key} is named twice, with weights {earlier:g} and {weight:g}; name it once"
+                )
+    return dict(found.values())
+
+
+def _logs_of(name: str | Path) -> list[Path]:
+    if is_manifest(name):
+        return listed_logs(name)
+    if is_url(name):
+        return list(find_remote(str(name)))
+    path = as_path(name)
     if path.is_dir():
         found = sorted(path.glob("*.mcap"))
         if not found:
@@ -157,7 +168,96 @@ def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
         return found
     if path.exists():
         return [path]
-    found = sorted(Path(name) for name in glob.glob(str(data)))
+    found = sorted(Path(match) for match in glob.glob(str(name)))
     if not found:
-        raise LogError(f"{data}: no such file, folder or match")
+        raise LogError(f"{name}: no such file, folder or match")
     return found
+
+
+class GrowingLogs:
+    """Reader of growing logs; each episode is read once, when it is finished.
+
+    Attributes:
+        dataset: Episodes read so far, in the order of reading; their numbers do not change.
+    """
+
+    def __init__(
+        self,
+        data: str | Path | Sequence[str | Path],
+        *,
+        patience_s: float = 60.0,
+        images: Storage = "auto",
+        threads: int = 1,
+    ) -> None:
+        """Wait for the first finished episode, and read all finished ones; see `open_logs`."""
+        self._data = [data] if isinstance(data, str | Path) else list(data)
+        self._read = partial(open_logs, images=images, threads=threads)
+        self._counts: dict[Path, int] = {}
+        # End of the last episode that was read, nanoseconds.
+        self._ends_ns: dict[Path, int] = {}
+        self._states: dict[Path, tuple[int, int, int]] = {}
+        give_up_s = time.monotonic() + patience_s
+        while True:
+            parts = self._read_more()
+            if parts:
+                self.dataset = self._joined(parts)
+                return
+            if time.monotonic() > give_up_s:
+                names = ", ".join(map(str, self._data))
+                raise LogError(f"no episode was finished in {names} for {patience_s:.0f} s")
+            time.sleep(_POLL_S)
+
+    def grow(self) -> Dataset:
+        """Return `dataset` after reading the episodes that ended since the last call."""
+        parts = self._read_more()
+        if parts:
+            self.dataset = self._joined([self.dataset, *parts])
+        return self.dataset
+
+    def _joined(self, parts: list[Dataset]) -> Dataset:
+        joined = Dataset.concatenate(parts)
+        joined.origin = Origin(tuple(dict.fromkeys(joined.sources)), grow=self.grow)
+        return joined
+
+    def _read_more(self) -> list[Dataset]:
+        try:
+            paths = find_logs(self._data)
+        except LogError:
+            return []
+        parts = []
+        for path in paths:
+            # Inode, size and mtime change when a log grows or is compacted.
+            facts = path.stat()
+            state = facts.st_ino, facts.st_size, facts.st_mtime_ns
+            if state == self._states.get(path):
+                continue
+            self._states[path] = state
+            part = self._read_from(path)
+            if part is not None:
+                self._counts[path] = self._counts.get(path, 0) + len(part.episodes)
+                self._ends_ns[path] = part.episodes[-1].summary.end_time_ns
+                parts.append(part)
+        return parts
+
+    def _read_from(self, path: Path) -> Dataset | None:
+        """Read the new episodes of a log; return None if there are none.
+
+        Raises:
+            LogError: The log is damaged, or does not contain the episodes that were read before.
+        """
+        first = self._counts.get(path, 0)
+        with warnings.catch_warnings():
+            # The warning that a log is still being written is expected here.
+            warnings.simplefilter("ignore", UserWarning)
+            try:
+                whole = open_logs(path, columns=[]).episodes
+                if first and (
+                    len(whole) < first
+                    or whole[first - 1].summary.end_time_ns != self._ends_ns[path]
+                ):
+                    raise LogError(
+                        f"{path} was replaced by another log during the training: train again"
+                    )
+                return self._read(path, episodes=slice(first, None)) if len(whole) > first else None
+            except NoStepsError:
+                return None

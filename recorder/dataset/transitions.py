@@ -103,9 +103,9 @@ class Transitions:
         names = ("log_time_ns", *STEP_COLUMNS)
         leaves = range(len(parts[0].frames))
         return cls(
+            infos=joined_infos([(part.infos, len(part.log_time_ns)) for part in parts]),
             frames=tuple(joined([part.frames[leaf] for part in parts]) for leaf in leaves),
             episodes=tuple(episode for part in parts for episode in part.episodes),
-            infos=joined_infos([(part.infos, len(part.log_time_ns)) for part in parts]),
             **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names},
         )
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.errors import SpaceError
+from mcaprl.files import as_type
 from mcaprl.recorder.format import messages
 from mcaprl.texts import counted
 
@@ -57,6 +59,22 @@ class EpisodeSummary(NamedTuple):
             f"episode {self.episode} ends after {counted(self.length, 'step')}: {self.reason},"
             f" return {self.total_reward:.4g}"
         )
+
+
+def summary_of(values: Mapping[str, Any]) -> EpisodeSummary:
+    """Return the summary that another format stores.
+
+    Raises:
+        SpaceError: A field is missing, has another type, or cannot be stored in a log.
+    """
+    plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in values.items()}
+    try:
+        found: EpisodeSummary = as_type(EpisodeSummary, plain, "the episode")
+    except ValueError as error:
+        raise SpaceError(f"an episode is damaged: {error}") from error
+    if found.seed is not None and not 0 <= found.seed <= messages.MAX_SEED:
+        raise SpaceError(f"an episode is damaged: a log cannot store the seed {found.seed}")
+    return found
 
 
 def begin_line(episode: int, policy: str) -> str:

@@ -226,6 +226,10 @@ class LogMetadata:
                 f"format version {found}; mcaprl {__version__} reads {FORMAT_VERSION}:"
                 " pip install -U mcaprl"
             )
+        for name, text in strings.items():
+            # The map may come from the JSON of another format.
+            if not isinstance(text, str):
+                raise LogError(f"metadata record '{METADATA_NAME}': {name} is not a text")
         try:
             action_space = space_from_json(strings["action_space"])
             action_leaf(action_space)

@@ -14,9 +14,9 @@ from mcaprl.recorder.columns.definitions import (
     leaf_kinds,
 )
 from mcaprl.recorder.columns.file_check import check_chunk, check_file, check_statistics, place
-from mcaprl.recorder.columns.file_map import prefetch, release
 from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, MessageRange
 from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.records import prefetch, release
 from mcaprl.recorder.columns.salvage import Damage
 from mcaprl.recorder.columns.topic import LOG_TIME, Topic
 

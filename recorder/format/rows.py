@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+from mcap.records import Channel
 from numpy.typing import NDArray
 
 from mcaprl.recorder.columns.cdr import ENCAPSULATION, ENCAPSULATION_BYTES
@@ -198,6 +199,49 @@ def make_final(message: NDArray[Any]) -> None:
     for name, value in _FINAL.items():
         if name in (message.dtype.names or ()):
             message[name] = value
+
+
+class Part(NamedTuple):
+    """Part of an episode that becomes an episode.
+
+    Attributes:
+        start_ns: log_time of the first record.
+        end_ns: log_time of the last record.
+        first_step: Step of the first record, which becomes step 0.
+        length: Number of transitions.
+        is_cut: Whether the episode went on after the part, or its end is missing.
+    """
+
+    start_ns: int
+    end_ns: int
+    first_step: int
+    length: int
+    is_cut: bool
+
+
+class Shorten:
+    """Callable that changes records of `/rl/step` of parts of episodes into those of episodes.
+
+    Attributes:
+        spans: (P, 2) first and last log_time of each part, increasing.
+    """
+
+    def __init__(self, parts: Sequence[Part], dtypes: Mapping[int, np.dtype[Any]]) -> None:
+        """Store the parts, which do not overlap, and the dtype of the messages by channel id."""
+        self._parts = sorted(parts, key=lambda part: part.end_ns)
+        self._dtypes = dtypes
+        found = [(part.start_ns, part.end_ns) for part in self._parts]
+        self.spans = np.array(found, np.int64).reshape(-1, 2)
+
+    def __call__(self, channel: Channel, time_ns: int, payload: memoryview) -> None:
+        """Change one message in place: number its step, and end a part that is cut."""
+        part = self._parts[int(np.searchsorted(self.spans[:, 1], time_ns))]
+        row = np.frombuffer(payload, self._dtypes[channel.id], 1)
+        row["step"] -= part.first_step
+        if part.is_cut and row["step"] == part.length - 1:
+            row["truncated"] = True
+        elif part.is_cut and row["step"] == part.length:
+            make_final(row)
 
 
 def _count(most: int, payload: np.dtype[Any]) -> int:

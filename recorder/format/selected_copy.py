@@ -6,7 +6,6 @@ messages of a chunk are kept, or some are changed, the kept messages are written
 
 from __future__ import annotations
 
-import heapq
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +18,6 @@ from mcap.records import Channel, ChunkIndex, Schema
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError
-from mcaprl.recorder.columns.append import TopLevelRecord
 from mcaprl.recorder.columns.chunks import Scratch
 from mcaprl.recorder.columns.message_rows import (
     INDEX_ENTRY,
@@ -29,12 +27,18 @@ from mcaprl.recorder.columns.message_rows import (
 )
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import MAGIC, RECORD_HEADER, contents_of
+from mcaprl.recorder.columns.summary import TopLevelRecord
 from mcaprl.recorder.columns.valid_copy import writer_like
 from mcaprl.recorder.columns.writer import McapWriter
+from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.messages import EPISODE_TEXT, EPISODE_TYPE
+from mcaprl.recorder.format.topics import EPISODE_TOPIC
 
 Times = NDArray[np.int64]
 Change = Callable[[Channel, int, memoryview], None]
 """Function that changes a message in place, given its channel, log_time and payload."""
+Choice = Callable[[ChunkIndex, Channel, NDArray[Any]], NDArray[np.bool_]]
+"""Function that returns a mask of messages, given their chunk, channel and message index."""
 # Channel ids are 16-bit numbers.
 _MAX_CHANNEL_ID = 2**16 - 1
 _NO_TIMES: Times = np.empty(0, np.int64)
@@ -56,6 +60,7 @@ class Source:
         also: Times of additional messages to keep, by channel id.
         without: Times of messages to drop, by channel id, even if `spans` or `also` contains these
             times.
+        choice: Function that selects the messages, in place of `spans`, `also` and `without`.
         changed: (S, 2) first and last time of each time range whose messages are passed to
             `change`, by channel id. Messages that get other times or ids are always passed to it.
         change: Function that changes a message.
@@ -67,12 +72,16 @@ class Source:
     spans: Times = field(default_factory=lambda: ALL_TIMES)
     also: Mapping[int, Times] = field(default_factory=dict)
     without: Mapping[int, Times] = field(default_factory=dict)
+    choice: Choice | None = None
     changed: Mapping[int, Times] = field(default_factory=dict)
     change: Change | None = None
     delay_ns: int = 0
 
-    def keeps(self, channel_id: int, times: Times) -> NDArray[np.bool_]:
-        """Return a mask of the messages of a channel that are kept, given their times."""
+    def keeps(self, chunk: ChunkIndex, channel_id: int, index: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return a mask of the messages of a channel that are kept, given their message index."""
+        if self.choice is not None:
+            return self.choice(chunk, self.reader.channels[channel_id], index)
+        times = index["log_time"].astype(np.int64)
         kept = within(self.spans, times)
         if channel_id in self.also:
             kept |= np.isin(times, self.also[channel_id])
@@ -176,19 +185,19 @@ def copy_selected(
     sources: Sequence[Source],
     target: Path,
     top_level: Sequence[TopLevelRecord],
-    more: Sequence[tuple[int, int, bytes]] = (),
+    summaries: Sequence[EpisodeSummary] = (),
     *,
     like: McapReader | None = None,
 ) -> Copied:
     """Write the selected messages of files to a new file.
 
-    The chunks of each file keep their order. Chunks of several files are ordered by their times.
+    Chunks are ordered by their start times.
 
     Args:
         sources: Files and the selections of their messages.
         target: Path of the new file; an existing one is replaced.
         top_level: Records at the start of the new file, with all its channels.
-        more: Additional messages: channel id, log_time in nanoseconds, and data.
+        summaries: Additional messages of `/rl/episode`.
         like: File whose profile and compression the new file uses; default: the first source.
 
     Raises:
@@ -201,10 +210,14 @@ def copy_selected(
         copy = _Copy(writer)
         for source, chunk in _in_time_order(sources):
             copy.take(source, chunk)
-        writer.write_messages(more)
+        if summaries:
+            channel_id = writer.add_channel(EPISODE_TOPIC, EPISODE_TYPE, EPISODE_TEXT)
+            writer.write_messages(
+                [(channel_id, one.end_time_ns, one.to_message()) for one in summaries]
+            )
         for source in sources:
             source.reader.check_unchanged()
-        copy.copied.messages += len(more)
+        copy.copied.messages += len(summaries)
     return copy.copied
 
 
@@ -224,14 +237,9 @@ def times_of(reader: McapReader, channel: Channel) -> Times:
 
 
 def _in_time_order(sources: Sequence[Source]) -> Iterator[tuple[Source, ChunkIndex]]:
-    """Merge the chunks of files by start time; the chunks of each file keep their order."""
-
-    def chunks_of(source: Source) -> Iterator[tuple[Source, ChunkIndex]]:
-        return ((source, chunk) for chunk in source.reader.chunks)
-
-    return heapq.merge(
-        *map(chunks_of, sources), key=lambda pair: pair[1].message_start_time + pair[0].delay_ns
-    )
+    """Yield the chunks of files by start time; the order of a file decides between equal ones."""
+    pairs = [(source, chunk) for source in sources for chunk in source.reader.chunks]
+    return iter(sorted(pairs, key=lambda pair: pair[1].message_start_time + pair[0].delay_ns))
 
 
 class _Copy:
@@ -262,7 +270,9 @@ class _Copy:
         )
         if not kept_whole and self._is_outside(source, start, end, list(ids)):
             return
-        masks = {} if kept_whole else {i: _kept(source, i, index) for i, index in indexes.items()}
+        masks = {}
+        if not kept_whole:
+            masks = {id_: source.keeps(chunk, id_, index) for id_, index in indexes.items()}
         if not kept_whole and not any(mask.any() for mask in masks.values()):
             return
         is_whole = all(mask.all() for mask in masks.values())
@@ -276,12 +286,16 @@ class _Copy:
             self._rewrite(source, chunk, indexes)
 
     def _is_inside(self, source: Source, start: int, end: int) -> bool:
+        if source.choice is not None:
+            return False
         spans = source.spans
         span = int(np.searchsorted(spans[:, 0], start, side="right")) - 1
         return span >= 0 and end <= int(spans[span, 1])
 
     def _is_outside(self, source: Source, start: int, end: int, ids: Sequence[int]) -> bool:
         """Return whether a chunk's time range shows that none of its messages is kept."""
+        if source.choice is not None:
+            return False
         spans = source.spans
         following = int(np.searchsorted(spans[:, 1], start))
         if following < len(spans) and int(spans[following, 0]) <= end:
@@ -306,7 +320,7 @@ class _Copy:
     ) -> None:
         scratch = self._scratches.setdefault(id(source.reader), Scratch())
         records = source.reader.chunk_records(chunk, scratch)
-        kept = {id_: index[_kept(source, id_, index)] for id_, index in indexes.items()}
+        kept = {id_: index[source.keeps(chunk, id_, index)] for id_, index in indexes.items()}
         count = sum(map(len, kept.values()))
         if not count:
             return
@@ -329,10 +343,6 @@ def _check_times(source: Source, chunk: ChunkIndex, indexes: Mapping[int, NDArra
         raise CorruptLogError(f"{where} has times that do not match its messages")
     if bounds and bounds[1] + source.delay_ns > _LAST_TIME:
         raise CorruptLogError(f"{where} has a log_time after the year 2262")
-
-
-def _kept(source: Source, channel_id: int, index: NDArray[Any]) -> NDArray[np.bool_]:
-    return source.keeps(channel_id, index["log_time"].astype(np.int64))
 
 
 def _top_level_ids(reader: McapReader) -> set[int]:

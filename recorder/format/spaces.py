@@ -144,7 +144,7 @@ def outside(space: spaces.Space[Any], values: NDArray[Any]) -> NDArray[np.bool_]
     low, high = bounds
     wrong = ~((values >= low) & (values <= high))
     # The type is a string, because evaluating it takes as long as the comparison of short arrays.
-    return cast("NDArray[np.bool_]", wrong.reshape(len(values), -1).any(1))
+    return cast("NDArray[np.bool_]", wrong.any(tuple(range(1, wrong.ndim))))
 
 
 def bounds_of(space: spaces.Space[Any]) -> tuple[NDArray[Any], NDArray[Any]] | None:

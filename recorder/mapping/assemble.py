@@ -12,6 +12,7 @@ from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.mapped import Frames
+from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import LogMetadata
@@ -91,7 +92,7 @@ def assembled(
         behavior_probs=np.concatenate([run.probs for run in runs])[steps],
         episodes=tuple(summaries),
     )
-    return Dataset(transitions, metadata, sources=plan.bag.paths)
+    return Dataset(transitions, metadata, origin=Origin(plan.bag.paths))
 
 
 def _shift(run: Steps, episodes: list[Segment], times: list[NDArray[np.int64]]) -> int:

@@ -21,8 +21,8 @@ from pydantic import (
     model_validator,
 )
 
-from mcaprl.errors import UsageError, import_extra
-from mcaprl.files import read_file
+from mcaprl.errors import UsageError
+from mcaprl.files import read_yaml
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.format.spaces import MAX_ACTIONS
 
@@ -563,25 +563,13 @@ def load_mapping(source: str | Path | MappingOf[str, Any]) -> tuple[Mapping, Pla
     """
     if not isinstance(source, str | Path):
         return parse_mapping(source), Place()
-    path, yaml = source, import_extra("ruamel.yaml", "bags")
-    try:
-        tree = yaml.YAML(typ="rt").load(read_file(path).decode())
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise UsageError(f"{path} is not UTF-8 text: {error.reason}") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"{path}:{mark.line + 1}" if mark else str(path)
-        raise UsageError(f"{where}: not YAML: {getattr(error, 'problem', error)}") from error
-    # ruamel.yaml converts numbers and dates that are impossible, and nesting has no limit.
-    except (ValueError, RecursionError) as error:
-        raise UsageError(f"{path}: a value cannot be read: {str(error)[:200]}") from error
+    path = Path(source)
+    tree = read_yaml(path, "bags", with_lines=True)
     place = Place(str(path), tree)
     if not isinstance(tree, dict):
         raise UsageError(f"{path}: a mapping has keys and values, such as `clock: {{rate_hz: 10}}`")
     found = parse_mapping(tree, place)
-    folder = Path(path).parent.absolute()
+    folder = path.parent.absolute()
     paths = [str(folder / each) for each in found.definitions]
     for number, each in enumerate(paths):
         if not Path(each).exists():

@@ -53,21 +53,9 @@ def read_bag(
     images: Storage = "auto",
     definitions: Sequence[str | Path] = (),
 ) -> MappedBag:
-    """Read a bag as a dataset.
+    """Read the bag of `data` (see `open_bag`) as a dataset; see `mcaprl.open`.
 
-    Args:
-        data: MCAP file, rosbag2 folder, ROS 1 bag, or several; see `bags.bag.open_bag`.
-        mapping: Mapping, path of a mapping file, or its keys and values.
-        changes: Values that replace those of the mapping's keys.
-        trust_code: Whether `reward` may name a function of a Python module, which is imported.
-        images: Storage of images: `memory`, `mapped`, or `auto`; see `mcaprl.open`.
-        definitions: Files and folders with definitions of ROS types that the bag lacks, in addition
-            to those of the mapping.
-
-    Raises:
-        UsageError: The mapping does not fit the bag; the message names file, line and key.
-        LogError: The bag cannot be read, or has no episode; or no image can be decoded.
-        MissingExtraError: The packages of the `bags` extra are not installed.
+    `changes` has values that replace those of the mapping's keys.
     """
     place = Place()
     if not isinstance(mapping, Mapping):
@@ -118,6 +106,10 @@ def _read(plan: Plan, images: Storage) -> MappedBag | None:
     report = replace(report, images=problems)
     if (commands := dataset.action_commands) is not None:
         report = replace(report, commands=commands.by_name(dataset.action_names))
+    tree = mapping.model_dump(mode="json", by_alias=True)
+    if commands is not None and None not in commands.commands:
+        tree["action"]["representatives"] = commands.to_json()["commands"]
+    dataset.origin = replace(dataset.origin, mapping=tree, report=report)
     return MappedBag(dataset, report)
 
 

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
+from mcaprl.limits import MAX_TIME_NS
 from mcaprl.recorder.bags.bag import Bag, Failure, Stream
 from mcaprl.recorder.mapping.config import Stamp, TimeSource
 from mcaprl.recorder.mapping.paths import FieldPath, field_path
 
 _PUBLISH_TIME, _STAMP = "publish_time", "header.stamp"
 _NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
-_MAX_NS = 2.0**63
 
 
 class TopicStream:
@@ -142,5 +142,5 @@ def _is_time(stamps: NDArray[Any], unit_ns: int) -> NDArray[np.bool_]:
     """Return whether stamps are numbers that are times in nanoseconds."""
     if stamps.dtype.kind not in "iuf" or stamps.ndim != 1:
         return np.zeros(len(stamps), bool)
-    found: NDArray[np.bool_] = np.abs(stamps.astype(np.float64)) * unit_ns < _MAX_NS
+    found: NDArray[np.bool_] = np.abs(stamps.astype(np.float64)) * unit_ns < MAX_TIME_NS
     return found

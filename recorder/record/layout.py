@@ -23,7 +23,7 @@ from mcaprl.recorder.format.topics import (
     RUNNING,
     STEP_TOPIC,
 )
-from mcaprl.recorder.record import panels, series
+from mcaprl.recorder.record import panels
 from mcaprl.recorder.record.panels import Node, Panel
 
 LAYOUT_NAME = "foxglove-layout.json"
@@ -72,7 +72,7 @@ def layout_of(
     nodes = {"Drive": screens.drive(), "Learning": screens.learning(), "Data": screens.data()}
     return {
         "configById": {"Tab!screens": panels.tabs(nodes), **screens.found},
-        "globalVariables": {series.EPISODE_VARIABLE: 0},
+        "globalVariables": {panels.EPISODE_VARIABLE: 0},
         "userNodes": {},
         "playbackConfig": {"speed": 1},
         "layout": "Tab!screens",
@@ -138,9 +138,9 @@ class _Screens:
         ]
         others = [name for name in self.telemetry if name != RETURN_SO_FAR]
         numbers = {
-            "observations": series.observation_series(self.metadata),
-            "actions": series.action_series(self.metadata),
-            **series.telemetry_groups(others),
+            "observations": panels.observation_series(self.metadata),
+            "actions": panels.action_series(self.metadata),
+            **panels.telemetry_groups(others),
         }
         shown = {title: paths for title, paths in numbers.items() if paths}
         plots: dict[str, Node] = {title: self._plot(title, title, shown[title]) for title in shown}
@@ -236,15 +236,15 @@ class _Screens:
         if RETURN_SO_FAR in self.telemetry:
             returns = {"return so far": f"/telemetry.{RETURN_SO_FAR}"}
         plots: list[Node] = [
-            self._plot("reward", "reward", {"reward": f"{series.STEPS}.reward"}),
+            self._plot("reward", "reward", {"reward": f"{panels.STEPS}.reward"}),
             self._plot("return", next(iter(returns)), returns),
         ]
         rows = [[*lights, *plots]] if len(lights) < 2 else [lights, plots]
         watched = [name for name in self.telemetry if name.endswith(_WATCHED)]
         if watched:
             title = "offsets, steering" if len(watched) > 1 else watched[0]
-            rows.insert(1, [self._plot("drive", title, series.telemetry_series(watched))])
-        elif observed := series.observation_series(self.metadata):
+            rows.insert(1, [self._plot("drive", title, panels.telemetry_series(watched))])
+        elif observed := panels.observation_series(self.metadata):
             rows.append([self._plot("drive", "observation", observed)])
         actions, share = self._actions()
         sizes = [(panels.stack(row, "row"), (1 - share) / len(rows)) for row in rows]
@@ -275,10 +275,10 @@ class _Screens:
         """Add a panel of recent logged and policy actions; return its node and relative height."""
         title = f"actions of the last {_LAST_S} s"
         if not self.metadata.action_names():
-            paths = series.action_series(self.metadata)
+            paths = panels.action_series(self.metadata)
             panel = panels.plot(title, paths, isSynced=False, followingViewWidth=_LAST_S)
             return self._put("Plot!action", panel), 0.25
-        rows = {"action": f"{series.STEPS}.action"}
+        rows = {"action": f"{panels.STEPS}.action"}
         for topic in self._values_topics():
             name = topic.removeprefix(VALUES_TOPIC).removeprefix("/")
             rows[f"{name} would take".strip()] = f"{topic}.policy_action"
@@ -290,7 +290,7 @@ class _Screens:
     def _returns(self) -> list[tuple[Node, float]]:
         """Add the return of each episode, and an overview of the episodes."""
         paths = {"return": f"{EPISODE_TOPIC}.total_reward"}
-        rows: dict[str, str] = {"episode": f"{series.STEPS}.episode"}
+        rows: dict[str, str] = {"episode": f"{panels.STEPS}.episode"}
         if PHASE_TOPIC in self.topics:
             rows["state"] = f"{PHASE_TOPIC}.data"
         overview = panels.state_transitions("episodes", rows)
@@ -321,7 +321,7 @@ class _Screens:
     def _policy(self, topic: str) -> Node:
         """Add a policy's outputs over time, current Q-values, errors and agreement with the log."""
         title = topic.removeprefix("/rl/")
-        names = list(self.metadata.action_names().values())[: series.MAX_SERIES]
+        names = list(self.metadata.action_names().values())[: panels.MAX_SERIES]
         over_time: dict[str, Node] = {}
         for label, array in (("Q-values", "q"), ("probabilities", "preference")):
             paths = {name: f"{topic}.{array}[{index}]" for index, name in enumerate(names)}
@@ -346,7 +346,7 @@ class _Screens:
         return panels.weighted(rows, "column")
 
     def _chosen_episode(self) -> Node:
-        chosen, title = series.EPISODE_VARIABLE, "reward of the chosen episode"
+        chosen, title = panels.EPISODE_VARIABLE, "reward of the chosen episode"
         knob = panels.slider("episode to plot", chosen, _MAX_EPISODE)
-        plot = self._plot("episode", title, {"reward": series.CHOSEN_REWARD})
+        plot = self._plot("episode", title, {"reward": panels.CHOSEN_REWARD})
         return panels.split(self._put("GlobalVariableSliderPanel!episode", knob), plot, "row", 30)

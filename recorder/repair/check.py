@@ -3,7 +3,7 @@
     file      summary, CRCs of the data section and attachments        (file_check)
     chunks    CRCs, message indexes, chunk indexes of the summary      (file_check)
     log       metadata, schema, episodes, order of steps, images       (episode_check)
-    bag       all messages, if the file is another robot's bag         (bag_check)
+    bag       all messages, if the file is another robot's bag
 
 Each chunk is decompressed once.
 """
@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from itertools import cycle, islice
 from pathlib import Path
@@ -21,6 +22,7 @@ from mcap.records import ChunkIndex
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError, SpaceError
 from mcaprl.problem import Problem, Shortlist
+from mcaprl.recorder.bags.bag import Bag, open_bag
 from mcaprl.recorder.bags.files import is_bag_file
 from mcaprl.recorder.format.metadata import METADATA_NAME
 from mcaprl.recorder.format.reading import (
@@ -32,9 +34,63 @@ from mcaprl.recorder.format.reading import (
     place,
 )
 from mcaprl.recorder.format.topics import STEP_TOPIC
-from mcaprl.recorder.repair.bag_check import check_messages
 from mcaprl.recorder.repair.episode_check import EpisodeCheck
 from mcaprl.storage.remote import RemotePath, as_path
+from mcaprl.texts import counted
+
+_LISTED = 3
+"""Number of undecodable messages of a topic that are listed."""
+
+
+def check_messages(path: Path) -> list[Problem]:
+    """Decode all messages of a bag file, or of a rosbag2 folder; return the problems by topic.
+
+    One message is in memory at a time. If the file can be opened, the last finding is a note that
+    it is a bag.
+    """
+    try:
+        with closing(open_bag(path)) as bag:
+            found = Shortlist[Problem]()
+            if not any(info.count for info in bag.topics.values()):
+                found.append(Problem("the bag has no messages", "all topics", file=str(path)))
+            for name in bag.topics:
+                found.extend(_problems_of(bag, name, str(path)))
+            return [*found, *found.rest(), _note(path)]
+    except LogError as error:
+        what = str(error).removeprefix(f"{path}: ").removeprefix(f"{path} ")
+        return [Problem(what, "reading the bag", file=str(path))]
+
+
+def _note(path: Path) -> Problem:
+    return Problem(
+        "this is another robot's bag, not a log: its messages were decoded",
+        "no topic /rl/step",
+        next="to check its transitions, pass --mapping FILE; `mcaprl convert --suggest BAG > FILE`"
+        " drafts one",
+        file=str(path),
+        severity="note",
+    )
+
+
+def _problems_of(bag: Bag, name: str, file: str) -> Iterator[Problem]:
+    info = bag.topics[name]
+    if info.problem:
+        effect = f"its {counted(info.count, 'message')} cannot be read"
+        yield Problem(info.problem, name, effect=effect, file=file)
+        return
+    count = 0
+    try:
+        for failure in bag.failures(name):
+            count += 1
+            if count <= _LISTED:
+                what = f"message {failure.row} at {failure.log_time_ns} ns: {failure.reason}"
+                yield Problem(what, name, file=file)
+    except LogError as error:
+        yield Problem(str(error).removeprefix(f"{file}: "), name, file=file)
+    if count > _LISTED:
+        what = f"{count} of {counted(info.count, 'message')} cannot be decoded"
+        yield Problem(what, name, file=file)
+
 
 # Number of chunks that a thread decompresses before it hands them over. Handing over each one takes
 # more time.

@@ -152,8 +152,7 @@ def _keep_whole_episodes(
         return
     _add_plan(recovery, plan)
     if plan.changes_anything:
-        write_planned(reader, result, plan)
-        recovery.messages = _count_messages(McapReader(result))
+        recovery.messages = write_planned(reader, result, plan).messages
     else:
         os.replace(copied, result)
     problems = [one for one in check_log(result) if one.next != IMPOSSIBLE_ACTION]
@@ -195,7 +194,7 @@ def _add_plan(recovery: Recovery, plan: EpisodePlan) -> None:
         NoEpisodesError: No episode can be kept.
     """
     recovery.episodes, recovery.dropped = plan.episodes, plan.dropped
-    recovery.ended, recovery.strays = plan.ended, plan.strays
+    recovery.ended, recovery.strays = len(plan.ended), plan.strays
     if plan.episodes == 0:
         can_end = any(dropped.can_end for dropped in plan.dropped)
         hint = "; pass --keep-unfinished to keep unfinished episodes" if can_end else ""

@@ -10,18 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.records import Channel, ChunkIndex, Schema
+from mcap.records import Channel, ChunkIndex, Metadata, Schema
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.problem import Shortlist
 from mcaprl.recorder.dataset.log_reader import described
-from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.episode_summary import INTERRUPTED, EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import METADATA_NAME
 from mcaprl.recorder.format.reading import (
@@ -30,11 +28,12 @@ from mcaprl.recorder.format.reading import (
     McapReader,
     Topic,
 )
-from mcaprl.recorder.format.rows import make_final
+from mcaprl.recorder.format.rows import Part, Shorten
 from mcaprl.recorder.format.schema import message_dtype
+from mcaprl.recorder.format.selected_copy import Copied, Source, copy_selected, within
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
-from mcaprl.recorder.format.writing import DROP, KEEP, copy_messages
+from mcaprl.recorder.format.writing import finished_state
 
 _FIELDS = ("reward", "episode", "step", "terminated", "truncated", "final")
 # Prefix of topics whose messages belong to episodes; other topics are copied unchanged.
@@ -44,16 +43,6 @@ _MAX_GAP = 10**6
 
 Place = tuple[int, int]
 """Offset of a chunk and id of a channel, which identify a message index."""
-
-
-class RowAction(IntEnum):
-    """Action for one record of `/rl/step`."""
-
-    DROP = DROP
-    KEEP = KEEP
-    # If the end of an episode is missing: actions for its last transition and its last record.
-    TRUNCATE = 2
-    MAKE_FINAL = 3
 
 
 @dataclass(frozen=True)
@@ -83,19 +72,19 @@ class EpisodePlan:
     """Selection of the records to keep.
 
     Attributes:
-        actions: `RowAction` of each record of `/rl/step` in file order, by `Place`.
+        kept: Mask of the records of `/rl/step` in file order, by `Place`.
         spans: (E, 2) first and last log_time of the kept episodes, increasing.
         dropped: Episodes that are not kept.
-        ended: Number of kept episodes whose end is missing.
+        ended: Parts of kept episodes whose end is missing, up to their last whole transition.
         new_summaries: Summaries of kept episodes that `/rl/episode` does not contain.
         strays: Number of messages on other `/rl/` topics that do not belong to a kept episode.
         is_in_order: Whether the records are in time order.
     """
 
-    actions: dict[Place, NDArray[np.uint8]] = field(default_factory=dict)
+    kept: dict[Place, NDArray[np.bool_]] = field(default_factory=dict)
     spans: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
     dropped: Shortlist[DroppedEpisode] = field(default_factory=Shortlist)
-    ended: int = 0
+    ended: list[Part] = field(default_factory=list)
     new_summaries: list[EpisodeSummary] = field(default_factory=list)
     strays: int = 0
     is_in_order: bool = True
@@ -109,6 +98,15 @@ class EpisodePlan:
     def changes_anything(self) -> bool:
         """Whether the copy is different from the log."""
         return bool(self.dropped or self.new_summaries or self.strays) or not self.is_in_order
+
+    def keeps(self, chunk: ChunkIndex, channel: Channel, index: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return a mask of the messages of a channel in a chunk that are kept."""
+        place = (chunk.chunk_start_offset, channel.id)
+        if place in self.kept:
+            return self.kept[place]
+        if not channel.topic.startswith(_EPISODE_TOPICS):
+            return np.ones(len(index), np.bool_)
+        return within(self.spans, index["log_time"].astype(np.int64))
 
 
 def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan | None:
@@ -132,55 +130,44 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
         raise CorruptLogError(f"{STEP_TOPIC} has no field {', '.join(missing)}")
     if missing:
         return None
+    channels = reader.channels_of(STEP_TOPIC)
+    can_change = all(_message_dtype(reader.schema_of(one)) is not None for one in channels)
     order = np.lexsort((steps.times, steps.channel_ids))
     columns = steps.read(_FIELDS, order)
-    plan, actions = EpisodePlan(), np.zeros(len(steps), np.uint8)
+    plan, kept = EpisodePlan(), np.zeros(len(steps), np.bool_)
     plan.is_in_order = bool((np.diff(order) > 0).all())
     listed, spans = _listed_episodes(reader), []
     for run in _runs(reader, columns, steps.channel_ids[order]):
-        can_end = run.can_end and all(map(_message_dtype, _schemas(reader)))
+        can_end = run.can_end and can_change
         if not run.is_whole and not (can_end and keep_unfinished):
             plan.dropped.append(run.dropped(columns, can_end))
             continue
-        actions[order[run.start : run.last + 1]] = RowAction.KEEP
+        kept[order[run.start : run.last + 1]] = True
         if not run.is_whole:
-            actions[order[run.last - 1]], actions[order[run.last]] = (
-                RowAction.TRUNCATE,
-                RowAction.MAKE_FINAL,
-            )
-            plan.ended += 1
+            start_ns, end_ns = columns[LOG_TIME][[run.last - 1, run.last]].tolist()
+            plan.ended.append(Part(start_ns, end_ns, 0, run.last - run.start, is_cut=True))
         spans.append(columns[LOG_TIME][[run.start, run.last]])
         if int(spans[-1][1]) not in listed:
             plan.new_summaries.append(run.summary(columns))
     plan.dropped.extend(_missing(columns, listed.values()))
     plan.spans = np.array(sorted(map(tuple, spans)), np.int64).reshape(-1, 2)
-    plan.actions = dict(_by_place(steps, actions))
+    plan.kept = dict(_by_place(steps, kept))
     plan.strays = _count_strays(reader, plan)
     return plan
 
 
-def write_planned(reader: McapReader, target: Path, plan: EpisodePlan) -> None:
+def write_planned(reader: McapReader, target: Path, plan: EpisodePlan) -> Copied:
     """Write the records that a plan keeps to another file."""
-
-    def actions_of(chunk: ChunkIndex, channel: Channel, index: NDArray[Any]) -> NDArray[np.uint8]:
-        place = (chunk.chunk_start_offset, channel.id)
-        if place in plan.actions:
-            return plan.actions[place]
-        if not channel.topic.startswith(_EPISODE_TOPICS):
-            return np.full(len(index), RowAction.KEEP, np.uint8)
-        return _is_inside(plan, index["log_time"]).astype(np.uint8)
-
-    def edit(channel: Channel, data: memoryview, action: int) -> None:
-        _end_episode(data, _message_dtype(reader.schema_of(channel)), RowAction(action))
-
-    with copy_messages(reader, target, actions_of, edit) as writer:
-        if plan.new_summaries:
-            channel_id = writer.add_channel(
-                EPISODE_TOPIC, messages.EPISODE_TYPE, messages.definition(messages.EPISODE_TYPE)
-            )
-            writer.write_messages(
-                [(channel_id, one.end_time_ns, one.to_message()) for one in plan.new_summaries]
-            )
+    source = Source(reader, {id_: id_ for id_ in reader.channels}, choice=plan.keeps)
+    if plan.ended:
+        dtypes = {
+            one.id: _message_dtype(reader.schema_of(one)) for one in reader.channels_of(STEP_TOPIC)
+        }
+        change = Shorten(plan.ended, {id_: one for id_, one in dtypes.items() if one is not None})
+        source.change, source.changed = change, dict.fromkeys(dtypes, change.spans)
+    top_level = finished_state(reader).top_level
+    top_level = sorted(top_level, key=lambda record: not isinstance(record, Metadata))
+    return copy_selected([source], target, top_level, plan.new_summaries)
 
 
 @dataclass(frozen=True)
@@ -256,10 +243,6 @@ def _is_log(reader: McapReader) -> bool:
     )
 
 
-def _schemas(reader: McapReader) -> list[Schema]:
-    return [reader.schema_of(channel) for channel in reader.channels_of(STEP_TOPIC)]
-
-
 def _message_dtype(schema: Schema) -> np.dtype[Any] | None:
     return message_dtype(schema.data.decode(errors="replace"))
 
@@ -302,39 +285,17 @@ def _missing(columns: Columns, listed: Iterable[int]) -> Iterator[DroppedEpisode
 
 def _count_strays(reader: McapReader, plan: EpisodePlan) -> int:
     return sum(
-        int((~_is_inside(plan, part.index["log_time"])).sum())
+        int((~within(plan.spans, part.index["log_time"].astype(np.int64))).sum())
         for channel in reader.channels.values()
         if channel.topic.startswith(_EPISODE_TOPICS) and channel.topic != STEP_TOPIC
         for part in reader.message_ranges(channel)
     )
 
 
-def _by_place(
-    steps: Topic, actions: NDArray[np.uint8]
-) -> Iterator[tuple[Place, NDArray[np.uint8]]]:
+def _by_place(steps: Topic, kept: NDArray[np.bool_]) -> Iterator[tuple[Place, NDArray[np.bool_]]]:
     start = 0
     for decoder, part in steps.parts:
         stop = start + len(part)
         assert part.chunk is not None, "all messages are in chunks"
-        yield (part.chunk.chunk_start_offset, decoder.channel.id), actions[start:stop]
+        yield (part.chunk.chunk_start_offset, decoder.channel.id), kept[start:stop]
         start = stop
-
-
-def _is_inside(plan: EpisodePlan, log_times: NDArray[np.uint64]) -> NDArray[np.bool_]:
-    """Return a mask of the times that are within a kept episode."""
-    if not plan.episodes:
-        return np.zeros(len(log_times), np.bool_)
-    times = log_times.astype(np.int64)
-    span = np.searchsorted(plan.spans[:, 0], times, side="right") - 1
-    is_inside: NDArray[np.bool_] = (span >= 0) & (times <= plan.spans[np.maximum(span, 0), 1])
-    return is_inside
-
-
-def _end_episode(data: memoryview, dtype: np.dtype[Any] | None, action: RowAction) -> None:
-    """Apply `TRUNCATE` or `MAKE_FINAL` to a message."""
-    assert dtype is not None, "only messages with a known dtype are changed"
-    message = np.frombuffer(data, dtype, 1)
-    if action == RowAction.TRUNCATE:
-        message["truncated"] = True
-        return
-    make_final(message)

@@ -16,9 +16,9 @@ from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
-from mcaprl.recorder.dataset.open import open_logs
 from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.record.display import TELEMETRY
+from mcaprl.recorder.source import open_data
 from mcaprl.texts import counted
 
 Positions = NDArray[np.float64]
@@ -141,7 +141,7 @@ def _cards(dataset: Dataset, tracks: Sequence[Positions]) -> list[Card]:
 
 def _commands(dataset: Dataset) -> list[str]:
     """Return a replay command for each episode, or empty strings if their files are unknown."""
-    counts = [len(open_logs(path, columns=[]).episodes) for path in dataset.sources]
+    counts = [len(open_data(path, columns=[]).episodes) for path in dataset.sources]
     if sum(counts) != len(dataset.episodes):
         return [""] * len(dataset.episodes)
     return [

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.canvas import Canvas
 from mcaprl.sims.drawing.painter import NEAR_M, RIM, Eye, Faces, Painter, joined
 from mcaprl.sims.drawing.scene import Color, Frame, Shape
+from mcaprl.sims.drawing.top_view import Canvas
 from mcaprl.sims.geometry.mesh import box_faces
 
 Floats = NDArray[np.float64]

@@ -14,10 +14,9 @@ from highway_env.envs.racetrack_env import RacetrackEnv, RacetrackEnvOval
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
-from mcaprl.sims.drawing.follow_view import Body, FollowView
-from mcaprl.sims.drawing.motion import car_moments
 from mcaprl.sims.drawing.scene import Frame, Shape
-from mcaprl.sims.drawing.shapes import car_frame
+from mcaprl.sims.drawing.shapes import car_frame, car_moments
+from mcaprl.sims.drawing.top_view import Body, FollowView
 from mcaprl.sims.highway import scene as highway_scene
 from mcaprl.sims.highway.course import FLIP, Course, Place, courses_of
 from mcaprl.sims.highway.scene import Car

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.camera import focal_lengths
-from mcaprl.sims.drawing.follow_view import Body, FollowView
 from mcaprl.sims.drawing.scene import Frame, Shape
 from mcaprl.sims.drawing.shapes import car_frame
+from mcaprl.sims.drawing.top_view import Body, FollowView
 from mcaprl.sims.lane import scene as lane_scene
 from mcaprl.sims.lane.camera import IMAGE_SHAPE, LENS
 from mcaprl.sims.lane.fleet import LaneFleet

@@ -12,13 +12,6 @@ from mcaprl.errors import UsageError
 from mcaprl.sims.drawing.depth import encode_depth, encode_nearness
 from mcaprl.sims.geometry.vectors import Vector, norm, plus
 from mcaprl.sims.powerline.camera import CAMERAS, IMAGE_SHAPE, DroneCamera
-from mcaprl.sims.powerline.classic import (
-    CLASSIC_DECISION_S,
-    CLASSIC_FIRST_COMMAND_M_S,
-    CLASSIC_VELOCITY_STEP_M_S,
-    classic_end,
-    step_classic,
-)
 from mcaprl.sims.powerline.course import (
     LENGTH_M,
     POINTS_M,
@@ -30,6 +23,9 @@ from mcaprl.sims.powerline.quadrotor import PLANTS, Drone, fly
 from mcaprl.sims.powerline.rules import (
     ACTION_MEANINGS,
     CHECK_S,
+    CLASSIC_DECISION_S,
+    CLASSIC_FIRST_COMMAND_M_S,
+    CLASSIC_VELOCITY_STEP_M_S,
     DECISION_S,
     FIRST_COMMAND_M_S,
     FLIGHT_SIZE,
@@ -42,10 +38,12 @@ from mcaprl.sims.powerline.rules import (
     Flight,
     approach,
     begin,
+    classic_end,
     collides,
     end_of,
     flight_at,
     observe,
+    step_classic,
     step_flights,
     store_bearings,
     store_flight,

@@ -10,8 +10,7 @@ import numpy as np
 
 from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.paths import Path
-from mcaprl.sims.racer.car import Car, store_car
-from mcaprl.sims.racer.course import Track
+from mcaprl.sims.racer.course import Car, Track, store_car
 from mcaprl.sims.racer.fleet import ANYWHERE, RacerFleet, start_anywhere, start_on_line
 from mcaprl.sims.racer.rays import BLOCK_SIZE
 from mcaprl.sims.racer.rules import CRASH, advance, observe_with

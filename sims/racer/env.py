@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.motion import car_moments
 from mcaprl.sims.drawing.scene import Frame, Shape
+from mcaprl.sims.drawing.shapes import car_moments
 from mcaprl.sims.racer import scene as racer_scene
-from mcaprl.sims.racer.car import Car
-from mcaprl.sims.racer.course import Track
+from mcaprl.sims.racer.course import Car, Track
 from mcaprl.sims.racer.fleet import RacerFleet
 from mcaprl.sims.racer.rules import STEP_S
 from mcaprl.sims.vehicle.batched import BatchedEnv

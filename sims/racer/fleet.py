@@ -15,13 +15,16 @@ from mcaprl.compiled import compiled, ready
 from mcaprl.errors import UsageError
 from mcaprl.sims.geometry.paths import leg_at, point_at
 from mcaprl.sims.racer.block import StepResult, car_info, step_cars, step_only_car
-from mcaprl.sims.racer.car import STARTED_AT, Car, placed, store_car
 from mcaprl.sims.racer.course import (
     HALF_WIDTH_PX,
     IMAGE_HEIGHT_PX,
     METERS_PER_PX,
+    STARTED_AT,
+    Car,
     Track,
     make_track,
+    placed,
+    store_car,
 )
 from mcaprl.sims.racer.rules import (
     ACTION_MEANINGS,

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled
-from mcaprl.sims.racer.car import Car
-from mcaprl.sims.racer.course import Track
+from mcaprl.sims.racer.course import Car, Track
 from mcaprl.sims.racer.env import RacerEnv
 from mcaprl.sims.racer.rays import BLOCK_SIZE, CENTER_RAYS, CENTER_RAYS_RAD, LENGTH, measure
 from mcaprl.sims.racer.rules import MAX_SPEED_PX, SPEED_CHANGE_PX, THROTTLE, TURN

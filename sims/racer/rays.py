@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.paths import heading_of
 from mcaprl.sims.geometry.ray_code import FAR_M, ray_name
-from mcaprl.sims.racer.car import Car, corner_at
-from mcaprl.sims.racer.course import METERS_PER_PX
+from mcaprl.sims.racer.course import METERS_PER_PX, Car, corner_at
 
 FAR_PX = FAR_M / METERS_PER_PX
 JOINT = 1e-9

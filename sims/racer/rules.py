@@ -13,8 +13,17 @@ from numpy.typing import NDArray
 from mcaprl.compiled import compiled, inlined
 from mcaprl.sims.geometry.paths import project, wrap_angle
 from mcaprl.sims.geometry.ray_code import log_code
-from mcaprl.sims.racer.car import CAR_LENGTH_PX, CAR_WIDTH_PX, Car, car_at, corner_at, store_car
-from mcaprl.sims.racer.course import IMAGE_HEIGHT_PX, METERS_PER_PX, Track
+from mcaprl.sims.racer.course import (
+    CAR_LENGTH_PX,
+    CAR_WIDTH_PX,
+    IMAGE_HEIGHT_PX,
+    METERS_PER_PX,
+    Car,
+    Track,
+    car_at,
+    corner_at,
+    store_car,
+)
 from mcaprl.sims.racer.rays import (
     BLOCK_SIZE,
     LENGTH,

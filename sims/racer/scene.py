@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.sims.drawing import shapes
-from mcaprl.sims.drawing.canvas import Canvas, Rgb
 from mcaprl.sims.drawing.scene import Color, Frame, Shape, cut, raised
 from mcaprl.sims.drawing.shapes import car_part
-from mcaprl.sims.drawing.top_view import Patch, patches, placed
-from mcaprl.sims.racer.car import Car
+from mcaprl.sims.drawing.top_view import Canvas, Patch, Rgb, patches, placed
 from mcaprl.sims.racer.course import (
     IMAGE_HEIGHT_PX,
     IMAGE_WIDTH_PX,
     METERS_PER_PX,
+    Car,
     Track,
     asphalt,
     to_map,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -58,6 +59,9 @@ def test_a_bag_is_opened_by_a_mapping(bag: Path, tmp_path: Path) -> None:
     assert data.rewards.tolist() == [0.5] * (STEPS - 1)
     assert data.terminated.tolist() == [False] * (STEPS - 2) + [True]
     assert data.episodes[0].policy == "operator"
+    kept = pickle.loads(pickle.dumps(data.filter(lambda episode: True)))
+    assert kept.origin.mapping["reward"] == "next(speed) - speed"
+    assert kept.origin.report.steps == STEPS - 1
     with pytest.raises(UsageError, match="are for logs, not for a mapping"):
         mcaprl.open(bag, mapping=tmp_path / "robot.yaml", columns=[])
 
@@ -105,7 +109,7 @@ def test_commands_read_a_bag_by_a_mapping(
     request = ["train-offline", str(bag), *mapping, "--out", str(run_folder), "--algo", "bc"]
     assert run([*request, "--updates", "3", "--batch-size", "4"]) == 0
     assert json.loads((run_folder / "mapping.json").read_text())["reward"] == "next(speed) - speed"
-    assert "bc learns from 1 episode" in capsys.readouterr().out
+    assert "learning from 1 episode" in capsys.readouterr().out
     request = ["annotate", str(bag), *mapping, "--policy", str(run_folder)]
     assert run([*request, "--out", str(tmp_path / "values.mcap")]) == 0
     assert "/rl/values has the values of" in capsys.readouterr().out

@@ -22,12 +22,13 @@ from tests.support.paths import GOLDEN
 
 ROOT = Path(__file__).parent.parent.parent
 PACKAGES = ("api", "device", "offline", "online", "recorder", "sims")
-CLASSES = ("Dataset", "Episode", "OpenBag", "RecordMcap", "RecordVecMcap")
+CLASSES = ("ClusterOptions", "Dataset", "Episode", "OpenBag", "RecordMcap", "RecordVecMcap")
 FUNCTIONS = {
-    "train-offline": ("train", "sweep"),
+    "train-offline": ("train", "sweep", "open", "ClusterOptions"),
+    "annotate": ("annotate", "open"),
     "train-online": ("train_online",),
     "convert": ("convert", "suggest_mapping"),
-    "evaluate": ("evaluate", "estimate"),
+    "evaluate": ("evaluate", "estimate", "open"),
     "replay": ("replay", "verify", "render", "browse", "save_page"),
     "completion": (),
 }

@@ -440,7 +440,7 @@ def test_training_refuses_continuous_actions_before_it_prints_anything(
         assert (out, err.count("\n")) == ("", 1), f"{command}: {out!r}, {err!r}"
         assert "needs discrete actions, got Box" in err
     with pytest.raises(SpaceError, match="needs discrete actions, got Box"):
-        mcaprl.train(log, "run", on_data=lambda algo, dataset: pytest.fail("training began"))
+        mcaprl.train(log, "run", progress=lambda now: pytest.fail("training began"))
     with pytest.raises(SpaceError, match="needs discrete actions, got Box"):
         mcaprl.train_online(
             "Pendulum-v1", "run", live=True, port=0, on_live=lambda _: pytest.fail("it listens")
@@ -527,8 +527,8 @@ def test_stopped_recording_is_readable(number: signal.Signals) -> None:
         (["record", "lane", "--steps", "5", "--out", "x.mcap"], "record", "; finished episodes ar"),
         (["evaluate", "pilot", "--sim", "lane"], "evaluate", "\n"),
         (["evaluate", "run", "--data", "x"], "estimate", "\n"),
-        (["train-offline", "x", "--out", "new"], "train", "\n"),
-        (["train-offline", "x", "--out", "run"], "train", "; continue with --resume\n"),
+        (["train-offline", str(LANE_LOG), "--out", "new"], "train", "\n"),
+        (["train-offline", str(LANE_LOG), "--out", "run"], "train", "; continue with --resume\n"),
         (["train-online", "lane", "--out", "run"], "train_online", "; continue with --resume\n"),
     ],
 )

@@ -45,6 +45,8 @@ CASES = [
     (BCConfig(**TINY, frame_stack=2, normalize=True, channels=(4, 6, 8)), IMAGE),
     (DQNConfig(**TINY, frame_stack=2, layer_norm=True), spaces.Box(0, 255, (84, 90, 1), np.uint8)),
     (DQNConfig(**TINY), MIXED),
+    (DQNConfig(**TINY, frame_stack=2), spaces.Box(0, 255, (3, 12, 10), np.uint8)),
+    (DQNConfig(**TINY), spaces.Box(0, 255, (10, 10, 4), np.uint8)),
 ]
 
 

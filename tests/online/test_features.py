@@ -15,6 +15,7 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.torch_layers import NatureCNN
 
+import mcaprl
 from mcaprl.architecture import Architecture
 from mcaprl.errors import PolicyError, UsageError
 from mcaprl.online.agent import CENTERING_STEPS, Agent
@@ -227,6 +228,31 @@ def test_the_encoder_fits_the_images(
     channels: list[int], settings: dict[str, Any], encoder: str
 ) -> None:
     assert DoubleDQNConfig(**settings).architecture_for(channels).encoder == encoder
+
+
+class Grid(Camera):
+    """Random cells; episodes end at random."""
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        seen, _, _, _, info = super().step(action)
+        return seen, float(action), self.np_random.random() < 0.2, False, info
+
+
+@pytest.mark.parametrize("shape", [(10, 10, 4), (4, 10, 12), (7, 7, 3), (3, 40, 36)])
+@pytest.mark.parametrize("algo", ["double-dqn", "ppo"])
+def test_agents_learn_from_small_images_and_channels_first(
+    tmp_path: Path, shape: tuple[int, ...], algo: str
+) -> None:
+    name = f"Grid{'-'.join(map(str, shape))}-v0"
+    settings = {key: value for key, value in SHORT.items() if key != "learning_starts"}
+    gym.register(name, lambda **options: Grid(shape))
+    try:
+        mcaprl.train_online(name, tmp_path / "run", algo=algo, frame_stack=2, **settings)
+    finally:
+        gym.registry.pop(name)
+    policy = mcaprl.load_policy(tmp_path / "run" / "seed-0")
+    stacks = np.random.default_rng(0).integers(256, size=(5, *shape), dtype=np.uint8)
+    assert policy.act(stacks).shape == (5,)
 
 
 def test_settings_of_networks_are_validated() -> None:

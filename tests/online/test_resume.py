@@ -21,11 +21,11 @@ from stable_baselines3 import DQN
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import TrainingError, UsageError
-from mcaprl.offline.training.follow import GrowingLogs
 from mcaprl.online.agent import Agent
 from mcaprl.online.task import Task
 from mcaprl.online.train import OnlineSummary, train
 from mcaprl.progress import TrainingProgress
+from mcaprl.recorder.dataset.open import GrowingLogs
 from mcaprl.runs import read_curve
 from mcaprl.sims.evaluation.evaluate import Scale
 from tests.support.offline_tasks import corridor

@@ -71,7 +71,7 @@ def test_json_and_mappings_are_read_like_yaml(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("tree", "message"),
     [
-        ("algos: [bc\n", "line 2: not YAML"),
+        ("algos: [bc\n", "sweep.yaml:2: not YAML"),
         ("- bc\n", "a sweep must be a mapping"),
         ("algos: []\n", "algos must be a list of algorithms"),
         ("algos: [ppq]\n", "unknown algorithm"),
@@ -226,11 +226,11 @@ def test_a_trial_killed_between_checkpoint_and_score_has_all_scores(
     tree = {"algos": ["bc"], "settings": {"updates": 8, "hidden": [8]}, "seeds": 2}
     plan = read_plan({**tree, "score": {"every": 4, "updates": 5, "fraction": 0.5}})
     (trial,) = plan.trials
-    sweep._train([str(log)], plan, trial, tmp_path)
+    sweep._train({log: 1.0}, plan, trial, tmp_path)
     whole = sweep._result(trial, tmp_path).scores
     assert [one.updates for one in whole] == reported == [4, 8]
     sweep._save(tmp_path / trial.name, whole[:1], "")
-    sweep._train([str(log)], plan, trial, tmp_path)
+    sweep._train({log: 1.0}, plan, trial, tmp_path)
     assert sweep._result(trial, tmp_path).scores == whole
     assert reported == [4, 8, 4, 8]
 

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 import mcaprl
+from mcaprl.api.cluster import ClusterOptions
 from mcaprl.cli import run
 from mcaprl.errors import ClusterError, SpaceError, TrainingError, UsageError
 from mcaprl.progress import TrainingProgress
@@ -95,7 +96,9 @@ def trained(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Trained:
                 os.kill(process, signal.SIGKILL)
         done.append((now.seed, now.done))
 
-    found = mcaprl.train(data, folder / "ray", ray=True, workers=2, progress=progress, **OPTIONS)
+    found = mcaprl.train(
+        data, folder / "ray", ray=ClusterOptions(workers=2), progress=progress, **OPTIONS
+    )
     return Trained(data, mcaprl.train(data, folder / "local", **OPTIONS), found, done)
 
 
@@ -143,13 +146,14 @@ def test_options_that_cannot_be_used_with_ray(logs: Path, tmp_path: Path) -> Non
         mcaprl.train(data, tmp_path / "run", algo="bc", updates=1, **options)
 
     with pytest.raises(UsageError, match="--workers requires --ray"):
-        train(workers=2)
-    with pytest.raises(UsageError, match="--ray trains one algorithm on the paths of logs"):
-        train(mcaprl.open(logs), ray=True)
-    with pytest.raises(UsageError, match="--ray trains one algorithm on the paths of logs"):
-        train(ray=True, follow=True)
+        train(ray=ClusterOptions(False, workers=2))
+    first = mcaprl.open(logs).filter(lambda episode: episode.index == 0)
+    with pytest.raises(UsageError, match="workers read logs: pass their paths"):
+        train(first, ray=True)
+    with pytest.raises(UsageError, match="workers read logs: pass their paths"):
+        train(mcaprl.open(logs, follow=True), ray=True)
     with pytest.raises(ClusterError, match="the cluster has 2 CPUs for 3 workers"):
-        train(ray=True, workers=3)
+        train(ray=ClusterOptions(workers=3))
     with pytest.raises(ClusterError, match="the cluster has 0 GPUs for 1 worker:"):
         train(ray=True, device="cuda")
     with pytest.raises(SpaceError, match="needs discrete actions, got Box"):
@@ -206,10 +210,10 @@ def test_other_versions_and_unseen_paths_are_found_before_the_workers_start(
     logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def train() -> None:
-        mcaprl.train(logs, tmp_path / "run", algo="bc", updates=1, ray=True, workers=2)
+        mcaprl.train(logs, tmp_path / "run", algo="bc", updates=1, ray=ClusterOptions(workers=2))
 
     with monkeypatch.context() as patch:
-        patch.setattr(training, "weighted_logs", lambda data: [(tmp_path / "none.mcap", 1.0)])
+        patch.setattr(training, "logs_of", lambda data: {tmp_path / "none.mcap": 1.0})
         with pytest.raises(ClusterError, match=r"127\.0\.0\.1 cannot see .*/none\.mcap: choose"):
             train()
     versions = {**installed_versions(), "numpy": "1.2.3"}

@@ -11,7 +11,7 @@ import pytest
 
 from mcaprl.recorder.record.scene import MotionSource
 from mcaprl.sims import make_sim
-from mcaprl.sims.drawing.motion import arc
+from mcaprl.sims.drawing.shapes import arc
 
 CASES = [
     ("lane", {}, 4),

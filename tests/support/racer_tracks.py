@@ -7,8 +7,7 @@ import math
 import numpy as np
 
 from mcaprl.sims.geometry.paths import closed_path
-from mcaprl.sims.racer.car import Car, placed
-from mcaprl.sims.racer.course import Track
+from mcaprl.sims.racer.course import Car, Track, placed
 
 
 def corridor(top_px: float = 100.0, bottom_px: float = 200.0) -> Track:

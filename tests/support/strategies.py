@@ -59,6 +59,11 @@ def values_of(draw: st.DrawFn, space: spaces.Space[Any], rows: int) -> Any:
     return np.stack([np.asarray(space.sample()) for _ in range(rows)])
 
 
+def _finite(actions: Any) -> Any:
+    """Return actions as `from_arrays` accepts them."""
+    return np.where(np.isfinite(actions), actions, 0).astype(actions.dtype)
+
+
 @st.composite
 def transitions(draw: st.DrawFn) -> dict[str, Any]:
     """Draw keyword arguments for `Dataset.from_arrays`, including spaces."""
@@ -71,7 +76,7 @@ def transitions(draw: st.DrawFn) -> dict[str, Any]:
         "action_space": action_space,
         "observations": draw(values_of(observation_space, rows)),
         "next_observations": draw(values_of(observation_space, rows)),
-        "actions": draw(values_of(action_space, rows)),
+        "actions": _finite(draw(values_of(action_space, rows))),
         "rewards": draw(rewards),
         "terminated": draw(ends),
         "truncated": draw(ends),

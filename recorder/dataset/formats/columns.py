@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError
+from mcaprl.limits import MAX_TIME_NS
 from mcaprl.recorder.dataset.arrays import with_fresh_times
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.transitions import Transitions, joined_infos
@@ -21,7 +22,7 @@ from mcaprl.recorder.dataset.values import (
     probabilities_of,
     rewards_of,
 )
-from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
+from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up, summary_of
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
 from mcaprl.texts import shortened
@@ -104,7 +105,7 @@ def check_duration(metadata: LogMetadata, frames: int, where: object) -> None:
     Raises:
         LogError: The step duration is not positive, or too large.
     """
-    if not 0 < metadata.step_duration_ns * frames < 2**62:
+    if not 0 < metadata.step_duration_ns * frames < MAX_TIME_NS:
         raise LogError(
             f"{where}: step_duration_ns is {shortened(str(metadata.step_duration_ns), 40)},"
             " expected a positive number of nanoseconds"
@@ -112,11 +113,16 @@ def check_duration(metadata: LogMetadata, frames: int, where: object) -> None:
 
 
 def check_times(name: str, times_ns: NDArray[Any]) -> None:
-    """Check that the log_times of an episode do not fall.
+    """Check that the log_times of an episode are whole numbers of nanoseconds, and do not fall.
 
     Raises:
-        SpaceError: A time is earlier than the time before it.
+        SpaceError: A time is earlier than the time before it, or is not one.
     """
+    if (
+        times_ns.dtype.kind not in "iu"
+        or (np.abs(times_ns.astype(np.float64)) >= MAX_TIME_NS).any()
+    ):
+        raise SpaceError(f"{name} are not times in nanoseconds")
     falls = np.diff(times_ns) < 0
     if falls.any():
         row = int(falls.argmax())
@@ -129,7 +135,14 @@ def _place(where: object, index: int, episode: EpisodeArrays) -> str:
 
 
 def _check_times_and_probabilities(episode: EpisodeArrays, place: str) -> None:
-    first = episode.first_row or 0
+    first, count = episode.first_row or 0, len(episode.rewards)
+    for name, column, rows in (
+        ("rewards", episode.rewards, count),
+        ("log_time_ns", episode.times_ns, count + 1),
+        ("behavior_probs", episode.behavior_probs, count),
+    ):
+        if column is not None and np.shape(column) != (rows,):
+            raise SpaceError(f"{place}: {name} has shape {np.shape(column)}, expected {(rows,)}")
     if episode.times_ns is not None:
         check_times(f"{place}: log_time_ns", episode.times_ns)
     if episode.behavior_probs is not None:
@@ -229,14 +242,16 @@ def _summary(index: int, episode: EpisodeArrays) -> EpisodeSummary:
     known: dict[str, Any] = {
         "reason": "terminated" if episode.terminated else "truncated" if episode.truncated else ""
     }
-    known |= dict(episode.summary)
-    return EpisodeSummary(
-        episode=index,
-        length=len(episode.rewards),
-        total_reward=add_up(np.asarray(episode.rewards, np.float64)),
-        terminated=episode.terminated,
-        truncated=episode.truncated,
-        start_time_ns=0 if times is None else int(times[0]),
-        end_time_ns=0 if times is None else int(times[-1]),
-        **known,
+    return summary_of(
+        {
+            **known,
+            **episode.summary,
+            "episode": index,
+            "length": len(episode.rewards),
+            "total_reward": add_up(np.asarray(episode.rewards, np.float64)),
+            "terminated": episode.terminated,
+            "truncated": episode.truncated,
+            "start_time_ns": 0 if times is None else int(times[0]),
+            "end_time_ns": 0 if times is None else int(times[-1]),
+        }
     )

@@ -221,7 +221,7 @@ class _Steps:
             SpaceError: A column has another number of rows, or is not numeric.
         """
         for name in COLUMNS:
-            for path, array in _named_leaves(name, self._columns.get(name)):
+            for path, array in named_leaves(name, self._columns.get(name)):
                 if not array.ndim or len(array) != self._count:
                     rows = len(array) if array.ndim else 1
                     raise SpaceError(
@@ -287,18 +287,18 @@ def _like(tree: Any, other: Any, name: str) -> Any:
     return other if other.dtype == tree.dtype else exactly(name, other, tree.dtype)
 
 
-def _named_leaves(name: str, tree: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+def named_leaves(name: str, tree: Any) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield the name and the values of each array in nested dicts."""
     if isinstance(tree, Mapping):
         for key, part in tree.items():
-            yield from _named_leaves(f"{name}/{key}", part)
+            yield from named_leaves(f"{name}/{key}", part)
     elif tree is not None:
         yield name, tree
 
 
 def _leaves(tree: Any) -> list[NDArray[Any]]:
     """Return the arrays in nested dicts, in the order of their names."""
-    return [array for _, array in sorted(_named_leaves("", tree), key=lambda found: found[0])]
+    return [array for _, array in sorted(named_leaves("", tree), key=lambda found: found[0])]
 
 
 def _is_info(values: NDArray[Any], count: int) -> bool:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +43,8 @@ from mcaprl.recorder.dataset.tables import (
 )
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.dataset.values import exactly, probabilities_of
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.episode_summary import EpisodeSummary, summary_of
 from mcaprl.recorder.format.infos import Masked
-from mcaprl.recorder.format.messages import MAX_SEED
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of
 
@@ -269,34 +268,9 @@ class _Table:
             raise LogError(f"{self._path} has no column '{missing[0]}'")
         rows = self._table.select(list(EpisodeSummary._fields)).to_pylist()
         try:
-            return tuple(_summary(k, row) for k, row in enumerate(rows))
-        except (TypeError, ValueError) as error:
-            raise LogError(f"{self._path}: an episode is damaged: {error}") from error
-
-
-def _summary(index: int, row: Mapping[str, Any]) -> EpisodeSummary:
-    """Return a row of the table of episodes.
-
-    Raises:
-        TypeError, ValueError: A value has another type, or cannot be stored in a log.
-    """
-    seed = row["seed"]
-    if seed is not None and not 0 <= int(seed) <= MAX_SEED:
-        raise ValueError(f"seed {seed}")
-    return EpisodeSummary(
-        episode=index,
-        length=int(row["length"]),
-        total_reward=float(row["total_reward"]),
-        terminated=bool(row["terminated"]),
-        truncated=bool(row["truncated"]),
-        start_time_ns=int(row["start_time_ns"]),
-        end_time_ns=int(row["end_time_ns"]),
-        reason=str(row["reason"]),
-        policy=str(row["policy"]),
-        epsilon=float(row["epsilon"]),
-        seed=seed,
-        options=str(row["options"]),
-    )
+            return tuple(summary_of({**row, "episode": k}) for k, row in enumerate(rows))
+        except SpaceError as error:
+            raise LogError(f"{self._path}: {error}") from error
 
 
 def _check_ends(columns: Transitions, path: Path) -> None:

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.files import check_plain, replacing, replacing_folder
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.storage.remote import is_url
 
 KINDS = ("terminated", "truncated")
@@ -77,23 +78,16 @@ def format_named(name: str) -> Format:
     return FORMATS[name]
 
 
-def recognized(path: str | Path) -> Format | None:
-    """Return the format of a file, a folder or `FORMAT:NAME`; None if no format matches."""
-    name, colon, _ = str(path).partition(":")
-    if colon and name in FORMATS:
-        return FORMATS[name]
-    if not Path(path).exists():
-        return None
-    readable = (form for form in FORMATS.values() if form.reads)
-    return next((form for form in readable if form.module.matches(Path(path))), None)
-
-
 def other_format(name: str | Path) -> Format | None:
-    """Return the format of another tool's dataset; None for logs and unknown formats."""
+    """Return the format of a file, a folder or `FORMAT:NAME`; None for logs and unknown ones."""
     path = Path(name)
     if is_url(name) or path.suffix == ".mcap" or (path.is_dir() and any(path.glob("*.mcap"))):
         return None
-    return recognized(name)
+    start, colon, _ = str(name).partition(":")
+    if colon and start in FORMATS:
+        return FORMATS[start]
+    readable = (form for form in FORMATS.values() if form.reads and path.exists())
+    return next((form for form in readable if form.module.matches(path)), None)
 
 
 def target_format(path: str | Path, name: str | None) -> Format:
@@ -181,7 +175,8 @@ def read_format(path: str | Path, form: Format, **options: Any) -> Dataset:
     except OSError as error:
         raise LogError(f"cannot read {path}: {error}") from error
     dataset: Dataset = form.module.read(source, **given)
-    dataset.sources = dataset.sources or (source,)
+    if not dataset.sources:
+        dataset.origin = Origin((source,))
     return dataset
 
 

@@ -14,7 +14,12 @@ from mcaprl.recorder.dataset.arrays import description_of
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats import hdf5_nodes as nodes
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
-from mcaprl.recorder.dataset.formats.flat import joined_trees, rows_of_tree, unread_note
+from mcaprl.recorder.dataset.formats.flat import (
+    joined_trees,
+    named_leaves,
+    rows_of_tree,
+    unread_note,
+)
 from mcaprl.recorder.dataset.values import flags
 
 _KNOWN = ("data", "mask")
@@ -78,6 +83,9 @@ def _demo(group: Any, where: str, notes: dict[str, None]) -> EpisodeArrays:
         shapes = [values.shape for values in columns]
         raise LogError(f"{where}: actions, rewards and dones have shapes {shapes}")
     count = len(rewards)
+    for name, part in named_leaves("obs", observations):
+        if part.shape[:1] != (count,):
+            raise LogError(f"{where}: {name} has shape {part.shape}, but there are {count} rewards")
     is_done = dones is not None and count > 0 and bool(dones[-1])
     if dones is not None and dones[:-1].any():
         notes["dones before the last step of a demonstration are ignored"] = None

@@ -184,7 +184,9 @@ def _short_fields(bag: Bag, info: TopicInfo, names: list[str]) -> list[str]:
     """Return the fields that are not arrays of very many numbers, such as images of an own type."""
     arrays = [name for name in names if info.fields[name].endswith("]")]
     first = bag.read(info.name, arrays, np.array([0])).columns if arrays else {}
-    long = [name for name, column in first.items() if np.size(column[0]) > _MAX_SAMPLED]
+    long = [
+        name for name, column in first.items() if len(column) and np.size(column[0]) > _MAX_SAMPLED
+    ]
     return [name for name in names if name not in long]
 
 

@@ -37,6 +37,7 @@ _MAX_FIELDS, _MAX_VALUES, _MAX_NUMBER = 32, 16, 31
 """Number of elements of a command, number of different values of a discrete command, and largest
 number of a discrete field."""
 _DIGITS = 3
+_FLOAT = np.finfo(np.float32)
 
 
 class Command(NamedTuple):
@@ -102,6 +103,10 @@ def _commands(bag: Bag, topic: TopicOverview) -> Command | None:
             path = name.replace("[:]", "[{}]") if "[:]" in name else f"{name}[{{}}]"
             elements = column.astype(np.float64).T[:_MAX_FIELDS]
             found |= {path.format(k): each for k, each in enumerate(elements)}
+    # A Box action is float32.
+    found = {
+        name: np.where(np.abs(each) < _FLOAT.max, each, np.nan) for name, each in found.items()
+    }
     chosen = _chosen(found)
     if chosen:
         values = np.column_stack([found[name] for name in chosen])
@@ -193,7 +198,7 @@ def box_limits(values: NDArray[np.float64]) -> tuple[float, float]:
     low, high = float(values.min()), float(values.max())
     below = float(np.nextafter(np.float32(low), np.float32(-np.inf)))
     above = float(np.nextafter(np.float32(high), np.float32(np.inf)))
-    if low == high:
+    if high - low < _FLOAT.tiny:
         return min(math.floor(low) - 1.0, below), max(math.ceil(high) + 1.0, above)
     unit = 10.0 ** (math.floor(math.log10(high - low)) - _DIGITS + 1)
     least, most = math.floor(low / unit), math.ceil(high / unit)

@@ -1,12 +1,14 @@
-"""An HTTP server on 127.0.0.1 for the page of one log.
+"""The page of one log as an HTML text without references to other files, and its HTTP server.
 
-It answers two kinds of requests: `/` returns the page, and `/episode/K` the packed data of an
-episode. No request names a file. A web page of another site cannot read the answers, because the
-server checks the origin and the host name that browsers send with a request.
+The server on 127.0.0.1 answers two kinds of requests: `/` returns the page, and `/episode/K` the
+packed data of an episode. No request names a file. A web page of another site cannot read the
+answers, because the server checks the origin and the host name that browsers send with a request.
 """
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import re
 import socket
 import sys
@@ -14,13 +16,59 @@ import threading
 from contextlib import suppress
 from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from string import Template
 from typing import Any
 
 from mcaprl import limits
 from mcaprl.errors import McaprlError, UsageError
-from mcaprl.recorder.viewer.origin_filter import is_loopback
+from mcaprl.recorder.viewer.foxglove_server import is_loopback
 from mcaprl.recorder.viewer.page.episode_data import LogPage
-from mcaprl.recorder.viewer.page.html import page_html
+
+_SCRIPTS = ("data.js", "scene.js", "plots.js", "images.js", "main.js")
+
+
+def page_html(log: bytes, episode: bytes = b"") -> str:
+    """Return the page.
+
+    Texts from the log are encoded as base64, and the page's Content Security Policy permits only
+    the scripts of this package. Therefore, no text can become HTML or code.
+
+    Args:
+        log: Packed description of the log.
+        episode: Packed data of the only episode; empty if the page requests episodes from its
+            server.
+    """
+    style = _text("vendor/libraries.min.css") + _text("assets/style.css")
+    names = ("vendor/libraries.min.js", *(f"assets/{name}" for name in _SCRIPTS))
+    scripts = [_text(name) for name in names]
+    policy = [
+        "default-src 'none'",
+        f"script-src {' '.join(map(_hash, scripts))}",
+        # uPlot and OrbitControls set styles from scripts. `style-src` does not prevent this.
+        f"style-src {_hash(style)}",
+        "img-src data:",
+        "base-uri 'none'; form-action 'none'",
+        "connect-src 'none'" if episode else "connect-src 'self'",
+    ]
+    return Template(_text("assets/index.html")).substitute(
+        policy="; ".join(policy),
+        licenses=_text("vendor/LICENSES.txt"),
+        style=style,
+        log=base64.b64encode(log).decode(),
+        episode=base64.b64encode(episode).decode(),
+        scripts="\n".join(f"<script>{script}</script>" for script in scripts),
+    )
+
+
+def _text(name: str) -> str:
+    return files(__package__).joinpath(name).read_text("utf-8")
+
+
+def _hash(text: str) -> str:
+    digest = hashlib.sha256(text.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode()}'"
+
 
 _EPISODE = re.compile(r"/episode/(\d{1,9})")
 _EPISODES_KEPT = 4

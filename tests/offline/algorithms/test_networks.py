@@ -60,6 +60,21 @@ def test_images_go_through_convolutions(shape: tuple[int, ...]) -> None:
     assert network(images(2, shape)).shape == (2, 4)
 
 
+def test_small_images_have_two_convolutions_of_three_pixels() -> None:
+    # 10 -> 8 -> 3 pixels: (10 - 3) / 1 + 1 and (8 - 3) // 2 + 1.
+    network = Network(0, [ImageInput((10, 10, 4))], (6,), Architecture((128,), encoder="nature"))
+    assert weights_of(network) == [(16, 4, 3, 3), (32, 16, 3, 3), (128, 3 * 3 * 32), (6, 128)]
+    assert network(images(5, (10, 10, 4))).shape == (5, 6)
+
+
+def test_a_small_image_and_a_camera_have_their_own_convolutions() -> None:
+    architecture = Architecture((16,), channels=(4, 5, 6), encoder="nature")
+    network = Network(0, [ImageInput((36, 36, 1)), ImageInput((8, 9, 2))], (2,), architecture)
+    kernels = [shape for shape in weights_of(network) if len(shape) == 4]
+    assert kernels == [(4, 1, 8, 8), (5, 4, 4, 4), (6, 5, 3, 3), (4, 2, 3, 3), (5, 4, 3, 3)]
+    assert network(images(3, (36, 36, 1), (8, 9, 2))).shape == (3, 2)
+
+
 def test_images_and_vector_are_joined_after_one_layer_each() -> None:
     network = Network(
         3, [ImageInput((36, 36, 1)), ImageInput((40, 36, 2))], (4,), Architecture((8, 6))

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 import mcaprl
 from mcaprl.errors import UsageError
 from mcaprl.torch import TransitionDataset, TransitionStream
+from tests.support.paths import GOLDEN
 
 
 def numbered(lengths: list[int], terminated: list[bool] | None = None) -> mcaprl.Dataset:
@@ -146,7 +147,20 @@ def test_pickles_are_equal_and_shared() -> None:
     assert torch.equal(copy[:]["reward"], data[:]["reward"])
 
 
-@pytest.mark.parametrize(("method", "count"), [("fork", 2), ("spawn", 1)])
+def test_images_on_disk_are_sent_as_the_paths_of_whole_logs(tmp_path: Path) -> None:
+    log = tmp_path / "image.mcap"
+    mcaprl.open(GOLDEN / "image.mcap").save(log, compression="none")
+    data = mcaprl.open(log, images="mapped")
+    assert data.storage != "memory"
+    pickled = pickle.dumps(TransitionDataset(data))
+    assert torch.equal(
+        pickle.loads(pickled)[0]["observation"], TransitionDataset(log)[0]["observation"]
+    )
+    with pytest.raises(UsageError, match="images on disk cannot be sent to another process"):
+        pickle.dumps(TransitionDataset(data.filter(lambda episode: True)))
+
+
+@pytest.mark.parametrize(("method", "count"), [("fork", 2), ("spawn", 1), ("forkserver", 1)])
 def test_workers_read_all_items(method: str, count: int, log_path: Path) -> None:
     numbered([40, 30, 50]).save(log_path)
     data = TransitionDataset(log_path)

@@ -174,14 +174,46 @@ def test_a_mask_of_another_length_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shape", "says"),
-    [((35, 84, 1), r"36x36.*\(35, 84, 1\)"), ((4, 84, 84), r"\(height, width, channels\)")],
+    ("shape", "seen"),
+    [
+        ((35, 84, 1), (35, 84, 1)),
+        ((8, 8, 3), (8, 8, 3)),
+        ((10, 10), (10, 10, 1)),
+        ((10, 10, 16), (10, 10, 16)),
+        ((10, 12, 12), (10, 12, 12)),
+        ((4, 84, 84), (84, 84, 4)),
+        ((12, 84, 96), (84, 96, 12)),
+        ((3, 8, 9), (8, 9, 3)),
+        ((7, 7, 3), None),
+        ((4, 7, 7), None),
+        ((64,), None),
+    ],
 )
-def test_images_too_small_for_the_convolutions_are_refused(
-    shape: tuple[int, ...], says: str
+def test_images_are_small_or_have_their_channels_first(
+    shape: tuple[int, ...], seen: tuple[int, ...] | None
 ) -> None:
-    with pytest.raises(SpaceError, match=says):
-        ObservationEncoder(spaces.Box(0, 255, shape, np.uint8), 2)
+    encoder = ObservationEncoder(spaces.Box(0, 255, shape, np.uint8), 2)
+    assert [image.shape for image in encoder.image_inputs] == ([] if seen is None else [seen])
+
+
+def test_images_with_channels_first_are_those_with_channels_last() -> None:
+    last = batch(spaces.Box(0, 255, (9, 8, 3), np.uint8), rows=5)
+    first = np.moveaxis(last, -1, 1)
+    encoders = []
+    for images in (last, first):
+        encoder = ObservationEncoder(spaces.Box(0, 255, images.shape[1:], np.uint8), 2)
+        encoder.center_images(images)
+        encoders.append(encoder)
+    encoded = [
+        encoder.encode(images).images[0]
+        for encoder, images in zip(encoders, (last, first), strict=True)
+    ]
+    assert torch.equal(encoded[0], encoded[1])
+    inputs = [encoder.image_inputs[0] for encoder in encoders]
+    assert inputs[0].shift is not None
+    assert inputs[1].shift is not None
+    np.testing.assert_array_equal(inputs[0].shift, inputs[1].shift)
+    assert inputs[0].scale == inputs[1].scale
 
 
 @pytest.mark.parametrize("shape", [(2,), (3, 3), (3, 1, 2), ()])

@@ -209,7 +209,7 @@ def test_progress_is_that_of_one_training(data: Dataset, tmp_path: Path) -> None
 def test_a_budget_ends_the_run_with_a_policy(data: Dataset, tmp_path: Path) -> None:
     run = tmp_path / "run"
     config = replace(CONFIG, updates=100_000, log_interval=50, checkpoint_interval=50)
-    choice, _ = select(data, config, run, budget_minutes=0.15)
+    choice, _ = select(data, replace(config, budget_minutes=0.15), run)
     assert not choice.complete
     assert "--budget-minutes" in choice.advice[0]
     assert 0 < max(updates(run).values()) < 100_000
@@ -229,7 +229,7 @@ def test_checkpoints_meet_the_end_of_the_short_training() -> None:
 
 def test_a_budget_without_time_for_a_checkpoint_is_one_line(data: Dataset, tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="give more minutes") as caught:
-        select(data, CONFIG, tmp_path / "run", budget_minutes=1e-9)
+        select(data, replace(CONFIG, budget_minutes=1e-9), tmp_path / "run")
     assert "\n" not in str(caught.value)
 
 
@@ -240,6 +240,14 @@ def test_other_settings_or_data_cannot_resume(data: Dataset, finished: Path) -> 
         select(log(41), CONFIG, finished, seeds=2, resume=True)
     with pytest.raises(OutputExistsError, match="choose another folder"):
         select(data, CONFIG, finished, seeds=2)
+
+
+def test_growing_logs_are_refused(data: Dataset, tmp_path: Path) -> None:
+    data.save(tmp_path / "log.mcap")
+    growing = mcaprl.open(tmp_path / "log.mcap", follow=True)
+    with pytest.raises(UsageError, match="--follow is not for --algo auto"):
+        mcaprl.train(growing, tmp_path / "run", algo="auto")
+    assert not (tmp_path / "run").exists()
 
 
 def test_one_episode_is_refused(tmp_path: Path) -> None:
@@ -263,11 +271,11 @@ def test_auto_in_the_api_with_a_report(data: Dataset, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"algo": "bc", "budget_minutes": 1}, "--budget-minutes is not for --algo bc"),
-        ({"algo": "cql", "report": "page"}, "--report is not for --algo cql"),
+        ({"algo": "bc", "budget_minutes": 1}, "bc has no setting --budget-minutes"),
+        ({"algo": "cql", "report": "page"}, "cql has no setting --report"),
         ({"algo": "auto", "other_data": True}, "--other-data is not for --algo auto"),
-        ({"algo": "auto", "follow": True}, "--follow is not for --algo auto"),
-        ({"algo": "auto", "budget_minutes": 0}, "--budget-minutes 0: give a number above 0"),
+        ({"algo": "auto", "ray": True}, "--ray is not for --algo auto"),
+        ({"algo": "auto", "budget_minutes": 0}, "budget_minutes must be above 0, got 0"),
         ({"algo": "auto", "frame_stack": 2}, "frame_stack must be 1 for auto, got 2"),
         ({"algo": "auto", "survivors": 0}, "survivors must be at least 1"),
         ({"algo": "auto", "finalists": "iql,ppo"}, "unknown candidate 'ppo'"),

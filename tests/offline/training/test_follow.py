@@ -18,9 +18,9 @@ from mcaprl.errors import LogError
 from mcaprl.offline.algorithms.config import CQLConfig
 from mcaprl.offline.algorithms.cql import CQL
 from mcaprl.offline.batches.buffer import TransitionBuffer
-from mcaprl.offline.training.follow import CHECK_INTERVAL, GrowingLogs, with_more_data
-from mcaprl.offline.training.train import train
+from mcaprl.offline.training.train import CHECK_INTERVAL, train, with_more_data
 from mcaprl.progress import TrainingProgress
+from mcaprl.recorder.dataset.open import GrowingLogs
 from mcaprl.runs import read_curve
 from mcaprl.sims.evaluation.rollout import EpsilonGreedy, run_episode
 from tests.support.paths import ROOT
@@ -44,6 +44,11 @@ class Recorder:
             self.seed += 1
 
 
+def grows(logs: GrowingLogs) -> bool:
+    before = logs.dataset
+    return logs.grow() is not before
+
+
 def test_each_finished_episode_is_read_once(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "log.mcap")
     recorder.record(2)
@@ -51,13 +56,13 @@ def test_each_finished_episode_is_read_once(tmp_path: Path) -> None:
     recorder.env.step(0)
     logs = GrowingLogs([tmp_path / "log.mcap"])
     assert len(logs.dataset.episodes) == 2
-    assert not logs.grow()
+    assert not grows(logs)
     recorder.record(3)
-    assert logs.grow()
-    assert not logs.grow()
+    assert grows(logs)
+    assert not grows(logs)
     recorder.env.close()
     # Closing adds no episode: the first reset of `record` had ended the episode of seed 99.
-    assert not logs.grow()
+    assert not grows(logs)
     whole = mcaprl.open(tmp_path / "log.mcap")
     assert [len(e.rewards) for e in logs.dataset.episodes] == [
         len(e.rewards) for e in whole.episodes
@@ -76,8 +81,8 @@ def test_a_compacted_log_is_not_read_twice(tmp_path: Path) -> None:
     recorder.record(3)
     recorder.env.close()
     assert path.stat().st_ino != before
-    assert logs.grow()
-    assert not logs.grow()
+    assert grows(logs)
+    assert not grows(logs)
     whole = mcaprl.open(path)
     assert len(whole.episodes) == 9
     np.testing.assert_array_equal(logs.dataset.observations, whole.observations)
@@ -86,7 +91,7 @@ def test_a_compacted_log_is_not_read_twice(tmp_path: Path) -> None:
     copy.write_bytes(path.read_bytes())
     logs._counts[path], logs._ends_ns[path] = 8, whole.episodes[7].summary.end_time_ns
     copy.replace(path)
-    assert logs.grow()
+    assert grows(logs)
 
 
 def test_a_replaced_log_is_an_error(tmp_path: Path) -> None:
@@ -110,10 +115,10 @@ def test_new_files_are_read(tmp_path: Path) -> None:
     logs = GrowingLogs([tmp_path])
     before = logs.dataset.rewards.sum()
     second = Recorder(tmp_path / "a.mcap")
-    assert not logs.grow()
+    assert not grows(logs)
     second.record(2)
     first.record(1)
-    assert logs.grow()
+    assert grows(logs)
     assert len(logs.dataset.episodes) == 4
     # Episodes read earlier keep their numbers.
     assert logs.dataset.episodes[0].rewards.sum() == before
@@ -135,7 +140,7 @@ def test_a_learner_continues_with_the_same_state(tmp_path: Path) -> None:
         learner.update()
     recorder.record(5)
     recorder.env.close()
-    assert logs.grow()
+    assert grows(logs)
     grown = with_more_data(learner, logs.dataset, np.array([3]))
     assert (grown.step, grown.seeds) == (10, (0, 1))
     for seed in (0, 1):
@@ -151,18 +156,16 @@ def test_a_learner_continues_with_the_same_state(tmp_path: Path) -> None:
 def test_new_episodes_are_learned_from(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "log.mcap")
     recorder.record(3)
-    logs = GrowingLogs([tmp_path / "log.mcap"])
-    seen: list[int] = []
+    data = mcaprl.open(tmp_path / "log.mcap", follow=True)
+    assert data.grow() is data
 
     def report(now: TrainingProgress) -> None:
-        seen.append(len(logs.dataset.episodes))
         if now.done == 200:
             recorder.record(4)
 
-    train(logs.dataset, SMALL, tmp_path / "run", follow=logs, progress=report)
+    train(data, SMALL, tmp_path / "run", progress=report)
     recorder.env.close()
     per_check = CHECK_INTERVAL // SMALL.log_interval
-    assert seen == [3] * per_check + [7] * per_check
     whole = np.cumsum(mcaprl.open(tmp_path / "log.mcap").episode_lengths)
     metrics = read_curve(tmp_path / "run" / "seed-0" / "metrics.csv")
     assert metrics["transitions"].tolist() == [whole[2]] * per_check + [whole[6]] * per_check

@@ -578,12 +578,13 @@ def test_other_data_are_accepted_on_request(tmp_path: Path) -> None:
 def test_weights_are_part_of_the_data(tmp_path: Path) -> None:
     data = crossing()
     weights = np.array([1.0, 2.0, 1.0])
-    train(data, SHORT_CQL, tmp_path / "run", weights=weights, progress=silent)
-    train(data, SHORT_CQL, tmp_path / "run", weights=weights, resume=True, progress=silent)
+    weighted = data.with_weights(weights)
+    train(weighted, SHORT_CQL, tmp_path / "run", progress=silent)
+    train(weighted, SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
     with pytest.raises(TrainingError, match="other data"):
         train(data, SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
     with pytest.raises(UsageError, match="3 numbers of at least 0"):
-        train(data, SHORT_CQL, tmp_path / "other", weights=-weights, progress=silent)
+        data.with_weights(-weights)
 
 
 @pytest.mark.parametrize("leave", [True, False])

@@ -19,7 +19,7 @@ from mcap.records import ChunkIndex
 
 import mcaprl
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns.chunk_indexes import (
+from mcaprl.recorder.columns.chunks import (
     ChunkIndexes,
     chunk_index_record,
     indexes_of_one,

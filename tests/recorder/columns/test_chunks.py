@@ -7,8 +7,8 @@ import zstandard
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.columns import chunks
-from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.chunks import ChunkHeader, Scratch, chunk_records
+from mcaprl.recorder.columns.records import crc32
 
 RECORDS = bytes(range(256)) * 40_000
 """10 MB, more than the window of a frame without a size."""

@@ -19,7 +19,7 @@ from mcap.records import ChunkIndex
 import mcaprl
 from mcaprl.errors import LogError
 from mcaprl.files import is_at, try_lock
-from mcaprl.recorder.columns import compact, file_lock
+from mcaprl.recorder.columns import file_lock, output
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.repair.check import check_log
 from tests.recorder.repair.test_faults_writes import FailingFile, failing
@@ -57,7 +57,7 @@ def test_all_messages_stay(
 
     other = log_path.with_name("small.mcap")
     write(log_path)
-    monkeypatch.setattr(compact, "_MIN_CHUNKS_SAVED", 10**9)
+    monkeypatch.setattr(output, "_MIN_CHUNKS_SAVED", 10**9)
     write(other)
     assert messages_of(log_path) == messages_of(other)
     assert attachments_of(log_path) == attachments_of(other)
@@ -72,7 +72,7 @@ def chunk(number: int, size: int, *channels: int) -> ChunkIndex:
 
 
 def groups(*chunks: ChunkIndex) -> list[list[int]]:
-    return [[c.chunk_start_offset for c in group] for group in compact.groups_of(chunks)]
+    return [[c.chunk_start_offset for c in group] for group in output.groups_of(chunks)]
 
 
 def test_only_small_chunks_of_one_kind_are_merged() -> None:
@@ -105,10 +105,10 @@ def test_channels_are_of_one_kind_if_chunks_connect_them() -> None:
 
 def test_nothing_worth_rewriting_is_left(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copies: list[Path] = []
-    monkeypatch.setattr(compact._CompactedFile, "copy", lambda out, *_: copies.append(out.path))
+    monkeypatch.setattr(output._CompactedFile, "copy", lambda out, *_: copies.append(out.path))
     write_log(log_path, 3)
     assert not copies
-    monkeypatch.setattr(compact, "_MAX_BYTES_PER_CHUNK", 1)
+    monkeypatch.setattr(output, "_MAX_BYTES_PER_CHUNK", 1)
     write_log(log_path, 20, overwrite=True)
     assert not copies
 
@@ -166,7 +166,7 @@ def test_killed_while_compacting(log_path: Path, writes: int) -> None:
     code = """
         import os, signal, sys
         from pathlib import Path
-        from mcaprl.recorder.columns.compact import _CompactedFile
+        from mcaprl.recorder.columns.output import _CompactedFile
         from tests.support.damage.faults import write_log
         write, left = _CompactedFile._write, int(sys.argv[2])
         def dying(out, *parts):

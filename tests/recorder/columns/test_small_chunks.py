@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 import mcaprl
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns import compact
+from mcaprl.recorder.columns import output
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY
 from mcaprl.recorder.columns.reader import McapReader
 from tests.support.recordings import MIXED_SPACE, ScriptedEnv, record
@@ -27,7 +27,7 @@ def test_merged_or_not(
     record(log_path, MIXED_SPACE, spaces.Discrete(2), LENGTHS, compression=compression)
     merged, chunks = mcaprl.open(log_path, threads=threads, images="memory"), _chunks(log_path)
     assert [episode.length for episode in merged.episodes] == LENGTHS
-    monkeypatch.setattr(compact, "_MIN_CHUNKS_SAVED", 10**9)
+    monkeypatch.setattr(output, "_MIN_CHUNKS_SAVED", 10**9)
     record(
         log_path,
         MIXED_SPACE,

@@ -147,6 +147,25 @@ def test_actions_that_the_mask_forbids_are_found() -> None:
     assert problem.severity == "problem"
 
 
+def test_joint_actions_that_the_mask_forbids_are_found() -> None:
+    # The actions have the numbers 0, 4 and 5, of 2 x 3; each mask forbids number 4.
+    mask = np.array([[1, 1, 1, 1, 0, 1]] * 4, np.int8)
+    found = lint(
+        Dataset.from_arrays(
+            observations={"action_mask": mask[:3], "x": np.arange(3.0)},
+            next_observations={"action_mask": mask[1:], "x": np.arange(1, 4.0)},
+            actions=[[0, 0], [1, 1], [1, 2]],
+            rewards=[1, 2, 3],
+            terminated=[False, False, True],
+            truncated=[False] * 3,
+            action_space=spaces.MultiDiscrete([2, 3]),
+        )
+    )
+    (problem,) = [one for one in found if "forbids" in one.what]
+    assert problem.what == "1 action that the log's own action_mask forbids"
+    assert problem.where == "episode 0 step 1"
+
+
 @pytest.mark.parametrize(
     ("space", "wrong"),
     [

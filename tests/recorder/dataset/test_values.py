@@ -51,6 +51,8 @@ IMPOSSIBLE: list[tuple[str, Any, str]] = [
     ("actions", np.array([0, 2**63, 0], np.uint64), "action 9223372036854775808 in row 1 is too"),
     ("actions", np.array([0, 1, 2**20]), "action 1048576 in row 2 is too large"),
     ("actions", ["a", "b", "c"], "actions has dtype <U1"),
+    ("actions", np.array([0.5, 1, np.nan]), "actions: row 2 is nan, which is not finite"),
+    ("actions", np.array([[0.5], [-np.inf], [1]]), "actions: row 1 is -inf, which is not finite"),
     ("observations", np.array([["a"], ["b"], ["c"]]), "array of <U1"),
     ("next_observations", np.zeros((3, 1), object), "next_observations has dtype object"),
 ]

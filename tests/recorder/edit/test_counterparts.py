@@ -23,7 +23,7 @@ from rosbags.highlevel import AnyReader
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns.chunk_indexes import chunk_index_record
+from mcaprl.recorder.columns.chunks import chunk_index_record
 from mcaprl.recorder.columns.reader import McapReader
 from tests.conftest import need
 from tests.recorder.edit.contents import messages_of

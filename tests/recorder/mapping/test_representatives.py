@@ -177,7 +177,7 @@ def test_a_trained_policy_has_the_commands(tmp_path: Path) -> None:
         "episodes": {"max_steps": 10},
     }
     run = tmp_path / "run"
-    mcaprl.train(bag, algo="bc", updates=2, seeds=1, out=run, mapping=mapping)
+    mcaprl.train(mcaprl.open(bag, mapping=mapping), algo="bc", updates=2, seeds=1, out=run)
     policy = mcaprl.load_policy(run)
     assert policy.action_commands == ActionCommands(("/cmd.data",), ((0.0,), (1.0,), (2.0,)))
     saved = json.loads((run / "mapping.json").read_text())

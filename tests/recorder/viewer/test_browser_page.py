@@ -33,8 +33,7 @@ from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.display import SCENE
 from mcaprl.recorder.viewer.annotate import annotated_copy
 from mcaprl.recorder.viewer.page import server
-from mcaprl.recorder.viewer.page.episode_data import LogPage
-from mcaprl.recorder.viewer.page.packed import pack
+from mcaprl.recorder.viewer.page.episode_data import LogPage, pack
 from mcaprl.recorder.viewer.scene_reader import moments_of_episode
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.scene import Frame, Shape, yaw_rotation

@@ -32,7 +32,7 @@ from mcaprl.recorder.record.layout import layout_of
 from mcaprl.recorder.viewer.live_stream import LiveStep, LiveStream
 from mcaprl.recorder.viewer.log_layout import layout_of_log
 from mcaprl.recorder.viewer.playback import Played, Player, Track
-from mcaprl.recorder.viewer.prefix import prefixed_message, prefixes_of, side_by_side
+from mcaprl.recorder.viewer.player_server import prefixed_message, prefixes_of, side_by_side
 from mcaprl.sims import make_sim
 from tests.conftest import need
 from tests.support.paths import NODE
@@ -381,7 +381,7 @@ class Channels:
 
 
 def test_live_messages_are_sent_at_their_times() -> None:
-    from mcaprl.recorder.viewer.live_sink import LiveSink
+    from mcaprl.recorder.viewer.live_stream import LiveSink
 
     viewers: Any = Channels()
     sink = LiveSink(viewers, ["/scene"])

@@ -18,8 +18,7 @@ from gymnasium import spaces
 from mcaprl import limits
 from mcaprl.errors import UsageError
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.viewer.foxglove_server import HOST, _hidden_host
-from mcaprl.recorder.viewer.origin_filter import VIEWER_ORIGINS, is_allowed
+from mcaprl.recorder.viewer.foxglove_server import HOST, VIEWER_ORIGINS, _hidden_host, is_allowed
 from mcaprl.recorder.viewer.playback import Player, Track
 from mcaprl.recorder.viewer.player_server import MAX_SPEED, LiveServer
 from tests.support.recordings import record

@@ -17,8 +17,8 @@ from gymnasium import spaces
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import UsageError
-from mcaprl.sims.evaluation import limits
-from mcaprl.sims.evaluation.limits import (
+from mcaprl.sims.evaluation import rollout
+from mcaprl.sims.evaluation.rollout import (
     DEFAULT_MAX_STEPS,
     StepLimit,
     make_limited,
@@ -45,7 +45,7 @@ class Endless(gym.Env[Any, Any]):
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(limits, "DEFAULT_MAX_STEPS", 70)
+    monkeypatch.setattr(rollout, "DEFAULT_MAX_STEPS", 70)
     gym.register("Endless-v0", cast(Any, Endless), disable_env_checker=True)
     gym.register("Ending-v0", cast(Any, Endless), disable_env_checker=True, max_episode_steps=20)
     yield

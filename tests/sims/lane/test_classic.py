@@ -18,15 +18,7 @@ from mcaprl.sims.lane.classic import (
 )
 from mcaprl.sims.lane.course import COURSE
 from mcaprl.sims.lane.env import LaneKeepingEnv
-from mcaprl.sims.lane.rules import (
-    BRAKE,
-    COLLISION,
-    DRIVING,
-    LOW_REWARD,
-    OFF_LANE,
-    SLOW,
-    located,
-)
+from mcaprl.sims.lane.rules import BRAKE, COLLISION, DRIVING, LOW_REWARD, OFF_LANE, SLOW, located
 
 STRAIGHT, RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT = range(1, 6)
 

@@ -10,16 +10,19 @@ import pytest
 
 from mcaprl.sims import make_sim
 from mcaprl.sims.geometry.vectors import Vector
-from mcaprl.sims.powerline.classic import (
+from mcaprl.sims.powerline.course import LEG_LENGTHS_M, LENGTH_M, POINTS_M, TANGENTS, point_on_line
+from mcaprl.sims.powerline.env import PowerlineEnv
+from mcaprl.sims.powerline.quadrotor import POINT
+from mcaprl.sims.powerline.rules import (
+    COLLISION,
+    FLYING,
+    OFF_LINE,
+    begin,
     classic_decide,
     classic_distance,
     classic_end,
     classic_reward,
 )
-from mcaprl.sims.powerline.course import LEG_LENGTHS_M, LENGTH_M, POINTS_M, TANGENTS, point_on_line
-from mcaprl.sims.powerline.env import PowerlineEnv
-from mcaprl.sims.powerline.quadrotor import POINT
-from mcaprl.sims.powerline.rules import COLLISION, FLYING, OFF_LINE, begin
 
 ZERO = Vector(0.0, 0.0, 0.0)
 NORTH, SOUTH, NOTHING = 0, 3, 6

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaprl.sims.racer.block import step_cars
-from mcaprl.sims.racer.car import car_at, is_beyond, placed
-from mcaprl.sims.racer.course import make_track
+from mcaprl.sims.racer.course import car_at, is_beyond, make_track, placed
 from mcaprl.sims.racer.rays import (
     BLOCK_SIZE,
     FAR_PX,

@@ -13,7 +13,7 @@ from mcaprl.sims import SIMS, DeviceSims, make_device_sims
 from mcaprl.sims.lane.block import step_cars as step_lane_cars
 from mcaprl.sims.lane.rules import Car as LaneCar
 from mcaprl.sims.racer.block import step_cars as step_racer_cars
-from mcaprl.sims.racer.car import Car as RacerCar
+from mcaprl.sims.racer.course import Car as RacerCar
 from mcaprl.sims.racer.course import make_track
 from mcaprl.sims.vehicle.device import draw
 

@@ -113,6 +113,10 @@ class _Reader:
 
     def episode(self, index: int, stored: _Stored) -> EpisodeArrays:
         where = f"{self._path}: episode {index}"
+        parts = zip((leaf.name for leaf in self._leaves), stored.observations, strict=True)
+        for name, values in [*stored.steps.items(), *parts]:
+            if not np.ndim(values):
+                raise LogError(f"{where}: {name} is one value, expected one for each step")
         steps = {name: _column(values) for name, values in stored.steps.items()}
         count = len(steps["rewards"])
         ends = []
