@@ -305,8 +305,10 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     path = folder / CONFIG_NAME
     try:
-        found: dict[str, Any] = read_json(path, TrainingError, dict[str, Any])
-        as_type(_Config, found, str(path))
+        found: dict[str, Any] = read_json(path, TrainingError)
+        if not isinstance(found, dict):
+            raise TrainingError(f"{path} is not a JSON object")
+        as_type(_Config, found)
     except ValueError as error:
         raise TrainingError(f"cannot resume: {path} cannot be read: {error}") from error
     except (FileNotFoundError, TrainingError) as error:

@@ -273,6 +273,11 @@ class _Description:
     mask_from: str = ""
     reward_scale: float = 1.0
 
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.threshold) and 0 < self.reward_scale < math.inf):
+            scale = self.reward_scale
+            raise ValueError(f"threshold {self.threshold} or reward_scale {scale} is impossible")
+
 
 def read_policy(folder: Path) -> Policy:
     """Read the policy of one seed's folder.

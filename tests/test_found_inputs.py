@@ -74,6 +74,8 @@ def test_log_times_whose_differences_overflow(tmp_path: Path, time_ns: int) -> N
     ("change", "reason"),
     [
         ({"env_id": 3}, "env_id must be a text"),
+        ({"threshold": None}, "threshold nan or reward_scale 1.0 is impossible"),
+        ({"reward_scale": 0}, "reward_scale 0.0 is impossible"),
         ({"reward_scale": 10**400}, "reward_scale must be a number"),
         ({"frame_stack": 1e400}, "frame_stack must be a whole number"),
         ({"algo": None}, "algo must be a text"),
