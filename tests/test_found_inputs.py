@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import random
 import shutil
 import zipfile
 from collections.abc import Callable
@@ -16,6 +18,7 @@ from gymnasium import spaces
 
 import mcaprl
 from mcaprl.errors import LogError, McaprlError, PolicyError, TrainingError
+from mcaprl.offline.estimate.values import gamma_of_run
 from mcaprl.offline.selection.choice import read_choice
 from mcaprl.offline.training.curves import curve_panels
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
@@ -25,6 +28,7 @@ from mcaprl.recorder.format.spaces import outside
 from mcaprl.recorder.mapping.suggest.likely_action import box_limits
 from mcaprl.runs import choose_seeds, read_config, saved_updates
 from tests.support.bags import numbers, write_channels
+from tests.support.damage.changed import changed_archive, changed_json
 from tests.support.damage.datasets import dataset
 from tests.support.recordings import record
 
@@ -296,3 +300,24 @@ def test_a_log_at_the_end_of_time_is_not_continued(tmp_path: Path) -> None:
     record(path, space, spaces.Discrete(2), [2], start_time_ns=2**62)
     reason = "log.mcap cannot be appended to: its last log_time is 46116860"
     refused(reason, lambda: record(path, space, spaces.Discrete(2), [2], append=True), LogError)
+
+
+def test_the_discount_of_a_damaged_run(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text('{"config": {"gamma": 0.5')
+    refused("config.json cannot be read: ", lambda: gamma_of_run(tmp_path), PolicyError)
+    (tmp_path / "config.json").write_text('{"config": {"gamma": 1}}')
+    assert gamma_of_run(tmp_path) == 1.0
+
+
+def test_changes_keep_the_form_of_a_file(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", x=np.zeros(3))
+    archive, text = (tmp_path / "a.npz").read_bytes(), b'{"a": {"b": [1, 2]}, "c": 0}'
+    new = [changed_json(text, random.Random(seed)) for seed in range(200)]
+    # Keys are repeated, left out and added, and values are replaced.
+    assert any(each.count(b'"c"') == 2 for each in new)
+    assert any(b'"b"' not in each and b'"c"' in each for each in new)
+    assert sum(b"9" * 400 in each for each in new) > 2
+    assert len(set(new)) > 100
+    for seed in range(50):
+        out = changed_archive(archive, random.Random(seed))
+        assert zipfile.ZipFile(io.BytesIO(out)).testzip() is None
