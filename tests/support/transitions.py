@@ -31,14 +31,10 @@ def same_transitions(found: Dataset, data: Dataset, *, probs: bool = True) -> No
         probs: Whether to compare action probabilities.
     """
     assert found.episode_lengths.tolist() == data.episode_lengths.tolist()
-    names = [
-        "actions",
-        "rewards",
-        "terminated",
-        "truncated",
-        *(["behavior_probs"] if probs else []),
-    ]
-    for name in names:
+    is_index = data.actions.ndim == 1 and data.actions.dtype.kind in "iu"
+    same_bits(found.actions, data.actions.astype(np.int64) if is_index else data.actions)
+    names = ["rewards", "terminated", "truncated"]
+    for name in [*names, "behavior_probs"] if probs else names:
         same_bits(getattr(found, name), getattr(data, name))
     mine, theirs = leaves_of(found.observation_space), leaves_of(data.observation_space)
     for leaf, other in zip(mine, theirs, strict=True):

@@ -248,7 +248,7 @@ class _Steps:
         if len(cut) and not self._breaks[cut].any():
             yield (
                 f"next_observations are those of the following row, also at the ends of"
-                f" {counted(len(cut), 'truncated episode')}: there, they are of another episode"
+                f" {counted(len(cut), 'truncated episode')}: there, they may be of another episode"
             )
 
     def _is_left_out(self, row: int) -> bool:

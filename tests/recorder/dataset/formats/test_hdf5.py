@@ -86,6 +86,7 @@ def test_the_arrays_are_those_of_d4rl(tmp_path: Path) -> None:
         }
 
 
+@pytest.mark.filterwarnings("ignore:.*may be of another episode")
 @settings(max_examples=30)
 @given(given_arrays=transitions())
 def test_any_transitions_come_back(given_arrays: dict[str, Any]) -> None:
