@@ -179,7 +179,7 @@ def check_lacks(path: FieldPath, values: Sequence[Any], *, optional: bool) -> No
     """Check that a field has a value in any message; `optional` permits arrays without elements.
 
     Raises:
-        UsageError: All messages lack the field; the message says why.
+        UsageError: No message has the field; the error says why.
     """
     lacks = [value for value in values if isinstance(value, Lack)]
     if not lacks or any(value is not None and not isinstance(value, Lack) for value in values):

@@ -133,7 +133,7 @@ def warn_of_cuts(results: Iterable[EpisodeResult], policy: str, sim: str) -> Non
 
 
 def _default_of(name: str, kwargs: dict[str, Any]) -> int | None:
-    """Return the default limit of an environment; None if it has a time limit."""
+    """Return the default limit on steps; None if the environment has a time limit itself."""
     options = {key: value for key, value in kwargs.items() if key != "autoreset_mode"}
     env = make_limited(name, None, **options)
     env.close()

@@ -377,7 +377,7 @@ def head_of(size: int, *lines: str, status: str = "200 OK") -> bytes:
     return "\r\n".join([*every, "", ""]).encode()
 
 
-def test_a_range_answer_that_does_not_end_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_range_answer_without_end_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     sent = [0]
 
     def answer(connection: socket.socket, head: bytes) -> None:

@@ -175,7 +175,7 @@ def test_fault_a_whole_lap_scores_far_below_leaving_at_once() -> None:
     assert score < 5 * -3.0
 
 
-def test_fault_speed_is_hardly_rewarded() -> None:
+def test_fault_a_high_speed_hardly_adds_to_the_reward() -> None:
     """A speed of 30 instead of 10 m/s adds 0.069 per second; an offset of 2.4 cm costs more."""
     gain = classic_reward(0.0, 30.0) - classic_reward(0.0, 10.0)
     assert gain == pytest.approx(20.0 / 290.0)
