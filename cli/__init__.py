@@ -68,11 +68,7 @@ for _command in _COMMANDS:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the program and exit.
-
-    Args:
-        arguments: Command-line arguments; default: `sys.argv[1:]`.
-    """
+    """Run the program and exit."""
     # SIGTERM and SIGHUP act like Ctrl-C, so that a recording closes its file. A signal that is
     # ignored, such as SIGHUP under nohup, stays ignored.
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):

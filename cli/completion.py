@@ -18,12 +18,7 @@ class Name(click.ParamType[str]):
     name = "text"
 
     def __init__(self, names: Callable[[], Iterable[str]], *, is_path: bool = False) -> None:
-        """Create the type.
-
-        Args:
-            names: Function that returns the known names.
-            is_path: Whether the text may also be a path.
-        """
+        """Create the type."""
         self._names, self._is_path = names, is_path
 
     def shell_complete(

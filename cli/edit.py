@@ -114,11 +114,7 @@ def _show(results: list[Edited], as_json: bool) -> None:
 
 
 def _bounds(option: str, text: str) -> tuple[float | None, float | None]:
-    """Parse A:B; an empty bound is None.
-
-    Raises:
-        UsageError: The text does not have the form A:B, or a bound is not a number.
-    """
+    """Parse A:B; an empty bound is None."""
     parts = text.split(":")
     if len(parts) != 2:
         raise UsageError(f"--{option} is '{text}', expected A:B, such as 100:200")

@@ -102,9 +102,6 @@ def env_arguments(texts: Iterable[str]) -> dict[str, Any] | None:
 
     >>> env_arguments(["continuous=false", "map_name=8x8", 'config={"lanes": 2}'])
     {'continuous': False, 'map_name': '8x8', 'config': {'lanes': 2}}
-
-    Raises:
-        UsageError: A text has another form, or a key is given twice.
     """
     found: dict[str, Any] = {}
     for text in texts:

@@ -39,11 +39,7 @@ def hint(text: str) -> None:
 
 
 def working(text: str) -> AbstractContextManager[ProgressBar]:
-    """Show on a terminal that a command is working, until the command opens a progress bar.
-
-    Args:
-        text: What the command does first, such as `reading data`.
-    """
+    """Show on a terminal that a command is working, until the command opens a progress bar."""
     return nullcontext(no_progress) if _is_quiet() else terminal_wait(text)
 
 
@@ -54,12 +50,7 @@ def training_progress(unit: str, *terms: str) -> AbstractContextManager[Progress
 
 @contextmanager
 def keeping(text: str, proof: Path | None = None) -> Iterator[None]:
-    """Context manager that adds what is kept to the message of an interruption.
-
-    Args:
-        text: What is kept, such as `finished episodes are kept`.
-        proof: File that must exist for the text to be true; None if it is always true.
-    """
+    """Context manager that adds what is kept to the message of an interruption."""
     try:
         yield
     except KeyboardInterrupt as error:

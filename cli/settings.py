@@ -21,14 +21,7 @@ class SettingsCommand(Command):
         tuned: Callable[[], Mapping[str, Mapping[str, Any]]] = dict,
         **others: Any,
     ) -> None:
-        """Create the command.
-
-        Args:
-            *arguments: Arguments of `Command`.
-            configs: Function that loads the algorithms, and returns the default settings of each.
-            tuned: Function that returns, for each sim, the settings that differ from the defaults.
-            **others: Arguments of `Command`.
-        """
+        """Create the command."""
         super().__init__(*arguments, **others)
         self._configs, self._tuned = configs, tuned
 

@@ -21,11 +21,7 @@ _postponed_since: float | None = None
 
 
 def raise_interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, or postpone the signal; this is a signal handler.
-
-    Raises:
-        KeyboardInterrupt: The interrupted code can raise it.
-    """
+    """Raise KeyboardInterrupt, or postpone the signal; this is a signal handler."""
     if not is_postponed(number, frame):
         raise KeyboardInterrupt
 

@@ -51,11 +51,7 @@ class JointActions:
 
     @classmethod
     def of(cls, space: spaces.Space[Any]) -> JointActions:
-        """Return the numbering of a space.
-
-        Raises:
-            TypeError: The space is not Discrete, MultiDiscrete or MultiBinary.
-        """
+        """Return the numbering of a space."""
         match space:
             case spaces.Discrete():
                 sizes, starts = np.array([space.n]), np.array([space.start])
@@ -146,11 +142,7 @@ def has_source(space: spaces.Space[Any] | None) -> bool:
 
 
 def masked(observation: Any, info: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Return one observation of an environment with its mask from a source.
-
-    Raises:
-        PolicyError: The environment returned no such info, or the observation has no such part.
-    """
+    """Return one observation of an environment with its mask from a source."""
     name = info_name(source)
     found: Any = observation if name is None else info
     for key in source.split("/") if name is None else name.split("."):

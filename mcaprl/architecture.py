@@ -61,14 +61,7 @@ SMALL_EDGE: Final = 36
 
 
 def choose_encoder(name: str, widths: Sequence[int], channels: Iterable[int]) -> str:
-    """Return the encoder that a setting selects.
-
-    Args:
-        name: Setting: `auto` or a key of `ENCODERS`.
-        widths: Output channels of the convolutions, or empty. If given, `auto` selects the encoder
-            with the same number of convolutions.
-        channels: Number of channels of each image, before frames are stacked.
-    """
+    """Return the encoder that a setting selects."""
     if name != AUTO:
         return name
     if widths:
@@ -112,11 +105,7 @@ class Architecture:
 
 
 def architecture_of(found: Mapping[str, Any]) -> Architecture:
-    """Return the architecture that a file describes.
-
-    Args:
-        found: JSON object with the fields of `Architecture`.
-    """
+    """Return the architecture that a file describes."""
     lists = {key: tuple(value) for key, value in found.items() if isinstance(value, list)}
     return Architecture(**{**found, **lists})
 
@@ -150,10 +139,6 @@ class NetworkSettings(Settings):
         self._require("channels", fits or not self.channels, allowed)
 
     def architecture_for(self, channels: Iterable[int]) -> Architecture:
-        """Return the architecture of the networks.
-
-        Args:
-            channels: Number of channels of each image observation, without frame stacking.
-        """
+        """Return the architecture of the networks."""
         encoder = choose_encoder(self.encoder, self.channels, channels)
         return Architecture(self.hidden, self.channels, self.layer_norm, encoder=encoder)

@@ -52,11 +52,6 @@ def ready(
     A normal call inspects the type of each argument. For a single vehicle, this takes as long as
     the step itself. This function inspects the types once. The contents of the bound arrays may
     change, but not their shape or memory.
-
-    Args:
-        function: Compiled function.
-        *arguments: First arguments, which each call reuses.
-        examples: Example values of the arguments that each call passes; only the types matter.
     """
     if not isinstance(function, numba.core.dispatcher.Dispatcher):
         return partial(function, *arguments)
@@ -79,12 +74,6 @@ def ready_at(
 
     For each array that is passed in a call, numba checks its type and counts a reference. For four
     arrays, this takes nearly as long as computing a car's step.
-
-    Args:
-        function: Compiled function. Its first argument is the bound arrays, for `array_at`.
-        arrays: Arrays, contiguous in C order.
-        *constants: Next arguments, numbers.
-        examples: Example values of the arguments that each call passes; only the types matter.
     """
     if not isinstance(function, numba.core.dispatcher.Dispatcher):
         return partial(function, arrays, *constants)
@@ -96,14 +85,7 @@ def ready_at(
 
 
 def array_at(arrays: Arrays, k: int, shape: tuple[int, ...], kind: DTypeLike) -> NDArray[Any]:
-    """Return array k of those that `ready_at` bound; for compiled functions.
-
-    Args:
-        arrays: First argument of the compiled function.
-        k: Index of the array.
-        shape: Shape of the array.
-        kind: NumPy type of the array.
-    """
+    """Return array k of those that `ready_at` bound; for compiled functions."""
     # Without compilation, `ready_at` binds the arrays themselves.
     return cast(NDArray[Any], arrays[k])
 
@@ -179,11 +161,6 @@ def _replace_conversion() -> None:
 
 def _box_named_tuple(kind: Any, value: Any, context: Any) -> Any:
     """Return code that converts a NamedTuple to an object and runs no Python code.
-
-    Args:
-        kind: numba's type of the NamedTuple.
-        value: LLVM value of the NamedTuple.
-        context: numba's context of the conversion.
 
     Returns:
         LLVM value of the pointer to the object.

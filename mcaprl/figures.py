@@ -45,17 +45,7 @@ _SVG_STYLE: Final = {"svg.fonttype": "none", "svg.hashsalt": "mcaprl"}
 def new_figure(
     size: tuple[float, float], rows: int = 1, columns: int = 1, *, grid: bool = False
 ) -> tuple[Any, Any]:
-    """Create a figure and its axes, without a display and without global state.
-
-    Args:
-        size: Width and height, inches.
-        rows: Number of rows of axes.
-        columns: Number of columns of axes.
-        grid: Whether the axes are always an array (rows, columns), even if there is only one.
-
-    Raises:
-        MissingExtraError: Matplotlib is not installed.
-    """
+    """Create a figure and its axes, without a display and without global state."""
     matplotlib = import_extra("matplotlib", "report")
     figure_type = import_extra("matplotlib.figure", "report").Figure
     with matplotlib.rc_context(_STYLE):
@@ -64,11 +54,7 @@ def new_figure(
 
 
 def save_png(figure: Any, path: Path) -> None:
-    """Write a figure on a white background; create the folder if needed.
-
-    Raises:
-        ReportError: The file cannot be written.
-    """
+    """Write a figure on a white background; create the folder if needed."""
     matplotlib = import_extra("matplotlib", "report")
     _make_literal(figure)
     with replacing(path, ReportError) as unfinished, matplotlib.rc_context(_LITERAL):
@@ -92,11 +78,7 @@ class Panel(NamedTuple):
 
 
 def save_panels(path: Path, panels: Sequence[Panel], title: str = "") -> None:
-    """Write panels as one PNG with three columns.
-
-    Raises:
-        ReportError: The file cannot be written.
-    """
+    """Write panels as one PNG with three columns."""
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
     width, height = map(max, zip(*(panel.size for panel in panels), strict=True))

@@ -94,10 +94,6 @@ def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Ite
     """Create a folder if it is missing, and lock it against other writers.
 
     If the folder is new and empty at the end, it is removed.
-
-    Raises:
-        UsageError: The path is a URL.
-        McaprlError: Another process is writing to the folder, or it cannot be created.
     """
     check_local(folder)
     is_new, opened = not folder.exists(), None
@@ -126,16 +122,7 @@ def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Ite
 
 
 def subfolder(path: Path, *, own: bool = False) -> Path:
-    """Create a folder in the folder of an output, if it is missing; return its path.
-
-    Args:
-        path: Path of the folder.
-        own: Whether the folder must belong to this user.
-
-    Raises:
-        OutputExistsError: A symbolic link, a file or the folder of another user is at the path.
-        OSError: The folder cannot be created.
-    """
+    """Create a folder in the folder of an output, if it is missing; return its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with suppress(FileExistsError):
         path.mkdir()
@@ -150,16 +137,7 @@ def subfolder(path: Path, *, own: bool = False) -> Path:
 
 
 def open_own(path: Path, mode: str) -> FileIO:
-    """Open a file of a cache, or create it; follow no symbolic link.
-
-    Args:
-        path: Path of the file.
-        mode: `a` to write at the end, `r+` to read and write; both create the file.
-
-    Raises:
-        OutputExistsError: A symbolic link, or what is not a regular file, is at the path.
-        OSError: The file cannot be opened.
-    """
+    """Open a file of a cache, or create it; follow no symbolic link."""
     flags = {"a": os.O_WRONLY | os.O_APPEND, "r+": os.O_RDWR}[mode]
     flags |= os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     if os.path.lexists(path) and not stat.S_ISREG(path.lstat().st_mode):
@@ -168,14 +146,7 @@ def open_own(path: Path, mode: str) -> FileIO:
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:
-    """Check that a path is new, or belongs to a regular file that may be replaced.
-
-    Raises:
-        OutputExistsError: The file exists and `overwrite` is not set, or the path belongs to a
-            symbolic link, folder, device or FIFO.
-        UsageError: The path is a URL.
-        LogError: Another writer has locked the file, or this program has an open recorder of it.
-    """
+    """Check that a path is new, or belongs to a regular file that may be replaced."""
     check_local(path)
     try:
         mode = path.lstat().st_mode
@@ -196,12 +167,7 @@ def check_target(path: Path, *, overwrite: bool) -> None:
 
 
 def check_writable(path: Path, error_type: type[McaprlError]) -> None:
-    """Check that a file can be written, without writing it; create its folder if it is missing.
-
-    Raises:
-        LogError: Another process is writing the file.
-        McaprlError: The file cannot be written; the type is `error_type`.
-    """
+    """Check that a file can be written, without writing it; create its folder if it is missing."""
     try:
         with work_folder(path):
             pass
@@ -210,11 +176,7 @@ def check_writable(path: Path, error_type: type[McaprlError]) -> None:
 
 
 def check_log_name(path: str | Path) -> Path:
-    """Check that the name of a log to write ends in `.mcap`; return the path.
-
-    Raises:
-        UsageError: It has another suffix, so that folders and globs of logs would not include it.
-    """
+    """Check that the name of a log to write ends in `.mcap`; return the path."""
     path = Path(path)
     if path.suffix != ".mcap":
         raise UsageError(f"{path}: the name of a log must end in .mcap")
@@ -233,18 +195,6 @@ def replacing(
 
     The content is synced to disk before the move. `path` is left as it was if the body raises an
     error, or if another writer has locked or created the file in the meantime.
-
-    Args:
-        path: File to create or replace; missing folders are created.
-        error_type: Type raised in place of an OSError; None lets the OSError pass.
-        overwrite: Whether an existing file is replaced.
-        concurrent: Whether several processes may replace `path` at the same time.
-
-    Raises:
-        OutputExistsError: The file exists and is not to be replaced, or is not a regular file.
-        LogError: Another process is writing the file.
-        McaprlError: The file cannot be written, and `error_type` is given.
-        OSError: The file cannot be written, and `error_type` is None.
     """
     check_target(path, overwrite=overwrite)
     try:
@@ -268,17 +218,6 @@ def replacing_folder(
 
     The files are synced to disk before the move. If the body raises an error, `path` is left as it
     was.
-
-    Args:
-        path: Folder to create or replace.
-        error_type: Type raised in place of an OSError.
-        overwrite: Whether an existing folder is replaced.
-
-    Raises:
-        OutputExistsError: The folder exists and is not to be replaced, has files with other names
-            than the new one, apart from their numbers, or is not a folder.
-        LogError: Another process is writing the folder, or a file in it.
-        McaprlError: A file cannot be written.
     """
     _check_folder(path, overwrite=overwrite)
     try:
@@ -325,13 +264,7 @@ def _check_folder(path: Path, *, overwrite: bool) -> None:
 
 
 def _check_contents(path: Path, replacement: Path) -> None:
-    """Check that a folder has only files that an earlier run of the same command wrote.
-
-    Raises:
-        OutputExistsError: A file has another name than all files of the replacement, apart from
-            its numbers.
-        LogError: Another writer has locked a file.
-    """
+    """Check that a folder has only files that an earlier run of the same command wrote."""
     names = {_without_numbers(entry, replacement) for entry in _files_in(replacement)}
     for entry in sorted(_files_in(path)):
         if _without_numbers(entry, path) not in names:

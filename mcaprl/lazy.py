@@ -9,14 +9,7 @@ from typing import Any
 
 
 def lazy_attributes(package: str, sources: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
-    """Return a function `__getattr__` that imports a package's public names on first use.
-
-    Args:
-        package: Name of the package.
-        sources: Dict from the full name of each module to the public names that the module defines.
-            `a as b` makes its name `a` public as `b`. If a name equals the last part of the
-            module's name, such as `torch` in `mcaprl.torch`, it refers to the module.
-    """
+    """Return a function `__getattr__` that imports a package's public names on first use."""
     modules: dict[str, str] = {}
     attributes: dict[str, str] = {}
     for module, names in sources.items():

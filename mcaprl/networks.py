@@ -240,11 +240,7 @@ def check_size(
     n_outputs: int,
     weights: Mapping[str, Tensor],
 ) -> None:
-    """Check that a file has enough weights for a network, before the network is created.
-
-    Raises:
-        ValueError: The file has fewer weights, or no network has this architecture.
-    """
+    """Check that a file has enough weights for a network, before the network is created."""
     if architecture.encoder not in ENCODERS:
         raise ValueError(f"encoder {architecture.encoder!r} is not supported")
     for image in images:

@@ -95,12 +95,7 @@ def _kind(cells: Sequence[str]) -> str:
 
 
 def write_page(path: Path, title: str, lead: str, sections: Sequence[Section]) -> None:
-    """Write a page; create the folder if needed.
-
-    Raises:
-        MissingExtraError: Jinja2 is not installed.
-        ReportError: The file cannot be written.
-    """
+    """Write a page; create the folder if needed."""
     jinja2 = import_extra("jinja2", "report")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(files("mcaprl").joinpath("page.html").read_text())

@@ -155,10 +155,6 @@ def terminal_progress(unit: str, *terms: str) -> Iterator[ProgressCallback]:
     """Show a progress bar for each seed on a terminal: rate, one term and remaining time.
 
     If stderr is not a terminal, print a line about one seed at long intervals.
-
-    Args:
-        unit: Unit of the total, such as `updates`.
-        *terms: Names of terms, such as `loss`; the first one that has a value is shown.
     """
     if not _stderr_is_terminal():
         yield _training_lines(unit, terms)

@@ -57,16 +57,6 @@ def run_workers(
     If a worker fails, or this process is interrupted, all other tasks receive a KeyboardInterrupt,
     and this function waits until they end. If this process is killed, all tasks receive a
     KeyboardInterrupt, too.
-
-    Args:
-        task: Module-level function, called with a request and a function that sends a message.
-        requests: Arguments of the tasks; they are pickled.
-        on_message: Function called with the index of the request and the message.
-
-    Raises:
-        WorkerEndedError: A worker was killed.
-        KeyboardInterrupt: This process or a worker was interrupted.
-        Exception: The task of a worker raised it.
     """
     context = multiprocessing.get_context("spawn")
     # Only this process has `held`, the write end of the pipe. Therefore, the pipe closes when this

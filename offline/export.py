@@ -98,13 +98,7 @@ def _channels_last(images: Tensor) -> Tensor:
 
 
 def export_onnx(policy: object, path: Path, *, overwrite: bool = True) -> None:
-    """Write the policy of an offline run as an ONNX file, for a batch of any size.
-
-    Raises:
-        MissingExtraError: onnx or onnxscript is not installed.
-        OutputExistsError: The file exists and is not to be replaced, or is not a regular file.
-        PolicyError: The actions are not finite in number, or the file cannot be written.
-    """
+    """Write the policy of an offline run as an ONNX file, for a batch of any size."""
     if not isinstance(policy, Policy) or not isinstance(policy.head, DiscreteHead):
         raise PolicyError(f"{getattr(policy, 'name', policy)} has no scores of actions to export")
     for package in ("onnx", "onnxscript"):

@@ -58,11 +58,7 @@ ALGORITHMS: Final = {
 
 
 def find_algorithm(name: str) -> Algorithm:
-    """Find an algorithm by its name.
-
-    Raises:
-        UnknownNameError: No algorithm has that name.
-    """
+    """Find an algorithm by its name."""
     if name not in ALGORITHMS:
         raise UnknownNameError("algorithm", name, ALGORITHMS)
     return ALGORITHMS[name]
@@ -71,12 +67,7 @@ def find_algorithm(name: str) -> Algorithm:
 def check_spaces(
     algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
 ) -> None:
-    """Check that an algorithm supports the spaces of an environment.
-
-    Raises:
-        UnknownNameError: No algorithm has that name.
-        SpaceError: The algorithm does not support the spaces.
-    """
+    """Check that an algorithm supports the spaces of an environment."""
     find_algorithm(algo)
     joint = joint_actions(action_space)
     if joint is None or joint.shape:
@@ -137,12 +128,7 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
 
 
 def own_architecture(config: OnlineConfig, space: spaces.Space[Any]) -> Architecture | None:
-    """Return the architecture of this package's network, or None to use SB3's own network.
-
-    Args:
-        config: Settings of the algorithm.
-        space: Space of the stacked observations.
-    """
+    """Return the architecture of this package's network, or None to use SB3's own network."""
     images = inputs_of(channels_first(space))[1]
     architecture = config.architecture_for(image.shape[2] // config.frame_stack for image in images)
     adapts_images = images and (config.center_images or architecture.encoder != "nature")

@@ -44,19 +44,7 @@ _COUNTERS = (
 def save_checkpoint(
     path: Path, model: BaseAlgorithm, task: Task, extra: dict[str, Any], best: bytes
 ) -> None:
-    """Replace a checkpoint with the current state of a model.
-
-    Args:
-        path: Path of the file.
-        model: Model between two rollouts.
-        task: Task of the run.
-        extra: JSON object for `load_checkpoint` to return.
-        best: Contents of the file of the best policy so far, for `load_checkpoint` to return; empty
-            if there is no such file.
-
-    Raises:
-        TrainingError: The file cannot be written.
-    """
+    """Replace a checkpoint with the current state of a model."""
     generators, states = _generators(model)
     tensors = {
         **{f"policy.{name}": value for name, value in model.policy.state_dict().items()},
@@ -80,9 +68,6 @@ def load_checkpoint(path: Path, model: BaseAlgorithm, task: Task) -> tuple[dict[
 
     Returns:
         The arguments `extra` and `best` of `save_checkpoint`.
-
-    Raises:
-        TrainingError: The checkpoint belongs to another task, or is broken.
     """
     try:
         tensors, description = read_tensors(path)

@@ -58,16 +58,7 @@ class Evaluation(EvalCallback):
         on_new_best: Callable[[], None],
         on_point: Callable[[CurvePoint], None],
     ) -> None:
-        """Prepare the evaluations.
-
-        Args:
-            env: Batch with one environment for each episode.
-            interval: Training steps between two evaluations.
-            training_envs: Number of environments in the training batch.
-            scale: Scale of the scores.
-            on_new_best: Function called when the mean return is the highest so far.
-            on_point: Function called with each evaluation, after `on_new_best`.
-        """
+        """Prepare the evaluations."""
 
         def new_best(*_: Any) -> bool:
             on_new_best()

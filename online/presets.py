@@ -173,11 +173,7 @@ IMAGE_SETTINGS: Final[dict[tuple[str, str], dict[str, Any]]] = {
 
 
 def find_preset(name: str) -> Preset:
-    """Find a preset by its name.
-
-    Raises:
-        UnknownNameError: There is no such preset.
-    """
+    """Find a preset by its name."""
     if name not in PRESETS:
         raise UnknownNameError("preset", name, PRESETS)
     return PRESETS[name]
@@ -187,12 +183,6 @@ def settings_for(config_type: type, sim: str, sim_options: Mapping[str, Any]) ->
     """Return the tuned settings of a sim.
 
     The dict is empty for classic rules and for other environments.
-
-    Args:
-        config_type: Type of the algorithm's settings. For types without `n_steps` or
-            `buffer_size`, the result is empty.
-        sim: Short name or Gymnasium id.
-        sim_options: Arguments of the environment.
     """
     known = {field.name for field in fields(config_type)}
     default_rules = sim_options.get("rules", "default") == "default"

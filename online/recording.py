@@ -27,12 +27,7 @@ from mcaprl.recorder.repair.recover import recover_log
 
 
 def log_paths(record: Path, seeds: range, resume: bool) -> dict[int, Path]:
-    """Return the log of each seed: `record` if it ends in .mcap, else `record`/seed-K.mcap.
-
-    Raises:
-        UsageError: `record` is one file for several seeds.
-        OutputExistsError: A log exists, and `resume` is false.
-    """
+    """Return the log of each seed: `record` if it ends in .mcap, else `record`/seed-K.mcap."""
     if len(seeds) > 1 and record.suffix == ".mcap":
         raise UsageError(
             f"{len(seeds)} seeds write one log each: choose a folder; {record} is a file name"
@@ -49,19 +44,7 @@ def log_paths(record: Path, seeds: range, resume: bool) -> dict[int, Path]:
 def recorded(
     env: VectorEnv[Any, Any, Any], path: Path, *, algo: str, seed: int, resume: bool = False
 ) -> RecordVecMcap:
-    """Wrap a batch of environments to record each step of training.
-
-    Args:
-        env: Environments to record.
-        path: Path of the log.
-        algo: Name of the algorithm.
-        seed: Seed of the agent.
-        resume: Whether to append to an existing log. The log of a killed recorder is recovered
-            first, and the damaged file is kept as `*.damaged`.
-
-    Raises:
-        SpaceError, OutputExistsError, LogError: As for `RecordVecMcap`.
-    """
+    """Wrap a batch of environments to record each step of training."""
 
     def wrap(append: bool) -> RecordVecMcap:
         return RecordVecMcap(env, path, policy=algo, policy_version=0, seed=seed, append=append)

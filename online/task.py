@@ -156,23 +156,7 @@ def choose_task(
     max_steps: int | None = None,
     resumed: Path | None = None,
 ) -> Task:
-    """Return the task that the arguments of a command line describe.
-
-    Args:
-        sim: Short name or Gymnasium id; None selects the sim of the preset or run.
-        algo: Name of the algorithm; None selects the algorithm of the preset or run, or else
-            Double DQN.
-        sim_options: Arguments of the environment.
-        given: Settings of the algorithm.
-        preset: Name of published settings.
-        max_steps: Limit on the steps of an episode; None selects that of the run, else no limit.
-        resumed: Folder of a run to resume; None for a new run.
-
-    Raises:
-        UnknownNameError: There is no such algorithm or preset.
-        UsageError: No sim is given, or the arguments contradict the preset.
-        TrainingError: The arguments contradict the run, or the folder contains no run.
-    """
+    """Return the task that the arguments of a command line describe."""
     if resumed is not None and run_to_resume(resumed):
         task = Task.of_run(resumed, **given)
         options = {**task.sim_options, **sim_options}

@@ -215,11 +215,7 @@ class _Run:
 def write_scores(
     folder: Path, summaries: Sequence[OnlineSummary], scale: Scale, episodes: int
 ) -> None:
-    """Write the scores of all seeds on new episodes into a run folder.
-
-    Raises:
-        TrainingError: The file cannot be written.
-    """
+    """Write the scores of all seeds on new episodes into a run folder."""
     seeds = {
         summary.folder.name: {
             "best_step": summary.best_step,

@@ -34,12 +34,7 @@ class BatchedVecEnv(VecEnv):
     """
 
     def __init__(self, env: Any) -> None:
-        """Adapt `env`. In the step that ends an episode, it must also reset that environment.
-
-        Args:
-            env: `VectorEnv` with `metadata["autoreset_mode"]` SAME_STEP, whose `reset` accepts a
-                list of seeds, as in Gymnasium.
-        """
+        """Adapt `env`. In the step that ends an episode, it must also reset that environment."""
         assert isinstance(env, VectorEnv)
         assert env.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP
         self.env: Any = env

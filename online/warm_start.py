@@ -32,16 +32,8 @@ def fill_buffer(model: BaseAlgorithm, dataset: Dataset) -> int:
     of a part counts as truncated at that end. If the log has more transitions than the buffer can
     store, only the last ones are copied.
 
-    Args:
-        model: Fresh model.
-        dataset: Dataset with the spaces of the model's environment.
-
     Returns:
         Number of copied transitions, a multiple of the number of environments.
-
-    Raises:
-        UsageError: The algorithm has no replay buffer, or there are too few transitions.
-        SpaceError: The spaces differ.
     """
     buffer = model.replay_buffer if isinstance(model, DQN) else None
     if buffer is None:
@@ -74,18 +66,7 @@ def _add(buffer: Any, dataset: Dataset, steps: NDArray[np.int64], cut: bool) -> 
 
 
 def take_weights(model: BaseAlgorithm, policy: Policy, space: spaces.Space[Any]) -> None:
-    """Copy the weights of a trained Q-network into a DQN, layer by layer.
-
-    Args:
-        model: Fresh model.
-        policy: Policy of `load_policy`.
-        space: Space of a single observation, sampled to verify that both networks produce the
-            same values.
-
-    Raises:
-        UsageError: The algorithm has no Q-network.
-        PolicyError: The policy has no Q-network, or its Q-network has another architecture.
-    """
+    """Copy the weights of a trained Q-network into a DQN, layer by layer."""
     if not isinstance(model, DQN):
         raise UsageError(f"{type(model).__name__} has no Q-values to copy from a policy")
     frames = policy.frame_stack
@@ -109,11 +90,7 @@ def take_weights(model: BaseAlgorithm, policy: Policy, space: spaces.Space[Any])
 
 
 def _copy_layers(policy: Policy, ours: nn.Module) -> None:
-    """Copy the weights of a policy's network, and its normalization, into an agent's network.
-
-    Raises:
-        PolicyError: The networks differ.
-    """
+    """Copy the weights of a policy's network, and its normalization, into an agent's network."""
     theirs = policy.head.networks["q"]
     if _weights_of(theirs) != _weights_of(ours):
         raise PolicyError(

@@ -111,9 +111,6 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any], dict[str, Te
     Returns:
         The description given to `write_model` (empty for files of plain SB3); SB3's own data, whose
         pickled values are not unpickled; and the weights by name.
-
-    Raises:
-        PolicyError: The file is not a model of SB3, or is broken.
     """
     try:
         check_regular(path)
@@ -296,13 +293,7 @@ def _own_network(
 
 
 def _layers(space: spaces.Space[Any], frames: int, net_arch: Any) -> Iterator[list[int]]:
-    """Yield the widths of successive layers for each part of the observation.
-
-    Args:
-        space: Space of one observation.
-        frames: Number of successive observations that the network receives.
-        net_arch: Widths of SB3's hidden layers: one list, a dict of lists, or None.
-    """
+    """Yield the widths of successive layers for each part of the observation."""
     chains = net_arch.values() if isinstance(net_arch, dict) else [net_arch or ()]
     for leaf in observation_leaves(space):
         if leaf.encoding is None:
@@ -404,12 +395,7 @@ def _moved(images: Any, shape: tuple[int, ...] | None) -> Any:
 
 
 def _read(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
-    """Read a member of a zip file.
-
-    Raises:
-        ValueError: The member has more than `most` bytes.
-        KeyError: There is no such member.
-    """
+    """Read a member of a zip file."""
     # A check of the declared size is sufficient, because `zipfile` reads at most this size.
     size = archive.getinfo(name).file_size
     if size > most:
@@ -420,11 +406,7 @@ def _read(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
 
 
 def _check_size(weights: io.BytesIO, most: int) -> None:
-    """Check the declared sizes of the members of a PyTorch file, which is a zip file.
-
-    Raises:
-        ValueError: The sum of these sizes is more than `most` bytes.
-    """
+    """Check the declared sizes of the members of a PyTorch file, which is a zip file."""
     if zipfile.is_zipfile(weights):
         with zipfile.ZipFile(weights) as archive:
             size = sum(part.file_size for part in archive.infolist())
@@ -447,16 +429,9 @@ def _are_weights(found: object) -> bool:
 def describe_sb3(data: Mapping[str, Any], weights: Mapping[str, Any]) -> dict[str, Any]:
     """Derive the description of a policy from a file of plain SB3.
 
-    Args:
-        data: SB3's own data, as `read_model` returns it.
-        weights: Weights of the policy by name.
-
     Returns:
         Description as `save_policy` writes it. The bounds of observations are unknown; they are set
         to 0 and 255 for uint8, else to infinity.
-
-    Raises:
-        PolicyError: The description cannot be derived without unpickling, or is not supported.
     """
     kwargs = data.get("policy_kwargs") or {}
     own = {key: value for key, value in kwargs.items() if not key.startswith(":")}

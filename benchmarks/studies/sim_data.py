@@ -61,7 +61,7 @@ class LogSet(NamedTuple):
         medium_epsilon: The same in the medium log.
         mixed_epsilons: The same in each part of the mixed log.
         wrong: Probability of the wrong action in the weak log.
-        clumsy: Probability of a random action in the weak log, among the steps without the wrong one.
+        clumsy: Probability of a random action in the weak log, at steps without the wrong one.
     """
 
     steps: int

@@ -250,11 +250,7 @@ class Agents:
 def _train(
     agents: Agents, folder: Path, report: ProgressCallback, save: Callable[[], None]
 ) -> None:
-    """Train until all steps are done; write `_ROWS` rows of metrics, and save the policies.
-
-    Raises:
-        TrainingError: The loss is NaN or infinite, or a file cannot be written.
-    """
+    """Train until all steps are done; write `_ROWS` rows of metrics, and save the policies."""
     learner, config = agents.learner, agents.config
     seeds, row = learner.seeds, 0
     with ExitStack() as stack:

@@ -95,16 +95,7 @@ def keys_of(description: LogMetadata, names: Sequence[str]) -> tuple[str, ...] |
 
 
 def dataset_of(columns: Columns, description: LogMetadata, where: str) -> Dataset:
-    """Return the episodes of a block, sorted by number and step.
-
-    Args:
-        columns: Columns of a block. `log_time_ns` is not used, and `behavior_prob` may be missing.
-        description: Metadata of the environment.
-        where: Name of the place for errors.
-
-    Raises:
-        SpaceError: A column is missing or does not fit the spaces, or an episode is not whole.
-    """
+    """Return the episodes of a block, sorted by number and step."""
     missing = empty_columns(description).keys() - columns.keys() - {*_OPTIONAL}
     if missing:
         raise SpaceError(f"{where}: the rows have no column {', '.join(sorted(missing))}")

@@ -56,16 +56,6 @@ def cluster(address: str | None = None, *, workers: int | None = None) -> Iterat
 
     If this process is already connected, the connection is used and kept. At the end of the
     context, a local cluster that this function started is stopped.
-
-    Args:
-        address: `HOST:PORT` of a cluster, `auto` for this machine's cluster, or `local` for a new
-            local cluster. Default: the environment variable RAY_ADDRESS, or else `local`.
-        workers: Number of CPUs of a local cluster; default: number of processors.
-
-    Raises:
-        ClusterError: The cluster cannot be reached, or has other versions of Ray or Python.
-        MissingExtraError: Ray is not installed.
-        UsageError: This process is connected to another cluster.
     """
     connected = connect(address, workers=workers, store_bytes=SMALL_STORE_BYTES)
     ray = sys.modules["ray"]
@@ -84,16 +74,8 @@ def connect(
 ) -> bool:
     """Connect this process to a cluster until the process ends. Keep an existing connection.
 
-    Args:
-        address: As for `cluster`.
-        workers: Number of CPUs of a local cluster; default: number of processors.
-        store_bytes: Size of the object store of a local cluster; default: Ray's choice.
-
     Returns:
         Whether this call created the connection.
-
-    Raises:
-        ClusterError, MissingExtraError, UsageError: As for `cluster`.
     """
     if "ray" in sys.modules and sys.modules["ray"].is_initialized():
         _check_same(address)

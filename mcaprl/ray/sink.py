@@ -33,12 +33,7 @@ class LogSink(Datasink[LogFile | None]):  # type: ignore[misc]
     def __init__(
         self, folder: str | Path, description: LogMetadata | None, compression: str
     ) -> None:
-        """Create the folder. The arguments are those of `ray.write`.
-
-        Raises:
-            OutputExistsError: The folder is not empty.
-            UsageError, MissingExtraError: The URL cannot be written to.
-        """
+        """Create the folder. The arguments are those of `ray.write`."""
         self._url = str(folder).rstrip("/") if is_url(folder) else None
         self._description, self._compression = description, compression
         self._versions = installed_versions()

@@ -86,12 +86,7 @@ class SweepPlan:
 
 
 def read_plan(source: str | Path | Mapping[str, Any]) -> SweepPlan:
-    """Read and check a sweep file, or a mapping of the same form.
-
-    Raises:
-        UsageError: The file cannot be read, or has an unknown key or a wrong value.
-        MissingExtraError: The packages of the extra `ray` are not installed.
-    """
+    """Read and check a sweep file, or a mapping of the same form."""
     where, tree = "the sweep", source
     if not isinstance(source, Mapping):
         where, tree = str(source), read_yaml(Path(source), "ray")

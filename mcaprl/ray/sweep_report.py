@@ -41,11 +41,7 @@ def table_of(results: Sequence[TrialResult]) -> Table:
 
 
 def write_table(path: Path, table: Table) -> None:
-    """Write a table as CSV.
-
-    Raises:
-        ReportError: The file cannot be written.
-    """
+    """Write a table as CSV."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(table.columns)
@@ -54,11 +50,7 @@ def write_table(path: Path, table: Table) -> None:
 
 
 def sweep_figure(results: Sequence[TrialResult]) -> Any:
-    """Draw the score of each trial over its updates. A dot marks the end of a trial.
-
-    Raises:
-        MissingExtraError: Matplotlib is not installed.
-    """
+    """Draw the score of each trial over its updates. A dot marks the end of a trial."""
     figure, axes = new_figure((8, 4.5))
     shown = [one for one in results if one.scores]
     algos = list(dict.fromkeys(one.trial.algo for one in results))
@@ -93,13 +85,7 @@ def _name_ends(axes: Any, shown: Sequence[TrialResult]) -> None:
 
 
 def write_sweep(results: Sequence[TrialResult], plan: SweepPlan, out: Path) -> Table:
-    """Write `sweep.csv`, `sweep.png` and `index.html` to a folder; return the table.
-
-    Raises:
-        MissingExtraError: The packages of the extra `report` are not installed; `sweep.csv` is
-            written nevertheless.
-        ReportError: A file cannot be written.
-    """
+    """Write `sweep.csv`, `sweep.png` and `index.html` to a folder; return the table."""
     table = table_of(results)
     write_table(out / TABLE_NAME, table)
     figure = sweep_figure(results)

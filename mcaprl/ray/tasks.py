@@ -55,11 +55,6 @@ def run_tasks(
     of this process, and see `paths`. `advance` is called with the amount of new work, and `on_news`
     with the news that tasks send; repeated tasks send theirs again. If a task fails, or this
     process is interrupted, all tasks end.
-
-    Raises:
-        ClusterError: A worker has other versions, or does not see a path.
-        WorkerDiedError: Workers died repeatedly, and the task made no progress.
-        Exception: A task raised it.
     """
     import ray
     from ray.util.queue import Queue
@@ -131,11 +126,7 @@ def _result(call: Any, index: int, paths: Sequence[Path]) -> Any:
 
 
 def check_machine(versions: dict[str, str], paths: Sequence[Path]) -> None:
-    """Check that a worker's machine has the same versions and files as the calling process.
-
-    Raises:
-        ClusterError: A version differs, or a path does not exist here.
-    """
+    """Check that a worker's machine has the same versions and files as the calling process."""
     mine = installed_versions()
     for name in versions.keys() | mine.keys():
         if versions.get(name) != mine.get(name):
@@ -153,11 +144,7 @@ def check_machine(versions: dict[str, str], paths: Sequence[Path]) -> None:
 
 
 def check_machines(paths: Sequence[Path]) -> None:
-    """Check all machines of the cluster that this process is connected to.
-
-    Raises:
-        ClusterError: A machine has other versions, does not see a path, or cannot import mcaprl.
-    """
+    """Check all machines of the cluster that this process is connected to."""
     import ray
 
     check, versions = ray.remote(check_machine), installed_versions()

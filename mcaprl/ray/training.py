@@ -35,14 +35,7 @@ def train_on_ray(
     workers: int | None,
     progress: ProgressCallback,
 ) -> list[OfflineSummary]:
-    """Train on the workers, which read the logs of the dataset again.
-
-    Raises:
-        UsageError: The dataset is not that of whole logs.
-        ClusterError: The cluster has fewer processors, a machine has other versions or does not
-            see a path, or workers died repeatedly.
-        McaprlError: As for a local training.
-    """
+    """Train on the workers, which read the logs of the dataset again."""
     logs, workers = logs_of(dataset), _workers(workers, device)
     texts: dict[str, None] = {}
 

@@ -32,11 +32,7 @@ _SCALARS = {
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON; refuse texts that are nested more deeply than the files of this package.
-
-    Raises:
-        ValueError: The text is not JSON, or is nested too deeply.
-    """
+    """Parse JSON; refuse texts that are nested more deeply than the files of this package."""
     try:
         found = json.loads(text)
     except RecursionError as error:
@@ -48,17 +44,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_json(path: Path, error_type: type[McaprlError], kind: type[Any] | None = None) -> Any:
-    """Read a JSON file.
-
-    Args:
-        path: Path of the file.
-        error_type: Type of the error if the file exists but cannot be read.
-        kind: Type of the result, as `as_type` accepts it; None for any JSON.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        McaprlError: The file is not JSON, or has other types.
-    """
+    """Read a JSON file."""
     try:
         found = parse_json(read_file(path))
         return found if kind is None else as_type(kind, found)
@@ -69,18 +55,7 @@ def read_json(path: Path, error_type: type[McaprlError], kind: type[Any] | None 
 
 
 def read_yaml(path: Path, extra: str, *, with_lines: bool = False) -> Any:
-    """Read a YAML 1.2 file, which may also be JSON.
-
-    Args:
-        path: Path of the file.
-        extra: Extra that installs the YAML library.
-        with_lines: Whether the mappings and lists of the result have the attribute `lc`, which
-            has the line of each key.
-
-    Raises:
-        UsageError: The file cannot be read, is not YAML, or is too large; the message has the line.
-        MissingExtraError: The YAML library is not installed.
-    """
+    """Read a YAML 1.2 file, which may also be JSON."""
     yaml = import_extra("ruamel.yaml", extra)
     parser = yaml.YAML(typ="rt") if with_lines else yaml.YAML(typ="safe", pure=True)
     try:
@@ -107,11 +82,7 @@ def read_yaml(path: Path, extra: str, *, with_lines: bool = False) -> Any:
 
 
 def _check_nesting(found: object, most: float) -> None:
-    """Check the depth of nested dicts and lists, and the number of values, with all aliases.
-
-    Raises:
-        ValueError: A value is nested too deeply, which may contain itself, or there are too many.
-    """
+    """Check the depth of nested dicts and lists, and the number of values, with all aliases."""
     level, count = [found] if isinstance(found, dict | list) else [], 0
     for _ in range(_MAX_DEPTH + 1):
         if not level:
@@ -129,9 +100,6 @@ def as_type(kind: Any, found: object, name: str = "it") -> Any:
 
     Whole numbers have at most 64 bits. A missing float is null in JSON, and becomes NaN. Further
     keys of a JSON object are not read.
-
-    Raises:
-        ValueError: A value has another type, or a key is missing; the message names it.
     """
     parts = get_args(kind)
     if get_origin(kind) is types.UnionType:

@@ -26,21 +26,12 @@ class BoundedAnswer(aiohttp.ClientResponse):
     """
 
     async def start(self, connection: Any) -> aiohttp.ClientResponse:
-        """Read the status and the headers.
-
-        Raises:
-            TimeoutError: They are not complete in time.
-        """
+        """Read the status and the headers."""
         async with asyncio.timeout(limits.SILENCE_TIMEOUT_S):
             return await super().start(connection)
 
     async def read(self) -> bytes:
-        """Return the body.
-
-        Raises:
-            OSError: The answer has another range or more bytes than requested, is compressed, or
-                arrives too slowly.
-        """
+        """Return the body."""
         if self._body is None:
             try:
                 self._body = await self._bounded()

@@ -54,11 +54,7 @@ class OpenFolder:
         return self._descriptor is None
 
     def fileno(self) -> int:
-        """Return the descriptor.
-
-        Raises:
-            ValueError: It is closed.
-        """
+        """Return the descriptor."""
         if self._descriptor is None:
             raise ValueError("the folder is closed")
         return self._descriptor
@@ -94,12 +90,7 @@ def lock(file: Lockable) -> bool:
 
 
 def hold(file: Lockable, *, records: bool = False) -> None:
-    """Close a locked file in processes that are forked from this one.
-
-    Args:
-        file: File or folder.
-        records: Whether a recorder writes the file.
-    """
+    """Close a locked file in processes that are forked from this one."""
     _held[file] = records
 
 
@@ -126,12 +117,7 @@ def surely_locked(descriptor: int) -> bool | None:
 
 
 def taken(path: Path, descriptor: int | None = None) -> LogError:
-    """Return the error for a file that is locked already.
-
-    Args:
-        path: Path that the message names.
-        descriptor: Descriptor of the locked file; None if another process has locked it.
-    """
+    """Return the error for a file that is locked already."""
     if descriptor is not None:
         state = os.fstat(descriptor)
         for file in [file for file, records in list(_held.items()) if records]:
@@ -164,11 +150,7 @@ def waiting_lock(file: BinaryIO | FileIO) -> Iterator[None]:
 
 @contextmanager
 def locked_file(path: Path) -> Iterator[None]:
-    """Lock a file against other writers. Do nothing if it does not exist or cannot be read.
-
-    Raises:
-        LogError: Another writer has locked the file, or this program has an open recorder of it.
-    """
+    """Lock a file against other writers. Do nothing if it does not exist or cannot be read."""
     while True:
         try:
             file = FileIO(open_at_once(path))
@@ -185,12 +167,7 @@ def locked_file(path: Path) -> Iterator[None]:
 
 
 def open_at_once(path: str | Path) -> int:
-    """Open a regular file for reading, without waiting for the writer of a FIFO.
-
-    Raises:
-        OSError: The file cannot be opened, or is a folder, device, socket or FIFO. Opening a device
-            can have effects, so the type is checked before and after.
-    """
+    """Open a regular file for reading, without waiting for the writer of a FIFO."""
     check_regular(path)
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -200,21 +177,13 @@ def open_at_once(path: str | Path) -> int:
 
 
 def check_regular(path: str | Path) -> None:
-    """Check that a path belongs to a regular file, so that opening it does not wait.
-
-    Raises:
-        OSError: There is no such file, or it is a folder, device, socket or FIFO.
-    """
+    """Check that a path belongs to a regular file, so that opening it does not wait."""
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise OSError(_NOT_REGULAR)
 
 
 def read_file(path: str | Path) -> bytes:
-    """Read a regular file.
-
-    Raises:
-        OSError: The file cannot be read, or is a folder, device, socket or FIFO.
-    """
+    """Read a regular file."""
     with FileIO(open_at_once(path)) as file:
         return file.readall()
 
@@ -223,9 +192,6 @@ def check_plain(path: str | Path) -> None:
     """Check that a path is a regular file, or a folder of nothing but regular files and folders.
 
     Libraries that open the files by their names would wait for the writer of a FIFO.
-
-    Raises:
-        OSError: There is something else; the error's file name is its path.
     """
     if not os.path.isdir(path):
         check_regular(path)

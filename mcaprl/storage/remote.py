@@ -53,12 +53,7 @@ class RemoteFile:
     """
 
     def __init__(self, url: str) -> None:
-        """Request the size of the remote file, and create the local file.
-
-        Raises:
-            LogError: There is no such file, or it cannot be reached.
-            MissingExtraError: The package for the URL's protocol is not installed.
-        """
+        """Request the size of the remote file, and create the local file."""
         self.url = url
         self._connected = os.getpid(), system_of(url)
         facts = self._facts()
@@ -95,11 +90,7 @@ class RemoteFile:
 
     @classmethod
     def of(cls, url: str) -> RemoteFile:
-        """Return the file of this URL that is in use, if it is unchanged; otherwise, open it.
-
-        Raises:
-            LogError, MissingExtraError: See `RemoteFile`.
-        """
+        """Return the file of this URL that is in use, if it is unchanged; otherwise, open it."""
         key = os.getpid(), url
         found = _in_use.get(key)
         if found is None or not found._version or not found._is_unchanged():
@@ -107,11 +98,7 @@ class RemoteFile:
         return found
 
     def fetch(self, ranges: Iterable[Range]) -> None:
-        """Fetch the missing blocks of these byte ranges, with concurrent requests.
-
-        Raises:
-            LogError: The file cannot be reached, has changed, or its server ignores ranges.
-        """
+        """Fetch the missing blocks of these byte ranges, with concurrent requests."""
         with self._lock:
             wanted = np.zeros(len(self._has), bool)
             for start, stop in ranges:
@@ -171,11 +158,7 @@ class RemoteFile:
             file.write(np.packbits(self._has).tobytes())
 
     def check_unchanged(self) -> None:
-        """Check that the remote file has not changed since it was opened.
-
-        Raises:
-            LogError: The file has changed, or cannot be reached.
-        """
+        """Check that the remote file has not changed since it was opened."""
         if not self._is_unchanged():
             raise LogError(f"{self.url} has changed while it was read: open it again")
 
@@ -245,16 +228,7 @@ class RemotePath(type(Path())):  # type: ignore[misc]
 
 
 def as_path(name: str | Path, *, whole: bool = False) -> Path:
-    """Return the path of a local file, or of the local copy of a remote file.
-
-    Args:
-        name: Path, or URL.
-        whole: Whether all of a remote file is fetched, for readers that do not call `fetch`.
-
-    Raises:
-        LogError: The remote file cannot be read.
-        MissingExtraError: The package for the URL's protocol is not installed.
-    """
+    """Return the path of a local file, or of the local copy of a remote file."""
     path = RemotePath.of(str(name)) if is_url(name) else name
     path = path if isinstance(path, Path) else Path(path)
     if whole and isinstance(path, RemotePath) and path.remote is not None:
@@ -263,12 +237,7 @@ def as_path(name: str | Path, *, whole: bool = False) -> Path:
 
 
 def find_remote(url: str) -> list[RemotePath]:
-    """Return the logs of a URL: a file, a folder of `.mcap` files, or a glob, sorted by name.
-
-    Raises:
-        LogError: There are no files, or the server cannot be reached.
-        MissingExtraError: The package for the URL's protocol is not installed.
-    """
+    """Return the logs of a URL: a file, a folder of `.mcap` files, or a glob, sorted by name."""
     if url.endswith(".mcap") and not any(sign in url for sign in "*?["):
         return [RemotePath.of(url)]
     system, path = system_of(url)
@@ -285,17 +254,7 @@ def find_remote(url: str) -> list[RemotePath]:
 
 
 def upload(path: str | Path, url: str) -> None:
-    """Copy a file to a URL. Until the copy is complete, its name ends with `.part`.
-
-    Args:
-        path: Local file.
-        url: URL of the copy; an existing file is replaced.
-
-    Raises:
-        LogError: The file cannot be copied; the local file is unchanged.
-        UsageError: The protocol cannot be written to.
-        MissingExtraError: The package for the URL's protocol is not installed.
-    """
+    """Copy a file to a URL. Until the copy is complete, its name ends with `.part`."""
     system, target = system_of(url)
     local = import_extra("fsspec.implementations.local", "remote").LocalFileSystem
     unfinished = f"{target}.part"
@@ -333,18 +292,7 @@ def upload_all(paths: Sequence[Path], url: str) -> None:
 
 
 def check_upload(url: str, *, overwrite: bool) -> None:
-    """Check that a URL can be written to, before anything is recorded.
-
-    Args:
-        url: URL of a file or folder.
-        overwrite: Whether an existing file at the URL may be replaced.
-
-    Raises:
-        UsageError: The name is not a URL, or the protocol can only be read.
-        OutputExistsError: There is a file at the URL, and `overwrite` is not set.
-        LogError: The server cannot be reached.
-        MissingExtraError: The package for the URL's protocol is not installed.
-    """
+    """Check that a URL can be written to, before anything is recorded."""
     if not is_url(url):
         raise UsageError(f"{url} is not a URL, such as s3://bucket/lane.mcap")
     if url.startswith(("http://", "https://")):
@@ -359,12 +307,7 @@ def check_upload(url: str, *, overwrite: bool) -> None:
 
 
 def system_of(url: str) -> tuple[Any, str]:
-    """Return the fsspec file system of a URL, and the path in it.
-
-    Raises:
-        LogError: The URL is not valid, or its server cannot be reached.
-        MissingExtraError: The package for the protocol is not installed.
-    """
+    """Return the fsspec file system of a URL, and the path in it."""
     core = import_extra("fsspec.core", "remote")
     options: dict[str, Any] = {}
     if "http" in url.partition("://")[0]:

@@ -20,11 +20,7 @@ _DESCRIPTION = "description"
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
-    """Write tensors atomically, with a description in the header of the file.
-
-    Raises:
-        TrainingError: The file cannot be written.
-    """
+    """Write tensors atomically, with a description in the header of the file."""
     # Safetensors refuses tensors that share storage.
     whole = {
         name: tensor.clone(memory_format=torch.contiguous_format)
@@ -35,13 +31,7 @@ def write_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str,
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read the tensors and the description of a file that `write_tensors` wrote.
-
-    Raises:
-        OSError: The file cannot be opened.
-        SafetensorError: The file is not a safetensors file.
-        ValueError: The header has no description.
-    """
+    """Read the tensors and the description of a file that `write_tensors` wrote."""
     check_regular(path)
     with safe_open(path, framework="pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -52,26 +42,14 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def check_finite(weights: Mapping[str, Tensor]) -> None:
-    """Check that all weights are finite, as those of every policy of a training are.
-
-    Raises:
-        ValueError: A weight is NaN or infinite.
-    """
+    """Check that all weights are finite, as those of every policy of a training are."""
     for name, tensor in weights.items():
         if not torch.isfinite(tensor).all():
             raise ValueError(f"{name} is not finite")
 
 
 def check_widths(widths: Sequence[int], weights: Mapping[str, Tensor]) -> None:
-    """Check that a file has enough weights for layers, before the layers are created.
-
-    Args:
-        widths: Numbers of inputs, hidden units and outputs of successive layers.
-        weights: Weights by name.
-
-    Raises:
-        ValueError: A layer has more weights than the file, or a width is not a positive integer.
-    """
+    """Check that a file has enough weights for layers, before the layers are created."""
     if not all(isinstance(width, int) and width >= 1 for width in widths):
         raise ValueError(f"layers of widths {list(widths)} cannot be made")
     present = sum(tensor.numel() for tensor in weights.values())

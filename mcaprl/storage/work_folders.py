@@ -41,17 +41,6 @@ def work_folder(path: Path, *, concurrent: bool = False) -> Iterator[Path]:
 
     The work folder is removed at the end. What killed writers left in the same folder is removed
     first.
-
-    Args:
-        path: Target, which this function neither reads nor writes.
-        concurrent: Whether several processes may write files for the target at the same time.
-
-    Raises:
-        OutputExistsError: A symbolic link, a file, or a folder that is not a work folder of this
-            user is at the path of the work folder.
-        LogError: Another process is writing the target, or a log in the folder cannot be written.
-        UsageError: The target is a URL.
-        OSError: The folder cannot be created.
     """
     check_local(path)
     folder = _work_path(path, f".{os.getpid()}.part" if concurrent else ".part")
@@ -76,11 +65,7 @@ def work_folder(path: Path, *, concurrent: bool = False) -> Iterator[Path]:
 
 
 def remove_leftover(path: Path) -> None:
-    """Remove the work folder of a target if a process was killed while writing it.
-
-    Raises:
-        OutputExistsError: As for `work_folder`.
-    """
+    """Remove the work folder of a target if a process was killed while writing it."""
     remove_leftovers(path.parent)
     with suppress(OSError):
         _remove_left(_work_path(path))
@@ -123,11 +108,7 @@ class TemporaryFolder:
     """
 
     def __init__(self) -> None:
-        """Create the folder.
-
-        Raises:
-            OSError: It cannot be created.
-        """
+        """Create the folder."""
         remove_leftovers(Path(tempfile.gettempdir()))
         folder = Path(tempfile.mkdtemp(prefix="mcaprl-"))
         opened = _opened(folder)
@@ -146,11 +127,7 @@ class TemporaryFolder:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Create a temporary folder; remove it at the end.
-
-    Raises:
-        LogError: It cannot be created.
-    """
+    """Create a temporary folder; remove it at the end."""
     try:
         folder = TemporaryFolder()
     except OSError as error:
@@ -166,10 +143,6 @@ def fresh_folder(path: Path) -> Path:
     """Create a hidden folder that other processes fill, or empty the one of an earlier run.
 
     The caller must hold a lock that keeps out other runs.
-
-    Raises:
-        OutputExistsError: As for `work_folder`.
-        OSError: The folder cannot be created.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     opened = _opened(path)
@@ -237,12 +210,7 @@ def _locked(folder: Path, path: Path) -> OpenFolder:
 
 
 def _opened(folder: Path, *, create: bool = True) -> OpenFolder:
-    """Open a folder of this package; create it if it is missing and `create` is set.
-
-    Raises:
-        OutputExistsError: Something else is at this path.
-        OSError: The folder cannot be created or opened.
-    """
+    """Open a folder of this package; create it if it is missing and `create` is set."""
     is_new = False
     if create:
         with suppress(FileExistsError):
@@ -354,10 +322,6 @@ def _remove_left(folder: Path, *, marked: bool = False) -> None:
 
     Its process locks a new folder before it writes the mark. An empty folder is therefore left
     alone: locking it here could refuse its process.
-
-    Raises:
-        OutputExistsError: The folder is not one of this package.
-        OSError: There is no such folder, or it cannot be opened.
     """
     opened = _opened(folder, create=False)
     try:

@@ -25,15 +25,7 @@ class CapturedUpdate:
     def __init__(
         self, gradients: Callable[[Tensor], Terms], optimizer: torch.optim.Optimizer, rows: Tensor
     ) -> None:
-        """Record an update; weights and optimizer do not change.
-
-        Args:
-            gradients: Function that accepts the rows of a batch, computes the gradients of all
-                weights, and returns the terms of the loss.
-            optimizer: Optimizer with a state on the GPU (`capturable`) and learning rates that are
-                tensors.
-            rows: Rows of any batch, as an example.
-        """
+        """Record an update; weights and optimizer do not change."""
         device = next(iter(optimizer.state)).device
         self._rows = rows.to(device, copy=True)
         # PyTorch requires some calls on another stream before a capture.

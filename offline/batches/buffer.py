@@ -265,12 +265,7 @@ def return_spread(dataset: Dataset, gamma: float) -> float:
 
 
 def choose_device(name: str) -> torch.device:
-    """Return the torch device with this name.
-
-    Raises:
-        UnknownNameError: The name is not in `DEVICES`.
-        UsageError: torch finds no such device on this machine.
-    """
+    """Return the torch device with this name."""
     if name not in DEVICES:
         raise UnknownNameError("device", name, DEVICES)
     if name == "cuda" and not torch.cuda.is_available():
@@ -285,9 +280,6 @@ def discrete_actions(space: spaces.Space[Any]) -> JointActions:
     """Return the numbering of the actions of a space.
 
     Each combination of the elements of a MultiDiscrete or MultiBinary space is one action.
-
-    Raises:
-        SpaceError: The space is not finite, or has too many actions.
     """
     joint = joint_actions(space)
     if joint is None:

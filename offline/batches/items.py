@@ -40,11 +40,7 @@ class ItemOptions:
     stride: int = 1
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            UsageError: A value is out of range, or two options exclude each other.
-        """
+        """Check the values."""
         counts = {
             "n_steps": self.n_steps,
             "frame_stack": self.frame_stack,
@@ -153,11 +149,6 @@ def n_step_returns(
 
     A return that ends with a termination has no bootstrap value. A return that ends with a
     truncation bootstraps from the last next observation.
-
-    Args:
-        dataset: Dataset with N transitions.
-        n_steps: Number of rewards in a return.
-        gamma: Discount per step.
 
     Returns:
         Two arrays. The first, (2, N), contains two frame indexes for each transition: the index of

@@ -148,11 +148,7 @@ class ObservationEncoder:
     """Layout in memory of the arrays of images; empty for any."""
 
     def __init__(self, space: spaces.Space[Any], n_actions: int, mask_key: str = MASK_KEY) -> None:
-        """Create the encoder, without normalization.
-
-        Raises:
-            SpaceError: No network supports these observations.
-        """
+        """Create the encoder, without normalization."""
         self.space = space
         leaves = {leaf.path: leaf for leaf in observation_leaves(space)}
         self.mask = leaves.pop((mask_key,), None)
@@ -210,9 +206,6 @@ class ObservationEncoder:
         """Encode B observations of the space: arrays (B, *shape), or nested dicts of these.
 
         The result shares the memory of the arrays if they need no conversion.
-
-        Raises:
-            SpaceError: The observations have other shapes.
         """
         for leaf in self.leaves:
             _check_shape(leaf, observations)
@@ -226,11 +219,7 @@ class ObservationEncoder:
         return Observations(vector, tuple(images), self._allowed(observations))
 
     def encode_frames(self, frames: Any) -> Observations | FramesOnDisk:
-        """Encode all frames of a dataset; images on disk stay there.
-
-        Raises:
-            SpaceError: The frames have other shapes.
-        """
+        """Encode all frames of a dataset; images on disk stay there."""
         images = tuple(leaf.of(frames) for leaf in self.images)
         if not any(isinstance(image, MappedImages) for image in images):
             return self.encode(frames)

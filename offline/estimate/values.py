@@ -32,18 +32,7 @@ _ROWS_AT_ONCE = 4096
 def value_columns(
     policy: BasePolicy, episode: Episode, action_space: spaces.Space[Any], gamma: float
 ) -> Columns:
-    """Return the fields (T, ...) of `recorder.format.schema.values_schema` for an episode.
-
-    Args:
-        policy: Policy to evaluate; if it has no Q-values, fields computed from them are NaN.
-        episode: Episode of T steps.
-        action_space: Action space of the log.
-        gamma: Discount with which the policy was trained.
-
-    Raises:
-        UsageError: The action space is not finite.
-        PolicyError: The observations do not fit the policy.
-    """
+    """Return the fields (T, ...) of `recorder.format.schema.values_schema` for an episode."""
     joint = joint_actions(action_space)
     if joint is None:
         raise UsageError(f"values need discrete actions, got {action_space}")

@@ -180,12 +180,7 @@ class Choice:
         write_json(run / CHOICE_NAME, asdict(self), TrainingError)
 
     def write_report(self, folder: Path, title: str) -> Path:
-        """Write the choice as an HTML page; return its path.
-
-        Raises:
-            MissingExtraError: Jinja2 is not installed.
-            ReportError: The page cannot be written.
-        """
+        """Write the choice as an HTML page; return its path."""
         log = [(name.replace("_", " "), _shown(one)) for name, one in asdict(self.traits).items()]
         sections = [
             Section("Confidence", self.confidence),
@@ -199,11 +194,7 @@ class Choice:
 
 
 def read_choice(run: Path) -> Choice:
-    """Read `choice.json` of a run.
-
-    Raises:
-        TrainingError: The run has no such file, or the file is broken.
-    """
+    """Read `choice.json` of a run."""
     try:
         found: Choice = read_json(run / CHOICE_NAME, TrainingError, Choice)
     except FileNotFoundError as error:

@@ -33,11 +33,7 @@ class Checkpoint:
     tensors: dict[str, Tensor]
 
     def restore(self, learner: Learner, seed: int) -> None:
-        """Load this state into a seed of a fresh learner.
-
-        Raises:
-            TrainingError: The tensors do not match the learner.
-        """
+        """Load this state into a seed of a fresh learner."""
         try:
             learner.load_state(seed, self.tensors, self.step)
         except (KeyError, RuntimeError) as error:
@@ -51,11 +47,7 @@ def save_checkpoint(folder: Path, learner: Learner, seed: int, identity: RunIden
 
 
 def read_checkpoint(folder: Path, identity: RunIdentity) -> Checkpoint | None:
-    """Read the checkpoint in a folder; return None if there is none.
-
-    Raises:
-        TrainingError: The checkpoint is from another run, or broken.
-    """
+    """Read the checkpoint in a folder; return None if there is none."""
     path = folder / CHECKPOINT_NAME
     if not path.exists():
         return None

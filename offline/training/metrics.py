@@ -24,16 +24,7 @@ class MetricsWriter:
     """
 
     def __init__(self, folder: Path, first_update: int) -> None:
-        """Open both files in `folder`.
-
-        Args:
-            folder: Existing folder.
-            first_update: Number of this session's first update, counted from 1. Rows of an earlier
-                session for this or later updates are dropped.
-
-        Raises:
-            TrainingError: A file cannot be written.
-        """
+        """Open both files in `folder`."""
         # Imported here because a process that only handles summaries does not need torch.
         from torch.utils.tensorboard import SummaryWriter
 
@@ -47,11 +38,7 @@ class MetricsWriter:
         self._has_header = bool(kept)
 
     def write(self, update: int, learning_rate: float, terms: Mapping[str, float]) -> None:
-        """Append the values of one update.
-
-        Raises:
-            TrainingError: A file cannot be written.
-        """
+        """Append the values of one update."""
         scalars = {"learning_rate": learning_rate, **terms}
         with writing(self._path):
             if not self._has_header:
@@ -63,11 +50,7 @@ class MetricsWriter:
                 self._board.add_scalar(f"train/{name}", value, update)
 
     def close(self) -> None:
-        """Close both files.
-
-        Raises:
-            TrainingError: A file cannot be written.
-        """
+        """Close both files."""
         with writing(self._path):
             try:
                 self._file.close()

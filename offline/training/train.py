@@ -120,9 +120,6 @@ def train_seeds(
     """Train some seeds of a run that another process has locked and started.
 
     The seeds continue from their checkpoints. The other arguments are those of `train`.
-
-    Raises:
-        SpaceError, TrainingError, UsageError: As for `train`.
     """
     run = _prepared(dataset, config, folder, identity, device, reuses=True)
     return run.train(config, seeds, report)
@@ -143,11 +140,7 @@ def start_run(
     seeds: range,
     resume: bool,
 ) -> None:
-    """Write or check the config of a locked run; warn of settings that hardly learn.
-
-    Raises:
-        OutputExistsError, TrainingError: As for `train`.
-    """
+    """Write or check the config of a locked run; warn of settings that hardly learn."""
     late = schedule_warning(read_updates(folder), config) if resume else None
     size = len(dataset)
     open_run(folder, identity, resume, seeds, env_id=dataset.env_id, transitions=size)
@@ -340,13 +333,7 @@ def earlier_scales(folder: Path) -> tuple[ObservationEncoder | None, float | Non
 def with_more_data(
     learner: Learner, dataset: Dataset, held_out_episodes: NDArray[np.int64]
 ) -> Learner:
-    """Return a learner for the grown dataset, with the weights and state of `learner`.
-
-    Args:
-        learner: Learner to continue.
-        dataset: Dataset of the learner, followed by new episodes.
-        held_out_episodes: Numbers of the held-out episodes.
-    """
+    """Return a learner for the grown dataset, with the weights and state of `learner`."""
     weights = dataset.weights.copy()
     weights[held_out_episodes] = 0.0
     buffer = TransitionBuffer.from_dataset(

@@ -38,14 +38,7 @@ class HeldOut:
     def __init__(
         self, dataset: Dataset, buffer: TransitionBuffer, episodes: NDArray[np.int64], gamma: float
     ) -> None:
-        """Choose the transitions.
-
-        Args:
-            dataset: All episodes.
-            buffer: The same episodes as tensors.
-            episodes: Numbers of the held-out episodes.
-            gamma: Discount.
-        """
+        """Choose the transitions."""
         lengths = dataset.episode_lengths
         rows = np.flatnonzero(np.isin(np.repeat(np.arange(len(lengths)), lengths), episodes))
         returns = monte_carlo_returns(dataset, episodes, gamma)
@@ -87,11 +80,6 @@ def monte_carlo_returns(
 ) -> NDArray[np.float64]:
     """Return the discounted sum of rewards from each transition to the end of its episode.
 
-    Args:
-        dataset: All episodes.
-        episodes: Numbers of the requested episodes, ascending.
-        gamma: Discount.
-
     Returns:
         One sum for each transition of these episodes. The sum is NaN if the episode was truncated
         and the discount factor of the first missing reward is above 5 %.
@@ -130,12 +118,7 @@ def horizon_warning(config: TrainingConfig) -> str | None:
 
 
 def schedule_warning(earlier: int | None, config: TrainingConfig) -> str | None:
-    """Return a warning if a run is continued to more updates while its learning rate decays.
-
-    Args:
-        earlier: Number of updates that the run had; None if unknown.
-        config: Settings with the new number of updates.
-    """
+    """Return a warning if a run is continued to more updates while its learning rate decays."""
     if earlier is None or earlier >= config.updates or config.final_learning_rate_fraction == 1:
         return None
     return (
@@ -146,14 +129,7 @@ def schedule_warning(earlier: int | None, config: TrainingConfig) -> str | None:
 
 
 def divergence_warning(before: float, value: float, limit: float) -> str | None:
-    """Return a warning if values grow beyond twice the largest possible return.
-
-    Args:
-        before: Mean value of an earlier batch. There is no warning unless `value` is larger,
-            because values of untrained networks can be large.
-        value: Mean value of this batch.
-        limit: Largest possible return.
-    """
+    """Return a warning if values grow beyond twice the largest possible return."""
     if abs(value) <= max(MAX_EXCESS * limit, 1.0) or abs(value) <= abs(before):
         return None
     return (

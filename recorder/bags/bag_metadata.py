@@ -25,11 +25,6 @@ def read_metadata(path: Path) -> dict[str, Any]:
     Returns:
         `relative_file_paths`, a list of texts, and the texts `compression_mode` and `ros_distro`;
         those that the file has.
-
-    Raises:
-        LogError: The file cannot be read, is not YAML, is too large, or has a value of another
-            type.
-        MissingExtraError: The packages of the `bags` extra are not installed.
     """
     yaml = import_extra("ruamel.yaml", "bags")
     try:
@@ -47,11 +42,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
 
 
 def _values(events: Iterator[Any]) -> dict[str, Any]:
-    """Return the used values of a document, given as the events of a YAML parser.
-
-    Raises:
-        LogError: A value has another type, or is nested too deeply.
-    """
+    """Return the used values of a document, given as the events of a YAML parser."""
     # The first two events begin the stream and the document. An empty stream has no third one.
     start = next(islice(events, 2, None), None)
     tree = _value(events, start) if start else None

@@ -23,11 +23,7 @@ _FREE_SHARE = 0.9
 
 
 def decompress_file(path: Path, target: Path) -> None:
-    """Decompress a file to `target`.
-
-    Raises:
-        LogError: The file is damaged, is too large, or does not fit on the disk.
-    """
+    """Decompress a file to `target`."""
     try:
         size = path.stat().st_size
         most = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * size)
@@ -93,11 +89,7 @@ class CompressedTopic:
 
 
 def _decompressed(data: bytes) -> bytes:
-    """Decompress a message.
-
-    Raises:
-        LogError: The message is damaged or too large.
-    """
+    """Decompress a message."""
     found: bytes | None = None
     try:
         size = zstandard.frame_content_size(data)

@@ -20,17 +20,7 @@ class Database:
     """
 
     def __init__(self, path: Path, distribution: str) -> None:
-        """Open a database and read its topics.
-
-        Args:
-            path: Path of the file.
-            distribution: ROS distribution that the folder of the bag names. If it is empty, that of
-                the database is used.
-
-        Raises:
-            LogError: The tables have not the expected columns.
-            sqlite3.Error: The file is damaged, or not a database.
-        """
+        """Open a database and read its topics."""
         # `immutable`: neither locks nor journals are written.
         uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         self._connection = sqlite3.connect(uri, uri=True, check_same_thread=False)

@@ -32,11 +32,7 @@ class MessageDecoder(Protocol):
     is_open: bool
 
     def decode(self, data: bytes) -> Any:
-        """Decode a message to an object or a dict.
-
-        Raises:
-            LogError: The bytes do not fit the type.
-        """
+        """Decode a message to an object or a dict."""
 
 
 def decoder_of(
@@ -48,19 +44,7 @@ def decoder_of(
     distribution: str = "",
     others: TypeSource | None = None,
 ) -> MessageDecoder:
-    """Return the decoder of a type.
-
-    Args:
-        encoding: Encoding of the messages: `cdr`, `ros1`, `protobuf` or `json`.
-        type_name: Name of the type.
-        schema_encoding: Encoding of the schema; empty without a schema.
-        schema: Definition of the type.
-        distribution: ROS distribution that the bag names.
-        others: Definitions of ROS types that the bag lacks.
-
-    Raises:
-        LogError: The encoding is not supported, or the definition cannot be used.
-    """
+    """Return the decoder of a type."""
     found = _outcome(encoding, type_name, schema_encoding, schema, distribution, others)
     if isinstance(found, LogError):
         raise LogError(str(found))
@@ -107,9 +91,6 @@ def merged(decoders: Sequence[MessageDecoder]) -> tuple[dict[str, str], dict[str
     """Return the fields and constants of a type that has one or more definitions.
 
     A field may be missing in some definitions. Constants with several values are omitted.
-
-    Raises:
-        LogError: A field is a number in one definition, and something else in another.
     """
     fields, values = dict[str, str](), dict[str, set[int]]()
     for decoder in decoders:

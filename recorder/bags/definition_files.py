@@ -28,15 +28,7 @@ class DefinitionFiles:
     """
 
     def __init__(self, paths: Sequence[str | Path]) -> None:
-        """Find the files.
-
-        Args:
-            paths: Files, or folders that are searched: a package, a workspace of packages, or a
-                folder of a package.
-
-        Raises:
-            UsageError: There is no such path, it has no definitions, or it has too many files.
-        """
+        """Find the files."""
         self._paths = [Path(path).absolute() for path in paths]
         self._files: dict[str, list[Path]] = {}
         self._parsed: dict[Path, dict[str, Any] | LogError] = {}
@@ -54,11 +46,7 @@ class DefinitionFiles:
         return ", ".join(map(str, self._paths))
 
     def types_of(self, name: str) -> Any | None:
-        """Return constants and fields of the type with this full name; None if no file has it.
-
-        Raises:
-            LogError: The file cannot be read, does not parse, or another file differs from it.
-        """
+        """Return constants and fields of the type with this full name; None if no file has it."""
         files = self._files.get(name, [])
         # An IDL file is usually generated from a `.msg` file beside it.
         kinds = {file.suffix for file in files}
@@ -89,11 +77,7 @@ class DefinitionFiles:
         return found
 
     def _types_in(self, file: Path) -> dict[str, Any]:
-        """Return the types of a file by their full names.
-
-        Raises:
-            LogError: The file cannot be read, or does not parse.
-        """
+        """Return the types of a file by their full names."""
         if file not in self._parsed:
             try:
                 self._parsed[file] = _parsed(file, _package_of(file))
@@ -148,11 +132,7 @@ def _names_of(file: Path, package: str) -> list[str]:
 
 
 def _parsed(file: Path, package: str) -> dict[str, Any]:
-    """Return the types of a file by their full names.
-
-    Raises:
-        LogError: The file cannot be read, is too large, or does not parse.
-    """
+    """Return the types of a file by their full names."""
     try:
         if not file.is_file():
             raise LogError("not a regular file")

@@ -42,9 +42,6 @@ def find_bags(data: str | Path | Sequence[str | Path]) -> list[Path]:
     A warning names folders that have no bags.
 
     Copies of images, which are beside their bags, are left out.
-
-    Raises:
-        LogError: There is no such path, or a folder has no bags.
     """
     if not isinstance(data, str | Path):
         parts = [part for part in data if Path(part).suffix != _COPY] or data
@@ -123,13 +120,6 @@ def open_recordings(paths: Sequence[Path], opened: ExitStack) -> list[list[McapF
 
     The files that a `metadata.yaml` lists are the parts of one recording, whether the folder or
     some of its files are given. Every other file is a recording.
-
-    Args:
-        paths: Paths of files and folders.
-        opened: Stack that closes the files, and removes decompressed copies.
-
-    Raises:
-        LogError: A path is not a bag, or a bag is damaged.
     """
     parts: dict[str, list[McapFile | RosbagFile]] = {}
     for path in paths:
@@ -176,11 +166,7 @@ def _unlisted(folder: Path, listed: Sequence[Path]) -> list[Path]:
 
 
 def _existing(path: Path) -> Path:
-    """Return a listed file, or its compressed or decompressed copy.
-
-    Raises:
-        LogError: The file is missing.
-    """
+    """Return a listed file, or its compressed or decompressed copy."""
     plain = path.with_name(_plain_name(path))
     for found in (path, plain, plain.with_name(plain.name + _COMPRESSED)):
         if found.exists():
@@ -196,12 +182,7 @@ def _plain_name(path: Path) -> str:
 
 
 def _metadata(folder: Path, *, is_optional: bool = False) -> dict[str, Any]:
-    """Return what is used of the metadata of a rosbag2 folder; empty if there is none.
-
-    Raises:
-        LogError: The file is damaged, too large, or has a value of another type, and is not
-            optional.
-    """
+    """Return what is used of the metadata of a rosbag2 folder; empty if there is none."""
     path = folder / _METADATA
     try:
         return read_metadata(path) if path.exists() else {}

@@ -28,11 +28,7 @@ class JsonDecoder:
     is_open = True
 
     def __init__(self, schema: bytes) -> None:
-        """Collect the fields of the JSON schema; without a schema, the fields are unknown.
-
-        Raises:
-            LogError: The schema is not JSON, or has too many fields.
-        """
+        """Collect the fields of the JSON schema; without a schema, the fields are unknown."""
         self.fields, self.constants = dict[str, str](), dict[str, int]()
         self.unreadable: dict[str, str] = {}
         self._visited = 0
@@ -48,11 +44,7 @@ class JsonDecoder:
         self._collect(self._root, "", "", ())
 
     def decode(self, data: bytes) -> Any:
-        """Decode a message to a dict.
-
-        Raises:
-            LogError: The bytes are not a JSON object.
-        """
+        """Decode a message to a dict."""
         try:
             found = json.loads(data)
         except (ValueError, RecursionError) as error:

@@ -36,15 +36,7 @@ class McapFile:
     """
 
     def __init__(self, path: Path, *, distribution: str = "") -> None:
-        """Open a file.
-
-        Args:
-            path: Path of the file.
-            distribution: ROS distribution that the folder of the bag names.
-
-        Raises:
-            LogError: The file is not an MCAP file, or damaged.
-        """
+        """Open a file."""
         self.path = path
         reader = McapReader(path)
         self.complete = reader.complete

@@ -31,11 +31,7 @@ _INDEX_DIGITS = 18
 
 @lru_cache(maxsize=1024)
 def steps_of(path: str) -> tuple[Step, ...]:
-    """Parse the path of a field.
-
-    Raises:
-        UsageError: The path has a wrong character, index or slice.
-    """
+    """Parse the path of a field."""
     steps: list[Step] = []
     place = 0
     while place < len(path):

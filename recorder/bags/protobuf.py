@@ -68,12 +68,7 @@ class ProtobufDecoder:
     is_open = False
 
     def __init__(self, type_name: str, schema: bytes) -> None:
-        """Build the message class.
-
-        Raises:
-            LogError: The schema is not a FileDescriptorSet with the type, or the type is too large.
-            MissingExtraError: protobuf is not installed.
-        """
+        """Build the message class."""
         factory = import_extra(f"{_PACKAGE}.message_factory", "bags")
         self._name = type_name.removeprefix(".")
         try:
@@ -93,11 +88,7 @@ class ProtobufDecoder:
         }
 
     def decode(self, data: bytes) -> Any:
-        """Decode a message to an object with an attribute for each field; None if it is not set.
-
-        Raises:
-            LogError: The bytes do not fit the type.
-        """
+        """Decode a message to an object with an attribute for each field; None if it is not set."""
         try:
             return self._wrapped(self._class.FromString(data))
         # protobuf's own error is DecodeError; other errors come from invalid strings.
@@ -145,9 +136,6 @@ def _pool(schema: bytes) -> Any:
     """Return a pool with the files of a FileDescriptorSet, which can be in any order.
 
     Files that come with protobuf may be missing, and those of which nothing is used.
-
-    Raises:
-        LogError: Files import each other, or a file has two versions.
     """
     descriptors = import_extra(f"{_PACKAGE}.descriptor_pb2", "bags")
     files: dict[str, Any] = {}

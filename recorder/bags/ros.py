@@ -40,19 +40,7 @@ class RosDecoder:
         distribution: str = "",
         others: TypeSource | None = None,
     ) -> None:
-        """Parse the definition.
-
-        Args:
-            type_name: Name of the type, such as `nav_msgs/msg/Odometry`.
-            text: Definition with its nested types; empty if the bag has none.
-            encoding: `ros2msg`, `ros2idl` or `ros1msg`.
-            distribution: ROS distribution that the bag names, such as `humble`.
-            others: Definitions of types that the bag lacks.
-
-        Raises:
-            LogError: The definition does not parse, a type is not defined, contains itself, or is
-                too large.
-        """
+        """Parse the definition."""
         self._is_ros1 = encoding == ROS1
         self._name = full_name(type_name)
         self._definitions = definitions_of(self._name, text, encoding, distribution, others)
@@ -69,10 +57,6 @@ class RosDecoder:
         self.fields = leaf_kinds(types, self._name, inner=True)
 
     def decode(self, data: bytes) -> Any:
-        """Decode a message to an object with an attribute for each field.
-
-        Raises:
-            LogError: The bytes do not fit the type.
-        """
+        """Decode a message to an object with an attribute for each field."""
         whole = None if self._wide is None else self._wide.decode(data)
         return self._definitions.decode(data, is_ros1=self._is_ros1) if whole is None else whole

@@ -32,15 +32,7 @@ class RosbagFile:
     complete = True
 
     def __init__(self, path: Path, *, distribution: str = "") -> None:
-        """Open a bag.
-
-        Args:
-            path: Path of the file.
-            distribution: ROS distribution that the folder of the bag names.
-
-        Raises:
-            LogError: The bag is damaged, or its format is unknown.
-        """
+        """Open a bag."""
         self.path = path
         is_ros1 = path.suffix == ".bag"
         try:
@@ -95,11 +87,7 @@ class _Ros1Reader(Reader):
 
 
 def _decompressed(compression: str, size: int, data: bytes) -> bytes:
-    """Decompress a chunk of `size` bytes.
-
-    Raises:
-        LogError: The chunk is too large, or has another size.
-    """
+    """Decompress a chunk of `size` bytes."""
     if size > MAX_CHUNK_BYTES:
         raise LogError(f"a chunk declares {size} bytes; the limit is {MAX_CHUNK_BYTES}")
     decompressor: Any = (

@@ -360,10 +360,6 @@ def column_of(values: Sequence[Any], kind: str) -> NDArray[Any]:
 
     If all messages lack the field, and not just because they omit a key, the column contains the
     `Lack` objects. A time that a message lacks makes the column float64, with NaN.
-
-    Args:
-        values: Value of the field in each message as from `value_at`.
-        kind: Kind of the field as in `bag.TopicInfo`; empty if unknown.
     """
     if are_bytes(kind):
         values = [_bytes_of(value) for value in values]

@@ -30,15 +30,7 @@ class WideForms:
     """
 
     def __init__(self, types: Mapping[str, Any], name: str) -> None:
-        """Find the wide strings.
-
-        Args:
-            types: Constants and fields of each type by its full name.
-            name: Full name of the type.
-
-        Raises:
-            ValueError: Another type has an unknown encoding, or an array contains wide strings.
-        """
+        """Find the wide strings."""
         self._name, self._all = name, types
         self.paths = tuple(_paths(types, name, ""))
         self.types = {key: _replaced(found, None) for key, found in types.items()}

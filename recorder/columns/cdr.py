@@ -130,11 +130,7 @@ class MessageType:
     """Message type parsed from a schema."""
 
     def __init__(self, name: str, text: str, encoding: str = "ros2msg") -> None:
-        """Parse a ROS 2 definition; see `definitions_of`.
-
-        Raises:
-            LogError: The definition does not parse, or a type is not defined.
-        """
+        """Parse a ROS 2 definition; see `definitions_of`."""
         self.name = name = full_name(name)
         self._layouts: dict[tuple[object, ...], Layout | None] = {}
         self._definitions = definitions_of(name, text, encoding)
@@ -169,11 +165,7 @@ class MessageType:
         return {path: np.dtype(codes.get(kind, object)) for path, kind in found.items()}
 
     def decode(self, data: bytes) -> Any:
-        """Decode one message to an object with an attribute for each field.
-
-        Raises:
-            CorruptLogError: The bytes do not fit the type.
-        """
+        """Decode one message to an object with an attribute for each field."""
         try:
             return self._definitions.decode(data)
         except LogError as error:
@@ -329,11 +321,7 @@ class _NoLayout(Exception):
 
 
 def message_type(schema: Schema) -> MessageType:
-    """Return the message type of a schema. Each schema is parsed only once.
-
-    Raises:
-        LogError: The encoding is neither `ros2msg` nor `ros2idl`, or the definition cannot be used.
-    """
+    """Return the message type of a schema. Each schema is parsed only once."""
     if schema.encoding not in ("ros2msg", "ros2idl"):
         raise LogError(f"schema {schema.name} has encoding {schema.encoding!r}, not 'ros2msg'")
     return _parsed(schema.name, schema.data.decode(errors="replace"), schema.encoding)

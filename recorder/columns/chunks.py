@@ -201,9 +201,6 @@ def chunk_records(file: memoryview, offset: int, scratch: Scratch | None = None)
     """Return the records of the chunk at `offset`, decompressed and checked against their CRC.
 
     The records are valid until the next use of `scratch`; without `scratch`, they get new memory.
-
-    Raises:
-        CorruptLogError: The chunk is damaged, or its decompressed size does not match its header.
     """
     header = chunk_header(file, offset)
     records = _decompress(file[header.data], header, offset, scratch or Scratch())
@@ -316,11 +313,7 @@ def chunk_index_record(chunk: ChunkIndex) -> bytes:
 
 
 def parse_chunk_index(content: memoryview) -> ChunkIndex:
-    """Parse the content of a ChunkIndex record.
-
-    Raises:
-        CorruptLogError: The record is damaged.
-    """
+    """Parse the content of a ChunkIndex record."""
     try:
         start_time, end_time, offset, length, map_bytes = _INDEX_START.unpack_from(content)
         middle = _INDEX_START.size + map_bytes
@@ -350,9 +343,6 @@ def parse_chunk_index(content: memoryview) -> ChunkIndex:
 def indexes_of_one(summary: memoryview) -> NDArray[Any]:
     """Return the leading ChunkIndex records of chunks with one channel and zstd compression.
 
-    Args:
-        summary: Records of the summary. The result ends before the first record of another kind.
-
     Returns:
         Copy of the records, an array of `_INDEX_OF_ONE`. Parsing many records takes a hundredth of
         the time of `parse_chunk_index`.
@@ -375,12 +365,7 @@ class ChunkIndexes(LazySequence[ChunkIndex]):
     """
 
     def __init__(self, rows: NDArray[Any], others: Sequence[ChunkIndex] = ()) -> None:
-        """Sort indexes by the offset of their chunk.
-
-        Args:
-            rows: Result of `indexes_of_one`.
-            others: Other indexes.
-        """
+        """Sort indexes by the offset of their chunk."""
         made = dict(enumerate(others, len(rows)))
         if others:
             rows = np.append(rows, np.array(list(map(_row_of, others)), _INDEX_OF_ONE))

@@ -62,11 +62,7 @@ class Decoder:
     """
 
     def __init__(self, reader: McapReader, channel: Channel) -> None:
-        """Parse the message type.
-
-        Raises:
-            LogError: The encoding of the messages is not supported.
-        """
+        """Parse the message type."""
         if channel.message_encoding != "cdr":
             raise LogError(
                 f"{reader.path}: messages of {channel.topic} have encoding"

@@ -44,16 +44,8 @@ def full_name(name: str) -> str:
 def parsed_types(name: str, text: str, encoding: str) -> dict[str, Any]:
     """Parse a definition.
 
-    Args:
-        name: Full name of the type that the text begins with. In IDL, each type has its name.
-        text: Definition, which may contain the definitions of nested types.
-        encoding: `ros2msg`, `ros2idl` or `ros1msg`.
-
     Returns:
         Constants and fields of each type by its name, as rosbags describes them.
-
-    Raises:
-        LogError: The definition does not parse.
     """
     text = text.replace("\r\n", "\n").replace("\r", "\n").strip("\ufeff\0")
     try:
@@ -79,11 +71,7 @@ def parsed_types(name: str, text: str, encoding: str) -> dict[str, Any]:
 
 
 def _check_length(count: int) -> None:
-    """Check the number of lines or declarations; the parser of rosbags takes 0.2 ms for each.
-
-    Raises:
-        LogError: There are too many.
-    """
+    """Check the number of lines or declarations; the parser of rosbags takes 0.2 ms for each."""
     if count > MAX_TYPE_FIELDS:
         raise LogError(f"it has more than {MAX_TYPE_FIELDS} fields and constants")
 
@@ -108,12 +96,7 @@ def _plain(description: Any) -> Any:
 
 
 def _plain_idl(text: str) -> str:
-    """Return IDL without comments, annotations and preprocessor lines.
-
-    Raises:
-        LogError: The text has an expression whose evaluation can take very long or much memory, or
-            a condition that cannot be evaluated.
-    """
+    """Return IDL without comments, annotations and preprocessor lines."""
     text = _preprocessed(_COMMENT.sub(lambda match: match[1] or " ", text))
     # Annotations, such as units and default values, do not change the encoding of a message.
     text = _ANNOTATION.sub(" ", text)

@@ -39,11 +39,7 @@ class TypeSource(Hashable, Protocol):
     """Definitions of types that a file lacks."""
 
     def types_of(self, name: str) -> Any | None:
-        """Return constants and fields of the type with this full name; None if it is unknown.
-
-        Raises:
-            LogError: The definition cannot be read.
-        """
+        """Return constants and fields of the type with this full name; None if it is unknown."""
 
 
 class Definitions:
@@ -60,11 +56,7 @@ class Definitions:
     """
 
     def __init__(self, name: str, types: dict[str, Any], *, is_own: bool = True) -> None:
-        """Check the parsed definitions; see `definitions_of`.
-
-        Raises:
-            LogError: A type contains itself, or is too large.
-        """
+        """Check the parsed definitions; see `definitions_of`."""
         self.name, self.is_own = name, is_own
         check_size(types, name)
         self.unreadable: dict[str, str] = {}
@@ -95,11 +87,7 @@ class Definitions:
         return store
 
     def decode(self, data: bytes, *, is_ros1: bool = False) -> Any:
-        """Decode a message to an object with an attribute for each field.
-
-        Raises:
-            LogError: The bytes do not fit the type, or no code can be generated for it.
-        """
+        """Decode a message to an object with an attribute for each field."""
         try:
             if self.unreadable:
                 return self._beginning(data, is_ros1=is_ros1)
@@ -132,17 +120,6 @@ def definitions_of(
 
     The definition of each type is that of the file, or else that of `others`, or else that of the
     distribution.
-
-    Args:
-        name: Full name of the type.
-        text: Definition with its nested types; empty if the file has none.
-        encoding: `ros2msg`, `ros2idl` or `ros1msg`.
-        distribution: ROS distribution of the file, such as `humble`; empty if unknown.
-        others: Definitions of types that the file lacks.
-
-    Raises:
-        LogError: The definition does not parse, a type is not defined, contains itself, or is too
-            large.
     """
     if len(text) > MAX_DEFINITION_BYTES:
         raise LogError(
@@ -202,13 +179,6 @@ def leaf_kinds(
     Kinds of numbers, strings and arrays are, for example, `float64`, `string`, `float32[36]` and
     `uint8[]`. Times and durations have the kind `time`; their fields `sec` and `nanosec` are leaf
     fields as well. The kind of an array of messages is, for example, `geometry_msgs/msg/Point[]`.
-
-    Args:
-        types: Definitions of the type and all nested ones; see `Definitions.types`.
-        name: Full name of the type.
-        prefix: Path of the field that has this type, with a final dot; empty at the top level.
-        inner: Whether to add the leaf fields in arrays of messages: the path is, for example,
-            `points[].x`, and `[]` is added to the kind for each such array, as in `float64[]`.
     """
     found = dict[str, str]()
     for field, description in types[name][1]:
@@ -260,9 +230,6 @@ def _readable(types: dict[str, Any], name: str, unreadable: dict[str, str]) -> d
 
     The encoding of a wide string depends on the DDS of the robot, so that the positions of all
     fields after it are unknown.
-
-    Raises:
-        LogError: The first field cannot be read.
     """
     found = dict(types)
     is_wide: dict[str, bool] = {}
@@ -317,11 +284,7 @@ def _wide_word(types: Mapping[str, Any], description: Any) -> str:
 
 
 def check_size(types: Mapping[str, Any], name: str) -> None:
-    """Check the size of a type and of all types that are nested in it.
-
-    Raises:
-        LogError: A type contains itself, or is too large.
-    """
+    """Check the size of a type and of all types that are nested in it."""
     _Sizes(types).of(name, ())
 
 
@@ -356,11 +319,7 @@ class _Sizes:
         self._fixed = 0
 
     def of(self, name: str, parents: tuple[str, ...]) -> _Size:
-        """Return the size of a type that is nested in the types `parents`.
-
-        Raises:
-            LogError: The type contains itself, or is too large.
-        """
+        """Return the size of a type that is nested in the types `parents`."""
         if name in parents:
             raise LogError(f"type {name} contains itself")
         if len(parents) >= MAX_TYPE_DEPTH:

@@ -40,11 +40,7 @@ def place(reader: McapReader, chunk: ChunkIndex) -> str:
 
 
 def check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> list[Problem]:
-    """Compare the records of a chunk with its header, its indexes, and its entry in the summary.
-
-    Raises:
-        CorruptLogError: An index or a record is damaged.
-    """
+    """Compare the records of a chunk with its header, its indexes, and its entry in the summary."""
     found = []
     header = chunk_header(reader.view, chunk.chunk_start_offset)
     listed = (chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size)
@@ -118,11 +114,7 @@ def _has_alike(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
 
 
 def check_statistics(reader: McapReader) -> list[Problem]:
-    """Compare the counts in the summary with the numbers of records in the file.
-
-    Raises:
-        CorruptLogError: An index is damaged.
-    """
+    """Compare the counts in the summary with the numbers of records in the file."""
     records = reader.records(reader.summary_start) if reader.summary_start else ()
     triples: list[tuple[str, int, int]] = []
     for content in (content for _, opcode, content in records if opcode == Opcode.STATISTICS):

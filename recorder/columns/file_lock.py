@@ -27,11 +27,6 @@ def create(path: Path, *, overwrite: bool) -> FileIO:
     """Create and lock a file and the missing folders of its path.
 
     If a file is overwritten, processes that have it open still read the old contents.
-
-    Raises:
-        OutputExistsError: The file exists and `overwrite` is not set, or the path is not a regular
-            file.
-        LogError: The file cannot be created, or another writer has locked it.
     """
     check_target(path, overwrite=overwrite)
     try:
@@ -50,11 +45,7 @@ def create(path: Path, *, overwrite: bool) -> FileIO:
 
 
 def reopen(path: Path) -> FileIO:
-    """Open and lock an existing file.
-
-    Raises:
-        LogError: The file cannot be written, or another writer has locked it.
-    """
+    """Open and lock an existing file."""
     try:
         while True:
             check_regular(path)
@@ -83,10 +74,6 @@ def replaced(path: Path, locked: FileIO, length: int) -> FileIO:
         path: Path of the file; a symbolic link is followed.
         locked: The file, locked by the caller.
         length: Number of bytes to copy; the returned file is positioned after them.
-
-    Raises:
-        LogError: Another process is writing the file.
-        OSError: The copy cannot be written.
     """
     path = path.resolve()
     with work_folder(path) as folder:
@@ -104,11 +91,7 @@ def replaced(path: Path, locked: FileIO, length: int) -> FileIO:
 
 
 def copy_start(source: FileIO, target: FileIO, length: int) -> None:
-    """Copy the first bytes of a file.
-
-    Raises:
-        OSError: The source is shorter, or the target cannot be written.
-    """
+    """Copy the first bytes of a file."""
     source.seek(0)
     while length:
         part = memoryview(source.read(min(length, _COPIED_BYTES)))

@@ -102,11 +102,6 @@ class FieldCopy:
     def __call__(self, records: memoryview, index: NDArray[Any], row: int = 0) -> bool:
         """Check and copy messages, in one pass.
 
-        Args:
-            records: Records of the chunk.
-            index: Array of `INDEX_ENTRY`, at least one.
-            row: Row of the columns for the first message.
-
         Returns:
             Whether all messages are in the chunk and have the times of the index, the channel, the
             size and the constants; if not, the contents of the rows are undefined.
@@ -147,11 +142,7 @@ def message_index_head(channel_id: int, entries_bytes: int) -> bytes:
 
 
 def message_index(file: memoryview, offset: int, channel_id: int) -> NDArray[Any]:
-    """Return the entries of the MessageIndex record at `offset`, an array of `INDEX_ENTRY`.
-
-    Raises:
-        CorruptLogError: The record is not a message index of this channel.
-    """
+    """Return the entries of the MessageIndex record at `offset`, an array of `INDEX_ENTRY`."""
     try:
         opcode, _, channel, entries_bytes = _INDEX_START.unpack_from(file, offset)
     # Offsets of 2**63 and above overflow.
@@ -188,9 +179,6 @@ class MessageRange:
         """Array of `INDEX_ENTRY`, one entry for each message.
 
         It is read from the file at first use.
-
-        Raises:
-            CorruptLogError: The index is damaged.
         """
         return self._read(self)
 
@@ -242,14 +230,7 @@ class MessageRanges(LazySequence[MessageRange]):
         range_of: Callable[[int, int], MessageRange],
         made: dict[int, MessageRange],
     ) -> None:
-        """Leave out the ranges without messages.
-
-        Args:
-            counts: Number of messages of each range.
-            chunks: Number of the chunk of each range; -1 for unchunked messages.
-            range_of: Function that creates a range from the number of its chunk and its count.
-            made: Ranges that exist already, by their position in `counts`.
-        """
+        """Leave out the ranges without messages."""
         kept = np.flatnonzero(counts)
         if made and len(kept) < len(counts):
             made = {new: made[old] for new, old in enumerate(kept.tolist()) if old in made}
@@ -276,14 +257,6 @@ def gather(records: memoryview, index: NDArray[Any], dtype: np.dtype[Any]) -> ND
 
     Adjacent messages are not copied. Other messages are copied by fancy indexing of void items, at
     the speed of memcpy; fancy indexing of structured items takes twenty times as long.
-
-    Args:
-        records: Records of the chunk.
-        index: Array of `INDEX_ENTRY`.
-        dtype: Result of `record_dtype`.
-
-    Raises:
-        CorruptLogError: An entry points outside of the chunk.
     """
     offsets, size = index["offset"], dtype.itemsize
     if len(offsets) == 0:

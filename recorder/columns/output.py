@@ -187,14 +187,6 @@ def compact(
     """Rewrite a finished file with larger chunks if it has many small chunks.
 
     An error while writing leaves the original unchanged.
-
-    Args:
-        path: Path of the file.
-        file: The file, locked by the caller. Its lock keeps out other writers until the new file
-            is in place.
-        summary: Summary of the file.
-        data_end: First byte of the DataEnd record.
-        compressors: Compression of the merged chunks.
     """
     groups = groups_of(summary.chunks)
     saved = len(summary.chunks) - len(groups)
@@ -262,12 +254,7 @@ class _CompactedFile(OutputFile):
         groups: list[list[ChunkIndex]],
         compressors: Compressors,
     ) -> None:
-        """Write the whole copy.
-
-        Raises:
-            CorruptLogError: The file is damaged, or has chunks that its summary does not list.
-            LogError: The copy cannot be written.
-        """
+        """Write the whole copy."""
         scratch = Scratch()
         self._summary.schemas, self._summary.channels = summary.schemas, summary.channels
         self._summary.counts = summary.counts

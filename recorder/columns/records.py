@@ -52,12 +52,7 @@ _FAILED = ctypes.c_void_p(-1).value
 
 
 def mapped(descriptor: int, size: int) -> memoryview:
-    """Map the first `size` bytes of a file; the caller may close the descriptor.
-
-    Raises:
-        OSError: The file cannot be mapped.
-        ValueError: The file is shorter, on systems where `mmap.mmap` is used.
-    """
+    """Map the first `size` bytes of a file; the caller may close the descriptor."""
     if _LIBC is None:
         return memoryview(mmap.mmap(descriptor, size, access=mmap.ACCESS_READ))
     return np.asarray(_Map(descriptor, size)).data
@@ -156,12 +151,7 @@ def map_file(path: Path) -> memoryview:
 
 
 def map_unchanged(path: Path) -> tuple[memoryview, os.stat_result]:
-    """Map a regular file into memory; return its bytes and its current `stat` result.
-
-    Raises:
-        NotMcapError: The file is empty.
-        LogError: The file cannot be read, or is a folder, device or FIFO.
-    """
+    """Map a regular file into memory; return its bytes and its current `stat` result."""
     try:
         descriptor = open_at_once(path)
         try:
@@ -197,11 +187,7 @@ def records_of(
 
 
 def parse_record(opcode: int, content: memoryview) -> Any:
-    """Parse the content of a record with the `mcap` library.
-
-    Raises:
-        CorruptLogError: The record is damaged.
-    """
+    """Parse the content of a record with the `mcap` library."""
     try:
         return _PARSERS[opcode].read(ReadDataStream(io.BytesIO(content)))
     # The `mcap` library raises errors of many types when a record is damaged.
@@ -232,11 +218,7 @@ class UnindexedMessages:
     _offsets: dict[int, array[int]] = field(default_factory=dict)
 
     def add(self, offset: int, content: memoryview) -> None:
-        """Add the Message record at `offset`.
-
-        Raises:
-            CorruptLogError: The record is shorter than its header.
-        """
+        """Add the Message record at `offset`."""
         if len(content) < MESSAGE_HEADER.itemsize - RECORD_HEADER_BYTES:
             raise CorruptLogError(f"the message at byte {offset} is shorter than its header")
         channel_id, _, log_time = MESSAGE_START.unpack_from(content)
@@ -267,11 +249,7 @@ class ChunkContents:
 
 
 def contents_of(chunk: memoryview) -> ChunkContents:
-    """Scan the records of a chunk.
-
-    Raises:
-        CorruptLogError: A record is damaged, or extends beyond the end of the chunk.
-    """
+    """Scan the records of a chunk."""
     indexes = _uniform_indexes(chunk) or _message_indexes(chunk)
     if indexes is not None:
         return ChunkContents([], indexes)
@@ -352,11 +330,7 @@ def start_of_summary(view: memoryview) -> int:
 
 
 def footer_of(view: memoryview) -> Footer | None:
-    """Return the footer; None if the file does not end with one.
-
-    Raises:
-        CorruptLogError: The summary is outside of the file, or does not match its CRC.
-    """
+    """Return the footer; None if the file does not end with one."""
     start = len(view) - len(MAGIC) - _FOOTER_BYTES
     if start < len(MAGIC) or bytes(view[-len(MAGIC) :]) != MAGIC:
         return None

@@ -142,11 +142,7 @@ class WrittenState:
 
 
 def written_state(path: Path) -> WrittenState:
-    """Open a finished file, and return the state that a writer needs to append to it.
-
-    Raises:
-        LogError: The file is damaged or not finished, or has messages outside of chunks.
-    """
+    """Open a finished file, and return the state that a writer needs to append to it."""
     try:
         return finished_state(McapReader(path))
     except CorruptLogError as error:
@@ -158,11 +154,7 @@ def written_state(path: Path) -> WrittenState:
 
 
 def finished_state(reader: McapReader) -> WrittenState:
-    """Return the state of a finished file, from which a writer can append to it.
-
-    Raises:
-        CorruptLogError: The file is damaged or not finished, or has messages outside of chunks.
-    """
+    """Return the state of a finished file, from which a writer can append to it."""
     end = reader.summary_start - _DATA_END.size
     if end <= 0 or _DATA_END.unpack_from(reader.view, end)[:2] != (Opcode.DATA_END, 4):
         raise CorruptLogError("the file is not finished")

@@ -43,12 +43,7 @@ class Topic:
     """
 
     def __init__(self, reader: McapReader, name: str) -> None:
-        """Find the messages without reading chunks that have an index.
-
-        Raises:
-            CorruptLogError: An index is damaged.
-            LogError: The encoding of messages is not supported.
-        """
+        """Find the messages without reading chunks that have an index."""
         self.name = name
         self._reader = reader
         found = [(channel, reader.message_ranges(channel)) for channel in reader.channels_of(name)]
@@ -80,11 +75,7 @@ class Topic:
 
     @cached_property
     def times(self) -> NDArray[np.int64]:
-        """(N,) log_time of each message, in the order of `parts`.
-
-        Raises:
-            CorruptLogError: An index is damaged.
-        """
+        """(N,) log_time of each message, in the order of `parts`."""
         times = np.empty(len(self), np.int64)
         self._fetch_indexes()
         for (_, part), stop in zip(self.parts, self._stops.tolist(), strict=True):
@@ -119,9 +110,6 @@ class Topic:
         """Dtypes of the top-level fields.
 
         The dtype is `object` for all fields except numbers, arrays of numbers, and times.
-
-        Raises:
-            LogError: The channels of the topic have different types.
         """
         dtypes = [decoder.type.dtypes for decoder in self._decoders]
         if any(other != dtypes[0] for other in dtypes[1:]):
@@ -142,18 +130,6 @@ class Topic:
         """Read columns: `log_time` and the wanted fields.
 
         A time or duration is an int64 in nanoseconds. Arrays of strings and of messages are lists.
-
-        Args:
-            wanted: Names of fields, or dotted paths of nested fields; `kinds` lists all paths.
-            order: Positions in `times` of the messages to read, by default all. Chunks without
-                such messages are not read.
-            threads: Number of threads that decompress chunks and copy messages.
-
-        Raises:
-            CorruptLogError: A chunk is damaged, or a message does not fit its type.
-            LogError: The shape or type of a field is not the same in all messages, or a field
-                cannot be read; see `Definitions.unreadable`.
-            UnknownNameError: The type has no such field, or the field is a message.
         """
         self._check(wanted)
         if self._reader.is_remote:

@@ -29,17 +29,7 @@ RestoreMetadata = Callable[[list[Metadata], Iterable[Channel]], list[Metadata]]
 def recover_file(
     source: Path, target: Path, damages: list[Damage], restore: RestoreMetadata
 ) -> None:
-    """Write the valid records of a damaged file in chunks with new indexes and CRCs.
-
-    Args:
-        source: Path of the damaged file.
-        target: Path of the new file; an existing one is replaced.
-        damages: List to which the function adds damaged ranges and records that cannot be copied.
-        restore: Function that returns the metadata records to write.
-
-    Raises:
-        LogError: A file cannot be read or written.
-    """
+    """Write the valid records of a damaged file in chunks with new indexes and CRCs."""
     view = map_file(source)
     records = list(valid_records(view, damages))
     with writer_like(view, records, target) as writer:

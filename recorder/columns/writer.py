@@ -56,20 +56,7 @@ class McapWriter(OutputFile):
         source: Path | None = None,
         profile: str = "ros2",
     ) -> None:
-        """Create the file, or open it to append.
-
-        Args:
-            path: Path of the file; missing folders are created.
-            compression: Compression of chunks: `zstd`, `lz4` or `none`.
-            overwrite: Whether to replace an existing file.
-            append: Whether to write after the last record of an existing file.
-            source: Finished file whose records are copied to the start of a new file.
-            profile: Profile of a new file.
-
-        Raises:
-            OutputExistsError: The file exists, and neither `overwrite` nor `append` is set.
-            LogError: The file cannot be written, another writer has locked it, or it is damaged.
-        """
+        """Create the file, or open it to append."""
         if compression not in COMPRESSIONS:
             raise UnknownNameError("compression", compression, COMPRESSIONS)
         self._compressors, self._profile = Compressors(compression), profile
@@ -150,12 +137,7 @@ class McapWriter(OutputFile):
         self._top_level.append(record)
 
     def start_next(self, path: Path) -> None:
-        """Close the file and start another with the same channels, metadata and attachments.
-
-        Raises:
-            OutputExistsError: The file exists.
-            LogError: The file cannot be written.
-        """
+        """Close the file and start another with the same channels, metadata and attachments."""
         self.close()
         self._begin(path, overwrite=False)
         for record in self._top_level:
@@ -211,12 +193,7 @@ class McapWriter(OutputFile):
         )
 
     def write_records(self, records: memoryview, indexes: Mapping[int, NDArray[Any]]) -> None:
-        """Write a chunk of complete records.
-
-        Args:
-            records: Message records with sequence numbers. Their channels are already in the file.
-            indexes: Arrays of `message_rows.INDEX_ENTRY` by channel id.
-        """
+        """Write a chunk of complete records."""
         starts = [int(index["log_time"].min()) for index in indexes.values()]
         ends = [int(index["log_time"].max()) for index in indexes.values()]
         self._store(
@@ -227,13 +204,7 @@ class McapWriter(OutputFile):
         )
 
     def copy_chunk(self, view: memoryview, chunk: ChunkIndex, counts: Mapping[int, int]) -> None:
-        """Copy a chunk and its message indexes from another file without decompressing it.
-
-        Args:
-            view: Bytes of the other file.
-            chunk: Index of the chunk. Its channels are already in this file, with the same ids.
-            counts: Number of messages of the chunk by channel id.
-        """
+        """Copy a chunk and its message indexes from another file without decompressing it."""
         with HoldSignals():
             self._copy_chunk(view, chunk)
             for channel_id, count in counts.items():
@@ -288,9 +259,6 @@ class McapWriter(OutputFile):
         """Replace the file with a copy that has no summary section.
 
         The file is not changed in place, because readers may have mapped it into memory.
-
-        Raises:
-            LogError: The copy cannot be written; the file stays unchanged.
         """
         try:
             self._file = replaced(self.path, self._file, self.position)

@@ -20,18 +20,8 @@ def with_mask(
 ) -> tuple[Transitions, LogMetadata]:
     """Add the flags of the allowed actions to the observations.
 
-    Args:
-        columns: Columns of a dataset, whose observations have no part `action_mask`.
-        description: Metadata of the dataset.
-        source: `info:NAME`, or the key of a part of a Dict observation, such as `robot/legal`.
-
     Returns:
         The columns and metadata of Dict observations, whose part `observation` is the original one.
-
-    Raises:
-        SpaceError: The observations have a mask already, the values are not rows of flags, or a
-            frame in which an action was chosen has none.
-        UnknownNameError: There is no such info or part.
     """
     space = description.observation_space
     if isinstance(space, spaces.Dict) and MASK_KEY in space.spaces:

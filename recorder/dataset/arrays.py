@@ -57,11 +57,7 @@ def description_of(
 def columns_of_arrays(
     description: LogMetadata, observations: Any, next_observations: Any, given: Mapping[str, Any]
 ) -> Transitions:
-    """Convert arrays to columns without times; `given` maps the `STEP_COLUMNS` to arrays.
-
-    Raises:
-        SpaceError: Lengths or shapes do not agree with each other or with the spaces.
-    """
+    """Convert arrays to columns without times; `given` maps the `STEP_COLUMNS` to arrays."""
     steps = len(np.atleast_1d(numbers("rewards", given["rewards"])))
     if steps == 0:
         raise SpaceError("no transitions: the arrays are empty")
@@ -142,11 +138,7 @@ def _space_of(observations: Any) -> spaces.Space[Any]:
 
 
 def action_space_of(actions: NDArray[Any]) -> spaces.Space[Any]:
-    """Infer a Discrete space from integers (N,), or an unbounded Box from other arrays.
-
-    Raises:
-        SpaceError: An integer is negative or too large, or the array is not numeric.
-    """
+    """Infer a Discrete space from integers (N,), or an unbounded Box from other arrays."""
     if actions.ndim == 1 and actions.dtype.kind in "iu" and actions.size:
         least, most = int(actions.min()), int(actions.max())
         if least < 0:
@@ -166,9 +158,6 @@ def box_of(array: NDArray[Any]) -> spaces.Box:
     """Return a Box for the rows of an array (N, *shape).
 
     For integers, the bounds are the limits of the dtype. For floats, the bounds are infinite.
-
-    Raises:
-        SpaceError: The array contains neither integers nor floats.
     """
     kind = array.dtype.kind
     if kind in "iu":

@@ -38,9 +38,6 @@ def step_order(steps: Topic) -> NDArray[np.int64] | None:
 
     Records are sorted by log_time. If this does not yield whole episodes, for example because two
     robots recorded at the same time, records are sorted by channel and then by log_time.
-
-    Raises:
-        CorruptLogError: No order yields whole episodes.
     """
     order = time_order(steps)
     if steps.channels < 2:
@@ -54,15 +51,7 @@ def step_order(steps: Topic) -> NDArray[np.int64] | None:
 
 
 def episode_lengths(columns: Columns, where: object) -> NDArray[np.int64]:
-    """Return the number of transitions of each finished episode.
-
-    Args:
-        columns: Columns of `/rl/step`: `COUNTERS`, and optionally terminated and truncated.
-        where: Name of the log for error messages.
-
-    Raises:
-        CorruptLogError: Records are missing, duplicated or out of order.
-    """
+    """Return the number of transitions of each finished episode."""
     final = columns["final"].astype(bool)
     finals = np.flatnonzero(final)
     if not len(finals):
@@ -168,9 +157,6 @@ def summaries(
 
     `lengths` (E,) contains the number of transitions of each episode, and `recorded` contains the
     summaries from `/rl/episode`.
-
-    Raises:
-        CorruptLogError: A recorded summary disagrees with the records.
     """
     # Identify episodes by end time, because indexes restart at 0 in appended recordings.
     by_end = {summary.end_time_ns: summary for summary in recorded}

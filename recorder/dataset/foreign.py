@@ -33,16 +33,7 @@ def observation_fields(fields: Iterable[str]) -> list[str]:
 
 
 def inferred_metadata(reader: McapReader, columns: Columns) -> LogMetadata:
-    """Infer a log's metadata from its contents.
-
-    Args:
-        reader: Reader of the log.
-        columns: Columns of `/rl/step`. If there are several observations, the column `observation`
-            is renamed to `observation_state`.
-
-    Raises:
-        LogError: The log has no observations, or images of an unknown encoding.
-    """
+    """Infer a log's metadata from its contents."""
     images = sorted(
         channel.topic
         for channel in reader.channels.values()

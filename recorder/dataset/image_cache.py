@@ -54,9 +54,6 @@ def image_cache(reader: McapReader, leaf: Leaf, blocks: Blocks) -> McapReader:
     """Open the uncompressed copy of a log's images; write the copy beside the log if needed.
 
     `blocks` yields the images of the whole topic. It is iterated only if the copy is written.
-
-    Raises:
-        LogError: The copy cannot be written.
     """
     path = cache_path(reader.path, leaf)
     description = {"fingerprint": fingerprint(reader), "topic": leaf.topic}
@@ -90,19 +87,7 @@ def write_cache(
     most: int = IMAGES_PER_CHUNK,
     notes: dict[str, str] | None = None,
 ) -> McapReader:
-    """Write the uncompressed copy of images, and open it.
-
-    Args:
-        path: Path of the copy.
-        description: Origin of the images.
-        leaf: Leaf of the images, with their encoding.
-        blocks: Images.
-        most: Largest number of images in a chunk.
-        notes: Metadata that `blocks` fills while it is iterated; stored as `CACHE_NOTES`.
-
-    Raises:
-        LogError: The copy cannot be written.
-    """
+    """Write the uncompressed copy of images, and open it."""
     from mcaprl.recorder.format.writing import McapWriter
 
     with replacing(path, LogError, concurrent=True) as unfinished:

@@ -33,10 +33,6 @@ def decoded_file(
         extra: Extra of `mcaprl` that installs Pillow.
         formats: Formats that may be decoded.
         max_pixels: Maximum of width times height, which is checked before pixels are decoded.
-
-    Raises:
-        LogError: The file has another format, is damaged, or declares too many pixels.
-        MissingExtraError: Pillow is not installed.
     """
     pillow = import_extra("PIL.Image", extra)
     try:

@@ -29,11 +29,7 @@ _FIELDS = ("height", "width", "encoding", "step", "data")
 def read_images(
     reader: McapReader, leaf: Leaf, times: NDArray[np.int64], *, storage: Storage, threads: int
 ) -> Frames:
-    """Read the (F, *shape) images of a leaf at these log_times.
-
-    Raises:
-        CorruptLogError: An image is missing, or has another size or encoding.
-    """
+    """Read the (F, *shape) images of a leaf at these log_times."""
     images = _Images(reader, leaf)
     if not is_mapped(storage, len(times) * leaf.size):
         return images.read(images.order_at(times), threads)
@@ -43,11 +39,7 @@ def read_images(
 
 
 def mapped_images(cache: McapReader, leaf: Leaf, times: NDArray[np.int64]) -> MappedImages | None:
-    """Return the images of a copy at these log_times (F,); None if it lacks some of them.
-
-    Raises:
-        CorruptLogError: The copy is damaged, or has images of another size or encoding.
-    """
+    """Return the images of a copy at these log_times (F,); None if it lacks some of them."""
     images = _Images(cache, leaf)
     if not (images.are_mappable and np.isin(times, images.topic.times).all()):
         return None
@@ -75,11 +67,7 @@ class _Images:
         return all(chunk is not None and not chunk.compression for chunk in chunks)
 
     def order_at(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the row of the message at each time.
-
-        Raises:
-            CorruptLogError: A time has no message, or two messages have the same time.
-        """
+        """Return the row of the message at each time."""
         if self._reader.is_remote and self.topic.chunks_rise:
             return self._order_in_chunks(times)
         by_time = time_order(self.topic)
@@ -98,11 +86,7 @@ class _Images:
         return place if by_time is None else by_time[place]
 
     def _order_in_chunks(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the row of the message at each time; read only the chunks with these times.
-
-        Raises:
-            CorruptLogError: A time has no message.
-        """
+        """Return the row of the message at each time; read only the chunks with these times."""
         parts = [part for _, part in self.topic.parts]
         starts = [part.chunk.message_start_time for part in parts if part.chunk is not None]
         stops = np.cumsum([len(part) for part in parts])
@@ -183,11 +167,7 @@ class _Images:
         return check
 
     def _check(self, columns: Columns) -> None:
-        """Check the size and encoding of images against the leaf.
-
-        Raises:
-            CorruptLogError: The size or encoding of an image differs from the leaf.
-        """
+        """Check the size and encoding of images against the leaf."""
         height, width = self._leaf.shape[:2]
         encoding = self._leaf.encoding or ""
         as_stored = encoding.encode() if columns["encoding"].dtype.kind == "S" else encoding

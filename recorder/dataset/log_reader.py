@@ -252,22 +252,13 @@ class LogReader:
 
 
 def describe(reader: McapReader) -> LogMetadata:
-    """Return the metadata of a log, or empty metadata if the log has none.
-
-    Raises:
-        NoStepsError: The file has no steps.
-        LogError: The metadata is incomplete or damaged, or has a later version.
-    """
+    """Return the metadata of a log, or empty metadata if the log has none."""
     _steps_of(reader)
     return described(reader) or LogMetadata.from_strings({})
 
 
 def described(reader: McapReader) -> LogMetadata | None:
-    """Return the metadata of a log, or None if another program wrote the log.
-
-    Raises:
-        LogError: The metadata is damaged or has a later version.
-    """
+    """Return the metadata of a log, or None if another program wrote the log."""
     record = reader.metadata.get(METADATA_NAME)
     copies = [
         # This copy of the metadata is in the summary section, whose CRC detects damage.
@@ -303,11 +294,7 @@ def _steps_of(reader: McapReader) -> Topic:
 
 
 def _as_leaf(path: Path, columns: Columns, leaf: Leaf) -> NDArray[Any]:
-    """Convert a field's column to the shape and dtype of its leaf.
-
-    Raises:
-        CorruptLogError: The column has another size, or the conversion would change its values.
-    """
+    """Convert a field's column to the shape and dtype of its leaf."""
     column = columns[leaf.name]
     if column[0].size == leaf.size:
         shaped = column.reshape(len(column), *leaf.shape)

@@ -46,20 +46,12 @@ class _Manifest:
 
 
 def unfinished_folder(folder: Path) -> Path:
-    """Create a hidden folder for the unfinished logs of a folder, and return its path.
-
-    Raises:
-        OutputExistsError: Another program's folder, a file or a link is at this path.
-    """
+    """Create a hidden folder for the unfinished logs of a folder, and return its path."""
     return fresh_folder(folder / UNFINISHED_NAME)
 
 
 def write_manifest(folder: Path, files: Sequence[LogFile]) -> Path:
-    """Write the manifest of a folder, and return its path.
-
-    Raises:
-        LogError: The manifest cannot be written.
-    """
+    """Write the manifest of a folder, and return its path."""
     path = folder / MANIFEST_NAME
     content = {"manifest_version": _VERSION, "files": [asdict(file) for file in files]}
     write_json(path, content, LogError)
@@ -72,11 +64,7 @@ def is_manifest(name: str | Path) -> bool:
 
 
 def listed_logs(name: str | Path) -> list[Path]:
-    """Return the logs that a manifest lists, from its path or URL.
-
-    Raises:
-        LogError: The manifest cannot be read, or a file is missing or has another size.
-    """
+    """Return the logs that a manifest lists, from its path or URL."""
     try:
         files = as_type(_Manifest, parse_json(read_file(as_path(name, whole=True)))).files
         for file in files:

@@ -63,11 +63,7 @@ class ImageFile:
         release(self._view)
 
     def read(self, offsets: NDArray[np.int64], chunks: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Copy K images, given their byte offsets (K,) and the indexes (K,) of their chunks.
-
-        Raises:
-            CorruptLogError: A chunk is damaged.
-        """
+        """Copy K images, given their byte offsets (K,) and the indexes (K,) of their chunks."""
         self._check_unchanged()
         checked = self._is_checked[chunks]
         if not checked.all():

@@ -101,11 +101,7 @@ def _call_each(
 
 
 def episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
-    """Resolve a selection of episodes to sorted, unique indexes.
-
-    Raises:
-        UsageError: An index is out of range, or the selection is empty.
-    """
+    """Resolve a selection of episodes to sorted, unique indexes."""
     if isinstance(episodes, slice):
         selected = np.arange(count)[episodes]
     else:
@@ -119,23 +115,14 @@ def episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
 
 
 def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
-    """Resolve `data` (see `open_logs`) to files, sorted within a folder or glob.
-
-    Raises:
-        LogError: There are no files.
-    """
+    """Resolve `data` (see `open_logs`) to files, sorted within a folder or glob."""
     return list(weighted_logs(data))
 
 
 def weighted_logs(
     data: str | Path | Sequence[str | Path], weights: Sequence[float] | None = None
 ) -> dict[Path, float]:
-    """Resolve `data` and its weights (see `open_logs`) to files with their weights.
-
-    Raises:
-        LogError: There are no files.
-        UsageError: A file has two weights.
-    """
+    """Resolve `data` and its weights (see `open_logs`) to files with their weights."""
     names = [data] if isinstance(data, str | Path) else list(data)
     weights = [1.0] * len(names) if weights is None else weights
     if not names:
@@ -240,11 +227,7 @@ class GrowingLogs:
         return parts
 
     def _read_from(self, path: Path) -> Dataset | None:
-        """Read the new episodes of a log; return None if there are none.
-
-        Raises:
-            LogError: The log is damaged, or does not contain the episodes that were read before.
-        """
+        """Read the new episodes of a log; return None if there are none."""
         first = self._counts.get(path, 0)
         with warnings.catch_warnings():
             # The warning that a log is still being written is expected here.

@@ -33,10 +33,6 @@ def save_log(
 
     If the data has no times, or if they do not increase from frame to frame, they are replaced by
     times that start at the current time. Episodes are numbered from 0.
-
-    Raises:
-        OutputExistsError: The file exists and `overwrite` is not set.
-        LogError: The file cannot be written, there are no episodes, or a time is negative.
     """
     if not columns.episodes:
         raise LogError(f"nothing to write to {path}: the dataset has no episodes")
@@ -70,11 +66,7 @@ def _write_images(log: LogWriter, columns: Transitions) -> None:
 
 
 def _write_infos(path: Path, log: LogWriter, columns: Transitions) -> None:
-    """Write the infos in parts, each of which is one chunk.
-
-    Raises:
-        SpaceError: A log cannot store an info.
-    """
+    """Write the infos in parts, each of which is one chunk."""
     topics = InfoTopics(log)
     for first in range(0, len(columns.log_time_ns) if columns.infos else 0, STEPS_PER_CHUNK):
         rows = slice(first, first + STEPS_PER_CHUNK)

@@ -137,9 +137,6 @@ def info_columns(
     """Yield a field named `PREFIX.<name>` and the values at `rows` for each info.
 
     The metadata of a field has the NumPy dtype and the shape of a row.
-
-    Raises:
-        SpaceError: Arrow cannot hold an info.
     """
     for name, info in infos.items():
         values, mask = np.ma.getdata(info)[rows], np.ma.getmaskarray(info)[rows]

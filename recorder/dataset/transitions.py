@@ -134,15 +134,7 @@ class TransitionBatch:
 
 
 def joined_infos(parts: Sequence[tuple[Mapping[str, Masked], int]]) -> dict[str, Masked]:
-    """Concatenate infos; if a part lacks an info, the rows of this part are masked.
-
-    Args:
-        parts: Infos by name and number of rows, for each dataset or episode.
-
-    Raises:
-        SpaceError: An info differs in shape or kind (text, flag or number) between the parts, or
-            some of its integers cannot be converted exactly to the common dtype.
-    """
+    """Concatenate infos; if a part lacks an info, the rows of this part are masked."""
     found: dict[str, Masked] = {}
     for name in dict.fromkeys(name for infos, _ in parts for name in infos):
         present = [infos[name] for infos, _ in parts if name in infos]

@@ -20,15 +20,7 @@ _MAX_SHOWN = 40
 
 
 def numbers(name: str, values: Any) -> NDArray[Any]:
-    """Return flags, integers or floats as an array.
-
-    Args:
-        name: Name of the array, for errors.
-        values: Array, or anything that NumPy can convert to an array.
-
-    Raises:
-        SpaceError: The values are not real numbers, or a value is masked.
-    """
+    """Return flags, integers or floats as an array."""
     if isinstance(values, np.ma.MaskedArray) and np.ma.getmaskarray(values).any():
         raise SpaceError(f"{name} has no value in row {_first(np.ma.getmaskarray(values))}")
     try:
@@ -50,16 +42,7 @@ def numbers(name: str, values: Any) -> NDArray[Any]:
 
 
 def flags(name: str, values: Any, *, first_row: int = 0) -> NDArray[np.bool_]:
-    """Return 0 and 1, or False and True, as flags.
-
-    Args:
-        name: Name of the array, for errors.
-        values: Array of flags.
-        first_row: Number of the first row, for errors.
-
-    Raises:
-        SpaceError: A value is neither 0 nor 1.
-    """
+    """Return 0 and 1, or False and True, as flags."""
     array = numbers(name, values)
     wrong = (array != 0) & (array != 1)
     if wrong.any():
@@ -68,20 +51,12 @@ def flags(name: str, values: Any, *, first_row: int = 0) -> NDArray[np.bool_]:
 
 
 def rewards_of(name: str, values: Any) -> NDArray[np.float64]:
-    """Return rewards as float64.
-
-    Raises:
-        SpaceError: A value is not a number, or float64 cannot represent it exactly.
-    """
+    """Return rewards as float64."""
     return exactly(name, numbers(name, values), np.dtype(np.float64))
 
 
 def probabilities_of(name: str, values: Any, *, first_row: int = 0) -> NDArray[np.float32]:
-    """Return action probabilities as float32; NaN means unknown.
-
-    Raises:
-        SpaceError: A value is not in (0, 1].
-    """
+    """Return action probabilities as float32; NaN means unknown."""
     array = numbers(name, values)
     wrong = is_impossible(array)
     if wrong.any():
@@ -90,11 +65,7 @@ def probabilities_of(name: str, values: Any, *, first_row: int = 0) -> NDArray[n
 
 
 def check_finite(name: str, values: NDArray[Any], *, first_row: int = 0) -> None:
-    """Check that no value is NaN or infinite.
-
-    Raises:
-        SpaceError: A value is not finite.
-    """
+    """Check that no value is NaN or infinite."""
     if values.dtype.kind == "f" and not np.isfinite(values).all():
         wrong = ~np.isfinite(values)
         raise SpaceError(f"{name}: {_row(values, wrong, first_row)}, which is not finite")
@@ -103,11 +74,7 @@ def check_finite(name: str, values: NDArray[Any], *, first_row: int = 0) -> None
 def check_inside(
     name: str, values: NDArray[Any], space: spaces.Space[Any], *, first_row: int = 0
 ) -> None:
-    """Check that values are in a Discrete, MultiDiscrete or MultiBinary space.
-
-    Raises:
-        SpaceError: A value is outside the space.
-    """
+    """Check that values are in a Discrete, MultiDiscrete or MultiBinary space."""
     if isinstance(space, spaces.Box):
         return
     wrong = outside(space, values)
@@ -122,16 +89,7 @@ def is_beyond_float32(values: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def exactly(where: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Copy an array to another dtype without changing any value.
-
-    Args:
-        where: Name of the array for the error.
-        array: Any numeric array.
-        dtype: Data type of the result.
-
-    Raises:
-        SpaceError: The dtype cannot represent a value exactly.
-    """
+    """Copy an array to another dtype without changing any value."""
     if array.dtype == dtype:
         return array.copy()
     with np.errstate(all="ignore"):

@@ -66,9 +66,6 @@ class Delay:
             reader: Reader of the file.
             span: First and last log_time of the file, nanoseconds.
             delay_ns: Number of nanoseconds that is added.
-
-        Raises:
-            LogError: The messages of a channel are not CDR, or their type is not known.
         """
         self._reader, self._delay_ns = reader, delay_ns
         self._span = span[0] - _MARGIN_NS, span[1] + _MARGIN_NS
@@ -78,11 +75,7 @@ class Delay:
                 self._changes[channel.id] = self._change_of(channel)
 
     def __call__(self, channel: Channel, time_ns: int, payload: memoryview) -> None:
-        """Change the timestamps of one message in place.
-
-        Raises:
-            CorruptLogError: The message does not fit its type.
-        """
+        """Change the timestamps of one message in place."""
         change = self._changes[channel.id]
         if change is None:
             return
@@ -266,10 +259,6 @@ def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
     """Return the metadata of the joined log; None if none of the logs has metadata.
 
     If a field differs between the logs and is allowed to differ, it is empty in the result.
-
-    Raises:
-        SpaceError: The spaces differ.
-        LogError: Another field differs that must be equal, or only some logs have metadata.
     """
     found = [described(log.reader) for log in logs]
     described_ones = [(log, one) for log, one in zip(logs, found, strict=True) if one is not None]
@@ -313,14 +302,7 @@ def _check_same(first: Path, one: LogMetadata, second: Path, other: LogMetadata)
 
 
 def _check_types(logs: Sequence[FinishedLog], *, are_described: bool) -> None:
-    """Raise LogError if the messages of a `/rl/` topic have different types in two logs.
-
-    Args:
-        logs: Logs of episodes.
-        are_described: Whether the logs have metadata. If they do, the type of `/rl/step` is not
-            compared, because it follows from the spaces, and the metadata of the other channels
-            must be equal, too.
-    """
+    """Raise LogError if the messages of a `/rl/` topic have different types in two logs."""
     known: dict[str, tuple[Path, object]] = {}
     for log in logs:
         for channel in log.reader.channels.values():
@@ -339,11 +321,7 @@ def _check_types(logs: Sequence[FinishedLog], *, are_described: bool) -> None:
 
 
 def _delays(logs: Sequence[FinishedLog], metadata: LogMetadata | None, *, shift: bool) -> list[int]:
-    """Return the delay of each log: the number of nanoseconds to add to the times of the log.
-
-    Raises:
-        LogError: Episodes of two logs overlap in time, and `shift` is not set.
-    """
+    """Return the delay of each log: the number of nanoseconds to add to the times of the log."""
     gap = DEFAULT_STEP_DURATION_NS if metadata is None else metadata.step_duration_ns
     delays, spans, end = [], np.empty((0, 2), np.int64), -1
     for number, log in enumerate(logs):

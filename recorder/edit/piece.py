@@ -104,9 +104,6 @@ def _window_of_steps(log: FinishedLog, steps: Bounds) -> tuple[int, int]:
     """Return the first and last log_time of a part.
 
     The bounds in `steps` count the transitions of all episodes.
-
-    Raises:
-        UsageError: A bound is not an integer, or no transition is between the bounds.
     """
     log.need_steps()
     count = int(log.lengths.sum())
@@ -131,9 +128,6 @@ def _window_of_time(log: FinishedLog, time: Bounds | None) -> tuple[int, int]:
     """Return the first and last log_time of a part.
 
     The bounds in `time` are seconds since the first message.
-
-    Raises:
-        UsageError: No message is in this part.
     """
     assert time is not None
     begin_ns, end_ns = log.span_of_messages()
@@ -180,11 +174,7 @@ def _without_single_records(
 
 
 def _shorten(log: FinishedLog, pieces: list[_Piece], source: Source) -> list[EpisodeSummary]:
-    """Make `source` change the records of shortened episodes; return their new summaries.
-
-    Raises:
-        LogError: Another program or version wrote the messages of `/rl/step` or `/rl/episode`.
-    """
+    """Make `source` change the records of shortened episodes; return their new summaries."""
     dtypes = {one.id: _step_dtype(log, one) for one in log.reader.channels_of(STEP_TOPIC)}
     change = Shorten([piece.part(log) for piece in pieces], dtypes)
     source.change, source.changed = change, dict.fromkeys(dtypes, change.spans)
@@ -287,15 +277,7 @@ def split_log(
 def episode_columns(
     summaries: Sequence[EpisodeSummary], names: frozenset[str]
 ) -> dict[str, Column]:
-    """Return the columns that a filter can use, by name, with one row per episode.
-
-    Args:
-        summaries: Summaries of the episodes.
-        names: Names that the filter uses.
-
-    Raises:
-        UsageError: The filter uses `seed`, and a seed is too large to be compared exactly.
-    """
+    """Return the columns that a filter can use, by name, with one row per episode."""
     seeds = [summary.seed for summary in summaries]
     largest = max((seed for seed in seeds if seed is not None), default=0)
     if "seed" in names and largest > _LARGEST_EXACT:
@@ -332,12 +314,7 @@ def _copy_episodes(log: FinishedLog, chosen: NDArray[np.int64], target: Path, ou
 def _parts(
     count: int, episodes: int | None, ratio: Sequence[float] | None
 ) -> list[tuple[int, int]]:
-    """Divide `count` episodes into parts, and return the start and stop index of each part.
-
-    Raises:
-        UsageError: `episodes` and `ratio` are both given or both missing, a value is invalid, or a
-            part would be empty.
-    """
+    """Divide `count` episodes into parts, and return the start and stop index of each part."""
     if (episodes is None) == (ratio is None):
         raise UsageError("give either the episodes of each part or the ratio of the parts")
     if episodes is not None:

@@ -57,11 +57,7 @@ class FinishedLog:
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Open the file; a remote file is first downloaded completely.
-
-        Raises:
-            LogError: The file is damaged, not finished, or has records of an unfinished episode.
-        """
+        """Open the file; a remote file is first downloaded completely."""
         self.path = as_path(path, whole=True)
         self.reader = McapReader(self.path)
         try:
@@ -83,11 +79,7 @@ class FinishedLog:
 
     @cached_property
     def lengths(self) -> NDArray[np.int64]:
-        """(E,) number of transitions of each episode. Without `/rl/step`, the array is empty.
-
-        Raises:
-            LogError: The log has no episode, or its records are damaged.
-        """
+        """(E,) number of transitions of each episode. Without `/rl/step`, the array is empty."""
         if self._log is None:
             return np.empty(0, np.int64)
         with warnings.catch_warnings():
@@ -97,11 +89,7 @@ class FinishedLog:
 
     @cached_property
     def times(self) -> Times:
-        """(F,) log_time of each record of `/rl/step`, nanoseconds.
-
-        Raises:
-            LogError: The episodes overlap in time, or an episode is not finished.
-        """
+        """(F,) log_time of each record of `/rl/step`, nanoseconds."""
         if self._log is None:
             return np.empty(0, np.int64)
         lengths, found = self.lengths, self._log.record_times()
@@ -133,11 +121,7 @@ class FinishedLog:
             raise NoStepsError(f"{self.path} has no topic {STEP_TOPIC} and thus no episodes")
 
     def summaries(self) -> list[EpisodeSummary]:
-        """Return the summary of each episode.
-
-        Raises:
-            LogError: The log is damaged, or has no episodes.
-        """
+        """Return the summary of each episode."""
         self.need_steps()
         return LogReader(self.path, Selection(columns=())).episode_summaries()
 
@@ -154,9 +138,6 @@ class FinishedLog:
         An episode has all messages from its first record until the next episode. Messages before
         the first episode belong to the first episode. The ranges of adjacent episodes are merged
         into one range.
-
-        Args:
-            episodes: Increasing indexes of episodes.
         """
         starts = self.spans[:, 0].copy()
         starts[0] = 0

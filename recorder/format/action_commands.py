@@ -30,11 +30,7 @@ class ActionCommands:
 
     @classmethod
     def from_json(cls, found: Any, count: int) -> ActionCommands:
-        """Check JSON types that `to_json` returned; `count` is the number of actions.
-
-        Raises:
-            ValueError: A field or command is missing or has the wrong type.
-        """
+        """Check JSON types that `to_json` returned; `count` is the number of actions."""
         fields = found.get("fields") if isinstance(found, Mapping) else None
         commands = found.get("commands") if isinstance(found, Mapping) else None
         if not (isinstance(fields, list) and all(isinstance(each, str) for each in fields)):

@@ -62,11 +62,7 @@ class EpisodeSummary(NamedTuple):
 
 
 def summary_of(values: Mapping[str, Any]) -> EpisodeSummary:
-    """Return the summary that another format stores.
-
-    Raises:
-        SpaceError: A field is missing, has another type, or cannot be stored in a log.
-    """
+    """Return the summary that another format stores."""
     plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in values.items()}
     try:
         found: EpisodeSummary = as_type(EpisodeSummary, plain, "the episode")

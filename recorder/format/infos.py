@@ -34,9 +34,6 @@ def read_infos(reader: McapReader, times_ns: NDArray[np.int64]) -> dict[str, Mas
 
     Returns:
         (F, *shape) array of each info by dotted name, masked where the info is missing.
-
-    Raises:
-        CorruptLogError: A topic is damaged.
     """
     channels = [one for one in reader.channels.values() if one.topic.startswith(INFO_TOPICS)]
     found: dict[str, Masked] = {}
@@ -54,11 +51,7 @@ def read_infos(reader: McapReader, times_ns: NDArray[np.int64]) -> dict[str, Mas
 
 
 def shape_of(text: str, topic: str) -> tuple[int, ...]:
-    """Return the shape of an info in the metadata of its channel.
-
-    Raises:
-        CorruptLogError: The text is not a shape.
-    """
+    """Return the shape of an info in the metadata of its channel."""
     try:
         shape: tuple[int, ...] = as_type(tuple[int, ...], parse_json(text), "shape")
     except ValueError as error:

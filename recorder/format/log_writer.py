@@ -116,16 +116,7 @@ class LogTopics:
     def __init__(
         self, metadata: LogMetadata, sink: MessageSink, *, names_actions: bool = True
     ) -> None:
-        """Announce the topics that every log has.
-
-        Args:
-            metadata: Metadata of the log.
-            sink: Receiver of the messages.
-            names_actions: Whether schemas contain the names of the actions as constants.
-
-        Raises:
-            SpaceError: A log cannot contain these spaces.
-        """
+        """Announce the topics that every log has."""
         leaves = observation_leaves(metadata.observation_space)
         self.metadata, self.sink = metadata, sink
         self.action = action_leaf(metadata.action_space)
@@ -161,27 +152,13 @@ class LogTopics:
     def image_rows(
         self, topic: str, shape: tuple[int, ...], encoding: str | None, most: int = IMAGES_PER_CHUNK
     ) -> ImageRows:
-        """Announce a topic of images and preallocate its rows.
-
-        Args:
-            topic: Name of the topic.
-            shape: (height, width) or (height, width, channels).
-            encoding: `mono8`, `rgb8`, `rgba8` or `16UC1`.
-            most: Maximum number of rows; fewer rows are allocated if this number does not fit into
-                a chunk.
-        """
+        """Announce a topic of images and preallocate its rows."""
         assert encoding is not None, f"{topic} has no images"
         channel = self.add_channel(topic, "sensor_msgs/msg/Image")
         return ImageRows.of_shape(shape, encoding, channel, most, self.sink.write_rows)
 
     def write_episodes(self, summaries: list[EpisodeSummary], *, log_lines: bool = False) -> None:
-        """Write summaries to `/rl/episode`; the log_time of each is the end of its episode.
-
-        Args:
-            summaries: Summaries of the episodes.
-            log_lines: Whether to write the starts and ends of the episodes to `/rosout` and
-                `/rl/phase` as well.
-        """
+        """Write summaries to `/rl/episode`; the log_time of each is the end of its episode."""
         written = [
             (self._episode_channel, summary.end_time_ns, summary.to_message())
             for summary in summaries
@@ -241,22 +218,7 @@ class LogWriter(LogTopics):
         append: bool = False,
         source: Path | None = None,
     ) -> None:
-        """Create the file, or open it to append, and announce its topics.
-
-        Args:
-            path: Path of the file.
-            metadata: Metadata of the log.
-            compression: Compression of chunks: `zstd`, `lz4` or `none`.
-            overwrite: Whether to replace an existing file.
-            append: Whether to write after the last record of an existing file.
-            source: Finished log whose records are copied to the start of a new file.
-
-        Raises:
-            SpaceError: A log cannot contain these spaces. No file is created.
-            OutputExistsError: The file exists, and neither `overwrite` nor `append` is set.
-            LogError: The file cannot be created, or cannot be appended to. An existing file stays
-                unchanged.
-        """
+        """Create the file, or open it to append, and announce its topics."""
         strings = metadata.to_strings()
         # Raise SpaceError before a file is created.
         plain_name, _ = step_schema(metadata.observation_space, metadata.action_space)

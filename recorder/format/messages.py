@@ -90,11 +90,7 @@ def encode(message: Any) -> bytes:
 
 
 def decode(data: bytes, type_name: str) -> Any:
-    """Decode CDR bytes.
-
-    Raises:
-        CorruptLogError: The bytes do not fit the type.
-    """
+    """Decode CDR bytes."""
     try:
         return typestore().deserialize_cdr(data, type_name)
     # rosbags raises errors of many types when the bytes do not fit the type.

@@ -144,11 +144,7 @@ class LogMetadata:
 
     @cached_property
     def leaves(self) -> tuple[Leaf, ...]:
-        """Leaves of the observation space in order; empty for an empty Dict.
-
-        Raises:
-            SpaceError: A log cannot store a part of the space.
-        """
+        """Leaves of the observation space in order; empty for an empty Dict."""
         return leaves_of(self.observation_space)
 
     def action_names(self) -> dict[int, str]:
@@ -213,11 +209,7 @@ class LogMetadata:
 
     @classmethod
     def from_strings(cls, strings: Mapping[str, str]) -> LogMetadata:
-        """Parse the map that was read from a file.
-
-        Raises:
-            LogError: The format version is not supported, or a value cannot be parsed.
-        """
+        """Parse the map that was read from a file."""
         found = strings.get("format_version")
         if found is None:
             raise LogError(f"no metadata record '{METADATA_NAME}': the spaces are unknown")
@@ -367,11 +359,7 @@ def _is_default(value: Any, default: Any) -> bool:
 
 
 def as_json(value: Any) -> Any:
-    """Return a value as JSON types: tuples become lists, and NumPy numbers become numbers.
-
-    Raises:
-        ValueError: The value has other types, or is nested too deeply.
-    """
+    """Return a value as JSON types: tuples become lists, and NumPy numbers become numbers."""
     try:
         found = _plain(value)
         parse_json(json.dumps(found))
@@ -414,11 +402,7 @@ def same_env(first: str, second: str) -> bool:
 
 
 def _object(strings: Mapping[str, str], name: str) -> dict[str, Any]:
-    """Return a field that is a JSON object.
-
-    Raises:
-        ValueError: The field is not a JSON object.
-    """
+    """Return a field that is a JSON object."""
     found = parse_json(strings.get(name, "{}"))
     if not isinstance(found, dict):
         raise ValueError(f"{name} is not a JSON object")
@@ -426,11 +410,7 @@ def _object(strings: Mapping[str, str], name: str) -> dict[str, Any]:
 
 
 def _commands(strings: Mapping[str, str], space: spaces.Space[Any]) -> ActionCommands | None:
-    """Return the commands of the actions; None if there are none.
-
-    Raises:
-        ValueError: They do not fit the action space.
-    """
+    """Return the commands of the actions; None if there are none."""
     if "action_commands" not in strings:
         return None
     if not isinstance(space, spaces.Discrete):
@@ -449,11 +429,7 @@ def _numbers(values: Any) -> dict[str, float]:
 
 
 def _texts(strings: Mapping[str, str], name: str) -> tuple[str, ...]:
-    """Return a field that is a JSON list of strings.
-
-    Raises:
-        ValueError: The field is not a JSON list of strings.
-    """
+    """Return a field that is a JSON list of strings."""
     found = parse_json(strings.get(name, "[]"))
     if not (isinstance(found, list) and all(isinstance(part, str) for part in found)):
         raise ValueError(f"{name} is not a JSON list of strings")

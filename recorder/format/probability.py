@@ -25,15 +25,7 @@ def is_impossible(probs: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def check_probability(prob: Any, name: str) -> None:
-    """Check one probability.
-
-    Args:
-        prob: Probability, or NaN.
-        name: Name of the probability in the error message.
-
-    Raises:
-        UsageError: It is not a number within (0, 1].
-    """
+    """Check one probability."""
     try:
         if SMALLEST <= prob <= LARGEST or math.isnan(prob):
             return

@@ -44,15 +44,7 @@ class TopicRows:
 
     @classmethod
     def of_text(cls, text: str, channel_id: int, most: int, write: Write) -> Self:
-        """Preallocate records for messages of the type that `text` defines; their size is fixed.
-
-        Args:
-            text: ROS 2 definition of the message.
-            channel_id: Channel of the topic.
-            most: Maximum number of rows; fewer rows are allocated if this number does not fit into
-                a chunk.
-            write: Function that writes rows as one chunk.
-        """
+        """Preallocate records for messages of the type that `text` defines; their size is fixed."""
         dtype = message_dtype(text)
         assert dtype is not None, "the message has a fixed length by construction"
         rows = message_rows(_count(most, dtype), dtype, channel_id)
@@ -88,9 +80,6 @@ class TopicRows:
 
     def from_field(self, fields: Sequence[str]) -> tuple[NDArray[np.void], np.dtype[Any]]:
         """Describe the part of the rows from the first of these fields to the end of the message.
-
-        Args:
-            fields: Names in the message.
 
         Returns:
             A view of that part of each row as one item, (N,), and a dtype for buffers of these

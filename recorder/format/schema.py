@@ -90,11 +90,7 @@ def step_schema(
 
 
 def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
-    """Return the type name and definition of a message with one float32 scalar per name.
-
-    Raises:
-        SpaceError: A name is not a ROS field name.
-    """
+    """Return the type name and definition of a message with one float32 scalar per name."""
     names = list(names)
     for name in names:
         if not re.fullmatch(r"[a-z](_?[a-z0-9])*", name):
@@ -124,9 +120,6 @@ def action_constants(names: Mapping[int, str]) -> dict[str, int]:
 
     >>> action_constants({0: "brake", 1: "slightly left", 2: "faster north (+x)"})
     {'BRAKE': 0, 'SLIGHTLY_LEFT': 1, 'FASTER_NORTH': 2}
-
-    Args:
-        names: Name of each action by value.
     """
     words: dict[str, int] = {}
     for value, name in names.items():
@@ -152,10 +145,6 @@ def values_schema(actions: int, action_names: Mapping[int, str] | None = None) -
 
     Values of a MultiDiscrete or MultiBinary space are numbered from 0, the last element changing
     fastest, as by `numpy.ravel_multi_index`.
-
-    Args:
-        actions: Number of actions A.
-        action_names: Names of the discrete actions by value, for the constants of `policy_action`.
     """
     fields = [("int64", 0, "policy_action"), ("float32", actions, "q")]
     fields += [("float32", actions, "preference")]

@@ -132,13 +132,6 @@ class NewTopics:
 
         A channel that equals a channel of an earlier file gets the id of that channel. Any other
         channel keeps its id if the id is free.
-
-        Args:
-            reader: Reader of the file.
-            metadata: Channel metadata by topic. It replaces the channel metadata of the file.
-
-        Raises:
-            LogError: There are more channels than a file can have.
         """
         found: dict[int, int] = {}
         earlier = dict(self.channels)
@@ -192,16 +185,6 @@ def copy_selected(
     """Write the selected messages of files to a new file.
 
     Chunks are ordered by their start times.
-
-    Args:
-        sources: Files and the selections of their messages.
-        target: Path of the new file; an existing one is replaced.
-        top_level: Records at the start of the new file, with all its channels.
-        summaries: Additional messages of `/rl/episode`.
-        like: File whose profile and compression the new file uses; default: the first source.
-
-    Raises:
-        LogError: A file is damaged, or the new file cannot be written.
     """
     like = like or sources[0].reader
     with writer_like(like.view, like.records(len(MAGIC)), target) as writer:

@@ -68,11 +68,7 @@ class Leaf:
 
 
 def observation_leaves(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
-    """List the leaves of an observation space, in the space's order.
-
-    Raises:
-        SpaceError: The space has no leaves, or a log cannot store a part of the space.
-    """
+    """List the leaves of an observation space, in the space's order."""
     found = leaves_of(space)
     if not found:
         raise SpaceError("the observation space is an empty Dict: there is nothing to record")
@@ -80,11 +76,7 @@ def observation_leaves(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
 
 
 def leaves_of(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
-    """List the leaves of an observation space in order. An empty Dict has no leaves.
-
-    Raises:
-        SpaceError: A log cannot store a part of the space.
-    """
+    """List the leaves of an observation space in order. An empty Dict has no leaves."""
     taken: set[str] = set()
     found: list[Leaf] = []
     for path, part in _walk(space, ()):
@@ -101,13 +93,6 @@ def select(leaves: Sequence[Leaf], keys: Sequence[str] | None) -> list[Leaf]:
     """Select leaves of a Dict space by key.
 
     The key `joints/q` selects one leaf, and the key `joints` selects all leaves below it.
-
-    Args:
-        leaves: Leaves to select from.
-        keys: Keys to select; default: all.
-
-    Raises:
-        UnknownNameError: A key matches no leaf.
     """
     if keys is None:
         return list(leaves)
@@ -124,11 +109,7 @@ def is_below(name: str, key: str) -> bool:
 
 
 def check_key(key: object, role: str, path: tuple[str | int, ...] = ()) -> None:
-    """Check that a key of a Dict space is a text, because a log stores the keys as texts.
-
-    Raises:
-        SpaceError: The key is not a text.
-    """
+    """Check that a key of a Dict space is a text, because a log stores the keys as texts."""
     if not isinstance(key, str):
         raise SpaceError(
             f"keys of a Dict must be texts: {_place(role, path)} has the key {key!r:.60}; rename"
@@ -178,11 +159,7 @@ def restricted(space: spaces.Space[Any], leaves: Sequence[Leaf]) -> spaces.Dict:
 
 
 def action_leaf(space: spaces.Space[Any]) -> Leaf:
-    """Return the single leaf of an action space.
-
-    Raises:
-        SpaceError: The space is a Dict or too large, or a log cannot store this kind of space.
-    """
+    """Return the single leaf of an action space."""
     shape, dtype = _shape_and_dtype(space, "action", ())
     check_elements(math.prod(shape))
     check_actions(space)
@@ -190,11 +167,7 @@ def action_leaf(space: spaces.Space[Any]) -> Leaf:
 
 
 def check_actions(space: spaces.Space[Any]) -> None:
-    """Check that a space does not have too many discrete actions for a log or a policy.
-
-    Raises:
-        SpaceError: The space has too many actions.
-    """
+    """Check that a space does not have too many discrete actions for a log or a policy."""
     if isinstance(space, spaces.Discrete) and int(space.n) > MAX_ACTIONS:
         raise SpaceError(
             f"the action space Discrete({space.n}) is too large: at most {MAX_ACTIONS} discrete"
@@ -203,14 +176,7 @@ def check_actions(space: spaces.Space[Any]) -> None:
 
 
 def check_elements(count: float) -> None:
-    """Check that a space is small enough for a log or a policy.
-
-    Args:
-        count: Number of elements of one value.
-
-    Raises:
-        SpaceError: The space has too many elements.
-    """
+    """Check that a space is small enough for a log or a policy."""
     if not count <= MAX_ELEMENTS:
         raise SpaceError(
             f"a space of {count} elements is too large; at most {MAX_ELEMENTS} can be used"
@@ -231,20 +197,12 @@ def nest(leaves: tuple[Leaf, ...], arrays: Sequence[Any]) -> Any:
 
 
 def space_to_json(space: spaces.Space[Any]) -> str:
-    """Convert a space to JSON text, from which `space_from_json` creates an equal space.
-
-    Raises:
-        SpaceError: A log cannot store the space or a part of it.
-    """
+    """Convert a space to JSON text, from which `space_from_json` creates an equal space."""
     return json.dumps(_to_plain(space))
 
 
 def space_from_json(text: str) -> spaces.Space[Any]:
-    """Read a space that `space_to_json` wrote.
-
-    Raises:
-        SpaceError: The text does not describe a space, or the space is too large.
-    """
+    """Read a space that `space_to_json` wrote."""
     try:
         plain = parse_json(text)
         # Check the size first, because the bounds of a Box take memory for each element.

@@ -71,16 +71,7 @@ class CommandPart(NamedTuple):
 
 
 def actions_of(action: Action, commands: Sequence[CommandPart]) -> Actions:
-    """Convert commands to actions.
-
-    Args:
-        action: Action of the mapping.
-        commands: Parts of the command: its fields or expressions.
-
-    Raises:
-        UsageError: A value is not a whole number, or is a text that `names` does not contain, or
-            the mapping does not have an entry for each element.
-    """
+    """Convert commands to actions."""
     missing = np.logical_or.reduce([each.missing for each in commands])
     none, fields = np.zeros(len(missing), bool), tuple(f for part in commands for f in part.fields)
     if action.field is not None:

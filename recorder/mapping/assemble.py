@@ -45,10 +45,6 @@ def assembled(
 
     Returns:
         The dataset; None if images cannot be decoded. `plan.unreadable` lists their messages then.
-
-    Raises:
-        UsageError: A reward or probability is impossible, or an observation is a text.
-        LogError: No image can be decoded, or the images differ in size.
     """
     summaries: list[EpisodeSummary] = []
     times: list[NDArray[np.int64]] = []
@@ -221,11 +217,7 @@ def _put_vector(
 
 
 def _as_float32(values: NDArray[np.float64], name: str) -> NDArray[np.float32]:
-    """Round values to float32.
-
-    Raises:
-        UsageError: A finite value becomes infinite.
-    """
+    """Round values to float32."""
     with np.errstate(over="ignore"):
         found = values.astype(np.float32)
     lost = values[np.isinf(found) & np.isfinite(values)]

@@ -157,11 +157,7 @@ def ticks_of_topic(times_ns: _Times, parts: Sequence[Stretch], gap_s: float) -> 
 
 
 def ticks_at_rate(rate_hz: float, parts: Sequence[Stretch], messages: int, gap_s: float) -> Ticks:
-    """Return steps at a fixed rate, beginning at the first message of each stretch.
-
-    Raises:
-        UsageError: There are too many steps for the number of messages.
-    """
+    """Return steps at a fixed rate, beginning at the first message of each stretch."""
     period_ns = NS_PER_S / rate_hz
     # If a duration is a whole number of periods, rounding must not add or remove a step.
     until = [math.ceil((last - first) / period_ns - 1e-6) for first, last, _ in parts]

@@ -386,11 +386,7 @@ class Action(_Part):
         return found
 
     def check_count(self, count: int) -> None:
-        """Check that commands, edges and limits have an entry for each of `count` elements.
-
-        Raises:
-            UsageError: One of them has another length.
-        """
+        """Check that commands, edges and limits have an entry for each of `count` elements."""
         for name, length in self._lengths():
             if length != count:
                 raise UsageError(
@@ -554,13 +550,7 @@ class Place:
 
 
 def load_mapping(source: str | Path | MappingOf[str, Any]) -> tuple[Mapping, Place]:
-    """Read and validate a mapping; return it with the positions of its keys.
-
-    Raises:
-        UsageError: The file cannot be read, is not YAML, or has an unknown key or a wrong value;
-            the message names file, line and key.
-        MissingExtraError: The packages of the `bags` extra are not installed.
-    """
+    """Read and validate a mapping; return it with the positions of its keys."""
     if not isinstance(source, str | Path):
         return parse_mapping(source), Place()
     path = Path(source)
@@ -578,11 +568,7 @@ def load_mapping(source: str | Path | MappingOf[str, Any]) -> tuple[Mapping, Pla
 
 
 def parse_mapping(tree: MappingOf[str, Any], place: Place | None = None) -> Mapping:
-    """Validate the keys and values of a mapping.
-
-    Raises:
-        UsageError: A key is unknown, or a value is wrong; the message lists all errors.
-    """
+    """Validate the keys and values of a mapping."""
     place = place or Place()
     try:
         return Mapping.model_validate(tree)

@@ -77,11 +77,7 @@ class Expression:
     """
 
     def __init__(self, text: str) -> None:
-        """Parse the text.
-
-        Raises:
-            UsageError: The text is not an expression, or contains something that is not allowed.
-        """
+        """Parse the text."""
         self.text = text
         if len(text) > _MAX_CHARACTERS:
             raise UsageError(
@@ -262,11 +258,7 @@ def _is_integer(node: ast.AST) -> bool:
 
 
 def _number(value: Any) -> Any:
-    """Return booleans and numbers as float64.
-
-    Raises:
-        TypeError: The value is a text.
-    """
+    """Return booleans and numbers as float64."""
     found = np.asarray(value)
     if found.dtype.kind not in "biuf":
         raise TypeError(_STRING)

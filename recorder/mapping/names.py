@@ -31,12 +31,7 @@ class Named(NamedTuple):
 
 
 def names_field(info: TopicInfo, path: FieldPath, quantity: Quantity) -> str:
-    """Return the field with the names of a path's elements; empty if there are none.
-
-    Raises:
-        UsageError: The mapping selects elements by name and by an index, or the messages cannot
-            have such names.
-    """
+    """Return the field with the names of a path's elements; empty if there are none."""
     if quantity.names and path.elements is not None:
         raise UsageError(f"{path}: `names` selects the elements; remove the index or slice")
     if quantity.names_from is not None:
@@ -86,9 +81,6 @@ def by_names(
 
     Returns:
         Numbers (M, K) of K names, with the messages that contain them; (M,) for one name.
-
-    Raises:
-        UsageError: No message has one of the names, or a message has it twice.
     """
     names = [wanted] if isinstance(wanted, str) else wanted
     values = np.full((len(column), len(names)), np.nan)
@@ -181,9 +173,6 @@ def check_order(path: FieldPath, column: NDArray[Any], texts: NDArray[Any]) -> N
         path: Path of the field.
         column: Values of the whole field.
         texts: (M,) names of its elements.
-
-    Raises:
-        UsageError: The names of two messages differ.
     """
     orders: dict[tuple[str, ...], int] = {}
     length = column.shape[1] if column.ndim > 1 else None

@@ -72,11 +72,7 @@ class Source(NamedTuple):
 
 
 def source_of(bag: Bag, quantity: Quantity) -> Source:
-    """Resolve the topic and fields of a quantity.
-
-    Raises:
-        UsageError: There is no such topic or field.
-    """
+    """Resolve the topic and fields of a quantity."""
     if quantity.image is not None:
         return Source(topic_of(bag, quantity.image), (), None)
     if quantity.transform is not None:
@@ -143,9 +139,6 @@ def values_of(
             if None, `quantity.align` applies.
         gap_s: Longest gap, in seconds, across which a value is interpolated or taken from a later
             message.
-
-    Raises:
-        UsageError: A field is not a number.
     """
     if quantity.as_ == "count":
         counts = np.searchsorted(run.times_ns, steps_ns, side="right").astype(np.float64)

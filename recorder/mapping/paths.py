@@ -72,10 +72,6 @@ class FieldPath(NamedTuple):
 
         Returns:
             (N, K) or (N,) column. An element that an array lacks is None.
-
-        Raises:
-            UsageError: The field is not an array, has no elements, or is shorter than the index in
-                all messages.
         """
         if not len(column):
             return column
@@ -116,11 +112,7 @@ def _text(topic: str, steps: Sequence[Step]) -> str:
 
 
 def topic_of(bag: Bag, name: str) -> str:
-    """Return `name` if it is a readable topic of the bag.
-
-    Raises:
-        UsageError: There is no such topic, or its messages cannot be read.
-    """
+    """Return `name` if it is a readable topic of the bag."""
     if name not in bag.topics:
         near = difflib.get_close_matches(name, bag.topics, n=3, cutoff=0.4) or sorted(bag.topics)
         raise UsageError(f"no topic {name}; nearest: {', '.join(near[:8]) or 'the bag is empty'}")
@@ -176,11 +168,7 @@ def unknown_field(bag: Bag, path: FieldPath) -> UsageError:
 
 
 def check_lacks(path: FieldPath, values: Sequence[Any], *, optional: bool) -> None:
-    """Check that a field has a value in any message; `optional` permits arrays without elements.
-
-    Raises:
-        UsageError: No message has the field; the error says why.
-    """
+    """Check that a field has a value in any message; `optional` permits arrays without elements."""
     lacks = [value for value in values if isinstance(value, Lack)]
     if not lacks or any(value is not None and not isinstance(value, Lack) for value in values):
         return
@@ -196,16 +184,7 @@ def check_lacks(path: FieldPath, values: Sequence[Any], *, optional: bool) -> No
 
 
 def as_numbers(column: NDArray[Any], name: str, *, is_filled: bool = False) -> Floats:
-    """Return a column as float64 numbers (N,) or (N, K); bytes are numbers from 0 to 255.
-
-    Args:
-        column: Column of numbers, or of objects. None and empty arrays are missing: NaN.
-        name: Name of the column, for error messages.
-        is_filled: Whether arrays that are shorter than the longest one are filled with NaN.
-
-    Raises:
-        UsageError: The column has something other than numbers, or arrays of different lengths.
-    """
+    """Return a column as float64 numbers (N,) or (N, K); bytes are numbers from 0 to 255."""
     if column.dtype.kind in "biuf":
         return column.astype(np.float64)
     rows = rows_of(column, name)
@@ -241,11 +220,7 @@ def _uneven(name: str, shapes: set[tuple[int, ...]]) -> UsageError:
 
 
 def rows_of(column: NDArray[Any], name: str) -> list[Floats | None]:
-    """Return the number or array of numbers of each message; None where it is missing.
-
-    Raises:
-        UsageError: A value is something else.
-    """
+    """Return the number or array of numbers of each message; None where it is missing."""
     rows = []
     for value in column:
         row = None if value is None else as_array(value)
@@ -286,11 +261,6 @@ def pooled(rows: Sequence[Floats | None], kind: str, count: int) -> Floats:
     Sector k contains the elements from floor(k M / count) up to floor((k + 1) M / count), at least
     one. NaN is ignored. `min` and `max` are infinite if that is the smallest or largest element,
     and `mean` is that of the finite elements. A sector without numbers is NaN.
-
-    Args:
-        rows: Arrays of numbers; None where they are missing.
-        kind: `min`, `max` or `mean`.
-        count: Number of sectors.
     """
     found = np.full((len(rows), count), np.nan)
     places: dict[int, list[int]] = {}

@@ -71,17 +71,7 @@ class Plan:
     """
 
     def __init__(self, bag: Bag, mapping: Mapping, place: Place, *, trust_code: bool) -> None:
-        """Resolve all paths and parse all expressions.
-
-        Args:
-            bag: Bag to read.
-            mapping: Mapping of the bag's topics.
-            place: Positions of the mapping's keys in its file.
-            trust_code: Whether `reward` may name a Python function.
-
-        Raises:
-            UsageError: A topic, field or name is unknown, or an expression is wrong.
-        """
+        """Resolve all paths and parse all expressions."""
         self.bag, self.mapping, self.place = bag, mapping, place
         self.quantities = {
             name: self._wanted((section, name), quantity)
@@ -217,11 +207,7 @@ def _text(time: TimeSource | Stamp) -> str:
 
 
 def _reward_of(text: str, *, trust_code: bool) -> Reward:
-    """Return the function that computes the rewards of all steps.
-
-    Raises:
-        UsageError: The expression is wrong, or the function is not trusted or not found.
-    """
+    """Return the function that computes the rewards of all steps."""
     module, colon, name = text.partition(":")
     if not colon or not module.replace(".", "").isidentifier():
         expression = Expression(text)

@@ -36,9 +36,6 @@ def action_commands(
 
     Returns:
         None for a Box, and for a numeric field with too many values to list them.
-
-    Raises:
-        UsageError: `representatives` does not fit the actions.
     """
     if not isinstance(space, spaces.Discrete):
         return None

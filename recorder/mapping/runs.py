@@ -105,9 +105,6 @@ def runs_of(
         gap_s: Largest jitter in seconds.
         paths: Files of the bag.
         recordings: Index of the recording of each file, not descending.
-
-    Raises:
-        UsageError: The clock of a stream was reset while that of another stream went on.
     """
     found = Runs([], {}, [])
     for number in sorted(set(recordings)):
@@ -233,12 +230,7 @@ class _Resets:
         self._mixed: list[str] = []
 
     def find(self) -> tuple[dict[str, list[int]], list[str]]:
-        """Return the first message of each run but the first by stream, and the mixed streams.
-
-        Raises:
-            UsageError: The clock of a stream was reset while that of another stream went on, or
-                goes back very often.
-        """
+        """Return the first message of each run but the first by stream, and the mixed streams."""
         jumps = self._jumps()
         for name, rows in jumps.items():
             count = len(self._parts[name].rows)
@@ -342,11 +334,7 @@ class _Resets:
         return is_done
 
     def _sort(self, name: str, row: int, other: str) -> None:
-        """Note that messages are sorted by time, because the clock of another stream goes on.
-
-        Raises:
-            UsageError: Messages before and after a large step back would be mixed.
-        """
+        """Note that messages are sorted by time, because the clock of another stream goes on."""
         part, start = self._parts[name], self._start(name)
         is_after = np.arange(start, len(part.rows)) >= row
         switches = np.count_nonzero(np.diff(is_after[time_order(part.times_ns[start:])]))

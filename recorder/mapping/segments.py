@@ -66,10 +66,6 @@ def segments(marks: Marks, max_steps: int | None) -> list[Segment]:
     first: a terminal or truncating step, the last step before a gap or an unusable step, a step
     without an action, `max_steps` transitions, or the last step before the next rising edge of
     `begin`. The next episode begins after the final observation.
-
-    Args:
-        marks: Flags of the steps.
-        max_steps: Maximum number of transitions; None for no limit.
     """
     count = len(marks.usable)
     begins = marks.usable if marks.begin is None else marks.usable & _edges(marks.begin)

@@ -66,11 +66,7 @@ class StepReader:
     """
 
     def __init__(self, plan: Plan) -> None:
-        """Find the runs, and read the transforms if the mapping uses them.
-
-        Raises:
-            UsageError: The clock of a topic was reset while that of another topic went on.
-        """
+        """Find the runs, and read the transforms if the mapping uses them."""
         self._plan, self._mapping = plan, plan.mapping
         self._streams: dict[str, Recorded] = {**plan.streams}
         self._transforms: dict[str, Transforms] = {
@@ -96,11 +92,7 @@ class StepReader:
         return len(self.runs.runs)
 
     def read(self, number: int) -> Steps:
-        """Return the steps of one run; `number` is its index.
-
-        Raises:
-            UsageError: The mapping does not fit the messages.
-        """
+        """Return the steps of one run; `number` is its index."""
         plan, run = self._plan, self.runs.runs[number]
         ticks = self._ticks(run)
         times_ns = ticks.times_ns
@@ -145,11 +137,7 @@ class StepReader:
         return Steps(times_ns, quantities, actions, probs, rewards, episodes, reasons)
 
     def _transform_time(self, topic: str) -> TimeSource:
-        """Return the time of the transforms of a topic.
-
-        Raises:
-            UsageError: The mapping gives different times, or a field.
-        """
+        """Return the time of the transforms of a topic."""
         times = {
             wanted.quantity.time or self._mapping.time
             for wanted in self._plan.quantities.values()
@@ -211,11 +199,7 @@ class StepReader:
             )
 
     def _scalars(self, wanted: Wanted, found: Values) -> NDArray[np.float64]:
-        """Return values as numbers, one for each step.
-
-        Raises:
-            UsageError: The values are texts or arrays.
-        """
+        """Return values as numbers, one for each step."""
         with self._plan.place.named(*wanted.keys):
             numbers = as_numbers(found.values, str(wanted.source.path))
             if numbers.ndim > 1:

@@ -28,11 +28,7 @@ class TopicStream:
     def __init__(
         self, bag: Bag, topic: str, fields: Iterable[str], time: TimeSource | Stamp
     ) -> None:
-        """Select the fields; nothing is read yet.
-
-        Raises:
-            UsageError: The messages have no such time.
-        """
+        """Select the fields; nothing is read yet."""
         self.topic = topic
         self._bag, self._left_out = bag, np.empty(0, np.int64)
         self._fields = sorted(set(fields))
@@ -119,11 +115,7 @@ class TopicStream:
 
 
 def _stamp_of(bag: Bag, topic: str, time: TimeSource | Stamp) -> tuple[FieldPath, int]:
-    """Return the field that contains the times of a topic, and its unit in nanoseconds.
-
-    Raises:
-        UsageError: The messages have no such field.
-    """
+    """Return the field that contains the times of a topic, and its unit in nanoseconds."""
     info = bag.topics[topic]
     if not isinstance(time, Stamp):
         if info.fields and _STAMP not in info.fields:

@@ -20,11 +20,7 @@ _FINAL_NAMES = ("final_obs", "final_observation")
 
 
 def as_array(value: Any) -> NDArray[Any]:
-    """Convert a value to a NumPy array; the data is copied only if it is not in main memory.
-
-    Raises:
-        TypeError, ValueError, RuntimeError: The value cannot be converted.
-    """
+    """Convert a value to a NumPy array; the data is copied only if it is not in main memory."""
     if type(value) is np.ndarray:
         return value
     if hasattr(value, "detach") and hasattr(value, "cpu"):
@@ -57,11 +53,7 @@ def is_other_array(value: Any) -> bool:
 
 
 def one_each(what: str, values: NDArray[Any], count: int) -> NDArray[Any]:
-    """Return one value for each of `count` environments, (N,).
-
-    Raises:
-        SpaceError: There is another number of values.
-    """
+    """Return one value for each of `count` environments, (N,)."""
     if values.shape == (count,):
         return values
     if values.size != count:
@@ -78,18 +70,8 @@ def final_observation(
 ) -> Any:
     """Return the last observation of one environment that was reset in the same step.
 
-    Args:
-        infos: Infos of the vector environment. The last observations are a sequence or array with
-            one item for each environment. For a Dict or Tuple space, each part may also be batched.
-        number: Index of the environment.
-        count: Number of environments.
-        space: Space of one observation.
-
     Returns:
         The observation; None if the infos do not contain it.
-
-    Raises:
-        SpaceError: The last observations do not have one item for each environment.
     """
     for name in _FINAL_NAMES:
         mask = infos.get(f"_{name}")

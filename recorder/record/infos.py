@@ -16,13 +16,7 @@ class EpisodeInfos:
     """Collector of the infos of one episode, which are written at its end."""
 
     def __init__(self, topics: InfoTopics, names: bool | Sequence[str]) -> None:
-        """Begin without infos.
-
-        Args:
-            topics: Topics of the infos in the log.
-            names: Whether to record infos, or the names of the infos to record. The name `episode`
-                includes nested infos such as `episode.r`.
-        """
+        """Begin without infos."""
         self._topics = topics
         one = [names] if isinstance(names, str) else names
         self._names = None if isinstance(one, bool) else tuple(one)

@@ -59,15 +59,7 @@ def layout_of(
     follow_frame: str = "",
     training: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Return the layout for a log with these topics.
-
-    Args:
-        metadata: Metadata of the log.
-        topics: Topics of the log besides `/rl/step` and `/rl/episode`.
-        telemetry_names: Fields of `/telemetry`.
-        follow_frame: Frame that the 3D view moves with; empty for a fixed view.
-        training: Labels of the fields of `/rl/training` in a live stream, by name.
-    """
+    """Return the layout for a log with these topics."""
     screens = _Screens(metadata, topics, telemetry_names, follow_frame, training or {})
     nodes = {"Drive": screens.drive(), "Learning": screens.learning(), "Data": screens.data()}
     return {

@@ -100,14 +100,7 @@ def tabs(nodes: Mapping[str, Node]) -> Panel:
 
 
 def plot(title: str, paths: Mapping[str, str], *, values: bool = False, **options: Any) -> Panel:
-    """Return a plot of series. With several series, there is a legend to the left of the plot.
-
-    Args:
-        title: Title of the panel.
-        paths: Message path of each series, by label.
-        values: Whether the legend has the values at the current time.
-        options: Values that replace fields of the panel.
-    """
+    """Return a plot of series. With several series, there is a legend to the left of the plot."""
     several = len(paths) > 1
     return _titled(
         title,
@@ -178,14 +171,7 @@ def gauge(title: str, path: str, highest: float) -> Panel:
 
 
 def indicator(title: str, path: str, colors: Mapping[str, str], other: tuple[str, str]) -> Panel:
-    """Return an indicator whose color depends on a string.
-
-    Args:
-        title: Title of the panel.
-        path: Message path of the string.
-        colors: Color for each value of the string.
-        other: Color and label for any other value.
-    """
+    """Return an indicator whose color depends on a string."""
     rules = [
         {"operator": "=", "rawValue": text, "color": color, "label": text.replace("_", " ")}
         for text, color in colors.items()
@@ -236,16 +222,7 @@ def three_d(
     axes_m: float = 0.0,
     without_axes: Sequence[str] = (),
 ) -> Panel:
-    """Return a 3D view that hides outlines, and the names and connections of frames.
-
-    Args:
-        title: Title of the panel.
-        topics: Topics of markers to show, each with the namespaces to hide.
-        camera: Fields of the camera state.
-        follow: Frame to follow, and the mode: `follow-pose`, `follow-position` or `follow-none`.
-        axes_m: Length of the frames' axes; 0 for none.
-        without_axes: Frames whose axes are hidden.
-    """
+    """Return a 3D view that hides outlines, and the names and connections of frames."""
     return _titled(
         title,
         cameraState={

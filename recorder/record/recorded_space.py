@@ -30,11 +30,7 @@ _ADVICE_FOR_BATCH = (
 
 
 def check_single(env: Any) -> None:
-    """Check that an object is a single environment of Gymnasium.
-
-    Raises:
-        UsageError: It is a vector environment, or an environment of another package.
-    """
+    """Check that an object is a single environment of Gymnasium."""
     if isinstance(env, gym.vector.VectorEnv):
         raise UsageError("RecordMcap wraps single environments; RecordVecMcap wraps vector ones")
     if not isinstance(env, gym.Env):
@@ -44,11 +40,7 @@ def check_single(env: Any) -> None:
 
 
 def check_vector(env: Any) -> None:
-    """Check that an object is a vector environment of Gymnasium.
-
-    Raises:
-        UsageError: It is a single environment, or an environment of another package.
-    """
+    """Check that an object is a vector environment of Gymnasium."""
     if isinstance(env, gym.vector.VectorEnv):
         return
     if not isinstance(env, gym.Env):
@@ -127,18 +119,7 @@ class RecordedSpace(NamedTuple):
 
 
 def recorded_space(space: spaces.Space[Any], keys: Sequence[str] | None = None) -> RecordedSpace:
-    """Return the form in which a log stores the observations of an environment.
-
-    Args:
-        space: Observation space of the environment.
-        keys: Keys of the recorded parts of a Dict or Tuple, such as `joints`, or `joints/q` for a
-            part of a part; None for all.
-
-    Raises:
-        SpaceError: A log cannot store a recorded part.
-        UnknownNameError: A key matches no part.
-        UsageError: The observation has no keys.
-    """
+    """Return the form in which a log stores the observations of an environment."""
     parts = dict(_parts(space, ()))
     paths = list(parts)
     if keys is not None:
@@ -188,12 +169,7 @@ def _parts(
 def _selected(
     paths: Sequence[tuple[str | int, ...]], keys: Sequence[str], space: spaces.Space[Any]
 ) -> list[tuple[str | int, ...]]:
-    """Return the paths that the keys select.
-
-    Raises:
-        UnknownNameError: A key selects no path.
-        UsageError: There are no keys, or the space is not a Dict or Tuple.
-    """
+    """Return the paths that the keys select."""
     if isinstance(keys, str):
         keys = [keys]
     if not isinstance(space, spaces.Dict | spaces.Tuple):

@@ -68,12 +68,7 @@ class EpisodeLog:
         max_file_bytes: int | None,
         start_time_ns: int | None,
     ) -> None:
-        """Create the file or open it to append. For the arguments, see `RecordMcap`.
-
-        Raises:
-            UsageError: Timestamps would not increase, or `max_file_bytes` is too small.
-            SpaceError, OutputExistsError, LogError: Raised by `LogWriter`.
-        """
+        """Create the file or open it to append. For the arguments, see `RecordMcap`."""
         self._description = description
         # Relative paths are resolved in this folder, even if the process later changes to another
         # folder.
@@ -127,11 +122,7 @@ class EpisodeLog:
         return None if self._parts is None else self._parts.max_file_bytes
 
     def check_can_begin(self, seeds: Iterable[int | None]) -> None:
-        """Check that episodes with these seeds can be recorded.
-
-        Raises:
-            UsageError: The recording is closed, or a seed is too large.
-        """
+        """Check that episodes with these seeds can be recorded."""
         if self.closed:
             raise UsageError(f"{self.log.mcap.path} is closed; record to another file")
         for seed in seeds:
@@ -199,11 +190,7 @@ class EpisodeLog:
         )
 
     def advance(self, last: EpisodeSummary) -> None:
-        """Update the episode count and the next start time after `last` was written.
-
-        Raises:
-            LogError: The file was removed or replaced. The log is closed in this case.
-        """
+        """Update the episode count and the next start time after `last` was written."""
         self.next_start_ns = last.end_time_ns + self.step_ns
         self.episodes = last.episode + 1
         if not self._is_in_place():
@@ -249,11 +236,7 @@ class _Parts:
         return self.current
 
     def remove_replaced(self) -> None:
-        """Remove the old files of an overwritten recording, except the current file.
-
-        Raises:
-            LogError: Another process is writing one of these files.
-        """
+        """Remove the old files of an overwritten recording, except the current file."""
         for path in self._replaced:
             if path != self.current:
                 with locked_file(path):
@@ -261,11 +244,7 @@ class _Parts:
 
 
 def _episodes_in(log: LogWriter) -> int:
-    """Return the number of episodes in a log to append to.
-
-    Raises:
-        LogError: The last episode is not finished.
-    """
+    """Return the number of episodes in a log to append to."""
     path = log.mcap.path
     steps = Topic(McapReader(path), STEP_TOPIC)
     if not len(steps):

@@ -309,9 +309,6 @@ def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
     """Convert a value to the dtype and shape that its space declares.
 
     Arrays of another float type are converted with a warning; other values must convert exactly.
-
-    Raises:
-        SpaceError: The value has another shape, or does not convert exactly.
     """
     where = _where(leaf)
     try:
@@ -339,11 +336,7 @@ def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
 
 
 def reward_number(reward: Any) -> float:
-    """Convert a reward that is an array of one number to a float.
-
-    Raises:
-        SpaceError: The reward is not one number.
-    """
+    """Convert a reward that is an array of one number to a float."""
     array = as_array(reward)
     if array.size != 1 or array.dtype.kind not in "biuf":
         raise SpaceError(

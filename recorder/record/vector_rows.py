@@ -33,14 +33,7 @@ class OpenRows(Generic[Rows]):
     """
 
     def __init__(self, chunk: Rows, environments: int, fields: Sequence[str]) -> None:
-        """Allocate the array.
-
-        Args:
-            chunk: Message records of one chunk; their constant fields are set.
-            environments: Number of environments.
-            fields: Names of the fields that `put` sets. All fields of the message after the first
-                of these are copied to the records, so the caller sets the others there.
-        """
+        """Allocate the array."""
         self._chunk, self._fields, self.row_bytes = chunk, fields, chunk.itemsize
         self._records, dtype = chunk.from_field(fields)
         first = max(2, min(_FIRST_CAPACITY, _FIRST_BYTES // self.row_bytes))

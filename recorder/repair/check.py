@@ -104,11 +104,6 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
 
     If the file is another robot's bag, its messages are decoded instead of the episodes.
 
-    Args:
-        path: Path of a log, or of a bag: an MCAP file, a ROS 1 bag, a rosbag2 database, or a
-            rosbag2 folder.
-        threads: Number of threads that decompress chunks.
-
     Returns:
         Problems in file order; for a bag, a note follows them.
     """
@@ -145,16 +140,7 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
 
 
 def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: int) -> None:
-    """Check each chunk. If all chunks are valid, check the log.
-
-    Args:
-        reader: Reader of the file.
-        found: Problems found so far; this function adds further problems.
-        threads: Number of threads that decompress chunks.
-
-    Raises:
-        LogError, SpaceError: The file is not a valid log.
-    """
+    """Check each chunk. If all chunks are valid, check the log."""
     log, refusal = None, None
     if not found:
         try:

@@ -49,11 +49,7 @@ class EpisodeCheck:
     """Checker of a log. It collects values of each chunk, and validates the episodes at the end."""
 
     def __init__(self, reader: McapReader) -> None:
-        """Find the topics.
-
-        Raises:
-            LogError: The file has no `/rl/step`, or its metadata is damaged.
-        """
+        """Find the topics."""
         self._reader = reader
         self._steps = Topic(reader, STEP_TOPIC)
         if not reader.channels_of(STEP_TOPIC):
@@ -77,11 +73,7 @@ class EpisodeCheck:
             self._prepare()
 
     def take(self, chunk: ChunkIndex, records: memoryview) -> None:
-        """Check the messages of one chunk.
-
-        Raises:
-            CorruptLogError: Messages do not match the schema or the spaces of the metadata.
-        """
+        """Check the messages of one chunk."""
         for decoder, messages, where in self._places.get(chunk.chunk_start_offset, ()):
             if isinstance(where, slice):
                 self._take_steps(decoder.alike(records, messages.index, _FIELDS), where)
@@ -89,11 +81,7 @@ class EpisodeCheck:
                 self._take_images(decoder.alike(records, messages.index, _IMAGE_FIELDS), where)
 
     def finish(self) -> Iterator[Problem]:
-        """Yield the problems of the log.
-
-        Raises:
-            LogError, SpaceError: The log cannot be read.
-        """
+        """Yield the problems of the log."""
         if not self._has_our_form:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

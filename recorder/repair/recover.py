@@ -101,20 +101,7 @@ def recover_log(
     keep_unfinished: bool = False,
     overwrite: bool = False,
 ) -> Recovery:
-    """Write the valid part of `source` to `target` as a valid log.
-
-    Args:
-        source: MCAP file, which may be damaged. It is not changed.
-        target: Path of the new file.
-        keep_unfinished: Whether to keep the whole transitions of episodes without an end, and mark
-            these episodes as truncated. By default, these episodes are dropped.
-        overwrite: Whether to replace an existing file.
-
-    Raises:
-        OutputExistsError: The target exists and `overwrite` is not set.
-        UsageError: The target is the source.
-        LogError: Nothing can be kept, or the target cannot be written.
-    """
+    """Write the valid part of `source` to `target` as a valid log."""
     source, target = as_path(source, whole=True), Path(target)
     if source.exists() and target.exists() and target.samefile(source):
         raise UsageError(f"{target} is the damaged file: recover to another path")
@@ -133,9 +120,6 @@ def _keep_whole_episodes(
     """Write the file `copied` to `result`, without its incomplete episodes.
 
     If `keep_unfinished` is set, episodes without an end are kept up to their last whole transition.
-
-    Raises:
-        LogError: There is nothing to keep, or the new log has a problem.
     """
     reader = McapReader(copied)
     recovery.messages = _count_messages(reader)
@@ -188,11 +172,7 @@ def _count_messages(reader: McapReader) -> int:
 
 
 def _add_plan(recovery: Recovery, plan: EpisodePlan) -> None:
-    """Copy the counts and dropped episodes of an `EpisodePlan` to the result of the recovery.
-
-    Raises:
-        NoEpisodesError: No episode can be kept.
-    """
+    """Copy the counts and dropped episodes of an `EpisodePlan` to the result of the recovery."""
     recovery.episodes, recovery.dropped = plan.episodes, plan.dropped
     recovery.ended, recovery.strays = len(plan.ended), plan.strays
     if plan.episodes == 0:

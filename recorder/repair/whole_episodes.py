@@ -112,15 +112,8 @@ class EpisodePlan:
 def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan | None:
     """Find the whole episodes of a log.
 
-    Args:
-        reader: Reader of a valid MCAP file with all messages in chunks.
-        keep_unfinished: Whether to keep episodes without an end if they have a whole transition.
-
     Returns:
         Plan; None if the file is not a log because `/rl/step` or its required fields are missing.
-
-    Raises:
-        LogError: The file is a log according to its metadata, but lacks required fields.
     """
     steps = Topic(reader, STEP_TOPIC)
     if not len(steps):

@@ -32,17 +32,7 @@ from mcaprl.texts import counted
 
 @contextmanager
 def annotated_copy(source: Path, out: Path, *, overwrite: bool = False) -> Iterator[AnnotatedCopy]:
-    """Yield a copy of a log; move it to `out` if the `with` block ends without an error.
-
-    Args:
-        source: Path of the log.
-        out: Path of the copy; may be equal to `source`.
-        overwrite: Whether to replace an existing file.
-
-    Raises:
-        OutputExistsError: The file exists and `overwrite` is not set.
-        LogError: The log is damaged, unfinished or not an mcaprl log, or `out` cannot be written.
-    """
+    """Yield a copy of a log; move it to `out` if the `with` block ends without an error."""
     reader = McapReader(source)
     with replacing(out, LogError, overwrite=overwrite) as unfinished:
         log = LogWriter(unfinished, describe(reader), source=source)
@@ -70,9 +60,6 @@ class AnnotatedCopy:
         Args:
             topic: Topic to write; see `values_topics`.
             episodes: Pairs of an episode and its columns (T, ...) by field name.
-
-        Raises:
-            UsageError: The log already has the topic.
         """
         self._refuse(topic)
         rows = self._log.values_rows(topic, actions=episodes[0][1]["q"].shape[1])
@@ -80,17 +67,7 @@ class AnnotatedCopy:
             rows.write_columns(episode.log_time_ns[:-1], columns)
 
     def add_scene(self, dataset: Dataset, env: gym.Env[Any, Any], *, camera: bool) -> Verification:
-        """Replay the log in the environment, and write the scene.
-
-        Args:
-            dataset: Dataset of the log.
-            env: New environment of the same kind as the logged one.
-            camera: Whether to write metric depth images.
-
-        Raises:
-            UsageError: The log already has a scene, or the environment provides none.
-            LogError: The replay differs from the log, or the log has no seed for an episode.
-        """
+        """Replay the log in the environment, and write the scene."""
         self._refuse(SCENE)
         display = Display(self._log, env.unwrapped, scene=True, camera=camera)
         if not display.shows_steps:

@@ -39,12 +39,7 @@ _BLOCK_BYTES = 2**16
 
 
 def is_allowed(head: bytes, origins: Collection[str]) -> bool:
-    """Return whether a request opens a WebSocket from a trusted page or a local program.
-
-    Args:
-        head: Request line and headers.
-        origins: Allowed origins besides local pages, such as `https://app.foxglove.dev`.
-    """
+    """Return whether a request opens a WebSocket from a trusted page or a local program."""
     _, *lines = head.decode("latin-1").removesuffix("\r\n\r\n").split("\r\n")
     headers: dict[str, str] = {}
     for line in lines:
@@ -89,13 +84,7 @@ class OriginFilter:
     """
 
     def __init__(self, listener: socket.socket, server: tuple[str, int], origins: Collection[str]):
-        """Start to accept connections.
-
-        Args:
-            listener: Listening socket, which `close` closes.
-            server: Address of the server.
-            origins: Allowed origins besides local pages.
-        """
+        """Start to accept connections."""
         self.port: int = listener.getsockname()[1]
         self._listener, self._server, self._origins = listener, server, tuple(origins)
         self._loop = asyncio.new_event_loop()
@@ -175,11 +164,7 @@ class ViewerServer:
     """
 
     def __init__(self) -> None:
-        """Create a server without channels. It does not listen until `start` is called.
-
-        Raises:
-            MissingExtraError: foxglove-sdk is not installed.
-        """
+        """Create a server without channels. It does not listen until `start` is called."""
         self._foxglove = import_extra("foxglove", "foxglove")
         self._ws = import_extra("foxglove.websocket", "foxglove")
         self._context = self._foxglove.Context()
@@ -208,17 +193,7 @@ class ViewerServer:
         return channel
 
     def start(self, name: str, port: int, origins: Sequence[str], **options: Any) -> None:
-        """Start the server.
-
-        Args:
-            name: Name of the server, as viewers display it.
-            port: Port to listen on; 0 selects a free port.
-            origins: Origins of additional web pages that may connect.
-            **options: Further arguments of `foxglove.start_server`.
-
-        Raises:
-            UsageError: The port is in use.
-        """
+        """Start the server."""
         try:
             socket = create_server((HOST, port))
         except OSError as error:

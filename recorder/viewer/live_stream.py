@@ -70,12 +70,7 @@ class LiveSink(MessageSink):
     """
 
     def __init__(self, viewers: ViewerServer, kept: Sequence[str]) -> None:
-        """Create a sink without channels.
-
-        Args:
-            viewers: Server of the viewers.
-            kept: Topics whose latest message is also sent to each new viewer.
-        """
+        """Create a sink without channels."""
         self._viewers, self._kept = viewers, kept
         self._channels: list[Any] = []
         self._kept_ids: set[int] = set()
@@ -265,11 +260,6 @@ class LiveStream(ViewerServer):
             speed: Simulated seconds per second.
             pace: Limit on the time spent on episodes and metrics. `pace.period_s` is the minimum
                 time between two scenes, two depth images, or two messages with metrics.
-
-        Raises:
-            MissingExtraError: foxglove-sdk is not installed.
-            UsageError: The port is in use.
-            SpaceError: The log format does not support the spaces.
         """
         super().__init__()
         self._speed, self._pace = speed, pace or Pace()

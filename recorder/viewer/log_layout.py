@@ -17,16 +17,7 @@ from mcaprl.recorder.record.layout import LAYOUT_NAME, layout_of
 def layout_of_log(
     reader: McapReader, topics: Sequence[str] | None = None, shown: ShownTopics | None = None
 ) -> dict[str, Any]:
-    """Return a layout that shows the topics of a log and plots its series.
-
-    Args:
-        reader: Reader of the log.
-        topics: Topics to show; default: all topics of the log.
-        shown: Telemetry names and the frame to follow; default: read them from the log.
-
-    Raises:
-        LogError: The file has no transitions, or is damaged.
-    """
+    """Return a layout that shows the topics of a log and plots its series."""
     if topics is None:
         topics = sorted({channel.topic for channel in reader.channels.values()})
     if shown is not None:
@@ -36,11 +27,7 @@ def layout_of_log(
 
 
 def attached_layout(reader: McapReader) -> dict[str, Any]:
-    """Return the layout attached to a log, or a new one if there is none.
-
-    Raises:
-        CorruptLogError: The attachment is damaged.
-    """
+    """Return the layout attached to a log, or a new one if there is none."""
     attached = reader.attachment(LAYOUT_NAME)
     if attached is None:
         return layout_of_log(reader)

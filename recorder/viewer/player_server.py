@@ -160,10 +160,6 @@ class LiveServer(ViewerServer):
             name: Name of the server, as viewers display it.
             port: Port to listen on; 0 selects a free port.
             origins: Origins of additional web pages that may connect.
-
-        Raises:
-            MissingExtraError: foxglove-sdk is not installed.
-            UsageError: The port is in use.
         """
         super().__init__()
         self._player, self._prefixes = player, prefixes

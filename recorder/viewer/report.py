@@ -41,10 +41,6 @@ def dataset_page(
     """Write an HTML page about a dataset, and its plots as `dataset.png` beside it.
 
     `facts` are names and values for the first table, and `findings` the results of `lint`.
-
-    Raises:
-        MissingExtraError: matplotlib or jinja2 is not installed.
-        ReportError: A file cannot be written.
     """
     tracks = tracks_of(dataset)
     panels = _panels(dataset, tracks)
@@ -225,9 +221,6 @@ def tracks_of(dataset: Dataset) -> list[Positions]:
     """Return the positions (T + 1, 2) of each episode in meters.
 
     If the positions are unknown, the arrays have the shape (0, 2).
-
-    Raises:
-        LogError: A file of the dataset is missing or damaged.
     """
     logs = [log for log in (_positions_in(path) for path in dataset.sources) if log is not None]
     return [_positions_at(episode.log_time_ns, logs) for episode in dataset.episodes]

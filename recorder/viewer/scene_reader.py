@@ -72,17 +72,7 @@ class SeenStep:
 
 
 def moments_of_episode(reader: McapReader, episode: Episode, parts: int = 1) -> Iterator[SeenStep]:
-    """Yield the scene at each step of an episode.
-
-    Args:
-        reader: Reader of the log.
-        episode: Episode of the log.
-        parts: Number of moments for each step: the step itself, and evenly spaced moments before
-            the next step. The last step has only one moment.
-
-    Raises:
-        LogError: The log has no scene.
-    """
+    """Yield the scene at each step of an episode."""
     if reader.channel_of(SCENE) is None:
         raise LogError(
             f"{reader.path} has no scene: add it with `mcaprl annotate {reader.path} --scene`"
@@ -150,11 +140,7 @@ def frames_of(data: bytes) -> list[tuple[int, SeenFrame]]:
 
 
 def shapes_of(data: bytes) -> list[SeenShape]:
-    """Return the shapes that a `visualization_msgs/msg/MarkerArray` adds.
-
-    Raises:
-        CorruptLogError: The message is damaged.
-    """
+    """Return the shapes that a `visualization_msgs/msg/MarkerArray` adds."""
     array = messages.decode(data, "visualization_msgs/msg/MarkerArray")
     return [_shape(m) for m in array.markers if m.action == _ADD and m.type in _KINDS]
 

@@ -51,11 +51,7 @@ class Surprise:
 
 
 def moments_of(path: Path) -> list[Surprise]:
-    """Return the largest TD errors and strongest disagreements of each policy in a log.
-
-    Raises:
-        LogError: The log is damaged.
-    """
+    """Return the largest TD errors and strongest disagreements of each policy in a log."""
     reader = McapReader(path)
     topics = sorted({c.topic for c in reader.channels.values() if is_values_topic(c.topic)})
     if not topics:

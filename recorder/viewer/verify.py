@@ -300,11 +300,7 @@ def _at(episode: Episode, step: int) -> Any:
 
 
 def _checked_paths(dataset: Dataset, env: gym.Env[Any, Any]) -> Paths:
-    """Return the path of each logged leaf in an observation of the environment.
-
-    Raises:
-        SpaceError: The environment has other spaces than the log.
-    """
+    """Return the path of each logged leaf in an observation of the environment."""
     logged, actual = dataset.observation_space, env.observation_space
     own: dict[tuple[str, ...], tuple[str | int, ...]] = {}
     try:

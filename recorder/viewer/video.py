@@ -40,18 +40,7 @@ _GAP_PX = 6
 
 
 def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
-    """Check that a video or contact sheet can be written, before its images are rendered.
-
-    Args:
-        path: Path of the output.
-        kinds: Supported suffixes.
-        overwrite: Whether to replace an existing file.
-
-    Raises:
-        UnknownNameError: The suffix of the path is not supported.
-        OutputExistsError: The file exists and `overwrite` is not set.
-        MissingExtraError: PyAV for a video, or imageio for a contact sheet, is not installed.
-    """
+    """Check that a video or contact sheet can be written, before its images are rendered."""
     import_extra("av" if path.suffix in _ENCODERS else "imageio", "video")
     if path.suffix not in kinds:
         raise UnknownNameError("kind of output", path.suffix or path.name, kinds)
@@ -62,18 +51,8 @@ def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
 def write_video(path: Path, images: Iterable[Image], fps: float) -> int:
     """Write a video frame by frame: an H.264 encoded `.mp4`, or a `.gif` or `.webp` that loops.
 
-    Args:
-        path: Path of the video, `.mp4`, `.gif` or `.webp`.
-        images: (height, width, 3) frames of one size. An `.mp4` lacks the last row or column of an
-            odd height or width.
-        fps: Frames per second.
-
     Returns:
         Number of frames.
-
-    Raises:
-        UsageError: There are no frames, or their sizes differ.
-        ReportError: The file cannot be written.
     """
     with replacing(path, ReportError) as unfinished:
         count = _encode(unfinished, path.suffix, _of_one_size(images), fps)
@@ -83,11 +62,7 @@ def write_video(path: Path, images: Iterable[Image], fps: float) -> int:
 
 
 def _of_one_size(images: Iterable[Image]) -> Iterator[Image]:
-    """Yield images.
-
-    Raises:
-        UsageError: An image has another size than the first one.
-    """
+    """Yield images."""
     shape: tuple[int, ...] = ()
     for image in images:
         shape = shape or image.shape
@@ -172,11 +147,7 @@ def _frame(image: Image, kind: str) -> Any:
 
 
 def write_sheet(path: Path, images: Sequence[Image]) -> None:
-    """Write a contact sheet of images as PNG; see `contact_sheet`.
-
-    Raises:
-        ReportError: The file cannot be written.
-    """
+    """Write a contact sheet of images as PNG; see `contact_sheet`."""
     imageio = import_extra("imageio.v3", "video")
     with replacing(path, ReportError) as unfinished:
         imageio.imwrite(unfinished, contact_sheet(images), extension=".png")
@@ -201,10 +172,6 @@ def shown_steps(length: int, steps_per_s: float) -> tuple[range, float]:
 
     Steps are skipped at a constant stride if the frame rate would exceed `MAX_FPS`; the last step
     is always shown.
-
-    Args:
-        length: Number of steps of the episode.
-        steps_per_s: Number of steps per second at the video's speed.
     """
     stride = max(1, math.ceil(steps_per_s / MAX_FPS - 1e-9))
     return range(length % stride, length + 1, stride), steps_per_s / stride

@@ -17,13 +17,6 @@ def to_yuv420(image: Bytes, luma: Bytes, blue: Bytes, red: Bytes) -> None:
     """Convert an RGB image to planes of limited range, with the coefficients of BT.601.
 
     A chroma sample is the mean of its 2x2 pixels. Rows of the planes may be longer than needed.
-
-    Args:
-        image: (height, width, 3) contiguous image, which may have one row more than `luma`, and an
-            odd width, whose last column is omitted.
-        luma: (height, width) output for Y, 16 to 235, with an even height.
-        blue: (height / 2, width / 2) output for Cb, 16 to 240.
-        red: (height / 2, width / 2) output for Cr, 16 to 240.
     """
     # With rows as contiguous 1-D arrays, the compiler can vectorize the loops over columns.
     lines = image.reshape(image.shape[0], 3 * image.shape[1])

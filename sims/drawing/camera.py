@@ -140,15 +140,7 @@ def _quadrilaterals(
 
 @compiled
 def draw(faces: Faces, eye_m: Floats, axes: Floats, focal_px: float, inverse_z: Floats) -> None:
-    """Render a mesh into the image `inverse_z`.
-
-    Args:
-        faces: Result of `faces_of` for a mesh; a face is visible from its front.
-        eye_m: (3,) position of the camera.
-        axes: (3, 3) the camera's x, y and z axes as rows, in the mesh's coordinates.
-        focal_px: Focal length; the optical axis meets the middle of the image.
-        inverse_z: (height, width) output, 1/m; 0 where no triangle is visible.
-    """
+    """Render a mesh into the image `inverse_z`."""
     inverse_z[:] = 0.0
     corners, polygon = np.empty((4, 3)), np.empty((5, 3))
     middles, left_u, right_u = np.empty((3, inverse_z.shape[0]))
@@ -259,13 +251,6 @@ def _spans(
     from its upper end, both polygons get bit-identical results. The loop over rows is the inner
     loop, and its index is unsigned, so that the compiler can vectorize it.
 
-    Args:
-        polygon: (5, 3) u and v of the corners.
-        count: Number of corners.
-        middles: (height,) v of each row's middle.
-        left_u: (height,) output: leftmost u on each row that the polygon covers.
-        right_u: (height,) output: rightmost u on each row that the polygon covers.
-
     Returns:
         First row that the polygon covers, and the row after the last one.
     """
@@ -308,15 +293,6 @@ def _fill(
     At a pixel (u, v), relative to the middle of the image, the inverse depth of the plane is
     (x u/f + y v/f + z) / offset. Here, f is the focal length; the fields of `plane` are x, y,
     z and offset.
-
-    Args:
-        rows: First row that the polygon covers, and the row after the last one.
-        left_u: (height,) left end of the polygon on each row.
-        right_u: (height,) right end of the polygon on each row.
-        columns: (width,) numbers of the columns, from 0.
-        plane: Plane of the polygon in camera coordinates.
-        focal_px: Focal length.
-        inverse_z: Output image.
     """
     height, width = inverse_z.shape
     middle_u, middle_v = 0.5 * width, 0.5 * height
@@ -390,13 +366,7 @@ def _cut_near(ends: Floats) -> bool:
 
 @compiled
 def _trace(ends: Floats, main: int, inverse_z: Floats) -> None:
-    """Draw a line with one pixel per step along its main direction.
-
-    Args:
-        ends: (2, 3) u, v and 1/z of both ends.
-        main: Main direction: 0 for u, 1 for v.
-        inverse_z: Image to draw into; its second axis is the main direction.
-    """
+    """Draw a line with one pixel per step along its main direction."""
     first, last = (0, 1) if ends[0, main] <= ends[1, main] else (1, 0)
     width, length = inverse_z.shape
     start, end = ends[first, main], ends[last, main]

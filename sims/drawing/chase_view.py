@@ -65,11 +65,7 @@ class ChaseView:
     """Renderer that prepares lists of shapes once and then draws any number of images."""
 
     def __init__(self, height_px: int = HEIGHT_PX) -> None:
-        """Prepare an empty image of this height.
-
-        Raises:
-            MissingExtraError: Pygame is not installed.
-        """
+        """Prepare an empty image of this height."""
         width_px = 2 * round(height_px * 8 / 9)
         self._center_px, self._focal_px = np.array([width_px, height_px]) / 2, _FOCAL * width_px
         self._canvas = Canvas("rgb_array", (width_px, height_px), "", 1)
@@ -84,17 +80,7 @@ class ChaseView:
         follow: str,
         lines: Sequence[str],
     ) -> NDArray[np.uint8]:
-        """Render one image, (height, width, 3).
-
-        Args:
-            static: Static shapes. If this is the same list object as in the last call, they are
-                not prepared again. Shapes in the frame `map` are left out beyond 400 m.
-            moving: Shapes that change. They are not prepared again either if this is the same list
-                object as in the last call.
-            frames: All frames.
-            follow: Name of the frame that the camera follows; if empty, the map's origin.
-            lines: Lines of text in the corner.
-        """
+        """Render one image, (height, width, 3)."""
         if self._static.shapes is not static:
             self._static = _prepared(static)
         if self._moving.shapes is not moving:

@@ -83,14 +83,7 @@ class Painter:
         self._samples = np.empty((SMOOTH * height_px, SMOOTH * width_px), np.uint32)
 
     def draw(self, faces: Faces, far: int, eye: Eye, sky: Sequence[float]) -> NDArray[np.uint8]:
-        """Render one image, (height, width, 3).
-
-        Args:
-            faces: Faces in the map.
-            far: Number of faces at the start of `faces` that are drawn only within `FAR_M`.
-            eye: Camera.
-            sky: Red, green and blue of the background, each 0 to 1.
-        """
+        """Render one image, (height, width, 3)."""
         rows, columns = self._samples.shape
         order_by = np.empty(len(faces.widths_m))
         keys(faces, far, eye, columns // SMOOTH, rows // SMOOTH, order_by)
@@ -159,14 +152,7 @@ def keys(faces: Faces, far: int, eye: Eye, width_px: int, height_px: int, order_
 
 @compiled
 def paint(faces: Faces, order: NDArray[np.int64], eye: Eye, samples: Samples) -> None:
-    """Draw faces over the samples of an image.
-
-    Args:
-        faces: Faces in the map.
-        order: Indexes of the faces to draw, the first one first.
-        eye: Camera.
-        samples: (`SMOOTH` height, `SMOOTH` width) colors, in and out.
-    """
+    """Draw faces over the samples of an image."""
     # The near plane adds at most one corner to a convex polygon.
     corners, clipped, flat = np.empty((12, 3)), np.empty((13, 3)), np.empty((13, 2))
     lefts, rights = np.empty(samples.shape[0]), np.empty(samples.shape[0])
@@ -294,12 +280,7 @@ def _spans(flat: Floats, count: int, lefts: Floats, rights: Floats) -> tuple[int
 
 @compiled
 def shrink(samples: Samples, image: NDArray[np.uint8]) -> None:
-    """Average the samples of each pixel.
-
-    Args:
-        samples: (2 height, 2 width) colors, 0xRRGGBB.
-        image: (height, width, 3) contiguous output.
-    """
+    """Average the samples of each pixel."""
     # With rows as contiguous 1-D arrays, the compiler can vectorize the loop over columns.
     lines = image.reshape(image.shape[0], 3 * image.shape[1])
     outer_mask, green_mask = np.uint32(0xFF00FF), np.uint32(0xFF00)

@@ -115,10 +115,6 @@ def cut(segments_m: NDArray[np.float64], longest_m: float) -> NDArray[np.float64
     Viewers do not draw a line that begins behind the camera, even if the rest of the line is in
     front. With short pieces, only a small part of the line is missing.
 
-    Args:
-        segments_m: (2 N, K) alternating starts and ends of N segments.
-        longest_m: Length of a piece.
-
     Returns:
         (2 M, K) alternating starts and ends of M pieces.
 

@@ -143,11 +143,6 @@ def arc(start: Pose, end: Pose, share: float) -> Pose:
     The way is an arc with the turn angle w. Compare the chord of a fraction s of the arc with the
     chord of the whole arc: the ratio of their lengths is s sinc(s w / 2) / sinc(w / 2), and the
     angle between them is (s - 1) w / 2. Here, sinc(a) = sin(a) / a.
-
-    Args:
-        start: First pose.
-        end: Last pose.
-        share: Fraction of the way, 0 to 1.
     """
     dx_m, dy_m = end[0] - start[0], end[1] - start[1]
     turn_rad = wrap_angle(end[2] - start[2])

@@ -106,11 +106,7 @@ class Canvas:
         caption: str,
         images_per_s: int,
     ) -> None:
-        """Prepare an empty image of the given size; open a window in mode `human`.
-
-        Raises:
-            MissingExtraError: Pygame is not installed.
-        """
+        """Prepare an empty image of the given size; open a window in mode `human`."""
         # pygame would print a greeting among the results that commands print to stdout.
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         self.pygame = import_extra("pygame", "sims")
@@ -234,9 +230,6 @@ class FollowView:
         """Prepare the static shapes. Shapes in `floor` are drawn below all other shapes.
 
         The image shows `width_m` meters of the ground from left to right.
-
-        Raises:
-            MissingExtraError: Pygame is not installed.
         """
         self.canvas = Canvas(render_mode, (SIDE_PX, SIDE_PX), f"mcaprl {name}", frames_per_s)
         lowest = [patch._replace(top_m=-math.inf) for patch in patches(floor)]

@@ -132,10 +132,6 @@ def evaluation_page(
 
     `behavior` is that of `comparison_figure`. `recorded` is a log and a number N: the log contains
     the episodes of the first N policies in `scores`.
-
-    Raises:
-        MissingExtraError: Matplotlib or jinja2 is not installed.
-        ReportError: A file cannot be written.
     """
     save_png(comparison_figure(scores, "mean return", behavior), folder / "comparison.png")
     comparison = comparison_figure(scores, "", behavior, width=5.6)

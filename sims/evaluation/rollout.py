@@ -71,17 +71,7 @@ def make_or_borrow(name: str | gym.Env[Any, Any], /, **kwargs: Any) -> gym.Env[A
 def make_limited(
     name: str | gym.Env[Any, Any], max_steps: int | None, /, **kwargs: Any
 ) -> gym.Env[Any, Any]:
-    """Make an environment whose episodes end.
-
-    Args:
-        name: As in `make_sim`, or an environment, which `close` leaves open.
-        max_steps: Limit on the steps of an episode; None for `DEFAULT_MAX_STEPS` if the environment
-            has no time limit, and otherwise for no other limit.
-        **kwargs: As in `make_sim`.
-
-    Raises:
-        UnknownNameError, MissingExtraError, UsageError: As in `make_sim`.
-    """
+    """Make an environment whose episodes end."""
     env = make_or_borrow(name, **kwargs)
     if max_steps is None and not _has_time_limit(env):
         max_steps = DEFAULT_MAX_STEPS
@@ -94,15 +84,6 @@ def make_limited_sims(
     """Make environments whose episodes end, which are stepped together; see `make_limited`.
 
     With another limit than that of the environment, they are stepped one after the other.
-
-    Args:
-        name: As in `make_sims`.
-        num_envs: Number of environments.
-        max_steps: As in `make_limited`.
-        **kwargs: As in `make_sims`.
-
-    Raises:
-        UnknownNameError, MissingExtraError, UsageError: As in `make_sims`.
     """
     limit = max_steps or _default_of(name, kwargs)
     if limit is None:
@@ -111,13 +92,7 @@ def make_limited_sims(
 
 
 def warn_of_cuts(results: Iterable[EpisodeResult], policy: str, sim: str) -> None:
-    """Warn if episodes reached the limit on their steps.
-
-    Args:
-        results: Results of the episodes.
-        policy: Name of the policy.
-        sim: Name of the environment.
-    """
+    """Warn if episodes reached the limit on their steps."""
     cut, count = [], 0
     for result in results:
         count += 1
@@ -261,15 +236,7 @@ def run_episode(
     max_steps: int | None = None,
     on_action: Callable[[float], None] | None = None,
 ) -> EpisodeResult:
-    """Run one episode to its end.
-
-    Args:
-        env: Environment; this function resets it.
-        behavior: Exploration policy.
-        seed: Seed of the environment and of the exploration.
-        max_steps: Number of steps after which the episode is interrupted.
-        on_action: Function called with each action's probability before the step.
-    """
+    """Run one episode to its end."""
     observation, info = env.reset(seed=seed)
     behavior.begin(seed)
     telemetry = getattr(env.unwrapped, "telemetry", None)
@@ -350,12 +317,6 @@ def batch_rollout(
 
     All environments are stepped until the last of these episodes ends. Further episodes that start
     in an environment are ignored.
-
-    Args:
-        envs: Vector environment with one environment per seed, in autoreset mode `NextStep`.
-        policy: Policy for batches of observations.
-        seeds: Seeds of the episodes.
-        on_episode: Function called after each episode, in the order in which they end.
     """
     assert envs.num_envs == len(seeds)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
@@ -386,17 +347,7 @@ def batch_rollout(
 def check_fit(
     policy: BasePolicy, env: gym.Env[Any, Any], observation_space: spaces.Space[Any] | None = None
 ) -> None:
-    """Validate that the spaces of a trained policy and of an environment match; see `same_form`.
-
-    Args:
-        policy: Trained policy.
-        env: Environment.
-        observation_space: Space of the observations that the policy receives; default: that of the
-            environment.
-
-    Raises:
-        PolicyError: The policy was trained on spaces that do not match.
-    """
+    """Validate that the spaces of a trained policy and of an environment match; see `same_form`."""
     for role in ("observation_space", "action_space"):
         trained = getattr(policy, f"env_{role}", None) or getattr(policy, role, None)
         actual = getattr(env, role)

@@ -36,11 +36,7 @@ class Projection(NamedTuple):
 
 
 def closed_path(corners: ArrayLike) -> Path:
-    """Return the path through corners (N + 1, 2), meters; the last corner equals the first.
-
-    Raises:
-        ValueError: The corners do not form a closed polyline of legs longer than 0.
-    """
+    """Return the path through corners (N + 1, 2), meters; the last corner equals the first."""
     points = np.array(corners, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
         raise ValueError(f"corners have shape {points.shape}: at least (3, 2) is needed")

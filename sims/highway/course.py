@@ -80,11 +80,7 @@ class Course(NamedTuple):
 
 
 def courses_of(network: Any) -> tuple[Course, ...]:
-    """Return the courses of a road: one for each parallel lane.
-
-    Args:
-        network: A `highway_env.road.road.RoadNetwork` without forks.
-    """
+    """Return the courses of a road: one for each parallel lane."""
     edges = list(_edges(network.graph))
     return tuple(
         _course([lanes[number] for _, _, lanes in edges], edges[0][0] == edges[-1][1])

@@ -156,11 +156,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         start: str = "anywhere",
         render_mode: RenderMode | None = None,
     ) -> None:
-        """Make the environment; see "Arguments" of the class.
-
-        Raises:
-            UnknownNameError: An argument has a value that is not in its list.
-        """
+        """Make the environment; see "Arguments" of the class."""
         check_name("road", road, tuple(ROADS))
         check_name("rules", rules, ("default",))
         check_name("observation", observation, ("state",))
@@ -210,12 +206,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; see "Starting State".
-
-        Raises:
-            UsageError: `options` has an unknown key, or the pose is invalid, occupied or not on a
-                lane.
-        """
+        """Start an episode; see "Starting State"."""
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**31))
@@ -236,11 +227,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
     def step(
         self, action: int | np.integer[Any]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Advance the car by one decision.
-
-        Raises:
-            UsageError: The action is not 0 to 4.
-        """
+        """Advance the car by one decision."""
         check_action(action, len(ACTION_MEANINGS))
         self._last_action = int(action)
         # highway-env's angles are clockwise.
@@ -423,11 +410,7 @@ def drawn_pose(
 def pose_from_options(
     options: dict[str, Any], courses: Sequence[Course], others: Sequence[Car], own: Car
 ) -> Pose:
-    """Return the pose from the options of `reset`. The default speed is the car's current speed.
-
-    Raises:
-        UsageError: An option is unknown, or the pose is malformed, occupied, or not on a lane.
-    """
+    """Return the pose from the options of `reset`. The default speed is the car's current speed."""
     pose = pose_from(options, 0.0, FASTEST_M_S)
     if len(options["pose"]) < len(Pose._fields):
         pose = pose._replace(speed_m_s=own.speed_m_s)

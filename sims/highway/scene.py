@@ -60,10 +60,6 @@ def static_shapes(network: Any, courses: Sequence[Course]) -> tuple[Shape, ...]:
     """Return the shapes that never change.
 
     The world is in the frame `map`, and the parts of the car are in the frame `car`.
-
-    Args:
-        network: A `highway_env.road.road.RoadNetwork`.
-        courses: Center lines of the lanes.
     """
     points_m = np.concatenate([course.points_m for course in courses])
     low, high = points_m.min(axis=0) - MARGIN_M, points_m.max(axis=0) + MARGIN_M

@@ -81,10 +81,6 @@ def advance(row: NDArray[np.float64], action: int) -> tuple[Car, float, int]:
 def step_only_car(arrays: Arrays, action: int) -> tuple[float, int, float, float, float, float]:
     """Advance a single car like `step_cars`; also return the values for its `info`.
 
-    Args:
-        arrays: Row (10,) of the car, and the outputs: reward (1,), end (1,), observation (12,).
-        action: 0 to 5.
-
     Returns:
         Reward, end, offset, heading error, speed and progress.
     """

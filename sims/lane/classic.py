@@ -64,15 +64,7 @@ def classic_reward(distance_m: float, speed_m_s: float) -> float:
 
 @compiled
 def classic_end(distance_m: float, speed_m_s: float, action: int, hit: bool, by_code: bool) -> int:
-    """Return the outcome of a step: DRIVING, OFF_LANE, LOW_REWARD, SLOW or COLLISION.
-
-    Args:
-        distance_m: Distance to the nearest infinite line through a leg.
-        speed_m_s: Speed after the step.
-        action: Action of the step.
-        hit: Whether the car's body touched an obstacle.
-        by_code: Whether to follow the published code instead of the text.
-    """
+    """Return the outcome of a step: DRIVING, OFF_LANE, LOW_REWARD, SLOW or COLLISION."""
     if distance_m > CLASSIC_LANE_M:
         return OFF_LANE
     if classic_reward(distance_m, speed_m_s) < LOWEST_REWARD:

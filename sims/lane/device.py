@@ -35,11 +35,7 @@ class DeviceLane(DeviceSims):
         max_episode_steps: int,
         start: str | None = None,
     ) -> None:
-        """Allocate the cars; `start` is the argument of `LaneKeepingEnv`.
-
-        Raises:
-            UnknownNameError, MissingExtraError, UsageError: As for `DeviceSims`.
-        """
+        """Allocate the cars; `start` is the argument of `LaneKeepingEnv`."""
         fleet = LaneFleet(1, start=start)
         super().__init__(fleet, num_envs, device, seed, max_episode_steps)
         self._world = World(start == "line")

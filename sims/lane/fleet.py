@@ -68,11 +68,7 @@ class LaneFleet(Fleet):
         observation: str = "state",
         start: str | None = None,
     ) -> None:
-        """Allocate N cars; `begin` starts them.
-
-        Raises:
-            UnknownNameError: An argument has a value that is not in its list.
-        """
+        """Allocate N cars; `begin` starts them."""
         check_name("rules", rules, ("default", "classic", "classic-code"))
         check_name("observation", observation, OBSERVATIONS)
         check_name("start", start, (None, "anywhere", "line"))
@@ -365,13 +361,7 @@ def beside(leg: int, rest_m: float, offset_m: float, error_rad: float, speed_m_s
 
 @compiled
 def start_at_random(shares: NDArray[np.float64], on_line: bool, classic: bool) -> Car:
-    """Return a car at the start of an episode.
-
-    Args:
-        shares: (4,) random numbers from 0 to 1.
-        on_line: Whether to start on the start line instead of anywhere.
-        classic: Whether a car on the start line first drives straight ahead for a second.
-    """
+    """Return a car at the start of an episode."""
     if not on_line:
         return start_anywhere(shares)
     car = start_on_line(shares)
@@ -381,12 +371,6 @@ def start_at_random(shares: NDArray[np.float64], on_line: bool, classic: bool) -
 @compiled
 def start_only_car(arrays: Arrays, on_line: bool, classic: bool) -> tuple[float, float, float]:
     """Start a single car like `start_cars`; also return the values for its `info`.
-
-    Args:
-        arrays: Attribute `addresses` of `Generators`, and the outputs: row (10,) of the car, reward
-            (1,), end (1,) and observation (12,).
-        on_line: Whether to start on the start line instead of anywhere.
-        classic: Whether a car on the start line first drives straight ahead for a second.
 
     Returns:
         Offset, heading error and speed.
@@ -437,11 +421,7 @@ def start_cars(
 
 
 def car_from(options: dict[str, Any]) -> Car:
-    """Return the starting state in the options of `reset`.
-
-    Raises:
-        UsageError: An option is unknown, or the pose is malformed or not on the lane.
-    """
+    """Return the starting state in the options of `reset`."""
     pose = pose_from(options, 0.0, MAX_SPEED_M_S)
     place = project(COURSE, pose.x_m, pose.y_m, 0.0, COURSE.length_m)
     if abs(place.offset_m) > LANE_HALF_WIDTH_M:

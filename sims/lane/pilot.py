@@ -86,10 +86,6 @@ def choose(car: Car, substeps: int = SUBSTEPS) -> int:
 
     The search tries all pairs of two actions, each followed by pursuit. The result is the first
     action of the best pair.
-
-    Args:
-        car: State of the car.
-        substeps: Number of substeps of 0.05 s in a decision.
     """
     if pursuit_value(car, substeps) >= HORIZON:
         return pursue(car)

@@ -75,12 +75,7 @@ class PowerlineFleet(Fleet):
         wind_m_s: float = 0.0,
         gust_m_s: float = 0.0,
     ) -> None:
-        """Allocate N drones; `begin` starts them.
-
-        Raises:
-            UnknownNameError: An argument has a value that is not in its list.
-            UsageError: A number is outside its range.
-        """
+        """Allocate N drones; `begin` starts them."""
         check_name("rules", rules, ("default", "classic"))
         check_name("observation", observation, ("state", "depth"))
         check_name("camera", camera, CAMERAS)
@@ -257,12 +252,7 @@ def start_anywhere(random: np.random.Generator, wind: Vector) -> Flight:
 
 
 def flight_from(options: dict[str, Any], wind: Vector, classic: bool) -> Flight:
-    """Return the starting state in the options of `reset`.
-
-    Raises:
-        UsageError: An option is unknown, or the pose is malformed, too fast, or would end the
-            episode at once.
-    """
+    """Return the starting state in the options of `reset`."""
     pose = read_pose(options, POSE_NAMES, least=3)
     position, velocity = Vector(*pose[:3]), Vector(*pose[3:])
     check_range("a pose's speed in m/s", norm(velocity), 0.0, MAX_COMMAND_M_S)

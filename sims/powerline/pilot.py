@@ -50,13 +50,7 @@ def wanted_velocity(position_m: Vector) -> Vector:
 
 @compiled
 def choose(flight: Flight, step_m_s: float, from_measured: bool) -> int:
-    """Choose the action that most reduces the command's error, or none if the error is small.
-
-    Args:
-        flight: State of the drone.
-        step_m_s: Velocity change of an action.
-        from_measured: Whether actions change the measured velocity instead of the last command.
-    """
+    """Choose the action that most reduces the command's error, or none if the error is small."""
     base = flight.drone.velocity_m_s if from_measured else flight.command_m_s
     missing = minus(wanted_velocity(flight.drone.position_m), base)
     best, most_m_s = NO_CHANGE, 0.5 * step_m_s

@@ -133,15 +133,7 @@ def cruising(position_m: Vector, velocity_m_s: Vector) -> Drone:
 def fly(
     plant: int, drone: Drone, command_m_s: Vector, wind_m_s: Vector, duration_s: float
 ) -> Drone:
-    """Return the drone after flying at a commanded velocity.
-
-    Args:
-        plant: QUAD or POINT; wind has no effect on POINT.
-        drone: Initial state.
-        command_m_s: Commanded velocity over the ground.
-        wind_m_s: Velocity of the air over the ground.
-        duration_s: Duration; for QUAD a multiple of 2 ms.
-    """
+    """Return the drone after flying at a commanded velocity."""
     if plant == POINT:
         return lag(drone, command_m_s, duration_s)
     for _ in range(round(duration_s / TIME_STEP_S)):

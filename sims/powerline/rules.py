@@ -156,11 +156,6 @@ def next_gust(gust_m_s: Vector, strength_m_s: float, noise: NDArray[np.float64])
 
     The new gust is g' = g e + sigma sqrt(1 - e^2) n, whose stationary standard deviation is sigma.
     A decision lasts 0.5 s and the time constant is 2 s, so e = exp(-0.5 / 2).
-
-    Args:
-        gust_m_s: Gust g of the last decision.
-        strength_m_s: Standard deviation sigma.
-        noise: (3,) standard normal numbers n.
     """
     kept = math.exp(-DECISION_S / GUST_TIME_S)
     fresh = strength_m_s * math.sqrt(1.0 - kept * kept)

@@ -265,11 +265,7 @@ class PowerlineView:
     """Renderer of one image per step, shown in a window in mode `human`."""
 
     def __init__(self, render_mode: Literal["human", "rgb_array"]) -> None:
-        """Prepare the shapes that never change.
-
-        Raises:
-            MissingExtraError: Pygame is not installed.
-        """
+        """Prepare the shapes that never change."""
         frames_per_s = round(1.0 / DECISION_S)
         floor = ground_shapes()
         above = static_shapes()[len(floor) :]

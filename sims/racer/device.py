@@ -42,11 +42,7 @@ class DeviceRacer(DeviceSims):
         drift: bool = False,
         track_seed: int | None = None,
     ) -> None:
-        """Allocate the cars; the last three arguments are those of `RacerEnv`.
-
-        Raises:
-            UnknownNameError, MissingExtraError, UsageError: As for `DeviceSims`.
-        """
+        """Allocate the cars; the last three arguments are those of `RacerEnv`."""
         fleet = RacerFleet(1, start=start, drift=drift, track_seed=track_seed)
         super().__init__(fleet, num_envs, device, seed, max_episode_steps)
         self._track, self._drift, self._on_line = fleet.track, drift, start == "line"

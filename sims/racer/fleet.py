@@ -62,12 +62,7 @@ class RacerFleet(Fleet):
         drift: bool = False,
         track_seed: int | None = None,
     ) -> None:
-        """Allocate N cars; `begin` starts them.
-
-        Raises:
-            UnknownNameError: An argument has a value that is not in its list.
-            UsageError: The track's seed is not an integer of at least 0.
-        """
+        """Allocate N cars; `begin` starts them."""
         check_name("rules", rules, ("default", "classic"))
         check_name("observation", observation, ("rays",))
         check_name("start", start, (None, "anywhere", "line"))
@@ -258,11 +253,7 @@ def start_cars(
 
 
 def car_from(track: Track, options: dict[str, Any]) -> Car:
-    """Return the starting state in the options of `reset`.
-
-    Raises:
-        UsageError: An option is unknown, or the pose is malformed or not on the track.
-    """
+    """Return the starting state in the options of `reset`."""
     pose = pose_from(options, -MAX_SPEED_M_S, MAX_SPEED_M_S)
     x_px, y_px = pose.x_m / METERS_PER_PX, IMAGE_HEIGHT_PX - pose.y_m / METERS_PER_PX
     speed_px = pose.speed_m_s * STEP_S / METERS_PER_PX

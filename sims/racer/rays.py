@@ -43,13 +43,6 @@ def crossing(
 ) -> tuple[float, float]:
     """Return the intersection of the line through two points with another line.
 
-    Args:
-        x: x of the first point.
-        y: y of the first point.
-        dx: Difference in x from the first point to the second.
-        dy: Difference in y from the first point to the second.
-        line: (4,) x1, y1, x2, y2.
-
     Returns:
         Position of the intersection as a fraction of the segment between the points, and as a
         fraction of `line`. Both are between 0 and 1 if the segments intersect, and infinite if

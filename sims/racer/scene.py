@@ -124,11 +124,7 @@ class RacerView:
     """Renderer of one image per step, shown in a window in mode `human`."""
 
     def __init__(self, render_mode: Literal["human", "rgb_array"], track: Track) -> None:
-        """Prepare the shapes that never change.
-
-        Raises:
-            MissingExtraError: Pygame is not installed.
-        """
+        """Prepare the shapes that never change."""
         size_px = (IMAGE_WIDTH_PX, IMAGE_HEIGHT_PX)
         self._canvas = Canvas(render_mode, size_px, "mcaprl racer", round(1 / STEP_S))
         self._track = track

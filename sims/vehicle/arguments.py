@@ -22,31 +22,19 @@ class Pose(NamedTuple):
 
 
 def check_name(argument: str, value: object, allowed: Sequence[object]) -> None:
-    """Validate that a value is allowed.
-
-    Raises:
-        UnknownNameError: The value is not allowed. The message lists the allowed values.
-    """
+    """Validate that a value is allowed."""
     if value not in allowed:
         raise UnknownNameError(argument, str(value), [str(name) for name in allowed])
 
 
 def check_range(argument: str, value: float, low: float, high: float) -> None:
-    """Validate that a number is in [low, high].
-
-    Raises:
-        UsageError: The number is outside this range, or NaN.
-    """
+    """Validate that a number is in [low, high]."""
     if not low <= value <= high:
         raise UsageError(f"{argument} must be {low:g} to {high:g}, not {value}")
 
 
 def check_action(action: int | np.integer[Any], count: int) -> int:
-    """Validate an action and return it as an int.
-
-    Raises:
-        UsageError: The action is not an integer from 0 to count - 1.
-    """
+    """Validate an action and return it as an int."""
     try:
         number = operator.index(action)
     except TypeError:
@@ -57,16 +45,7 @@ def check_action(action: int | np.integer[Any], count: int) -> int:
 
 
 def read_pose(options: dict[str, Any], names: Sequence[str], least: int) -> list[float]:
-    """Read `pose`, the only option of `reset`.
-
-    Args:
-        options: Options of `reset`.
-        names: Names, with units, of all numbers that a pose can have.
-        least: Number of required values; the others default to 0.
-
-    Raises:
-        UsageError: There is an option other than `pose`, or the pose is malformed or not finite.
-    """
+    """Read `pose`, the only option of `reset`."""
     if set(options) != {"pose"}:
         raise UsageError(f"reset accepts only the option 'pose', not {sorted(set(options))}")
     try:
@@ -81,11 +60,7 @@ def read_pose(options: dict[str, Any], names: Sequence[str], least: int) -> list
 
 
 def pose_from(options: dict[str, Any], slowest_m_s: float, fastest_m_s: float) -> Pose:
-    """Read the start of a ground vehicle: (x_m, y_m, yaw_rad) or (x_m, y_m, yaw_rad, speed_m_s).
-
-    Raises:
-        UsageError: There is another option, the pose is malformed, or the speed is out of range.
-    """
+    """Read the start of a ground vehicle: (x_m, y_m, yaw_rad) or (x_m, y_m, yaw_rad, speed_m_s)."""
     pose = Pose(*read_pose(options, Pose._fields, least=3))
     check_range("a pose's speed_m_s", pose.speed_m_s, slowest_m_s, fastest_m_s)
     return pose

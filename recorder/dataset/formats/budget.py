@@ -23,33 +23,20 @@ class Budget:
     """
 
     def __init__(self, where: object, stored_bytes: int) -> None:
-        """Create a budget in proportion to the size of the source.
-
-        Args:
-            where: Name of the source, for errors.
-            stored_bytes: Size of the file, or of all files of the folder.
-        """
+        """Create a budget in proportion to the size of the source."""
         self.where, self._stored = where, stored_bytes
         self._left = UNPACKED_ALLOWANCE_BYTES + MAX_UNPACKED_RATIO * stored_bytes
 
     @classmethod
     def of_files(cls, where: object, files: Sequence[Path]) -> Budget:
-        """Create a budget for files.
-
-        Raises:
-            LogError: A file does not exist.
-        """
+        """Create a budget for files."""
         try:
             return cls(where, sum(file.stat().st_size for file in files))
         except OSError as error:
             raise LogError(f"{where} cannot be read: {error}") from error
 
     def take(self, name: str, shape: Sequence[int], item_bytes: int) -> None:
-        """Subtract an array before it is read.
-
-        Raises:
-            LogError: The arrays take too many bytes.
-        """
+        """Subtract an array before it is read."""
         count = math.prod(shape)
         self._left -= count * item_bytes + ARRAY_COST_BYTES
         if self._left < 0:

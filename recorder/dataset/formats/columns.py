@@ -75,16 +75,6 @@ def dataset_of(
 
     Rewards and actions must be finite, and discrete values in their space. A log may contain other
     values, which `lint` reports.
-
-    Args:
-        episodes: Episodes in order; episodes without a transition are left out.
-        metadata: Spaces and description of the data.
-        where: Name of the source, for errors.
-        has_rewards: Whether the source has rewards; otherwise, they are NaN.
-
-    Raises:
-        LogError: There is no transition, or the step duration is not positive.
-        SpaceError: An array does not fit its space exactly, or has an impossible value.
     """
     kept = [(index, episode) for index, episode in enumerate(episodes) if len(episode.rewards)]
     if not kept:
@@ -98,11 +88,7 @@ def dataset_of(
 
 
 def check_duration(metadata: LogMetadata, frames: int, where: object) -> None:
-    """Check that log_times which increase by the step duration fit into 64 bits.
-
-    Raises:
-        LogError: The step duration is not positive, or too large.
-    """
+    """Check that log_times which increase by the step duration fit into 64 bits."""
     if not 0 < metadata.step_duration_ns * frames < MAX_TIME_NS:
         raise LogError(
             f"{where}: step_duration_ns is {shortened(str(metadata.step_duration_ns), 40)},"
@@ -111,11 +97,7 @@ def check_duration(metadata: LogMetadata, frames: int, where: object) -> None:
 
 
 def check_times(name: str, times_ns: NDArray[Any]) -> None:
-    """Check that the log_times of an episode are whole numbers of nanoseconds, and do not fall.
-
-    Raises:
-        SpaceError: A time is earlier than the time before it, or is not one.
-    """
+    """Check that the log_times of an episode are whole numbers of nanoseconds, and do not fall."""
     if (
         times_ns.dtype.kind not in "iu"
         or (np.abs(times_ns.astype(np.float64)) >= MAX_TIME_NS).any()

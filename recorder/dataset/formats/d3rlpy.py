@@ -57,12 +57,7 @@ def matches(path: Path) -> bool:
 
 
 def to_mdp_dataset(dataset: Dataset) -> Any:
-    """Return a `d3rlpy.dataset.MDPDataset` with all transitions.
-
-    Raises:
-        SpaceError: d3rlpy does not support the action space.
-        MissingExtraError: d3rlpy is not installed.
-    """
+    """Return a `d3rlpy.dataset.MDPDataset` with all transitions."""
     _check_action_space(dataset.action_space)
     try:
         d3rlpy = import_extra("d3rlpy", "")
@@ -96,11 +91,6 @@ def from_buffer(buffer: Any) -> Dataset:
 
     d3rlpy does not store the final observation of a terminated episode. The observation before it
     is repeated instead.
-
-    Raises:
-        SpaceError: A log cannot hold a space or dtype of the data.
-        LogError: There are no transitions.
-        UsageError: `buffer` is not a replay buffer of d3rlpy.
     """
     if not (hasattr(buffer, "episodes") and hasattr(buffer, "dataset_info")):
         raise UsageError(
@@ -116,17 +106,8 @@ def from_buffer(buffer: Any) -> Dataset:
 def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     """Write a file that d3rlpy's `ReplayBuffer.load` reads.
 
-    Args:
-        dataset: Episodes to write.
-        path: New file.
-        lossy: Whether to write actions of a space that d3rlpy does not support.
-
     Returns:
         One sentence for each thing that is stored in another way.
-
-    Raises:
-        SpaceError: d3rlpy does not support the action space, and `lossy` is not set.
-        MissingExtraError: h5py is not installed.
     """
     lost = []
     try:
@@ -165,17 +146,6 @@ def read(path: Path, *, one_episode: bool = False, dones: Kind | None = None) ->
 
     A file of version 2 does not state whether actions are discrete. They are read as discrete if
     each step has one integer.
-
-    Args:
-        path: File.
-        one_episode: See `FlatOptions`; ignored for files of version 2.
-        dones: See `FlatOptions`; ignored for files of version 2.
-
-    Raises:
-        LogError: The file is damaged, or of another version.
-        SpaceError: A log cannot hold a space or dtype of the data, or a value is impossible.
-        UsageError: The options contradict the arrays.
-        MissingExtraError: h5py is not installed.
     """
     with nodes.opened(path) as file:
         if _is_version_1(file):
@@ -356,11 +326,7 @@ def _whole_number(file: Any, name: str, where: object) -> int:
 
 
 def _check_arrays(episode: Mapping[str, Any], where: str) -> None:
-    """Check that the arrays of an episode are numeric and have one row for each step.
-
-    Raises:
-        LogError: An array is not numeric, or has another number of rows.
-    """
+    """Check that the arrays of an episode are numeric and have one row for each step."""
     stored = episode["observations"]
     parts = [*stored] if isinstance(stored, list) else [stored]
     parts += [episode["actions"], episode["rewards"]]

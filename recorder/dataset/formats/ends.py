@@ -72,19 +72,7 @@ class Ends:
 
 
 def ends_of(found: Mapping[str, Any], count: int, *, dones: Kind | None = None) -> Ends:
-    """Combine all arrays that say where episodes end.
-
-    Args:
-        found: Arrays by name; names that are not in `MEANINGS` are ignored.
-        count: Number of rows, N.
-        dones: What the end of an episode means if no array says it. Default: `terminated` for the
-            meaning `done`, and `truncated` for the others.
-
-    Raises:
-        LogError: There is no such array, an array has another shape, or two arrays contradict each
-            other.
-        SpaceError: A flag is neither 0 nor 1.
-    """
+    """Combine all arrays that say where episodes end."""
     sources = _Sources(found, count)
     terminated, truncated, done = (
         sources.flags(meaning) for meaning in ("terminated", "truncated", "done")
@@ -145,11 +133,7 @@ class _Sources:
             yield name, self._flags(name, values)
 
     def flags(self, meaning: str) -> Named | None:
-        """Return the flags of the only array with a meaning; None if there is none.
-
-        Raises:
-            LogError: There are several arrays.
-        """
+        """Return the flags of the only array with a meaning; None if there is none."""
         every = list(self.every(meaning))
         if len(every) > 1:
             raise LogError(f"there are both {every[0][0]} and {every[1][0]}: remove one of them")
@@ -240,9 +224,6 @@ def _combined(divisions: list[Named]) -> Named | None:
     """Return the only division, or the first of several that agree.
 
     The last row may be unmarked by flags, because a file may end within an episode.
-
-    Raises:
-        LogError: Two divisions differ.
     """
     for other in divisions[1:]:
         _check_equal(divisions[0], other, is_division=True)

@@ -55,22 +55,6 @@ def flat_dataset(
     If there are neither next nor final observations, the observation of a terminal transition is
     repeated as its next observation. The last transition of any other episode is left out, because
     its next observation is unknown.
-
-    Args:
-        found: Arrays by the names in `NAMES`: N rows, but E for the final observations of the
-            episodes, and N + E for the times. The observations may be nested dicts.
-        where: Name of the source, for errors and warnings.
-        infos: Arrays by dotted name. An array of N rows is read as an info of the N observations;
-            the final observations have no infos. An array of N + E rows has infos of all
-            observations, if there are final ones. Other arrays are named in a warning.
-        options: What the user says about the arrays.
-        unread: Names of other arrays of the source, for a warning.
-
-    Raises:
-        LogError: An array is missing, nothing says where episodes end, or arrays contradict each
-            other.
-        SpaceError: The arrays have different lengths, or values that are impossible.
-        UsageError: The user says that there is one episode, but there are several.
     """
     options = options or FlatOptions()
     says_ends = any(MEANINGS.get(name) not in (None, "truncated") for name in found)
@@ -161,12 +145,7 @@ class _Steps:
         return exactly(TIMES, times, np.dtype(np.int64))
 
     def check_ends(self, options: FlatOptions) -> None:
-        """Check that something says where episodes end, or that the user does.
-
-        Raises:
-            LogError: Nothing says where episodes end.
-            UsageError: The user says that there is one episode, but there are several.
-        """
+        """Check that something says where episodes end, or that the user does."""
         is_marked = bool((self._ends.terminated | self._ends.truncated).any())
         if len(self._spans) > 1 and options.one_episode:
             raise UsageError(
@@ -261,11 +240,7 @@ class _Steps:
         return len(inner) > 0 and not self._breaks[inner].any()
 
     def _check_lengths(self) -> None:
-        """Check that each column has a row for each reward.
-
-        Raises:
-            SpaceError: A column has another number of rows, or is not numeric.
-        """
+        """Check that each column has a row for each reward."""
         for name in COLUMNS:
             for path, array in named_leaves(name, self._columns.get(name)):
                 if not array.ndim or len(array) != self._count:
@@ -325,11 +300,7 @@ def _one_column(name: str, values: Any, where: object) -> Any:
 
 
 def _like(tree: Any, other: Any, name: str) -> Any:
-    """Return `other` with the keys and dtypes of `tree`.
-
-    Raises:
-        SpaceError: The keys or shapes differ, or a value cannot be converted exactly.
-    """
+    """Return `other` with the keys and dtypes of `tree`."""
     if isinstance(tree, Mapping) and isinstance(other, Mapping) and tree.keys() == other.keys():
         return {key: _like(part, other[key], f"{name}/{key}") for key, part in tree.items()}
     if isinstance(tree, Mapping) or isinstance(other, Mapping) or tree.shape != other.shape:

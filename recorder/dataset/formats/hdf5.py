@@ -36,18 +36,8 @@ def matches(path: Path) -> bool:
 def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     """Write a dataset in D4RL's form.
 
-    Args:
-        dataset: Episodes to write.
-        path: New file.
-        lossy: Whether to write Dict observations as one array for each key, and to leave out infos
-            that HDF5 cannot store.
-
     Returns:
         One sentence for each thing that was left out or differs from D4RL's form.
-
-    Raises:
-        SpaceError: `lossy` is not set, and observations are a Dict or HDF5 cannot store an info.
-        MissingExtraError: h5py is not installed.
     """
     infos, lost = stored_infos(dataset.infos)
     info_names, lost_names = nested_names(infos)
@@ -88,19 +78,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
 
 
 def read(path: Path, *, one_episode: bool = False, dones: Kind | None = None) -> Dataset:
-    """Read a file in D4RL's or robomimic's form.
-
-    Args:
-        path: File.
-        one_episode: See `FlatOptions`; ignored for robomimic's form.
-        dones: See `FlatOptions`; ignored for robomimic's form.
-
-    Raises:
-        LogError: The file is damaged, or has another form.
-        SpaceError: A log cannot store a dtype, or a value is impossible.
-        UsageError: The options contradict the arrays.
-        MissingExtraError: h5py is not installed.
-    """
+    """Read a file in D4RL's or robomimic's form."""
     with nodes.opened(path) as file:
         if nodes.has(file, "data"):
             return read_demos(file, path)
@@ -110,11 +88,7 @@ def read(path: Path, *, one_episode: bool = False, dones: Kind | None = None) ->
 
 
 def read_flat(file: Any, path: Path, options: FlatOptions) -> Dataset:
-    """Read flat arrays of transitions, and name those that are not read in a warning.
-
-    Raises:
-        LogError, SpaceError, UsageError: See `flat_dataset`.
-    """
+    """Read flat arrays of transitions, and name those that are not read in a warning."""
     names = nodes.names_in(file)
     arrays = {name: nodes.tree_in(file, name) for name in names if name in NAMES}
     has_infos = nodes.has(file, INFOS) and nodes.is_group(file, INFOS)

@@ -66,12 +66,7 @@ def is_hdf5(path: Path) -> bool:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """Open a file for reading.
-
-    Raises:
-        LogError: The file is missing, or data that is read in the context is damaged.
-        MissingExtraError: h5py is not installed.
-    """
+    """Open a file for reading."""
     h5py = import_extra("h5py", EXTRA)
     before = _budget.set(Budget.of_files(path, [path]))
     try:
@@ -88,16 +83,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 @contextmanager
 def created(path: Path, **options: Any) -> Iterator[Any]:
-    """Create a file, and yield it as a `h5py.File`.
-
-    Args:
-        path: File to create or replace.
-        options: Arguments of `h5py.File`.
-
-    Raises:
-        OSError: The file cannot be written.
-        MissingExtraError: h5py is not installed.
-    """
+    """Create a file, and yield it as a `h5py.File`."""
     h5py = import_extra("h5py", EXTRA)
     with _Output(path) as output:
         try:
@@ -118,11 +104,7 @@ class _Input(FileIO):
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the file.
-
-        Raises:
-            OSError: The file has addresses or lengths of another size than 8 bytes.
-        """
+        """Open the file."""
         super().__init__(path, "rb")
         self._size = path.stat().st_size
         self._left = MAX_READ_RATIO * self._size + UNPACKED_ALLOWANCE_BYTES
@@ -134,11 +116,7 @@ class _Input(FileIO):
             raise OSError("its addresses do not have 8 bytes")
 
     def readinto(self, buffer: Any) -> int:
-        """Read bytes, and return their number.
-
-        Raises:
-            OSError: The bytes are not in the file, too many are read, or a structure is circular.
-        """
+        """Read bytes, and return their number."""
         count, place = memoryview(buffer).nbytes, self.tell()
         self._left -= count
         if count > self._size - place or self._left < 0:
@@ -158,9 +136,6 @@ class _Input(FileIO):
             size: Size of the heap, bytes.
             free: Offset of the first free block; 1 if there is none.
             data: Address of the heap.
-
-        Raises:
-            OSError: The list has more blocks than fit into the heap.
         """
         # A free block has at least 16 bytes: the offset of the next one, and its size.
         for _ in range(min(size, self._size) // 16 + 1):
@@ -170,11 +145,7 @@ class _Input(FileIO):
         raise OSError("a list of free blocks is circular")
 
     def _check_global_heap(self, place: int, size: int) -> None:
-        """Check that each object in a collection of texts ends after its start.
-
-        Raises:
-            OSError: An object has no size.
-        """
+        """Check that each object in a collection of texts ends after its start."""
         data = os.pread(self.fileno(), min(size, _MAX_GLOBAL_HEAP_BYTES), place)
         offset = 16
         while offset + 16 <= len(data):
@@ -190,9 +161,6 @@ def stop_if_full(file: Any) -> None:
     """Raise the first error of writing a file that `created` yielded.
 
     Writers call this after each part of the data, because HDF5 does not notice such an error.
-
-    Raises:
-        OSError: The file cannot be written, for example because the disk is full.
     """
     if file.output.error is not None:
         raise file.output.error
@@ -269,11 +237,7 @@ def has(group: Any, name: str) -> bool:
 
 
 def names_in(group: Any) -> list[str]:
-    """Return the names of a group's members.
-
-    Raises:
-        LogError: A name is not UTF-8.
-    """
+    """Return the names of a group's members."""
     names = list(group)
     if not all(isinstance(name, str) for name in names):
         raise LogError(f"{source()}: {group.name} has a name that is not UTF-8")
@@ -281,11 +245,7 @@ def names_in(group: Any) -> list[str]:
 
 
 def group_in(parent: Any, name: str) -> Any:
-    """Return a group.
-
-    Raises:
-        LogError: There is no such group.
-    """
+    """Return a group."""
     h5py, found = import_extra("h5py", EXTRA), _identifier(parent, name)
     if not isinstance(found, h5py.h5g.GroupID):
         raise LogError(f"{_place(parent, name)} is not a group")
@@ -294,11 +254,7 @@ def group_in(parent: Any, name: str) -> Any:
 
 
 def array_in(parent: Any, name: str) -> NDArray[Any]:
-    """Read an array; variable-length strings become NumPy strings.
-
-    Raises:
-        LogError: There is no such array, or it is not stored in this file.
-    """
+    """Read an array; variable-length strings become NumPy strings."""
     h5py = import_extra("h5py", EXTRA)
     # h5py's low-level API is used, because it is several times as fast for small arrays.
     found = _identifier(parent, name)
@@ -330,9 +286,6 @@ def array_at(parent: Any, path: Sequence[str | int]) -> NDArray[Any]:
     """Read the array at a path of names and indexes.
 
     An index k is read as the name `_index_k`, under which Minari stores member k of a Tuple.
-
-    Raises:
-        LogError: There is no such array, or it is not stored in this file.
     """
     *groups, last = (f"_index_{key}" if isinstance(key, int) else key for key in path)
     for name in groups:
@@ -341,17 +294,7 @@ def array_at(parent: Any, path: Sequence[str | int]) -> NDArray[Any]:
 
 
 def tree_in(parent: Any, name: str, depth: int = 0) -> Any:
-    """Read an array, or the arrays of a group as nested dicts.
-
-    Args:
-        parent: Group.
-        name: Name of the member.
-        depth: Number of groups above the member.
-
-    Raises:
-        LogError: There is no such member, it is not stored in this file, or groups are nested too
-            deeply.
-    """
+    """Read an array, or the arrays of a group as nested dicts."""
     if not is_group(parent, name):
         return array_in(parent, name)
     group = _nested_group(parent, name, depth)
@@ -384,11 +327,7 @@ def arrays_below(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, 
 
 
 def attributes_of(group: Any) -> dict[str, Any]:
-    """Return the attributes as JSON types; the attribute `a/b` is the entry `b` of the dict `a`.
-
-    Raises:
-        LogError: The attributes are damaged.
-    """
+    """Return the attributes as JSON types; the attribute `a/b` is the entry `b` of the dict `a`."""
     found: dict[str, Any] = {}
     for path, value in group.attrs.items():
         *groups, name = path.split("/")
@@ -423,11 +362,7 @@ def with_names_for_hdf5(space: spaces.Space[Any]) -> tuple[spaces.Space[Any], li
 
 
 def is_group(parent: Any, name: str) -> bool:
-    """Return whether a member is a group.
-
-    Raises:
-        LogError: There is no such member.
-    """
+    """Return whether a member is a group."""
     return isinstance(_identifier(parent, name), import_extra("h5py", EXTRA).h5g.GroupID)
 
 

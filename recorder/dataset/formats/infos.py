@@ -48,11 +48,7 @@ def masked(values: NDArray[Any], is_missing: NDArray[np.bool_]) -> np.ma.MaskedA
 
 
 def info_type(text: str) -> np.dtype[Any]:
-    """Return the dtype with this name.
-
-    Raises:
-        ValueError: The dtype is unknown, or is not one of numbers, flags or text.
-    """
+    """Return the dtype with this name."""
     try:
         dtype = np.dtype(text)
     except TypeError as error:

@@ -46,16 +46,8 @@ def matches(path: Path) -> bool:
 def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     """Write a dataset.
 
-    Args:
-        dataset: Episodes to write.
-        path: New file.
-        lossy: Whether keys are renamed, and infos left out, that an archive cannot store.
-
     Returns:
         One sentence for each of these.
-
-    Raises:
-        SpaceError: A key or an info cannot be stored, and `lossy` is not set.
     """
     infos, lost = stored_infos(dataset.infos)
     for name in [name for name in infos if re.search(NO_NAME, name)]:
@@ -89,18 +81,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
 
 
 def read(path: Path, *, one_episode: bool = False, dones: Kind | None = None) -> Dataset:
-    """Read an archive. Only the arrays that are needed are read.
-
-    Args:
-        path: File.
-        one_episode: See `FlatOptions`.
-        dones: See `FlatOptions`.
-
-    Raises:
-        LogError: The file is damaged, or an array is missing.
-        SpaceError: A log cannot store a dtype, or a value is impossible.
-        UsageError: The options contradict the arrays.
-    """
+    """Read an archive. Only the arrays that are needed are read."""
     with Archive.opened(path) as archive:
         taken = [name for name in archive.names if name.split("/")[0] in (*NAMES, INFOS)]
         found = _nested({name: archive[name] for name in taken})

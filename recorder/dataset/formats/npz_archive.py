@@ -60,11 +60,7 @@ class Archive:
     @classmethod
     @contextmanager
     def opened(cls, path: Path) -> Iterator[Archive]:
-        """Open a file.
-
-        Raises:
-            LogError: The file is damaged, or contains Python objects.
-        """
+        """Open a file."""
         try:
             with zipfile.ZipFile(path) as file:
                 yield cls(path, file)
@@ -91,13 +87,7 @@ class Archive:
             return len(_header(file)[0]) > 0
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Read an array.
-
-        Raises:
-            KeyError: There is no such array.
-            ValueError: The array is damaged, or contains Python objects.
-            LogError: The array is too large.
-        """
+        """Read an array."""
         member = self._members[name]
         with self._file.open(member) as file:
             shape, dtype = _header(file)
@@ -112,11 +102,7 @@ class Archive:
 
 
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Read the header of an array: its shape and dtype.
-
-    Raises:
-        ValueError: The header is damaged or too long.
-    """
+    """Read the header of an array: its shape and dtype."""
     version = npy.read_magic(file)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"version {version} of the format")

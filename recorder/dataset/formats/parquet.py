@@ -63,18 +63,8 @@ def write(
 ) -> list[str]:
     """Write a dataset to an empty folder.
 
-    Args:
-        dataset: Episodes to write.
-        path: Empty folder.
-        lossy: Whether infos that are neither numbers, flags nor text are left out.
-        next_observations: Whether the rows have next observations, for other tools.
-
     Returns:
         One sentence for each info that was left out.
-
-    Raises:
-        SpaceError: An info is neither numbers, flags nor text, and `lossy` is not set.
-        MissingExtraError: PyArrow is not installed.
     """
     arrow, parquet = _pyarrow()
     leaves = leaves_of(dataset.observation_space)
@@ -103,13 +93,7 @@ def write(
 
 
 def read(path: Path) -> Dataset:
-    """Read a folder that `write` wrote. Whole episodes may have been removed from both tables.
-
-    Raises:
-        LogError: A file is damaged, lacks a column or the metadata, or the tables do not agree.
-        SpaceError: The values do not fit the spaces.
-        MissingExtraError: PyArrow is not installed.
-    """
+    """Read a folder that `write` wrote. Whole episodes may have been removed from both tables."""
     steps, episodes = _Table(path / TRANSITIONS), _Table(path / EPISODES)
     metadata = steps.metadata()
     lengths = episodes.values("length", (), _TIME)
@@ -175,11 +159,7 @@ class _Table:
         return len(self._table)
 
     def metadata(self) -> LogMetadata:
-        """Return the log's metadata.
-
-        Raises:
-            LogError: The file has no metadata, or the metadata cannot be parsed.
-        """
+        """Return the log's metadata."""
         found = (self._table.schema.metadata or {}).get(METADATA_NAME.encode())
         if found is None:
             raise LogError(
@@ -192,12 +172,7 @@ class _Table:
             raise LogError(f"{self._path}: metadata '{METADATA_NAME}': {error}") from error
 
     def values(self, name: str, shape: Sequence[int], dtype: np.dtype[Any]) -> NDArray[Any]:
-        """Return a column (N, *shape) in this dtype.
-
-        Raises:
-            LogError: There is no such column, or it has nulls.
-            SpaceError: The column has another shape, or values that the dtype cannot hold.
-        """
+        """Return a column (N, *shape) in this dtype."""
         if name not in self._table.column_names:
             raise LogError(f"{self._path} has no column '{name}'")
         arrow, _ = _pyarrow()
@@ -258,11 +233,7 @@ class _Table:
         return masked(values, is_missing)
 
     def summaries(self) -> tuple[EpisodeSummary, ...]:
-        """Return the rows of the table of episodes.
-
-        Raises:
-            LogError: A column is missing, or has a value of another type.
-        """
+        """Return the rows of the table of episodes."""
         missing = [n for n in EpisodeSummary._fields if n not in self._table.column_names]
         if missing:
             raise LogError(f"{self._path} has no column '{missing[0]}'")
@@ -274,12 +245,7 @@ class _Table:
 
 
 def _check_ends(columns: Transitions, path: Path) -> None:
-    """Check that flags and times do not contradict the lengths of the episodes.
-
-    Raises:
-        LogError: An end flag is set before the last row of an episode.
-        SpaceError: The log_times of an episode fall.
-    """
+    """Check that flags and times do not contradict the lengths of the episodes."""
     lasts = columns.first_steps + columns.lengths - 1
     inner = np.ones(len(columns.rewards), np.bool_)
     inner[lasts] = False

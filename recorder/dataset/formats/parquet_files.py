@@ -28,17 +28,7 @@ _MAX_DEPTH = 20
 def read_table(
     path: Path, wanted: Callable[[str], bool] = lambda _: True, *, budget: Budget | None = None
 ) -> Any:
-    """Read the columns of a Parquet file as a PyArrow table, and check the CRCs of its pages.
-
-    Args:
-        path: File.
-        wanted: Whether a column is read, by its name.
-        budget: Limit of the memory; default: a limit of this file.
-
-    Raises:
-        LogError: The file is missing or damaged, or its columns are too large.
-        MissingExtraError: PyArrow is not installed.
-    """
+    """Read the columns of a Parquet file as a PyArrow table, and check the CRCs of its pages."""
     arrow, parquet = import_extra("pyarrow", "tables"), import_extra("pyarrow.parquet", "tables")
     budget = budget or Budget.of_files(path, [path])
     try:
@@ -57,10 +47,6 @@ def _check_sizes(path: Path, names: set[str], budget: Budget) -> None:
 
     PyArrow ends the process if it is asked for a column's sizes and the column's statistics are
     damaged; its reader then raises an error. So this function reads the sizes from the footer.
-
-    Raises:
-        LogError: The columns are too large.
-        ValueError: A size is negative, or the footer is damaged.
     """
     for rows, chunks in _row_groups(path):
         if rows < 0:
@@ -87,11 +73,7 @@ class _Chunk(NamedTuple):
 
 
 def _row_groups(path: Path) -> list[tuple[int, list[_Chunk]]]:
-    """Return the number of rows and the columns of each row group, from the footer of a file.
-
-    Raises:
-        ValueError: The footer is damaged.
-    """
+    """Return the number of rows and the columns of each row group, from the footer of a file."""
     with path.open("rb") as file:
         file.seek(-_END.size, os.SEEK_END)
         length, magic = _END.unpack(file.read(_END.size))

@@ -33,14 +33,6 @@ def read_demos(file: Any, path: Path) -> Dataset:
     A demonstration is terminated if `dones` is set at its last step; otherwise it is truncated.
     If a truncated demonstration has no `next_obs`, its last step is left out, because the next
     observation of this step is unknown.
-
-    Args:
-        file: Open HDF5 file.
-        path: Name of the source, for errors and warnings.
-
-    Raises:
-        LogError: The file has another form, or an array is missing.
-        SpaceError: A log cannot store a dtype.
     """
     data = nodes.group_in(file, "data")
     names = sorted((name for name in nodes.names_in(data) if name.startswith("demo_")), key=_number)

@@ -34,23 +34,7 @@ _MODULE = "stable_baselines3.common.buffers"
 def to_buffer(
     dataset: Dataset, *, device: str = "cpu", buffer_class: Any = None, **options: Any
 ) -> Any:
-    """Return a replay buffer that contains all transitions, in order.
-
-    Args:
-        dataset: Episodes to copy.
-        device: Torch device of the samples.
-        buffer_class: Class of the buffer, such as `NStepReplayBuffer`; default: `ReplayBuffer`, or
-            `DictReplayBuffer` for a Dict space.
-        options: Further arguments of the buffer. The default of `buffer_size` is the number of
-            rows that the dataset needs. With `optimize_memory_usage`, SB3 overwrites the final
-            observations. With `handle_timeout_termination=False`, SB3 treats truncations as
-            terminations.
-
-    Raises:
-        SpaceError: SB3 does not support a space, or a number is too large for float32.
-        UsageError: `buffer_size` is too small, `n_envs` is not 1, or the buffer refuses an option.
-        MissingExtraError: Stable-Baselines3 is not installed.
-    """
+    """Return a replay buffer that contains all transitions, in order."""
     buffers = import_extra(_MODULE, "online")
     observation_space, action_space = dataset.observation_space, dataset.action_space
     _check_spaces(observation_space, action_space)
@@ -92,23 +76,6 @@ def from_buffer(
 
     If the buffer was full, the beginning of the first episode of each environment is missing,
     because SB3 has overwritten it.
-
-    Args:
-        buffer: `ReplayBuffer` or `DictReplayBuffer`.
-        channels_last: Whether to return images as (height, width, channels), the order of axes in
-            environments. Otherwise, images keep the order of axes in the buffer.
-        scaled_actions: Whether the actions of a bounded Box in the buffer are scaled to [-1, 1], as
-            SB3's algorithms store them. Such actions are scaled back to the bounds of the Box,
-            which rounds them.
-        lossy: Whether to read a buffer with `handle_timeout_termination=False`, which does not
-            distinguish truncations from terminations: all become terminations. If the buffer also
-            has `optimize_memory_usage`, it has lost the final observations: each becomes a copy of
-            the observation before it.
-
-    Raises:
-        SpaceError: A log cannot hold a space or dtype of the data.
-        LogError: The buffer is empty, or has lost information and `lossy` is not set.
-        UsageError: `buffer` is not a replay buffer of SB3.
     """
     if not isinstance(buffer, import_extra(_MODULE, "online").ReplayBuffer):
         raise UsageError(f"expected a ReplayBuffer of SB3, but this is a {type(buffer).__name__}")
@@ -145,11 +112,7 @@ def _fill_observations(buffer: Any, dataset: Dataset) -> None:
 
 
 def _rows_in_order(buffer: Any) -> NDArray[np.int64]:
-    """Return the indexes of a buffer's valid rows, from old to new.
-
-    Raises:
-        LogError: The buffer has no valid rows.
-    """
+    """Return the indexes of a buffer's valid rows, from old to new."""
     # With `optimize_memory_usage`, the newest next observation has overwritten the oldest
     # observation.
     oldest = buffer.pos + buffer.optimize_memory_usage if buffer.full else 0
@@ -169,17 +132,7 @@ def _of_environment(
     *,
     scaled_actions: bool,
 ) -> Dataset:
-    """Return the transitions of one environment.
-
-    Args:
-        buffer: Replay buffer.
-        number: Index of the environment.
-        rows: Indexes of the buffer's rows, from old to new.
-        space: Space of the observations to return.
-        orders: Permutation from the axes of each leaf in the buffer to its axes in `space`; None if
-            the order is the same.
-        scaled_actions: See `from_buffer`.
-    """
+    """Return the transitions of one environment."""
     dones, timeouts = (array[rows, number] > 0 for array in (buffer.dones, buffer.timeouts))
     leaves = observation_leaves(space)
     here: list[NDArray[Any]] = []
@@ -224,11 +177,7 @@ def _parts(space: spaces.Space[Any]) -> list[tuple[Leaf, spaces.Space[Any]]]:
 
 
 def _check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
-    """Check that SB3's algorithms can learn from data in these spaces.
-
-    Raises:
-        SpaceError: SB3 does not support one of the spaces.
-    """
+    """Check that SB3's algorithms can learn from data in these spaces."""
     if isinstance(observation_space, spaces.Dict):
         for key, part in observation_space.spaces.items():
             if isinstance(part, spaces.Dict):
@@ -301,11 +250,7 @@ def _reordered(values: NDArray[Any], order: Order | None) -> NDArray[Any]:
 
 
 def _scaled(space: spaces.Space[Any], actions: NDArray[Any]) -> NDArray[Any]:
-    """Return actions as SB3 stores them: scaled to [-1, 1] for a bounded Box.
-
-    Raises:
-        SpaceError: An action cannot be scaled.
-    """
+    """Return actions as SB3 stores them: scaled to [-1, 1] for a bounded Box."""
     if not isinstance(space, spaces.Box) or not space.is_bounded():
         return actions
     with np.errstate(all="ignore"):
@@ -316,11 +261,7 @@ def _scaled(space: spaces.Space[Any], actions: NDArray[Any]) -> NDArray[Any]:
 
 
 def _rounded(name: str, values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return numbers in the dtype of the buffer.
-
-    Raises:
-        SpaceError: A number is too large for the dtype.
-    """
+    """Return numbers in the dtype of the buffer."""
     with np.errstate(over="ignore"):
         found = values.astype(dtype)
     changed = values[np.isinf(found) & ~np.isinf(values)]
@@ -330,11 +271,7 @@ def _rounded(name: str, values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[A
 
 
 def _unscaled(space: spaces.Space[Any], actions: NDArray[Any]) -> NDArray[Any]:
-    """Scale the actions of a bounded Box from [-1, 1], as SB3 stores them, to the bounds.
-
-    Raises:
-        SpaceError: An action is not in [-1, 1].
-    """
+    """Scale the actions of a bounded Box from [-1, 1], as SB3 stores them, to the bounds."""
     if not isinstance(space, spaces.Box) or not space.is_bounded():
         return actions
     if not (np.abs(actions) <= 1).all():

@@ -37,15 +37,7 @@ def is_video(name: str) -> bool:
 
 
 def compressed_pixels(kind: str, data: bytes) -> Pixels:
-    """Decode a compressed image message.
-
-    Args:
-        kind: Format that the message names.
-        data: Bytes of the image.
-
-    Raises:
-        LogError: The image is damaged or too large, or its format is not supported.
-    """
+    """Decode a compressed image message."""
     encoding = kind.split(";")[0].strip().lower()
     if "compresseddepth" in kind.lower():
         return _depth(kind, encoding, data)

@@ -56,9 +56,6 @@ def copied_images(
 
     Returns:
         (N, H, W, C) images; None if one cannot be decoded.
-
-    Raises:
-        LogError: The copy cannot be written, or the sizes of the images differ.
     """
     encoding = IMAGE_ENCODINGS[like.shape[2]] if like.dtype == np.uint8 else "32FC1"
     leaf = Leaf(reader.name, (), like.shape, like.dtype, encoding)
@@ -101,12 +98,7 @@ def _existing(
 
 
 def _failures(cache: McapReader, times_ns: NDArray[np.int64]) -> list[Failure]:
-    """Return the failures that a copy lists.
-
-    Raises:
-        ValueError: The list is damaged, or names other messages than those of the topic.
-        TypeError: The list has values of other types.
-    """
+    """Return the failures that a copy lists."""
     found = []
     for row, reason in parse_json(cache.metadata.get(CACHE_NOTES, {}).get(_FAILURES, "[]")):
         if not isinstance(row, int) or not 0 <= row < len(times_ns):
@@ -151,11 +143,7 @@ def _write(
 
 
 def _fingerprint(paths: tuple[Path, ...]) -> str:
-    """Return the SHA-256 of the paths, sizes and times of change of files.
-
-    Raises:
-        LogError: A file is missing.
-    """
+    """Return the SHA-256 of the paths, sizes and times of change of files."""
     digest = hashlib.sha256()
     try:
         for file in _files(paths):

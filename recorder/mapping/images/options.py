@@ -51,11 +51,7 @@ class ImageOptions:
         return spaces.Box(low, np.inf, images.shape[1:], np.float32)
 
     def applied(self, pixels: Pixels) -> Image:
-        """Return the image (H, W, C) of an observation.
-
-        Raises:
-            UsageError: The options do not fit the image.
-        """
+        """Return the image (H, W, C) of an observation."""
         quantity, is_depth = self._quantity, self._is_depth(pixels)
         image, is_number = pixels.image, pixels.units_per_m > 0
         if is_number:
@@ -76,11 +72,7 @@ class ImageOptions:
         return values if values.ndim == 3 else values[..., np.newaxis]
 
     def _is_depth(self, pixels: Pixels) -> bool:
-        """Return whether the pixels are read as depth.
-
-        Raises:
-            UsageError: The mapping says that they are, but they have 8 bits.
-        """
+        """Return whether the pixels are read as depth."""
         wanted, kind = self._quantity.as_, one_line(pixels.encoding)
         if wanted == "intensity":
             return False

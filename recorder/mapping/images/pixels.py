@@ -103,11 +103,7 @@ def one_line(text: str) -> str:
 
 
 def raw_pixels(message: dict[str, Any]) -> Pixels:
-    """Decode a raw image message: its fields height, width, encoding, step, data, is_bigendian.
-
-    Raises:
-        LogError: The encoding is unknown, or the sizes do not match the bytes.
-    """
+    """Decode a raw image message: its fields height, width, encoding, step, data, is_bigendian."""
     encoding = str(message["encoding"])
     name = encoding.strip().lower()
     sizes = _Sizes.of(message, encoding)
@@ -150,19 +146,11 @@ class _Sizes(NamedTuple):
         return cls(height, width, step, data, is_bigendian, encoding)
 
     def rows(self, used: int) -> NDArray[np.uint8]:
-        """Return (height, used) bytes: the first bytes of each row.
-
-        Raises:
-            LogError: The rows are not in the data.
-        """
+        """Return (height, used) bytes: the first bytes of each row."""
         return self.plane(0, self.height, self.step, used)
 
     def plane(self, first: int, count: int, step: int, used: int) -> NDArray[np.uint8]:
-        """Return (count, used) bytes: the first bytes of rows that begin at byte `first`.
-
-        Raises:
-            LogError: The rows are not in the data.
-        """
+        """Return (count, used) bytes: the first bytes of rows that begin at byte `first`."""
         stop = first + count * step
         if step < used or stop > len(self.data):
             raise LogError(
@@ -172,11 +160,7 @@ class _Sizes(NamedTuple):
         return self.data[first:stop].reshape(count, step)[:, :used]
 
     def check_even(self, *, rows: bool) -> None:
-        """Check that pixels which share their color are complete.
-
-        Raises:
-            LogError: The width, or the height if `rows` is set, is odd.
-        """
+        """Check that pixels which share their color are complete."""
         if self.width % 2 or (rows and self.height % 2):
             raise LogError(
                 f"an image of {self.width} x {self.height} {one_line(self.encoding)}: its pixels"

@@ -74,18 +74,7 @@ class ImageReader:
         name: str = "image",
         strict: bool = False,
     ) -> None:
-        """Find out whether the images are raw or compressed.
-
-        Args:
-            bag: Bag that has the topic.
-            topic: Topic of the images.
-            quantity: Options of the mapping.
-            name: Name of the quantity.
-            strict: Whether an image that cannot be decoded is an error.
-
-        Raises:
-            UsageError: The topic has no images.
-        """
+        """Find out whether the images are raw or compressed."""
         self.bag, self.topic, self.name = bag, topic, name
         self.options, self._strict = ImageOptions(topic, quantity), strict
         self._fields = _image_fields(bag, bag.topics[topic])
@@ -103,11 +92,6 @@ class ImageReader:
         Returns:
             The images; None if a message has no readable image. All such messages among `rows` are
             in `failures` then: choose other rows, and read again.
-
-        Raises:
-            LogError: No image can be decoded, or sizes differ; if the reader is strict: an image
-                cannot be decoded.
-            UsageError: The options of the mapping do not fit the images.
         """
         wanted, places = np.unique(rows, return_inverse=True)
         first = next(self._images(wanted), None)
@@ -138,15 +122,6 @@ class ImageReader:
         """Yield positions (K,) and images (K, H, W, C) of the messages with readable images.
 
         The arrays are used again for the next block.
-
-        Args:
-            rows: Ascending positions of messages in the topic.
-            shape: Expected shape of an image.
-            dtype: Expected dtype.
-            count: Largest number of images in a block.
-
-        Raises:
-            LogError: An image has another shape or dtype.
         """
         numbers, images = np.empty(count, np.int64), np.empty((count, *shape), dtype)
         filled = 0
@@ -184,11 +159,7 @@ class ImageReader:
         return found
 
     def leave_out(self, failure: Failure) -> None:
-        """Add a message to `failures`.
-
-        Raises:
-            LogError: The reader is strict.
-        """
+        """Add a message to `failures`."""
         if self._strict:
             row, time_ns, reason = failure
             raise LogError(f"{self.topic}: message {row} at {time_ns} ns: {reason}")
@@ -302,11 +273,7 @@ def _length(data: Any) -> int:
 
 
 def _bytes_of(data: Any) -> bytes:
-    """Return the bytes of an image; in JSON, they are base64 or a list of numbers.
-
-    Raises:
-        LogError: The data is something else.
-    """
+    """Return the bytes of an image; in JSON, they are base64 or a list of numbers."""
     if isinstance(data, bytes):
         return data
     try:

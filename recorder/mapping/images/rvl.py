@@ -23,11 +23,7 @@ _MAX_NIBBLES = 11
 
 
 def rvl_decoded(data: bytes, count: int) -> NDArray[np.uint16]:
-    """Return the `count` pixels of an RVL stream, which the caller has limited.
-
-    Raises:
-        LogError: The stream is damaged or too short.
-    """
+    """Return the `count` pixels of an RVL stream, which the caller has limited."""
     numbers = _numbers(data)
     pixels = np.zeros(count, np.uint16)
     at, done, previous = 0, 0, 0

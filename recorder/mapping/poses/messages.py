@@ -64,15 +64,6 @@ def transforms_of(bag: Bag, topic: str, time: TimeSource) -> Iterator[Transform]
     """Yield the transforms of a topic in the order of recording.
 
     Transforms without a name of child or parent, and those of a frame in itself, are left out.
-
-    Args:
-        bag: Bag to read.
-        topic: Topic of transforms.
-        time: Time of a transform; `header` is the stamp of each transform.
-
-    Raises:
-        UsageError: A transform has no stamp, but `time` is `header`.
-        LogError: A message cannot be read.
     """
     single, places = _fields_of_one(bag, topic), bag.places(topic)
     fields = [*(single or [_LIST]), *(["publish_time"] if time == "publish_time" else [])]

@@ -89,15 +89,7 @@ class Transforms:
         topic: str = TF,
         frames: Iterable[str] | None = None,
     ) -> None:
-        """Read the transforms.
-
-        Args:
-            bag: Bag with the topic, its static sibling or both.
-            time: Time of a transform; `header` is the stamp of each transform.
-            topic: Topic of the transforms, such as `/tf`; its static sibling is `/tf_static`.
-            frames: Frames whose poses are used. Poses of frames that are neither these nor their
-                ancestors are not stored. None for all frames.
-        """
+        """Read the transforms."""
         self.topic = topic.removesuffix(STATIC)
         self._parents: dict[str, list[str]] = {}
         targets = None if frames is None else {_plain(frame) for frame in frames}
@@ -150,12 +142,7 @@ class Transforms:
         return found
 
     def streams(self, frame: str, fixed: str) -> dict[str, Recorded]:
-        """Return the moving transforms between two frames, in the order of recording, by name.
-
-        Raises:
-            UsageError: No transforms connect the frames, or a frame between them has several
-                parents, or no valid pose.
-        """
+        """Return the moving transforms between two frames, in the order of recording, by name."""
         path = [child for part in self._path(frame, fixed) for child in part]
         for child in path:
             if np.isnan(self._recorded[child].positions).all():
@@ -211,10 +198,6 @@ class Transforms:
             (N, K) parts in meters, radians and numbers, NaN where missing; and (N,) age in seconds
             of the transform that is farthest in time, negative if that transform is later than the
             step.
-
-        Raises:
-            UsageError: No transforms connect the frames, or a frame between them has several
-                parents.
         """
         count = len(steps_ns)
         age_s = np.zeros(count)
@@ -276,15 +259,7 @@ class Transforms:
 
 
 def transform_topic(bag: Bag, wanted: str | None) -> str:
-    """Return the topic of transforms that a quantity uses: the moving one, if the bag has both.
-
-    Args:
-        bag: Bag to read.
-        wanted: Topic in the mapping; None for `/tf`, or else the only topic of transforms.
-
-    Raises:
-        UsageError: There is no such topic, it has other messages, or the choice is not clear.
-    """
+    """Return the topic of transforms that a quantity uses: the moving one, if the bag has both."""
     found = {info.name: info.count for info in bag.topics.values() if are_transforms(info)}
     known = sorted({name.removesuffix(STATIC) for name, count in found.items() if count})
     listed = f"topics of transforms: {', '.join(known[:8]) or 'none'}"

@@ -53,13 +53,6 @@ def suggested(bag: Bag, bins: int | None = None) -> str:
 
     Comments list all other numbers and images that can be read, with type and rate. If the mapping
     finds no episode, or the bag has no commands, a comment and a warning say why.
-
-    Args:
-        bag: Bag with the topics.
-        bins: Number of bins of each element of a continuous command; None for a Box action.
-
-    Raises:
-        LogError: The bag has no topic that can be observed, or is a log.
     """
     where = ", ".join(map(str, bag.paths))
     if STEP_TOPIC in bag.topics:

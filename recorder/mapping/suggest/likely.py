@@ -140,23 +140,13 @@ def number_fields(info: TopicInfo) -> list[str]:
 
 
 def sampled(bag: Bag, info: TopicInfo, fields: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Return fields of at most 200 messages of a topic, spread evenly.
-
-    Raises:
-        LogError: The messages cannot be read.
-    """
+    """Return fields of at most 200 messages of a topic, spread evenly."""
     rows = np.unique(np.linspace(0, info.count - 1, min(info.count, _SAMPLES)).astype(np.int64))
     return dict(bag.read(info.name, list(fields), rows).columns)
 
 
 def candidates(bag: Bag, topic: TopicOverview, share: float) -> list[Candidate]:
-    """Return the quantities of a topic that may be observed, the likely ones first.
-
-    Args:
-        bag: Bag to read samples from.
-        topic: Topic with messages at different times.
-        share: Share of the time with a recent message.
-    """
+    """Return the quantities of a topic that may be observed, the likely ones first."""
     info, kind = topic.info, kind_of(topic.info)
     likely = [name for name in LIKELY.get(kind, ()) if name in info.fields]
     extra = ("range_min", "range_max", "name")

@@ -86,11 +86,6 @@ def _padded(data: bytes) -> bytes:
 def scene_data(track: Track, start_ns: int, end_ns: int) -> dict[str, Any]:
     """Return the scene of an episode.
 
-    Args:
-        track: Track of the log, with the scene topics.
-        start_ns: log_time of the episode's first record.
-        end_ns: log_time of the episode's last record.
-
     Returns:
         `shapes`: all different shapes; see `_Shapes.columns`.
         `static`: (S,) indexes of the static shapes.
@@ -231,11 +226,7 @@ class LogPage:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the summaries of the episodes.
-
-        Raises:
-            LogError: The log cannot be read.
-        """
+        """Read the summaries of the episodes."""
         self.name = path.name
         self.dataset = open_data(path, columns=[])
         self._path, self._reader = path, McapReader(path)
@@ -247,12 +238,7 @@ class LogPage:
         self._reading = threading.Lock()
 
     def index(self, only: int | None = None, **settings: Any) -> bytes:
-        """Return the packed description of the log and its episodes.
-
-        Args:
-            only: Index of the only episode to list; None for all.
-            **settings: Values to add, such as the episode to show first.
-        """
+        """Return the packed description of the log and its episodes."""
         view = self._metadata.view
         episodes = self.dataset.episodes[slice(None) if only is None else slice(only, only + 1)]
         reasons = sorted({episode.reason for episode in episodes})
@@ -278,11 +264,7 @@ class LogPage:
         )
 
     def episode(self, number: int) -> bytes:
-        """Return the packed data of an episode.
-
-        Raises:
-            LogError: A chunk or message is damaged.
-        """
+        """Return the packed data of an episode."""
         with self._reading:
             dataset = open_data(self._path, episodes=number)
             episode = dataset.episodes[0]

@@ -33,11 +33,6 @@ def page_html(log: bytes, episode: bytes = b"") -> str:
 
     Texts from the log are encoded as base64, and the page's Content Security Policy permits only
     the scripts of this package. Therefore, no text can become HTML or code.
-
-    Args:
-        log: Packed description of the log.
-        episode: Packed data of the only episode; empty if the page requests episodes from its
-            server.
     """
     style = _text("vendor/libraries.min.css") + _text("assets/style.css")
     names = ("vendor/libraries.min.js", *(f"assets/{name}" for name in _SCRIPTS))
@@ -90,16 +85,7 @@ class PageServer:
     """
 
     def __init__(self, page: LogPage, *, port: int, **settings: Any) -> None:
-        """Start to listen.
-
-        Args:
-            page: Data of the log.
-            port: Port on 127.0.0.1; 0 for any free port.
-            **settings: Values for the page; see `LogPage.index`.
-
-        Raises:
-            UsageError: The port is in use.
-        """
+        """Start to listen."""
         self._html = page_html(page.index(**settings)).encode()
         self._count = len(page.dataset.episodes)
         self._episode = lru_cache(_EPISODES_KEPT)(page.episode)

@@ -79,13 +79,7 @@ class Feature:
 
     @classmethod
     def from_json(cls, name: str, entry: dict[str, Any]) -> Feature:
-        """Read an entry of `meta/info.json`.
-
-        Raises:
-            KeyError: A field is missing.
-            TypeError: A field has another type.
-            ValueError: A dimension is not a number.
-        """
+        """Read an entry of `meta/info.json`."""
         info = entry.get("info") or entry.get("video_info") or {}
         shape = tuple(int(size) for size in entry["shape"])
         is_depth = bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
@@ -111,13 +105,7 @@ class Feature:
         return column
 
     def decode(self, column: Any) -> NDArray[Any]:
-        """Return the values (T, *shape) of an Arrow column.
-
-        Raises:
-            LogError: A value is missing, has another shape, or is a damaged image; or the images
-                do not fit into memory.
-            SpaceError: The declared shape has too many elements.
-        """
+        """Return the values (T, *shape) of an Arrow column."""
         if self.dtype == "image":
             files = [file for chunk in column.chunks for file in chunk.field("bytes").to_pylist()]
             # The declared shape limits the memory, in whichever order it has its dimensions.
@@ -148,14 +136,7 @@ def default_features() -> list[Feature]:
 
 
 def feature_of(name: str, leaf: Leaf, names: Sequence[str] = (), *, video: bool = False) -> Feature:
-    """Return the feature that stores a leaf of a space.
-
-    Args:
-        name: Name of the feature.
-        leaf: Leaf of the observation or action space.
-        names: Names of the elements; empty if unknown.
-        video: Whether images are stored as video.
-    """
+    """Return the feature that stores a leaf of a space."""
     if leaf.encoding or _is_depth(leaf):
         shape = leaf.shape if len(leaf.shape) == 3 else (*leaf.shape, 1)
         if video and leaf.encoding in ("rgb8", "mono8"):
@@ -233,9 +214,6 @@ def image_of(name: str, file: bytes | None, *, max_pixels: int = MAX_IMAGE_PIXEL
         name: Name of the feature, for messages.
         file: Content of the file; None if the data files do not contain it.
         max_pixels: Maximum number of pixels.
-
-    Raises:
-        LogError: The file is missing, damaged, of another format, or has too many pixels.
     """
     if file is None:
         raise LogError(f"an image of {name} is not in the data files: only its path is stored")

@@ -43,11 +43,7 @@ class Files:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the description and the table of episodes.
-
-        Raises:
-            LogError: A file is missing or of another version, or the files are inconsistent.
-        """
+        """Read the description and the table of episodes."""
         self.path = path
         info = parse_json((path / "meta/info.json").read_bytes())
         version = str(info["codebase_version"])
@@ -81,20 +77,11 @@ class Files:
         return zip([0, *self.stops[:-1].tolist()], self.stops.tolist(), strict=True)
 
     def values(self, feature: Feature) -> NDArray[Any]:
-        """Return the values (N, *shape) of a feature, or the images of a camera.
-
-        Raises:
-            LogError: A file is missing or damaged, or the values do not have the feature's shape.
-        """
+        """Return the values (N, *shape) of a feature, or the images of a camera."""
         return self._video(feature) if feature.dtype == "video" else self._column(feature)
 
     def steps(self) -> dict[str, NDArray[Any]]:
-        """Return the values (N, *shape) of each feature in `STEPS` that the dataset has.
-
-        Raises:
-            LogError: A feature other than the action has several values for each step.
-            SpaceError: A flag is neither 0 nor 1.
-        """
+        """Return the values (N, *shape) of each feature in `STEPS` that the dataset has."""
         found = {}
         for name in (name for name in STEPS if name in self.features):
             feature = self.features[name]
@@ -112,11 +99,7 @@ class Files:
         return sorted(names.difference(self.features, DEFAULTS))
 
     def times_s(self) -> NDArray[np.float64]:
-        """Return the time (N,) of each frame since the start of its episode, seconds.
-
-        Raises:
-            LogError: A time is not a number of seconds.
-        """
+        """Return the time (N,) of each frame since the start of its episode, seconds."""
         times = self._column(Feature("timestamp", "float32", (1,)))[:, 0].astype(np.float64)
         wrong = ~(np.abs(times) < _MAX_TIME_S)
         if wrong.any():
@@ -180,12 +163,7 @@ class Files:
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
-    """Read a Parquet file, and check the CRCs of its pages if it has any.
-
-    Args:
-        path: File.
-        columns: Columns to read; default: all.
-    """
+    """Read a Parquet file, and check the CRCs of its pages if it has any."""
     if columns is None:
         return parquet_files.read_table(path)
     return parquet_files.read_table(path, set(columns).__contains__)

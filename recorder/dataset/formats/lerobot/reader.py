@@ -68,14 +68,6 @@ def read(path: Path) -> Dataset:
     Otherwise, the observation of the last frame becomes the final observation, the action of the
     last frame is left out, and the episode is truncated. A warning states the number of episodes
     in each of these cases.
-
-    Args:
-        path: Folder of the dataset.
-
-    Raises:
-        LogError: A file is missing, damaged or of another version.
-        SpaceError: A log cannot hold a feature.
-        MissingExtraError: PyArrow, Pillow or PyAV is not installed.
     """
     arrow = import_extra("pyarrow", "tables")
     try:
@@ -86,12 +78,7 @@ def read(path: Path) -> Dataset:
 
 
 def _dataset_of(files: Files) -> Dataset:
-    """Convert a dataset that has no final observations; warn about the missing data.
-
-    Raises:
-        LogError: There is no observation or no action.
-        SpaceError: A log cannot hold a feature.
-    """
+    """Convert a dataset that has no final observations; warn about the missing data."""
     values, parts, labels = _observations(files)
     steps = files.steps()
     if features.ACTION not in steps:

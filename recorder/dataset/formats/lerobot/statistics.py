@@ -27,23 +27,13 @@ Stats = dict[str, NDArray[Any]]
 
 
 def sampled(feature: Feature, count: int) -> NDArray[np.int64]:
-    """Return evenly spaced indexes of an episode's images, from which statistics are computed.
-
-    Args:
-        feature: Feature of the images.
-        count: Number of images of the episode.
-    """
+    """Return evenly spaced indexes of an episode's images, from which statistics are computed."""
     limit = _MAX_ELEMENTS // math.prod(feature.shape) if feature.is_depth else _MAX_IMAGES
     return _spread(count, min(max(limit, 1), _MAX_IMAGES))
 
 
 def describe(feature: Feature, values: NDArray[Any]) -> Stats:
-    """Return the statistics of the values (T, *shape).
-
-    Args:
-        feature: Feature of the values.
-        values: Values of the feature; for images, only the images that `sampled` selects.
-    """
+    """Return the statistics of the values (T, *shape)."""
     channels = values.shape[3] if values.ndim == 4 else 1
     rows = values.reshape(-1, channels if feature.is_image else feature.shape[-1])
     if feature.is_image and values.dtype == np.uint8:

@@ -19,12 +19,7 @@ class ParquetFiles:
     """Writer of the data files, with one row group for each episode."""
 
     def __init__(self, path: Path, every: list[Feature]) -> None:
-        """Create a writer; the first episode creates a file.
-
-        Args:
-            path: Folder of the dataset.
-            every: All features of the dataset; videos are not written to the data files.
-        """
+        """Create a writer; the first episode creates a file."""
         self._path = path
         self._stored = [feature for feature in every if feature.dtype != "video"]
         self._number, self._file = -1, Path()

@@ -122,10 +122,6 @@ def read_frames(path: Path, times_s: NDArray[np.float64], tolerance_s: float) ->
         path: Video.
         times_s: (K,) times, seconds since the start of the video.
         tolerance_s: Largest difference between an element of `times_s` and the time of its image.
-
-    Raises:
-        LogError: The video is missing or damaged, or has no image at one of the times.
-        MissingExtraError: PyAV is not installed.
     """
     av = import_extra("av", "video")
     found: NDArray[np.uint8] | None = None

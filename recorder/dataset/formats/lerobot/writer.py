@@ -54,11 +54,6 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, video: bool = Fa
 
     Returns:
         One sentence for each thing that was left out or changed.
-
-    Raises:
-        SpaceError: `lossy` is not set, and LeRobot cannot store a space or dtype, or images would
-            become video.
-        MissingExtraError: PyArrow, Pillow or PyAV is not installed.
     """
     lost = _losses(dataset, lossy=lossy, video=video)
     writer = _Writer(dataset, path, video=video)
@@ -85,11 +80,7 @@ def task_of(options: str, metadata: LogMetadata) -> str:
 
 
 def _losses(dataset: Dataset, *, lossy: bool, video: bool) -> list[str]:
-    """Return one sentence for each change that loses data.
-
-    Raises:
-        SpaceError: Data would be lost, and `lossy` is not set.
-    """
+    """Return one sentence for each change that loses data."""
     leaves = leaves_of(dataset.observation_space)
     named = zip(features.observation_names(leaves), leaves, strict=True)
     every = [*named, (features.ACTION, action_leaf(dataset.action_space))]

@@ -16,16 +16,7 @@ from mcaprl.recorder.dataset.formats import parquet_files
 
 
 def read_table(folder: Path, form: str) -> Any:
-    """Read the PyArrow table of an episode.
-
-    Args:
-        folder: Folder of the episode.
-        form: `arrow` or `parquet`.
-
-    Raises:
-        LogError: The files are missing or damaged.
-        MissingExtraError: PyArrow is not installed.
-    """
+    """Read the PyArrow table of an episode."""
     pyarrow = import_extra("pyarrow", "interop")
     files = sorted(folder.glob(f"*.{form}"), key=_number)
     if not files:
@@ -39,16 +30,8 @@ def read_table(folder: Path, form: str) -> Any:
 def array_at(table: Any, path: tuple[str | int, ...], shape: tuple[int, ...] | None) -> Any:
     """Return a column, or a nested field of a column, as an array.
 
-    Args:
-        table: Table of an episode.
-        path: Name of the column, then keys of Dicts and indexes of Tuples.
-        shape: Shape of a row; None keeps the stored shape.
-
     Returns:
         An array, or a list of bytes for images that are stored as JPEG.
-
-    Raises:
-        LogError: There is no such column, or it has another type.
     """
     pyarrow = import_extra("pyarrow", "interop")
     name, *keys = path
@@ -78,11 +61,7 @@ def infos_of(table: Any) -> dict[str, NDArray[Any]]:
 
 
 def attributes_of(folder: Path) -> dict[str, Any]:
-    """Return the metadata of an episode: `seed`, `options` and others.
-
-    Raises:
-        LogError: The file is missing or damaged.
-    """
+    """Return the metadata of an episode: `seed`, `options` and others."""
     try:
         found = parse_json((folder / "metadata.json").read_bytes())
     except (OSError, ValueError) as error:

@@ -74,11 +74,7 @@ def datasets_folder() -> Path:
 
 
 def local_path(name: str) -> Path:
-    """Return the folder of the local dataset with this id.
-
-    Raises:
-        UsageError: `name` is not the id of a dataset.
-    """
+    """Return the folder of the local dataset with this id."""
     if not _ID.fullmatch(name):
         raise UsageError(
             f"'{name}' is not the id of a Minari dataset: expected a name that ends with its"
@@ -88,11 +84,7 @@ def local_path(name: str) -> Path:
 
 
 def options_for(path: Path) -> dict[str, Any]:
-    """Return the id of a new dataset at a path, and create the Minari namespaces of the id.
-
-    Raises:
-        UsageError: The name of the folder does not end with a version.
-    """
+    """Return the id of a new dataset at a path, and create the Minari namespaces of the id."""
     folder = datasets_folder().absolute()
     is_local = path.absolute().is_relative_to(folder)
     name = path.absolute().relative_to(folder).as_posix() if is_local else path.name
@@ -112,11 +104,7 @@ def data_folder(path: Path) -> Path:
 
 
 def raw_metadata(path: Path) -> dict[str, Any]:
-    """Read `metadata.json` of a dataset.
-
-    Raises:
-        LogError: The file is missing or damaged.
-    """
+    """Read `metadata.json` of a dataset."""
     file = data_folder(path) / FILE
     try:
         found = parse_json(read_file(file))
@@ -128,16 +116,7 @@ def raw_metadata(path: Path) -> dict[str, Any]:
 
 
 def read_description(path: Path, *, lossy: bool = False) -> Description:
-    """Read the description of a dataset.
-
-    Args:
-        path: Folder of the dataset.
-        lossy: Whether to leave out the parts of the spaces that a log cannot store.
-
-    Raises:
-        LogError: The metadata is missing or damaged.
-        SpaceError: A log cannot store a space.
-    """
+    """Read the description of a dataset."""
     raw = raw_metadata(path)
     env_id, env_kwargs = _env_of(raw)
     try:
@@ -169,14 +148,7 @@ def read_description(path: Path, *, lossy: bool = False) -> Description:
 def description_text(
     metadata: LogMetadata, space: spaces.Space[Any], *, dataset_id: str, counts: dict[str, Any]
 ) -> str:
-    """Return the content of `metadata.json`.
-
-    Args:
-        metadata: Metadata of the log.
-        space: Observation space with the names in the file.
-        dataset_id: Id of the dataset.
-        counts: `total_episodes`, `total_steps` and `dataset_size` in MB.
-    """
+    """Return the content of `metadata.json`."""
     raw = {
         **counts,
         "data_format": "hdf5",

@@ -61,17 +61,7 @@ class _Stored:
 
 
 def read(path: Path, *, lossy: bool = False) -> Dataset:
-    """Read a dataset.
-
-    Args:
-        path: Folder of the dataset, or its folder `data`.
-        lossy: Whether to leave out the parts of observations and actions that a log cannot store.
-
-    Raises:
-        LogError: A file is missing or damaged.
-        SpaceError: A log cannot store a space.
-        MissingExtraError: h5py, PyArrow or Pillow is not installed.
-    """
+    """Read a dataset."""
     description = read_description(path, lossy=lossy)
     forms = {"hdf5": _in_hdf5, "arrow": _in_arrow, "parquet": _in_arrow}
     if description.form not in forms:

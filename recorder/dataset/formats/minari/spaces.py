@@ -44,17 +44,7 @@ def space_to_text(space: spaces.Space[Any]) -> str:
 
 
 def space_from_text(text: str, role: str, *, lossy: bool = False) -> StoredSpace:
-    """Read a space.
-
-    Args:
-        text: Space in Minari's JSON text.
-        role: `observation` or `action`, for errors.
-        lossy: Whether to leave out the parts that a log cannot store, and to join the parts of an
-            action.
-
-    Raises:
-        SpaceError: The text does not describe a space, or a log cannot store the space.
-    """
+    """Read a space."""
     try:
         plain = parse_json(text)
         is_joined = role == "action" and _members(plain) is not None
@@ -144,14 +134,6 @@ def _ours(
 ) -> dict[str, Any] | None:
     """Convert Minari's description of a space to the form that `space_from_json` reads.
 
-    Args:
-        plain: Minari's description.
-        where: Name of the space, for errors.
-        path: Path of the space in Minari's files.
-        leaves: List to which the path of each leaf is appended.
-        lost: List to which a sentence is appended for each leaf that is left out; None to refuse
-            such leaves.
-
     Returns:
         The description; None if the space is left out.
     """
@@ -185,11 +167,7 @@ def _ours(
 
 
 def _joined(space: spaces.Space[Any]) -> tuple[spaces.Space[Any], str]:
-    """Join the leaves of a Dict to one space; return the space and a sentence about it.
-
-    Raises:
-        SpaceError: The leaves are of different kinds.
-    """
+    """Join the leaves of a Dict to one space; return the space and a sentence about it."""
     parts = [leaf.of(space) for leaf in leaves_of(space)]
     names = ", ".join("/".join(leaf.path) for leaf in leaves_of(space))
     if len(parts) == 1:

@@ -41,18 +41,8 @@ _MAX_ATTRIBUTE_BYTES = 60_000
 def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str = "") -> list[str]:
     """Write a dataset to an empty folder.
 
-    Args:
-        dataset: Episodes to write.
-        path: Empty folder.
-        lossy: Whether to leave out or convert data that Minari cannot store.
-        dataset_id: Id of the dataset; default: the name of the folder.
-
     Returns:
         One sentence for each thing that was left out or changed.
-
-    Raises:
-        SpaceError: `lossy` is not set, and Minari cannot store an option or a key of a space.
-        MissingExtraError: h5py is not installed.
     """
     metadata = LogMetadata.from_strings(dataset.metadata)
     space, renamed = with_names_for_hdf5(dataset.observation_space)
