@@ -26,13 +26,13 @@ def _configs() -> dict[str, Settings]:
 
 
 def _presets() -> Iterable[str]:
-    from mcaprl.online.presets import PRESETS
+    from mcaprl.online.config import PRESETS
 
     return PRESETS
 
 
 def _tuned() -> dict[str, dict[str, Any]]:
-    from mcaprl.online.presets import SIM_SETTINGS
+    from mcaprl.online.config import SIM_SETTINGS
 
     return SIM_SETTINGS
 

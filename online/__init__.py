@@ -18,10 +18,10 @@ from mcaprl.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from mcaprl.online.agent import Agent
+    from mcaprl.online.config import SIM_SETTINGS
     from mcaprl.online.curves import VALUES, CurvePoint, curve_figure, draw_curves, read_run
     from mcaprl.online.evaluation import FRESH_SEED, SELECTION_SEED, measure_scale
     from mcaprl.online.live import LiveTraining
-    from mcaprl.online.presets import SIM_SETTINGS
     from mcaprl.online.task import Task
     from mcaprl.online.zip_file import describe_run, read_policy, save_policy
 
@@ -55,7 +55,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.online.curves": ("VALUES", "CurvePoint", "curve_figure", "draw_curves", "read_run"),
         "mcaprl.online.evaluation": ("FRESH_SEED", "SELECTION_SEED", "measure_scale"),
         "mcaprl.online.live": ("LiveTraining",),
-        "mcaprl.online.presets": ("SIM_SETTINGS",),
+        "mcaprl.online.config": ("SIM_SETTINGS",),
         "mcaprl.online.task": ("Task",),
         "mcaprl.online.zip_file": ("describe_run", "read_policy", "save_policy"),
     },

@@ -12,8 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from mcaprl.errors import TrainingError, UsageError
 from mcaprl.online.algorithms import find_algorithm
-from mcaprl.online.config import OnlineConfig
-from mcaprl.online.presets import find_preset, settings_for
+from mcaprl.online.config import OnlineConfig, find_preset, settings_for
 from mcaprl.runs import CONFIG_NAME, RunIdentity, check_kind, read_config, run_to_resume
 from mcaprl.settings import check_settings, settings_from_json
 from mcaprl.sims import make_sims

@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 
 from mcaprl.api.cluster import ClusterOptions
 from mcaprl.api.environments import all_options, check_names, name_of, trained_options
-from mcaprl.api.evaluate_parts import results_on_ray
 from mcaprl.api.policies import SCRIPTED, Names, by_name, policies_of, policy_names
 from mcaprl.api.ranges import check_least
 from mcaprl.base_policy import Actor, BasePolicy
-from mcaprl.errors import ReportError, UsageError, import_extra
+from mcaprl.errors import ClusterError, ReportError, UsageError, import_extra
 from mcaprl.files import check_log_name, check_target, check_writable, write_json
 from mcaprl.page import Figure
-from mcaprl.progress import ProgressBar, no_progress
+from mcaprl.progress import Advance, ProgressBar, no_progress
 from mcaprl.recorder.format.metadata import same_env
 from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.recorder.source import Data, named, opened
@@ -31,14 +30,112 @@ from mcaprl.sims.evaluation.evaluate import (
     Improvement,
     PolicyScore,
     Scale,
+    greedy_episodes,
     improvements,
     normalize,
     score_of,
 )
 from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
 from mcaprl.sims.evaluation.pilots import has_pilot
-from mcaprl.sims.evaluation.rollout import StepLimit, make_limited, warn_of_cuts
+from mcaprl.sims.evaluation.rollout import EpisodeResult, StepLimit, make_limited, warn_of_cuts
 from mcaprl.sims.evaluation.statistics import mean_interval
+
+# Number of episodes that a worker runs as one task. The number of workers has no effect on the
+# parts, and thus on the results.
+_PART_EPISODES = 10
+
+
+class _Part(NamedTuple):
+    """Episodes of the policy of one training seed."""
+
+    name: str
+    policy: str
+    candidate: int
+    first: int
+    episodes: int
+
+
+def results_on_ray(
+    found: Mapping[str, Sequence[object]],
+    episodes: int,
+    options: ClusterOptions,
+    advance: Advance,
+    **setting: Any,
+) -> dict[str, list[list[EpisodeResult]]]:
+    """Run the episodes of each policy and training seed on Ray workers, and return them.
+
+    Args:
+        found: Policies of the training seeds, by name or path.
+        episodes: Number of episodes of each policy.
+        options: Cluster and workers.
+        advance: Function called with the number of finished episodes.
+        **setting: Named arguments of `_run_part`.
+
+    Raises:
+        ClusterError: The cluster cannot be used, or workers died repeatedly.
+        MissingExtraError: Ray is not installed.
+    """
+    from mcaprl.ray.tasks import WorkerDiedError, run_tasks
+
+    # Workers have other working directories, so all paths must be absolute.
+    paths = {name: Path(name).absolute() for name in found if name not in SCRIPTED}
+    parts = [
+        _Part(name, str(paths.get(name, name)), index, first, min(_PART_EPISODES, episodes - first))
+        for name, candidates in found.items()
+        for index in range(len(candidates))
+        for first in range(0, episodes, _PART_EPISODES)
+    ]
+    with options.connected():
+        try:
+            done = run_tasks(
+                partial(_run_part, **setting),
+                parts,
+                workers=options.workers,
+                paths=list(paths.values()),
+                advance=advance,
+            )
+        except WorkerDiedError as error:
+            raise ClusterError(
+                f"workers died repeatedly while they evaluated {parts[error.index].name}:"
+                f" {error.cause}"
+            ) from error
+    results = {name: [list[EpisodeResult]() for _ in each] for name, each in found.items()}
+    for part, some in zip(parts, done, strict=True):
+        results[part.name][part.candidate] += some
+    return results
+
+
+def _run_part(
+    part: _Part,
+    send: Callable[[int], None],
+    *,
+    sim: str,
+    sim_options: Mapping[str, Any],
+    seed: int,
+    is_batched: bool,
+    max_steps: int | None,
+    mask_from: str,
+) -> list[EpisodeResult]:
+    done = 0
+
+    def on_episode(_: EpisodeResult) -> None:
+        nonlocal done
+        done += 1
+        send(done)
+
+    with closing(make_limited(sim, max_steps, **sim_options)) as env:
+        is_batched = is_batched and part.policy not in SCRIPTED
+        return greedy_episodes(
+            env,
+            policies_of(part.policy, env)[part.candidate],
+            episodes=part.episodes,
+            seed=seed,
+            first_episode=part.first,
+            envs=make_sims(sim, part.episodes, **sim_options) if is_batched else None,
+            mask_from=mask_from,
+            on_episode=on_episode,
+        )
+
 
 RESULT_NAME = "evaluation.json"
 

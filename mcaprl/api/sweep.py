@@ -68,9 +68,8 @@ def sweep(
         ClusterError: The Ray cluster cannot be used.
         MissingExtraError: Ray or the packages of the `offline` extra are not installed.
     """
-    from mcaprl.ray.sweep import sweep_on_ray
+    from mcaprl.ray.sweep import sweep_on_ray, table_of, write_sweep
     from mcaprl.ray.sweep_file import read_plan
-    from mcaprl.ray.sweep_report import table_of, write_sweep
 
     on_cluster = ClusterOptions(True, workers, address)
     on_cluster.check()

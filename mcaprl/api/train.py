@@ -126,7 +126,7 @@ def train(
         dataset = opened(data, weighted=True, threads=threads)
         discrete_actions(dataset.action_space)
         if cluster.ray:
-            from mcaprl.ray.training import train_on_ray
+            from mcaprl.ray.tasks import train_on_ray
 
             request |= {"other_data": other_data, "threads": threads, "workers": cluster.workers}
             summaries = train_on_ray(dataset, config, out.absolute(), seeds=numbers, **request)

@@ -62,7 +62,7 @@ def read(
     """
     connect(address)
     ray_data = import_extra("ray.data", "ray")
-    from mcaprl.ray.source import LogSource
+    from mcaprl.ray.blocks import LogSource
 
     source = LogSource(
         list(logs_of(data)),
@@ -112,7 +112,7 @@ def write(
         MissingExtraError: Ray is not installed.
     """
     import_extra("ray.data", "ray")
-    from mcaprl.ray.sink import LogSink
+    from mcaprl.ray.blocks import LogSink
 
     sink = LogSink(folder, None if like is None else _described(like), compression)
     try:

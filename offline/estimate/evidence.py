@@ -33,10 +33,10 @@ from mcaprl.offline.batches.items import returns_to_go
 from mcaprl.offline.estimate.fqe import FQE, FQEConfig
 from mcaprl.offline.estimate.importance import (
     EpisodeTable,
+    Floats,
     effective_sample_size,
     weighted_per_decision,
 )
-from mcaprl.offline.estimate.self_normalized import Floats
 from mcaprl.offline.estimate.values import by_rows
 from mcaprl.recorder.format.probability import is_impossible
 

@@ -21,10 +21,11 @@ from mcaprl.offline.estimate.fqe import FQE, FQEConfig
 from mcaprl.offline.estimate.importance import (
     ESTIMATORS,
     EpisodeTable,
+    Floats,
+    RatioEstimate,
     effective_sample_size,
     mean_weight,
 )
-from mcaprl.offline.estimate.self_normalized import Floats, RatioEstimate
 from mcaprl.offline.estimate.values import by_rows, policy_inputs
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.format.probability import is_impossible

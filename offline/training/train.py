@@ -1,6 +1,9 @@
 """Train one algorithm on one dataset, with several seeds at once, into a run folder.
 
-`mcaprl.runs` lists the files of a run folder.
+`mcaprl.runs` lists the files of a run folder. A resumed run has the same result as an uninterrupted
+one: `checkpoint.safetensors` contains one seed's tensors (weights, target network, optimizer,
+generator), and its header the number of updates and the run's identity. All are in one file,
+because two files would be inconsistent if the process were killed between the two writes.
 """
 
 from __future__ import annotations
@@ -24,7 +27,6 @@ from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.batches.buffer import TransitionBuffer, choose_device
 from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.policy import read_policy, save_policy
-from mcaprl.offline.training.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
 from mcaprl.offline.training.metrics import MetricsWriter, OfflineSummary
 from mcaprl.offline.training.watch import (
     HeldOut,
@@ -48,6 +50,52 @@ from mcaprl.runs import (
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
+from safetensors import SafetensorError
+
+from mcaprl.runs import broken_checkpoint
+from mcaprl.storage.tensor_files import read_tensors, write_tensors
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Stored state of the training of one seed.
+
+    Attributes:
+        path: Path of the file.
+        step: Number of finished updates.
+        tensors: State as `Learner.state` returns it.
+    """
+
+    path: Path
+    step: int
+    tensors: dict[str, Tensor]
+
+    def restore(self, learner: Learner, seed: int) -> None:
+        """Load this state into a seed of a fresh learner."""
+        try:
+            learner.load_state(seed, self.tensors, self.step)
+        except (KeyError, RuntimeError) as error:
+            raise broken_checkpoint(self.path, error) from error
+
+
+def save_checkpoint(folder: Path, learner: Learner, seed: int, identity: RunIdentity) -> None:
+    """Replace the checkpoint in a folder with the current training state of a seed."""
+    description = {"step": learner.step, **identity.parts}
+    write_tensors(folder / CHECKPOINT_NAME, learner.state(seed), description)
+
+
+def read_checkpoint(folder: Path, identity: RunIdentity) -> Checkpoint | None:
+    """Read the checkpoint in a folder; return None if there is none."""
+    path = folder / CHECKPOINT_NAME
+    if not path.exists():
+        return None
+    try:
+        tensors, description = read_tensors(path)
+        identity.check_same(description, path)
+        return Checkpoint(path, int(description["step"]), tensors)
+    except (OSError, SafetensorError, ValueError, KeyError) as error:
+        raise broken_checkpoint(path, error) from error
+
 
 CHECK_INTERVAL: Final = 500
 """Number of updates between two checks of logs that grow. After each check that finds new episodes,

@@ -9,8 +9,16 @@ import pytest
 
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.online.algorithms import ALGORITHMS, find_algorithm
-from mcaprl.online.config import A2CConfig, DoubleDQNConfig, DQNConfig, OnlineConfig, PPOConfig
-from mcaprl.online.presets import IMAGE_SETTINGS, SIM_SETTINGS, settings_for
+from mcaprl.online.config import (
+    IMAGE_SETTINGS,
+    SIM_SETTINGS,
+    A2CConfig,
+    DoubleDQNConfig,
+    DQNConfig,
+    OnlineConfig,
+    PPOConfig,
+    settings_for,
+)
 from mcaprl.online.task import Task
 from mcaprl.settings import field_help
 from mcaprl.sims import SIMS

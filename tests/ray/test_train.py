@@ -29,7 +29,7 @@ pytest.importorskip("torch")
 from safetensors.torch import load_file
 
 from mcaprl.offline.training.metrics import OfflineSummary
-from mcaprl.ray import tasks, training
+from mcaprl.ray import tasks
 
 pytestmark = pytest.mark.usefixtures("ray_cluster")
 UPDATES = 1200
@@ -213,7 +213,7 @@ def test_other_versions_and_unseen_paths_are_found_before_the_workers_start(
         mcaprl.train(logs, tmp_path / "run", algo="bc", updates=1, ray=ClusterOptions(workers=2))
 
     with monkeypatch.context() as patch:
-        patch.setattr(training, "logs_of", lambda data: {tmp_path / "none.mcap": 1.0})
+        patch.setattr(tasks, "logs_of", lambda data: {tmp_path / "none.mcap": 1.0})
         with pytest.raises(ClusterError, match=r"127\.0\.0\.1 cannot see .*/none\.mcap: choose"):
             train()
     versions = {**installed_versions(), "numpy": "1.2.3"}

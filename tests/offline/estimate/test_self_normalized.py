@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from mcaprl.offline.estimate.importance import ESTIMATORS
-from mcaprl.offline.estimate.self_normalized import RatioEstimate, student_factor
+from mcaprl.offline.estimate.importance import ESTIMATORS, RatioEstimate, student_factor
 from tests.support import two_state_task as task
 
 columns = st.integers(2, 9).flatmap(

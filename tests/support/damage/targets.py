@@ -503,7 +503,7 @@ def sweeps(root: Path) -> list[Example]:
     module._save(root / "bc-000", scores, "")
 
     def result(folder: Path) -> None:
-        from mcaprl.ray.sweep_report import write_sweep
+        from mcaprl.ray.sweep import write_sweep
 
         (trial,) = plan.trials
         write_sweep([module._result(trial, folder)], plan, folder / "out")
