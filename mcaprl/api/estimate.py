@@ -12,7 +12,7 @@ from mcaprl.api.ranges import check_fraction, check_least
 from mcaprl.api.train import torch_threads
 from mcaprl.base_policy import BasePolicy, RandomPolicy
 from mcaprl.progress import ProgressBar, no_progress
-from mcaprl.recorder.dataset.calibration import Calibration, calibration
+from mcaprl.recorder.dataset.statistics import Calibration, calibration
 from mcaprl.recorder.source import Data, named, opened
 from mcaprl.texts import counted
 

@@ -14,9 +14,9 @@ from mcaprl.errors import LogError, NoEpisodesError, ReportError, UsageError, im
 from mcaprl.files import check_log_name, size_of, write_json
 from mcaprl.page import PAGE_NAME
 from mcaprl.problem import Problem
-from mcaprl.recorder.dataset.calibration import Calibration, calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
+from mcaprl.recorder.dataset.statistics import Calibration, calibration
 from mcaprl.recorder.source import Definitions, Source, open_data, opened
 from mcaprl.recorder.viewer.surprises import Surprise, moments_of
 from mcaprl.texts import size

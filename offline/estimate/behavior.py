@@ -24,8 +24,8 @@ from mcaprl.offline.algorithms.bc import BC
 from mcaprl.offline.algorithms.config import BCConfig
 from mcaprl.offline.algorithms.models import outputs_of_buffer
 from mcaprl.offline.batches.buffer import TransitionBuffer
-from mcaprl.recorder.dataset.calibration import EDGES
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.statistics import EDGES
 
 Floats = NDArray[np.float64]
 

@@ -27,7 +27,7 @@ from mcaprl.offline.estimate.importance import (
     mean_weight,
 )
 from mcaprl.offline.estimate.values import by_rows, policy_inputs
-from mcaprl.recorder.dataset.calibration import calibration
+from mcaprl.recorder.dataset.statistics import calibration
 from mcaprl.recorder.format.probability import is_impossible
 
 if TYPE_CHECKING:

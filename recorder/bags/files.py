@@ -1,21 +1,191 @@
-"""Functions that find the files of a bag, decompress them, and open them."""
+"""Functions that find the files of a bag, decompress them within limits, and open them.
+
+Of a `metadata.yaml`, only the few values that are used are read, and all of them are texts: no YAML
+type is constructed, and aliases, which can multiply the size of a value, are refused.
+"""
 
 from __future__ import annotations
 
 import glob
 import os
+import shutil
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from mcaprl.errors import LogError
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, import_extra
 from mcaprl.files import check_plain, temporary_folder
-from mcaprl.recorder.bags.bag_metadata import read_metadata
-from mcaprl.recorder.bags.compressed import CompressedTopic, decompress_file
+from mcaprl.limits import (
+    MAX_CHUNK_BYTES,
+    MAX_METADATA_BYTES,
+    MAX_METADATA_DEPTH,
+    MAX_UNPACKED_BYTES,
+    MAX_UNPACKED_RATIO,
+)
 from mcaprl.recorder.bags.mcap_file import McapFile
 from mcaprl.recorder.bags.rosbag_file import RosbagFile
+from mcaprl.recorder.bags.source import RawMessage, TopicSource
+
+_ROOT: Final = "rosbag2_bagfile_information"
+_TEXTS: Final = ("compression_mode", "ros_distro")
+_LISTS: Final = ("relative_file_paths",)
+
+
+def read_metadata(path: Path) -> dict[str, Any]:
+    """Read the metadata of a bag.
+
+    Returns:
+        `relative_file_paths`, a list of texts, and the texts `compression_mode` and `ros_distro`;
+        those that the file has.
+    """
+    yaml = import_extra("ruamel.yaml", "bags")
+    try:
+        if not path.is_file():
+            raise LogError("not a regular file")
+        with path.open("rb") as file:
+            data = file.read(MAX_METADATA_BYTES + 1)
+        if len(data) > MAX_METADATA_BYTES:
+            raise LogError(f"it has more than {MAX_METADATA_BYTES} bytes")
+        return _values(yaml.YAML(typ="safe").parse(data.decode("utf-8")))
+    # ruamel.yaml raises errors of many types for a wrong file.
+    except Exception as error:
+        why = getattr(error, "problem", None) or getattr(error, "strerror", None) or error
+        raise LogError(f"{path} is not the metadata of a rosbag2 bag: {why}") from error
+
+
+def _values(events: Iterator[Any]) -> dict[str, Any]:
+    """Return the used values of a document, given as the events of a YAML parser."""
+    # The first two events begin the stream and the document. An empty stream has no third one.
+    start = next(islice(events, 2, None), None)
+    tree = _value(events, start) if start else None
+    found = tree.get(_ROOT) if isinstance(tree, dict) else None
+    if found is None:
+        raise LogError(f"it has no {_ROOT}")
+    used: dict[str, Any] = {}
+    for name in (*_TEXTS, *_LISTS):
+        if isinstance(found, dict) and name in found:
+            kind, expected = (list, "a list") if name in _LISTS else (str, "a text")
+            if not isinstance(found[name], kind):
+                raise LogError(f"{name} is not {expected}")
+            texts = [each for each in found[name] if isinstance(each, str)]
+            if texts or kind is str:
+                used[name] = found[name] if kind is str else texts
+    return used
+
+
+def _value(events: Iterator[Any], event: Any, depth: int = 0) -> Any:
+    """Return the text, list or dict that begins with an event."""
+    name = type(event).__name__
+    if depth > MAX_METADATA_DEPTH:
+        raise LogError(f"it is nested in more than {MAX_METADATA_DEPTH} levels")
+    if name == "AliasEvent":
+        raise LogError("aliases are not supported")
+    if name == "ScalarEvent":
+        return str(event.value)
+    values = []
+    while not type(event := next(events)).__name__.endswith("EndEvent"):
+        values.append(_value(events, event, depth + 1))
+        if name == "MappingStartEvent":
+            if not isinstance(values[-1], str):
+                raise LogError("a key is not a text")
+            values[-1] = values[-1], _value(events, next(events), depth + 1)
+    return values if name == "SequenceStartEvent" else dict(values)
+
+
+_BLOCK_BYTES = 2**20
+# Content size of a frame that does not declare it.
+_UNKNOWN = -1
+# Part of the free disk space that decompressed files may take.
+_FREE_SHARE = 0.9
+
+
+def decompress_file(path: Path, target: Path) -> None:
+    """Decompress a file to `target`."""
+    try:
+        size = path.stat().st_size
+        most = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * size)
+        free = int(shutil.disk_usage(target.parent).free * _FREE_SHARE)
+        with path.open("rb") as packed, target.open("wb") as file:
+            declared = zstandard.frame_content_size(packed.read(18))
+            packed.seek(0)
+            _check_size(path, declared, most, free, target.parent)
+            written = 0
+            reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+            while block := reader.read(_BLOCK_BYTES):
+                written += len(block)
+                _check_size(path, written, most, free, target.parent)
+                file.write(block)
+    except (OSError, zstandard.ZstdError) as error:
+        raise LogError(f"{path} cannot be decompressed: {error}") from error
+
+
+def _check_size(path: Path, size: int, most: int, free: int, folder: Path) -> None:
+    if size > most:
+        raise LogError(
+            f"{path} has more than {most} bytes when it is decompressed: at most"
+            f" {MAX_UNPACKED_BYTES} bytes, or {MAX_UNPACKED_RATIO} for each byte, are read;"
+            " decompress it with zstd if you trust it"
+        )
+    if size > free:
+        raise LogError(
+            f"{path} is larger than {free} bytes when it is decompressed, the free space in"
+            f" {folder}: set TMPDIR to a folder of a larger disk"
+        )
+
+
+class CompressedTopic:
+    """Topic whose messages are compressed one by one."""
+
+    def __init__(self, source: TopicSource) -> None:
+        """Store the topic with the compressed messages."""
+        self._source, self.definition = source, source.definition
+
+    @property
+    def times_ns(self) -> NDArray[np.int64]:
+        """(N,) log_times in file order."""
+        return self._source.times_ns
+
+    @property
+    def positions(self) -> NDArray[np.int64]:
+        """(N,) positions in the file."""
+        return self._source.positions
+
+    def raw(self, rows: NDArray[np.int64]) -> Iterator[RawMessage]:
+        """Yield the messages at the positions `rows` (K,), which are distinct and ascending."""
+        for message in self._source.raw(rows):
+            try:
+                yield message._replace(data=_decompressed(message.data))
+            except LogError as error:
+                yield message._replace(data=b"", problem=str(error))
+
+    def columns(
+        self, fields: Sequence[str], rows: NDArray[np.int64] | None
+    ) -> dict[str, NDArray[Any]] | None:
+        """Return None: messages are decoded one by one."""
+        return None
+
+
+def _decompressed(data: bytes) -> bytes:
+    """Decompress a message."""
+    found: bytes | None = None
+    try:
+        size = zstandard.frame_content_size(data)
+        if size == _UNKNOWN:
+            found = zstandard.ZstdDecompressor().stream_reader(data).read(MAX_CHUNK_BYTES + 1)
+            size = len(found)
+        if size > MAX_CHUNK_BYTES:
+            raise LogError(f"a compressed message has more than {MAX_CHUNK_BYTES} bytes")
+        return found if found is not None else zstandard.ZstdDecompressor().decompress(data)
+    except zstandard.ZstdError as error:
+        raise LogError(f"a message cannot be decompressed: {error}") from error
+
 
 _METADATA = "metadata.yaml"
 _KINDS = (".mcap", ".db3", ".bag")

@@ -12,7 +12,15 @@ from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
 from mcaprl.recorder.bags.path_steps import path_text
 from mcaprl.recorder.bags.values import without_lacks
-from mcaprl.recorder.mapping.align import NONE, Matches, during, interpolated, last, nearest
+from mcaprl.recorder.mapping.align import (
+    NONE,
+    Matches,
+    TopicStream,
+    during,
+    interpolated,
+    last,
+    nearest,
+)
 from mcaprl.recorder.mapping.config import LARGEST, Quantity
 from mcaprl.recorder.mapping.names import Named, by_names, check_order, names_field
 from mcaprl.recorder.mapping.paths import (
@@ -27,10 +35,8 @@ from mcaprl.recorder.mapping.paths import (
     topic_of,
     unknown_field,
 )
-from mcaprl.recorder.mapping.poses.rotations import yaw_of
-from mcaprl.recorder.mapping.poses.transforms import Transforms, transform_topic
+from mcaprl.recorder.mapping.poses.transforms import Transforms, transform_topic, yaw_of
 from mcaprl.recorder.mapping.runs import Messages
-from mcaprl.recorder.mapping.streams import TopicStream
 
 _QUATERNION = ("x", "y", "z", "w")
 _ANGLES = ("roll", "pitch", "yaw")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
+from mcaprl.recorder.mapping.align import TopicStream
 from mcaprl.recorder.mapping.config import (
     Clock,
     Mapping,
@@ -24,7 +25,6 @@ from mcaprl.recorder.mapping.expression import Expression
 from mcaprl.recorder.mapping.images.reader import ImageReader
 from mcaprl.recorder.mapping.observe import Source, source_of
 from mcaprl.recorder.mapping.paths import topic_of
-from mcaprl.recorder.mapping.streams import TopicStream
 
 Columns = MappingOf[str, NDArray[Any]]
 Reward = Callable[[Columns, NDArray[np.int64]], NDArray[np.float64]]

@@ -24,11 +24,15 @@ from mcaprl.recorder.mapping.assemble import assembled, element_names, vector_na
 from mcaprl.recorder.mapping.blame import Blame
 from mcaprl.recorder.mapping.config import Mapping, Place, load_mapping
 from mcaprl.recorder.mapping.plan import Plan
-from mcaprl.recorder.mapping.precision import Rounding, rounding_of
-from mcaprl.recorder.mapping.runs import Runs
-from mcaprl.recorder.mapping.segments import Segment
+from mcaprl.recorder.mapping.runs import Runs, Segment
 from mcaprl.recorder.mapping.steps import StepReader, Steps
-from mcaprl.recorder.mapping.summary import FieldReport, MappingReport, RunReport
+from mcaprl.recorder.mapping.summary import (
+    FieldReport,
+    MappingReport,
+    Rounding,
+    RunReport,
+    rounding_of,
+)
 from mcaprl.texts import counted
 
 

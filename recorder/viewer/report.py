@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from mcaprl.figures import COLORS, INK, PALE, Panel, save_panels, tick_labels, to_svg
 from mcaprl.page import Card, Figure, Section, Table, write_page
 from mcaprl.problem import Problem
-from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.dataset.statistics import calibration
 from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.record.display import TELEMETRY
 from mcaprl.recorder.source import open_data

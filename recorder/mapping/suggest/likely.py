@@ -15,7 +15,7 @@ from mcaprl.recorder.bags.bag import Bag, TopicInfo
 from mcaprl.recorder.bags.overview import TopicOverview, instants_of, is_fresh
 from mcaprl.recorder.format.reading import full_name
 from mcaprl.recorder.mapping.config import Quantity
-from mcaprl.recorder.mapping.precision import needed_offset
+from mcaprl.recorder.mapping.summary import needed_offset
 
 _SAMPLES = 200
 _SIZES = (8, 16, 32, 64)

@@ -14,7 +14,7 @@ from mcap.writer import Writer
 
 from mcaprl.errors import LogError
 from mcaprl.recorder.bags.bag import open_bag
-from mcaprl.recorder.bags.ros import RosDecoder
+from mcaprl.recorder.bags.decoders import RosDecoder
 from tests.support.bags import START_NS, STORE1, STORE2, Channel, numbers, write_channels
 
 IDL = """\

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from mcaprl.recorder.bags.bag import open_bag
-from mcaprl.recorder.bags.decoders import column_of, value_at
-from mcaprl.recorder.bags.json_messages import JsonDecoder
+from mcaprl.recorder.bags.decoders import JsonDecoder, column_of, value_at
 from tests.conftest import need
 
 START_NS, STEP_NS, STEPS = 1_700_000_000 * 10**9, 50_000_000, 5

@@ -16,10 +16,10 @@ import pytest
 import zstandard
 
 from mcaprl.errors import LogError, McaprlError
-from mcaprl.recorder.bags import compressed
+from mcaprl.recorder.bags import files
 from mcaprl.recorder.bags.bag import open_bag
-from mcaprl.recorder.bags.bag_metadata import read_metadata
 from mcaprl.recorder.bags.decoders import decoder_of
+from mcaprl.recorder.bags.files import read_metadata
 from tests.recorder.bags.test_definition_files import write_database
 from tests.recorder.bags.test_protobuf import STATE, message_class, schema_of
 from tests.support.bags import (
@@ -172,14 +172,14 @@ def test_compressed_files_are_decompressed_within_limits(
         packed.write_bytes(form)
         with closing(open_bag(packed)) as bag:
             assert bag.read("/x", ["data"]).columns["data"].tolist() == [1, 2]
-    monkeypatch.setattr(compressed, "MAX_UNPACKED_BYTES", len(data) - 1)
-    monkeypatch.setattr(compressed, "MAX_UNPACKED_RATIO", 1)
+    monkeypatch.setattr(files, "MAX_UNPACKED_BYTES", len(data) - 1)
+    monkeypatch.setattr(files, "MAX_UNPACKED_RATIO", 1)
     for form in forms:
         packed.write_bytes(form)
         with pytest.raises(LogError, match=r"b.mcap.zstd has more than \d+ bytes when it is decom"):
             open_bag(packed)
-    monkeypatch.setattr(compressed, "MAX_UNPACKED_RATIO", 100)
-    monkeypatch.setattr(compressed, "_FREE_SHARE", 0)
+    monkeypatch.setattr(files, "MAX_UNPACKED_RATIO", 100)
+    monkeypatch.setattr(files, "_FREE_SHARE", 0)
     with pytest.raises(LogError, match="is larger than 0 bytes when it is decompressed"):
         open_bag(packed)
     packed.write_bytes(b"not zstd")
@@ -195,7 +195,7 @@ def test_messages_that_are_compressed_one_by_one(
     with closing(open_bag(folder)) as bag:
         found = bag.read("/odom", ["twist.twist.linear.x"]).columns["twist.twist.linear.x"]
         assert found.tolist() == [speed(k) for k in range(STEPS)]
-    monkeypatch.setattr(compressed, "MAX_CHUNK_BYTES", 100)
+    monkeypatch.setattr(files, "MAX_CHUNK_BYTES", 100)
     with closing(open_bag(folder)) as bag, pytest.raises(LogError, match="more than 100 bytes"):
         bag.read("/odom", ["twist.twist.linear.x"])
 

@@ -11,7 +11,7 @@ import pytest
 
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.bag import open_bag
-from mcaprl.recorder.bags.ros import RosDecoder
+from mcaprl.recorder.bags.decoders import RosDecoder
 from mcaprl.recorder.mapping.paths import field_path
 from tests.support.bags import Channel, write_channels
 

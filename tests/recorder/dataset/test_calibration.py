@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from mcaprl.recorder.dataset.calibration import ProbabilityRange, calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
+from mcaprl.recorder.dataset.statistics import ProbabilityRange, calibration
 
 
 def test_by_hand() -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mcaprl.recorder.mapping.config import parse_mapping
-from mcaprl.recorder.mapping.precision import needed_offset, rounding_of
 from mcaprl.recorder.mapping.read import MappedBag, read_open_bag
+from mcaprl.recorder.mapping.summary import needed_offset, rounding_of
 from tests.support.memory_bag import MemoryBag
 
 K = np.arange(19.0)

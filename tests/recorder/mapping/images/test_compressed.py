@@ -19,8 +19,7 @@ from PIL import Image
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.image_files import FORMATS, decoded_file
-from mcaprl.recorder.mapping.images.compressed import compressed_pixels
-from mcaprl.recorder.mapping.images.rvl import rvl_decoded
+from mcaprl.recorder.mapping.images.compressed import compressed_pixels, rvl_decoded
 
 
 def rvl_encoded(pixels: list[int]) -> bytes:
