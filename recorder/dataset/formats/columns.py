@@ -118,10 +118,7 @@ def check_times(name: str, times_ns: NDArray[Any]) -> None:
     Raises:
         SpaceError: A time is earlier than the time before it, or is not one.
     """
-    if (
-        times_ns.dtype.kind not in "iu"
-        or (np.abs(times_ns.astype(np.float64)) >= MAX_TIME_NS).any()
-    ):
+    if times_ns.dtype.kind not in "iu" or ((times_ns < 0) | (times_ns >= MAX_TIME_NS)).any():
         raise SpaceError(f"{name} are not times in nanoseconds")
     falls = np.diff(times_ns) < 0
     if falls.any():
