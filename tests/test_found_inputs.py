@@ -209,6 +209,7 @@ def episode(**changes: Any) -> EpisodeArrays:
         ({"times_ns": np.zeros(2, np.int64)}, "log_time_ns has shape"),
         ({"times_ns": np.zeros(3)}, "log_time_ns are not times"),
         ({"times_ns": np.full(3, 2**63, np.uint64)}, "log_time_ns are not times"),
+        ({"times_ns": np.full(3, -1)}, "log_time_ns are not times"),
         ({"behavior_probs": np.float64(1)}, "behavior_probs has shape"),
         ({"summary": {"reason": 3}}, "reason must be a text"),
         ({"summary": {"epsilon": "x"}}, "epsilon must be a number"),
@@ -229,6 +230,8 @@ def test_arrays_of_an_episode(changes: dict[str, Any], reason: str) -> None:
         ("terminated", "text", "terminated must be true or false"),
         ("total_reward", "1", "total_reward must be a number"),
         ("reason", None, "reason must be a text"),
+        ("start_time_ns", -1, "its times are impossible"),
+        ("end_time_ns", 2**62, "its times are impossible"),
     ],
 )
 def test_episodes_of_parquet(tmp_path: Path, name: str, value: Any, reason: str) -> None:

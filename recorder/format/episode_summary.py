@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError
 from mcaprl.files import as_type
+from mcaprl.limits import MAX_TIME_NS
 from mcaprl.recorder.format import messages
 from mcaprl.texts import counted
 
@@ -70,6 +71,8 @@ def summary_of(values: Mapping[str, Any]) -> EpisodeSummary:
         raise SpaceError(f"an episode is damaged: {error}") from error
     if found.seed is not None and not 0 <= found.seed <= messages.MAX_SEED:
         raise SpaceError(f"an episode is damaged: a log cannot store the seed {found.seed}")
+    if not all(0 <= each < MAX_TIME_NS for each in (found.start_time_ns, found.end_time_ns)):
+        raise SpaceError("an episode is damaged: its times are impossible")
     return found
 
 
