@@ -18,7 +18,7 @@ from mcaprl.entry_points import installed, load
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.files import check_plain, replacing, replacing_folder
 from mcaprl.recorder.dataset.origin import Origin
-from mcaprl.recorder.format.metadata import NO_TIMES
+from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
 from mcaprl.storage.remote import is_url
 
 if TYPE_CHECKING:
@@ -27,12 +27,17 @@ if TYPE_CHECKING:
 ENTRY_POINT_GROUP: Final = "mcaprl.formats"
 KINDS = ("terminated", "truncated")
 """Kinds of the end of an episode."""
+_OTHERS = ("success_reasons", "view", "epsilon", "seed", "unstored_kwargs")
 
 
 def _any_summary(*names: str) -> Callable[[Dataset], bool]:
     return lambda data: any(
         getattr(e.summary, n) not in (None, "") for e in data.episodes for n in names
     )
+
+
+def _metadata(data: Dataset) -> LogMetadata:
+    return LogMetadata.from_strings(data.metadata)
 
 
 def _has_final_infos(data: Dataset) -> bool:
@@ -44,7 +49,10 @@ FACTS: Mapping[str, Callable[[Dataset], bool]] = {
     "spaces": lambda data: True,
     "times": lambda data: data.metadata.get("times") != NO_TIMES,
     "environment": lambda data: bool(data.env_id),
-    "names of actions": lambda data: bool(data.action_meanings),
+    "names of observations": lambda data: bool(data.observation_names),
+    "names and commands of actions": lambda data: (
+        bool(data.action_meanings) or data.action_commands is not None
+    ),
     "behavior_prob": lambda data: not np.isnan(data.behavior_probs).all(),
     "policy names": _any_summary("policy"),
     "seeds and reset options": _any_summary("seed", "options"),
@@ -52,6 +60,8 @@ FACTS: Mapping[str, Callable[[Dataset], bool]] = {
     "infos": lambda data: bool(data.infos),
     "infos of final observations": _has_final_infos,
     "final observations after a termination": lambda data: bool(data.terminated.any()),
+    "description of the source": lambda data: bool(_metadata(data).about),
+    "other metadata": lambda data: any(getattr(_metadata(data), name) for name in _OTHERS),
 }
 """What a dataset has beside its transitions: names, and whether a dataset has it."""
 
@@ -70,9 +80,11 @@ class Format:
         about: Description of the format, for lists of formats.
         suffix: Suffix of the file names, such as `.npz`; empty if the format is a folder.
         keeps: Data beside the transitions that the format has a place for; default: all of
-            `spaces`, `times`, `environment`, `names of actions`, `behavior_prob`, `policy names`,
-            `seeds and reset options`, `end reasons`, `infos`, `infos of final observations` and
-            `final observations after a termination`. Writing lists the others that a dataset has.
+            `spaces`, `times`, `environment`, `names of observations`, `names and commands of
+            actions`, `behavior_prob`, `policy names`, `seeds and reset options`, `end reasons`,
+            `infos`, `infos of final observations`, `final observations after a termination`,
+            `description of the source` and `other metadata`. Writing lists the others that a
+            dataset has.
     """
 
     name: ClassVar[str]
@@ -170,17 +182,21 @@ class _BuiltIn(Format):
 
 class _LeRobot(_BuiltIn):
     name, about = "lerobot", "LeRobot dataset v3 (folder)"
-    keeps = frozenset({"behavior_prob", "infos", "infos of final observations"})
+    keeps = frozenset(
+        {"names of observations", "behavior_prob", "infos", "infos of final observations"}
+    )
 
 
 class _Minari(_BuiltIn):
     name, about = "minari", "Minari dataset (folder, or minari:ID of a local dataset)"
     keeps = frozenset(FACTS) - {
         "times",
-        "names of actions",
+        "names of observations",
+        "names and commands of actions",
         "behavior_prob",
         "policy names",
         "end reasons",
+        "other metadata",
     }
 
     def located(self, name: str) -> Path:

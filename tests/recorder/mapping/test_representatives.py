@@ -117,17 +117,19 @@ def test_continuous_actions_and_many_numbers_have_no_commands() -> None:
 
 def test_commands_are_kept_in_logs_and_other_formats(tmp_path: Path) -> None:
     data = read(fields=list(FIELDS), actions={"stop": [0, 0], "go": [1, 0.1]}).dataset
-    paths = [tmp_path / name for name in ("a.mcap", "b.mcap", "a.npz")]
+    paths = [tmp_path / name for name in ("a.mcap", "b.mcap", "table")]
     data.save(paths[0])
     part = read(fields=list(FIELDS), actions={"stop": [0, 0], "go": [2, 0.1]}).dataset
     part.save(paths[1])
-    mcaprl.convert(paths[0], paths[2])
+    mcaprl.convert(paths[0], paths[2], to="parquet")
+    lost = mcaprl.convert(paths[0], tmp_path / "a.npz").lost
+    assert "names and commands of actions" in lost[0]
     mcaprl.filter("length > 0", paths[0], tmp_path / "filtered.mcap")
     mcaprl.slice(paths[0], tmp_path / "slice.mcap", steps=(1, 3))
     mcaprl.merge([paths[0], paths[1]], tmp_path / "merged.mcap", shift=True)
     mcaprl.split(paths[0], tmp_path / "parts", episodes=1)
     for name in (
-        *("a.mcap", "a.npz", "filtered.mcap", "slice.mcap", "merged.mcap"),
+        *("a.mcap", "table", "filtered.mcap", "slice.mcap", "merged.mcap"),
         "parts/a-00000.mcap",
     ):
         found = mcaprl.open(tmp_path / name)

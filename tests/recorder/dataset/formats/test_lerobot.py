@@ -137,7 +137,8 @@ def test_all_frames_come_back_and_the_rest_is_said(tmp_path: Path) -> None:
         "not written: the observation after the last action; mcaprl reads 1 episode that did not"
         " terminate without the last transition",
         "lerobot has no place for spaces, times, environment, policy names, seeds and reset"
-        " options, end reasons, final observations after a termination: a log keeps them",
+        " options, end reasons, final observations after a termination, other metadata: a log"
+        " keeps them",
     ]
     found, said = _opened(tmp_path / "out")
     assert [text.partition(" episode")[0] for text in said] == [

@@ -58,7 +58,7 @@ def test_what_an_archive_has_no_place_for_is_said(tmp_path: Path) -> None:
     data = _two_episodes()
     assert data.to_npz(tmp_path / "toy.npz") == [
         "npz has no place for spaces, environment, policy names, seeds and reset options,"
-        " end reasons: a log keeps them"
+        " end reasons, other metadata: a log keeps them"
     ]
     found = Dataset.from_npz(tmp_path / "toy.npz")
     same_transitions(found, data)

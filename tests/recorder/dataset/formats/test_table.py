@@ -20,6 +20,7 @@ from mcaprl import Dataset
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.dataset.format_registry import FACTS, FORMATS
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.format.action_commands import ActionCommands
 from mcaprl.recorder.format.metadata import LogMetadata
 
 for _package in ("h5py", "pyarrow", "PIL", "stable_baselines3"):
@@ -193,6 +194,31 @@ _INFOS = [
     {"speed": np.ma.MaskedArray(np.arange(length + 1.0), np.arange(length + 1) < 1)}
     for length in _LENGTHS
 ]
+
+
+def _described(*names: str) -> tuple[Dataset, Callable[[Dataset, Dataset], bool]]:
+    """Return a dataset with metadata, and whether these fields of the metadata are kept."""
+    metadata = LogMetadata(
+        _VECTOR,
+        spaces.Discrete(3),
+        observation_names=("x", "y"),
+        action_meanings=("a", "b", "c"),
+        action_commands=ActionCommands(("/cmd",), ((0.0,), (1.0,), (2.0,))),
+        success_reasons=("goal",),
+        view={"distance_m": 2.0},
+        epsilon="0.5",
+        seed="4",
+        about={"author": "A. Author"},
+    )
+    data = Dataset(_made()._transitions, metadata)
+
+    def same(before: Dataset, after: Dataset) -> bool:
+        found = [LogMetadata.from_strings(one.metadata) for one in (before, after)]
+        return all(getattr(found[0], name) == getattr(found[1], name) for name in names)
+
+    return data, same
+
+
 _ASPECTS: dict[str, tuple[Dataset, Callable[[Dataset, Dataset], bool]]] = {
     "float32 vectors": (_made(), _observations),
     "float64 vectors": (_made(spaces.Box(-9, 9, (2,), np.float64)), _observations),
@@ -221,10 +247,10 @@ _ASPECTS: dict[str, tuple[Dataset, Callable[[Dataset, Dataset], bool]]] = {
     "times": (_made(), _summaries("start_time_ns")),
     "spaces": (_made(), _spaces),
     "env id": (_made(), lambda before, after: before.env_id == after.env_id),
-    "names of actions": (
-        _made(),
-        lambda before, after: before.action_meanings == after.action_meanings,
-    ),
+    "names of observations": _described("observation_names"),
+    "names and commands of actions": _described("action_meanings", "action_commands"),
+    "description of the source": _described("about"),
+    "other metadata": _described("success_reasons", "view", "epsilon", "seed"),
     "behavior_prob": (
         _made(behavior_probs=[np.full(length, 0.25) for length in _LENGTHS]),
         lambda before, after: _same_arrays(
