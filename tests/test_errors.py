@@ -34,7 +34,7 @@ def test_a_message_that_quotes_lines_is_one_line() -> None:
 def test_every_error_is_in_the_diagram() -> None:
     assert errors.__doc__ is not None
     for kind in subclasses(errors.McaprlError):
-        assert kind.__name__ in errors.__doc__
+        assert kind.__name__ in errors.__doc__ or not kind.__module__.startswith("mcaprl")
 
 
 def test_nearest_names_come_first() -> None:

@@ -68,7 +68,8 @@ def read_yaml(path: Path, extra: str, *, with_lines: bool = False) -> Any:
     except UsageError:
         raise
     except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+        reason = f"cannot be read: {error.strerror}" if error.strerror else str(error)
+        raise UsageError(f"{path}: {reason}") from error
     except UnicodeDecodeError as error:
         raise UsageError(f"{path} is not UTF-8 text: {error.reason}") from error
     except yaml.YAMLError as error:

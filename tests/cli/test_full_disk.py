@@ -74,7 +74,7 @@ def limited(limit: int, command: Sequence[str], folder: Path, errors: Connection
         (2_000, ["convert", LOG, "x", "--to", "parquet"], "x"),
         *(
             (limit, ["convert", LANE, name, "--to", form, "--lossy"], name)
-            for limit in (2_000, 20_000, 40_000, 70_000)
+            for limit in (2_000, 20_000, 40_000)
             for name, form in (("x-v0", "minari"), ("x.hdf5", "hdf5"), ("x.h5", "d3rlpy"))
         ),
         (2_000, ["convert", LANE, "x", "--to", "lerobot", "--lossy"], "x"),

@@ -318,7 +318,7 @@ def test_a_folder_without_a_run_is_reported(tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="an online run"):
         Task.of_run(tmp_path)
     (tmp_path / "config.json").write_text("[]")
-    with pytest.raises(TrainingError, match="it must be an object"):
+    with pytest.raises(TrainingError, match="is not a JSON object"):
         Task.of_run(tmp_path)
 
 
