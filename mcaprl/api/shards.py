@@ -1,4 +1,4 @@
-"""Recording of several files into a folder: by processes of this machine, or on a Ray cluster."""
+"""Recording of several files into a folder: by processes that end with their parent, or by Ray."""
 
 from __future__ import annotations
 
