@@ -27,7 +27,6 @@ from mcaprl.cli.progress import keeping, working
 from mcaprl.cli.show import echo, print_json, print_table
 from mcaprl.errors import UsageError
 from mcaprl.page import PAGE_NAME
-from mcaprl.settings import flag
 from mcaprl.texts import counted
 
 if TYPE_CHECKING:
@@ -153,8 +152,7 @@ def evaluate(
 def _refuse_unused(given: dict[str, Any], names: Sequence[str], needed: str) -> None:
     for name in names:
         if name in given:
-            shown = "--env-arg" if name == "sim_options" else flag(name)
-            raise UsageError(f"{shown} requires --{needed}")
+            raise UsageError(f"`{name}=` requires --{needed}")
 
 
 def _print_scores(found: Evaluation) -> None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import ast
+import json
+import re
+import shlex
 import shutil
 import sys
 import textwrap
@@ -12,6 +16,7 @@ import click
 
 from mcaprl.files import json_text
 from mcaprl.problem import Problem
+from mcaprl.settings import flag
 from mcaprl.texts import counted, printable, shortened
 
 if TYPE_CHECKING:
@@ -23,17 +28,52 @@ if TYPE_CHECKING:
 _PIPE_WIDTH = 120
 _MAX_ROWS = 40
 """Number of rows of a wide table that are printed."""
+_ARGUMENT = re.compile(r"""`([a-z]\w*)=('[^']*'|"[^"]*"|[^`]*)`""")
+_OPTIONS = {"sim_options": "--env-arg", "sources": "--from"}
+"""Options whose names differ from those of the arguments."""
 
 
 def echo(text: object, *, err: bool = False) -> None:
-    """Print a line to stdout or stderr, with control characters escaped.
+    """Print a line to stdout or stderr, with control characters escaped; see `as_options`.
 
     In a terminal, a long line is wrapped between words.
     """
-    line = printable(text).replace("\n", r"\n")
+    line = printable(as_options(str(text))).replace("\n", r"\n")
     if _is_terminal(sys.stderr if err else sys.stdout):
         line = "\n".join(_wrapped(line, shutil.get_terminal_size().columns)) or line
     click.echo(line, err=err)
+
+
+def as_options(message: str) -> str:
+    """Return a message in which arguments of Python functions are options of commands.
+
+    >>> as_options("pass `append=True`, `to='npz'`, `max_steps=N` or `keys=['a', 'b']`, not `to=`")
+    'pass --append, --to npz, --max-steps N or --keys a,b, not --to'
+    >>> as_options("pass `sim_options={'observation': 'depth', 'continuous': False}`")
+    'pass --observation depth --env-arg continuous=false'
+    """
+    return _ARGUMENT.sub(lambda found: _option(*found.groups()), message)
+
+
+def _option(name: str, value: str) -> str:
+    option = _OPTIONS.get(name, flag(name))
+    try:
+        parsed = ast.literal_eval(value)
+    except (ValueError, SyntaxError):
+        parsed = value
+    if parsed is True or not value:
+        return option
+    if isinstance(parsed, dict):
+        return " ".join(_env_option(key, each) for key, each in parsed.items())
+    if isinstance(parsed, list):
+        return f"{option} {','.join(map(str, parsed))}"
+    return f"{option} {parsed if isinstance(parsed, str) else value}"
+
+
+def _env_option(name: str, value: object) -> str:
+    if name in ("observation", "rules") and isinstance(value, str):
+        return f"--{name} {shlex.quote(value)}"
+    return f"--env-arg {shlex.quote(f'{name}={json.dumps(value)}')}"
 
 
 def _wrapped(line: str, width: int) -> list[str]:
@@ -143,7 +183,7 @@ def _print(console: Console, table: Table, title: str, rows: Iterable[Iterable[s
 
     table.title, table.title_style, table.title_justify = Text(printable(title)), "bold", "left"
     for row in rows:
-        table.add_row(*(Text(printable(cell)) for cell in row))
+        table.add_row(*(Text(printable(as_options(cell))) for cell in row))
     console.print(table)
 
 

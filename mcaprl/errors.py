@@ -1,5 +1,8 @@
 """Errors caused by data or by a user's request. Messages name the problem, place and remedy.
 
+They name arguments of Python functions as `overwrite=True` or `episodes=N`, and as `episodes=` for
+any value. The command line prints arguments as options, such as `--overwrite` or `--episodes N`.
+
 McaprlError
 ├── UsageError            the request is invalid                       (exit code 2)
 │   ├── UnknownNameError    a sim, policy, observation... is unknown

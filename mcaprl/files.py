@@ -161,9 +161,7 @@ def check_target(path: Path, *, overwrite: bool) -> None:
     with locked_file(path):
         pass
     if not overwrite:
-        raise OutputExistsError(
-            f"{path} exists: choose another path, or pass --overwrite (overwrite=True in Python)"
-        )
+        raise OutputExistsError(f"{path} exists: choose another path, or pass `overwrite=True`")
 
 
 def check_writable(path: Path, error_type: type[McaprlError]) -> None:
@@ -258,9 +256,7 @@ def _check_folder(path: Path, *, overwrite: bool) -> None:
     if path.name in ("", ".."):
         raise OutputExistsError(f"{path} cannot be replaced: give the name of the folder")
     if path.exists() and not overwrite:
-        raise OutputExistsError(
-            f"{path} exists: choose another path, or pass --overwrite (overwrite=True in Python)"
-        )
+        raise OutputExistsError(f"{path} exists: choose another path, or pass `overwrite=True`")
 
 
 def _check_contents(path: Path, replacement: Path) -> None:

@@ -117,7 +117,8 @@ class RunIdentity:
             if name == "data":
                 raise TrainingError(
                     f"cannot resume: {where} was trained on other data; resume with the same data"
-                    " and weights, train into another folder, or allow other data (--other-data)"
+                    " and weights, train into another folder, or allow other data:"
+                    " `other_data=True`"
                 )
             raise TrainingError(
                 f"cannot resume: {where} has {name} {old!r}, not {new!r}; resume with the same"
@@ -174,7 +175,7 @@ def open_run(
     leftovers = _leftovers(folder)
     if leftovers is None and not resume:
         raise OutputExistsError(
-            f"{folder} exists: choose another folder, or resume its run (--resume)"
+            f"{folder} exists: choose another folder, or resume its run (`resume=True`)"
         )
     versions: Any = _numerical_versions()
     if leftovers is None:
@@ -239,7 +240,7 @@ def choose_seeds(folder: Path, seeds: int | None, seed: int | None, resume: bool
     if not set(earlier) <= set(chosen):
         raise UsageError(
             f"{folder} is a run of {counted(len(earlier), 'seed')}, the first of which is"
-            f" {earlier.start}: resume it without --seeds and --seed, or choose another folder"
+            f" {earlier.start}: resume it without `seeds=` and `seed=`, or choose another folder"
         )
     return chosen
 
@@ -292,7 +293,8 @@ def run_to_resume(folder: Path) -> dict[str, Any]:
         return read_config(folder)
     if not folder.is_dir() or _leftovers(folder) is None:
         raise TrainingError(
-            f"{folder} has no run to resume: check the path, or start a new run without --resume"
+            f"{folder} has no run to resume: check the path, or start a new run without"
+            " `resume=True`"
         )
     return {}
 

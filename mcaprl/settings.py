@@ -99,8 +99,8 @@ def check_settings(algo: str, config: Settings | type[Settings], given: Iterable
     known = [field.name for field in fields(config)]
     for name in given:
         if name not in known:
-            options = ", ".join(map(flag, known))
-            raise UsageError(f"{algo} has no setting {flag(name)}; it has {options}")
+            options = ", ".join(f"`{each}=`" for each in known)
+            raise UsageError(f"{algo} has no setting `{name}=`; it has {options}")
 
 
 def settings_from_json(found: object) -> dict[str, Any]:

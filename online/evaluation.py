@@ -108,7 +108,7 @@ class Evaluation(EvalCallback):
             warnings.warn(
                 f"{self._cuts} of {len(self._lengths)} episodes of the evaluation at step"
                 f" {self.num_timesteps} reached the limit of {max(self._lengths)} steps and were"
-                " truncated; set another limit with --max-steps (max_steps in Python)",
+                " truncated; set another limit with `max_steps=N`",
                 stacklevel=2,
             )
         return going_on

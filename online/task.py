@@ -95,7 +95,7 @@ class Task:
         check_kind(folder, found, "online")
         if "device" in found:
             raise TrainingError(
-                f"cannot resume: {folder} was trained with --device; train into another folder"
+                f"cannot resume: {folder} was trained with `device=`; train into another folder"
             )
         try:
             earlier = settings_from_json(found["config"])
@@ -165,10 +165,10 @@ def choose_task(
         return task
     if preset is not None:
         task = Task.of_preset(preset, sim_options, **given)
-        for name, value, own in (("SIM", sim, task.sim), ("--algo", algo, task.algo)):
+        for what, value, own in (("the sim", sim, task.sim), ("`algo=`", algo, task.algo)):
             if value not in (None, own):
-                raise UsageError(f"preset {preset} sets {name} to {own}: omit {name} {value}")
+                raise UsageError(f"preset {preset} sets {what} to {own}: omit {what} {value}")
         return replace(task, max_steps=max_steps)
     if sim is None:
-        raise UsageError("train-online needs a SIM, such as lane, or a --preset")
+        raise UsageError("online training needs a sim, such as lane, or `preset=NAME`")
     return replace(Task.for_sim(sim, algo, sim_options, **given), max_steps=max_steps)

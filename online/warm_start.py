@@ -73,7 +73,7 @@ def take_weights(model: BaseAlgorithm, policy: Policy, space: spaces.Space[Any])
     if stacked_space(channels_first(space), frames) != model.observation_space:
         raise PolicyError(
             f"{policy.name} stacks {frames} observations, but the agent stacks another number: pass"
-            " --frame-stack"
+            f" `frame_stack={frames}`"
         )
     stacks = _sample_stacks(space, frames)
     expected = policy.q_values(stacks if frames > 1 else mapped(lambda part: part[:, 0], stacks))
@@ -95,7 +95,7 @@ def _copy_layers(policy: Policy, ours: nn.Module) -> None:
     if _weights_of(theirs) != _weights_of(ours):
         raise PolicyError(
             f"{policy.name} has layers {_chain(theirs)}, but the agent has {_chain(ours)}:"
-            " pass --hidden, --encoder, --channels, --dueling or --layer-norm"
+            " pass `hidden=`, `encoder=`, `channels=`, `dueling=` or `layer_norm=`"
         )
     for source, target in zip(_layers(theirs), _layers(ours), strict=True):
         target.load_state_dict(source.state_dict())

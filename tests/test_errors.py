@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import pickle
+import re
+from pathlib import Path
 
 import pytest
 
@@ -49,3 +52,46 @@ def test_a_missing_extra_names_the_install_command() -> None:
         errors.import_extra("no_such_module.inner", "sims")
     assert str(reported.value) == "no_such_module is not installed: pip install 'mcaprl[sims]'"
     assert errors.import_extra("json", "sims").dumps([1]) == "[1]"
+
+
+def test_functions_name_their_arguments_and_not_options() -> None:
+    root, found = Path(__file__).parents[1], list[str]()
+    for folder in ("mcaprl", "recorder", "sims", "offline", "online"):
+        for path in (root / folder).rglob("*.py"):
+            found += [f"{path}: {text}" for text in texts(path) if names_option(text)]
+    assert found == []
+
+
+def names_option(text: str) -> bool:
+    """Return whether a text names an option, except in a whole command or a style sheet."""
+    return (
+        re.search(r"(?<!var\()--[a-z]", re.sub(r"(mcaprl|pip|ray) [^;,`]*", "", text)) is not None
+    )
+
+
+def test_options_are_found() -> None:
+    assert names_option("a.mcap exists; pass --overwrite")
+    assert names_option("convert it by `mcaprl convert A B --to npz`, or omit (--to)")
+    assert not names_option("`mcaprl recover {} b.mcap --keep-unfinished` keeps it")
+    assert not names_option("a -- b")
+
+
+def texts(path: Path) -> list[str]:
+    """Return the strings of a module that are not docstrings; `{}` replaces values."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    parts = {
+        id(part)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr | ast.JoinedStr)
+        for part in (node.values if isinstance(node, ast.JoinedStr) else [node.value])
+    }
+    joined = [
+        "".join(part.value if isinstance(part, ast.Constant) else "{}" for part in node.values)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.JoinedStr)
+    ]
+    return joined + [
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in parts
+    ]

@@ -82,7 +82,7 @@ def annotate(
     names, added = as_names(policy), None
     check_log_name(out)
     if not names and not scene:
-        raise UsageError("annotate needs --policy POLICY, --scene, or both")
+        raise UsageError("annotate needs `policy=POLICY`, `scene=True`, or both")
     if isinstance(data, Dataset):
         if scene:
             raise UsageError("the scene of a bag cannot be added: there is no sim to step")

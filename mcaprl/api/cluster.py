@@ -8,7 +8,6 @@ from typing import Any
 
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import UsageError
-from mcaprl.settings import flag
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class ClusterOptions:
         given = {"workers": self.workers, "address": self.address, **others}
         for name, value in given.items():
             if value is not None and not self.ray:
-                raise UsageError(f"{flag(name)} requires --ray")
+                raise UsageError(f"`{name}=` requires `ray=True`")
 
     def connected(self) -> AbstractContextManager[Any]:
         """Return a context that connects to the cluster, if any; see `ray.cluster`."""

@@ -15,7 +15,6 @@ from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.format.metadata import as_json, same_env
 from mcaprl.sims import SIMS, make_sim
-from mcaprl.sims.evaluation.rollout import as_options
 from mcaprl.texts import shortened
 
 _MAX_SHOWN = 200
@@ -107,7 +106,7 @@ def trained_options(
         _warn(found, sim, "the policies were trained with different arguments: pass them")
         return {}
     if first and not trust_env and _needs_trust(sim):
-        _warn(found, sim, "to use the arguments of the run, pass --trust-env or the arguments")
+        _warn(found, sim, "to use the arguments of the run, pass `trust_env=True` or the arguments")
         return {}
     return first
 
@@ -116,7 +115,7 @@ def _warn(found: Mapping[str, dict[str, Any]], sim: str, advice: str) -> None:
     name, arguments = next((name, one) for name, one in found.items() if one)
     warnings.warn(
         f"{name} was trained with {_shown(arguments)}, but {sim} is used with its defaults;"
-        f" {advice}, as {shortened(as_options(arguments), _MAX_SHOWN)}",
+        f" {advice}, as `sim_options={shortened(repr(arguments), _MAX_SHOWN)}`",
         stacklevel=3,
     )
 
@@ -147,26 +146,25 @@ def sim_of(
     """
     name, given = sim or dataset.env_id, dict(sim_options or {})
     if not name:
-        raise UsageError(f"{path} has no environment id: pass --sim")
+        raise UsageError(f"{path} has no environment id: pass `sim=NAME`")
     if sim is None and ":" in name and not trust_env:
         module = name.partition(":")[0]
         raise UsageError(
             f"{path} names the environment {name}, so the module {module} would be imported: if you"
-            f" trust the log, pass --trust-env (trust_env=True in Python) or --sim {name}"
+            f" trust the log, pass `trust_env=True` or `sim={name!r}`"
         )
     missing = [argument for argument in dataset.unstored_kwargs if argument not in given]
     if missing:
         raise UsageError(
             f"{path} was recorded with arguments of {name} that are not stored, because they are"
-            f" not JSON: {', '.join(missing)}; pass them as sim_options in Python, or with"
-            " --env-arg"
+            f" not JSON: {', '.join(missing)}; pass them with `sim_options=`"
         )
     logged = {key: value for key, value in dataset.env_kwargs.items() if key not in given}
     logged = _special(logged, name, imports=trust_env or sim is not None)
     if logged and not trust_env and _needs_trust(name):
         raise UsageError(
             f"{path} names arguments of {name}: {_shown(logged)}; if you trust the log, pass"
-            " --trust-env (trust_env=True in Python)"
+            " `trust_env=True`"
         )
     others = {} if render_mode is None else {"render_mode": render_mode}
     return make_sim(name, **{**logged, **given, **others})
@@ -212,4 +210,4 @@ def check_episode(dataset: Dataset, episode: int | None, path: Path) -> None:
     """
     last = len(dataset.episodes) - 1
     if episode is not None and not 0 <= episode <= last:
-        raise UsageError(f"--episode {episode}: {path} has episodes 0 to {last}")
+        raise UsageError(f"`episode={episode}`: {path} has episodes 0 to {last}")

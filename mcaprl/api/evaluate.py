@@ -260,9 +260,9 @@ def evaluate(
     on_cluster = ClusterOptions(ray, workers, address)
     on_cluster.check()
     if ray and record is not None:
-        raise UsageError("--record needs one process: omit --ray")
+        raise UsageError("`record=` needs one process: omit `ray=True`")
     if keys is not None and record is None:
-        raise UsageError("--keys selects what --record writes: omit it, or pass --record")
+        raise UsageError("`keys=` selects what `record=` writes: omit it, or pass `record=`")
     given, options = by_name(policies), all_options(observation, rules, sim_options)
     paths = [policy for policy in given.values() if isinstance(policy, str)]
     options = trained_options(paths, sim, options, trust_env=trust_env)
@@ -363,11 +363,11 @@ def _behavior(data: Data, env: gym.Env[Any, Any], record: Path | None) -> Logged
     """
     dataset, name = opened(data), named(data)
     if record is not None and record.resolve() in [path.resolve() for path in dataset.sources]:
-        raise UsageError(f"{record} is in --behavior {name}: record the episodes elsewhere")
+        raise UsageError(f"{record} is in `behavior={name!r}`: record the episodes elsewhere")
     env_id = env.spec.id if env.spec else ""
     if not same_env(dataset.env_id, env_id):
         raise UsageError(
-            f"--behavior {name} was recorded in {dataset.env_id or 'unknown'}, not in {env_id}"
+            f"`behavior={name!r}` was recorded in {dataset.env_id or 'unknown'}, not in {env_id}"
         )
     returns = dataset.statistics.returns
     interval = mean_interval(returns[None])

@@ -45,13 +45,15 @@ def layout(
     if path is not None and path.suffix == ".mcap":
         raise UsageError(f"{path}: a layout is a JSON file and must not replace a log")
     if path is not None and path.exists() and not overwrite:
-        raise OutputExistsError(f"{path} exists: choose another path, or pass --overwrite")
+        raise OutputExistsError(f"{path} exists: choose another path, or pass `overwrite=True`")
     name = str(source)
     is_file = is_url(name) or Path(name).is_file() or name.endswith(".mcap")
     is_log = name not in SIMS and is_file
     options = dict(sim_options or {})
     if is_log and (options or keys is not None):
-        raise UsageError(f"{name} is a log, but --env-arg and --keys are for a sim: omit them")
+        raise UsageError(
+            f"{name} is a log, but `sim_options=` and `keys=` are for a sim: omit them"
+        )
     found = attached_layout(McapReader(name)) if is_log else _layout_of_sim(name, options, keys)
     if path is not None:
         write_json(path, found, ReportError)

@@ -153,7 +153,7 @@ def info(
     warned = [str(warning.message) for warning in caught]
     if isinstance(contents, BagInfo):
         if report is not None:
-            raise UsageError("a report of a bag needs a mapping: pass --mapping FILE")
+            raise UsageError("a report of a bag needs a mapping: pass `mapping=FILE`")
         return replace(contents, problems=[*warned, *contents.problems])
     if contents.origin.report is not None:
         warned = list(dict.fromkeys([*warned, *map(str, contents.origin.report.problems())]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 from mcaprl.errors import UsageError
-from mcaprl.settings import flag
 
 
 def check_least(least: int, **numbers: int | None) -> None:
@@ -13,7 +12,7 @@ def check_least(least: int, **numbers: int | None) -> None:
 
     >>> check_least(1, episodes=None, envs=0)
     Traceback (most recent call last):
-    mcaprl.errors.UsageError: --envs 0: give a number of at least 1
+    mcaprl.errors.UsageError: `envs=0`: give a number of at least 1
 
     Args:
         least: Smallest number that is accepted.
@@ -24,7 +23,7 @@ def check_least(least: int, **numbers: int | None) -> None:
     """
     for name, number in numbers.items():
         if number is not None and number < least:
-            raise UsageError(f"{flag(name)} {number}: give a number of at least {least}")
+            raise UsageError(f"`{name}={number}`: give a number of at least {least}")
 
 
 def check_fraction(**numbers: float | None) -> None:
@@ -35,7 +34,7 @@ def check_fraction(**numbers: float | None) -> None:
     """
     for name, number in numbers.items():
         if number is not None and not 0 <= number <= 1:
-            raise UsageError(f"{flag(name)} {number}: give a number from 0 to 1")
+            raise UsageError(f"`{name}={number}`: give a number from 0 to 1")
 
 
 def check_positive(**numbers: float) -> None:
@@ -46,7 +45,7 @@ def check_positive(**numbers: float) -> None:
     """
     for name, number in numbers.items():
         if not 0 < number < math.inf:
-            raise UsageError(f"{flag(name)} {number}: give a number above 0")
+            raise UsageError(f"`{name}={number}`: give a number above 0")
 
 
 def check_port(port: int) -> None:
@@ -56,4 +55,4 @@ def check_port(port: int) -> None:
         UsageError: The number is not from 0 to 65535.
     """
     if not 0 <= port <= 65535:
-        raise UsageError(f"--port {port}: give a number from 0 to 65535")
+        raise UsageError(f"`port={port}`: give a number from 0 to 65535")

@@ -23,7 +23,6 @@ from mcaprl.errors import UsageError
 from mcaprl.files import check_log_name
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.manifest import MANIFEST_NAME
-from mcaprl.settings import flag
 from mcaprl.sims.evaluation.rollout import EpisodeResult, warn_of_cuts
 from mcaprl.storage.remote import check_upload, upload_all
 
@@ -198,7 +197,7 @@ def record(
 
 def _check_request(request: FileRequest, envs: int) -> None:
     if (request.episodes is None) == (request.steps is None):
-        raise UsageError("record needs either --episodes N or --steps N")
+        raise UsageError("record needs either `episodes=N` or `steps=N`")
     check_fraction(epsilon=request.epsilon)
     if request.rotate_mb is not None:
         check_positive(rotate_mb=request.rotate_mb)
@@ -211,10 +210,12 @@ def _check_request(request: FileRequest, envs: int) -> None:
     )
     check_least(0, seed=request.seed)
     if envs > 1 and request.append:
-        raise UsageError("--append needs one file, but --envs writes several: omit one option")
+        raise UsageError(
+            "`append=True` needs one file, but `envs=` writes several: omit one of them"
+        )
     if envs > 1 and request.out.suffix == ".mcap":
         raise UsageError(
-            f"--envs {envs} writes one file per process into a folder; {request.out} is the name of"
+            f"`envs={envs}` writes one file per process into a folder; {request.out} is the name of"
             " a file"
         )
 
@@ -224,10 +225,10 @@ def _check_for_ray(request: FileRequest, envs: int) -> None:
     given = {"envs": envs > 1, "append": request.append, "rotate_mb": request.rotate_mb}
     for name, value in given.items():
         if value:
-            raise UsageError(f"{flag(name)} is for recording without --ray: omit one option")
+            raise UsageError(f"`{name}=` is for recording without `ray=True`: omit one of them")
     if request.out.suffix == ".mcap":
         raise UsageError(
-            f"--ray writes several files into a folder; {request.out} is the name of a file"
+            f"`ray=True` writes several files into a folder; {request.out} is the name of a file"
         )
 
 

@@ -228,7 +228,7 @@ def render(
         MissingExtraError: The packages of the `video` extra are not installed.
     """
     if not MIN_SPEED <= speed <= MAX_SPEED:
-        raise UsageError(f"--speed {speed}: give a number from {MIN_SPEED:g} to {MAX_SPEED:g}")
+        raise UsageError(f"`speed={speed}`: give a number from {MIN_SPEED:g} to {MAX_SPEED:g}")
     if video is None and contact_sheet is None:
         raise UsageError("render needs a video, a contact sheet, or both")
     if height is not None and not _HEIGHTS_PX[0] <= height <= _HEIGHTS_PX[1]:

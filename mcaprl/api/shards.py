@@ -413,7 +413,7 @@ def _replaceable(folder: Path, *, overwrite: bool) -> list[Path]:
     if foreign:
         raise OutputExistsError(f"{folder} has other logs ({foreign[0]}): choose another folder")
     if old and not overwrite:
-        raise OutputExistsError(f"{folder} exists: choose another folder, or pass --overwrite")
+        raise OutputExistsError(f"{folder} exists: choose another folder, or pass `overwrite=True`")
     for path in old:
         check_target(path, overwrite=True)
     return old

@@ -21,7 +21,7 @@ from mcaprl.recorder.source import Source, open_data, opened
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.live_stream import DEFAULT_SPEED
 from mcaprl.runs import check_kind, choose_seeds, run_to_resume
-from mcaprl.settings import check_settings, flag, settings_from_json
+from mcaprl.settings import check_settings, settings_from_json
 from mcaprl.storage.remote import check_upload, upload_all
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def train(
     check_settings(algo, defaults, settings)
     config = type(defaults)(**settings)
     if algo == AUTO and (other_data or cluster.ray):
-        raise UsageError(f"{'--other-data' if other_data else '--ray'} is not for --algo {algo}")
+        raise UsageError(f"`{'other_data' if other_data else 'ray'}=` is not for `algo={algo!r}`")
     request: dict[str, Any] = {"resume": resume, "device": device, "progress": progress}
     with cluster.connected(), torch_threads(threads):
         dataset = opened(data, weighted=True, threads=threads)
@@ -238,7 +238,7 @@ def train_online(
     options = all_options(observation, rules, sim_options)
     if device is not None:
         if algo not in (None, "double-dqn"):
-            raise UsageError(f"--device trains double-dqn only: omit --algo {algo}")
+            raise UsageError(f"`device=` trains double-dqn only: omit `algo={algo!r}`")
         _check_device_request(
             preset=preset is not None,
             record=record is not None,
@@ -286,8 +286,7 @@ def _check_device_request(**given: bool) -> None:
     """Check that no argument is given that training on a device does not support."""
     for name, is_given in given.items():
         if is_given:
-            shown = "--from" if name == "sources" else flag(name)
-            raise UsageError(f"{shown} cannot be combined with --device: omit one of them")
+            raise UsageError(f"`{name}=` cannot be combined with `device=`: omit one of them")
 
 
 def _train_on_device(
@@ -304,7 +303,7 @@ def _train_on_device(
     from mcaprl.device.training import train as train_agents
 
     if sim is None:
-        raise UsageError("--device needs a SIM: lane or racer")
+        raise UsageError("`device=` needs a sim: lane or racer")
     task = device_task(sim, options, **settings)
     with torch_threads(threads):
         return train_agents(

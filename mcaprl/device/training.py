@@ -31,7 +31,6 @@ from mcaprl.online.task import Task
 from mcaprl.online.train import OnlineSummary, write_scores
 from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
 from mcaprl.runs import locked_run, open_run, seed_folder
-from mcaprl.settings import flag
 from mcaprl.sims import DeviceSims, make_device_sims
 from mcaprl.sims.evaluation.evaluate import Scale, evaluate
 from mcaprl.sims.vehicle.device import Batch
@@ -75,7 +74,7 @@ def device_task(sim: str, sim_options: Mapping[str, Any] | None = None, **settin
     """
     for name in settings:
         if name in _UNUSED:
-            raise UsageError(f"{flag(name)} has no effect with --device: omit it")
+            raise UsageError(f"`{name}=` has no effect with `device=`: omit it")
     return Task.for_sim(sim, "double-dqn", sim_options, **{**SETTINGS, **settings})
 
 

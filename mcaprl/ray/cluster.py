@@ -141,7 +141,7 @@ def _join(address: str) -> None:
         os.environ.setdefault(_LOOPBACK, "0")
     import_extra("ray", "ray")
     if address != "auto" and ("/" in host or not host or not port.isdecimal()):
-        raise UsageError(f"--address {address}: give HOST:PORT, auto or local")
+        raise UsageError(f"`address={address!r}`: give HOST:PORT, auto or local")
     if address != "auto":
         # Try the address first, because Ray itself gives up only after minutes.
         try:
@@ -174,5 +174,5 @@ def _check_same(address: str | None) -> None:
     current = ray.get_runtime_context().gcs_address
     if address != current:
         raise UsageError(
-            f"--address {address}: this process is already connected to the cluster at {current}"
+            f"`address={address!r}`: this process is already connected to the cluster at {current}"
         )

@@ -147,10 +147,10 @@ def _open(out: Path, identity: dict[str, Any], resume: bool) -> None:
     if not resume:
         if any(one for one in out.iterdir() if not one.name.startswith(".")):
             raise OutputExistsError(
-                f"{out} exists: choose another folder, or resume its sweep (--resume)"
+                f"{out} exists: choose another folder, or resume its sweep (`resume=True`)"
             )
     elif not path.exists():
-        raise TrainingError(f"{out} has no sweep to resume: start a new one without --resume")
+        raise TrainingError(f"{out} has no sweep to resume: start a new one without `resume=True`")
     elif (found := read_json(path, TrainingError, dict[str, Any])) != identity:
         names = [name for name in identity if found.get(name) != identity[name]]
         raise TrainingError(

@@ -233,7 +233,7 @@ def train_on_ray(
         except WorkerDiedError as error:
             raise ClusterError(
                 f"{out}: workers failed repeatedly; the checkpoints are kept: continue with"
-                f" --resume ({error.cause})"
+                f" `resume=True` ({error.cause})"
             ) from error
         finally:
             for text in texts:
@@ -279,5 +279,5 @@ def _workers(wanted: int | None, device: str) -> int:
     available = int(ray.cluster_resources().get("GPU", 0)) if kind == "GPU" else cpus()
     if available < (wanted or 1):
         few = f"{counted(available, kind)} for {counted(wanted or 1, 'worker')}"
-        raise ClusterError(f"the cluster has {few}: start more machines, or lower --workers")
+        raise ClusterError(f"the cluster has {few}: start more machines, or lower `workers=`")
     return wanted or available

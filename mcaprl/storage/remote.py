@@ -302,7 +302,7 @@ def check_upload(url: str, *, overwrite: bool) -> None:
         exists = not overwrite and system.isfile(path)
     if exists:
         raise OutputExistsError(
-            f"{url} exists: choose another URL, or pass --overwrite to record or convert"
+            f"{url} exists: choose another URL, or pass `overwrite=True` to record or convert"
         )
 
 

@@ -160,7 +160,7 @@ def check_local(path: Path) -> None:
         url = str(path).replace(":/", "://", 1)
         raise UsageError(
             f"{url} is a URL, but outputs are local: choose a local path; record, convert and"
-            " train-online copy their logs with --upload URL"
+            " online training copy their logs with `upload=URL`"
         )
 
 

@@ -271,7 +271,7 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise UsageError(
             f"device cuda: torch {torch.__version__} finds no CUDA device; install a torch that is"
-            " built for CUDA, or omit --device"
+            " built for CUDA, or omit `device=`"
         )
     return torch.device(name)
 

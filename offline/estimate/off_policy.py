@@ -331,7 +331,7 @@ def _unusable(behavior: Floats) -> str | None:
     """Return a refusal if logged probabilities are missing or impossible, else None."""
     for wrong, what in (
         (is_impossible(behavior), "not in (0, 1]"),
-        (np.isnan(behavior), "unknown; --estimate-behavior estimates it"),
+        (np.isnan(behavior), "unknown; `estimate_behavior=True` estimates it"),
     ):
         if wrong.any():
             return f"refused: behavior_prob of {wrong.sum()} of {len(wrong)} steps is {what}"

@@ -198,7 +198,7 @@ def read_choice(run: Path) -> Choice:
     try:
         found: Choice = read_json(run / CHOICE_NAME, TrainingError, Choice)
     except FileNotFoundError as error:
-        raise TrainingError(f"{run} has no {CHOICE_NAME}: is it a run of --algo auto?") from error
+        raise TrainingError(f"{run} has no {CHOICE_NAME}: is it a run of `algo='auto'`?") from error
     return found
 
 
@@ -228,7 +228,7 @@ def _advice(traits: LogTraits, tried: Mapping[str, Tried], complete: bool) -> tu
     """Return what data, or which budget, would raise the confidence in the choice."""
     names = [name for name, one in tried.items() if one.outcome in ("chosen", "runner-up")]
     advice = {
-        "Resume with a larger --budget-minutes: the budget ended early.": not complete,
+        "Resume with a larger time budget: the budget ended early.": not complete,
         f"Record more episodes: {traits.episodes} are few for an interval.": (
             traits.episodes < _FEW_EPISODES
         ),

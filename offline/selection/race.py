@@ -195,10 +195,10 @@ def select(
         if name not in (*known, ALL):
             raise UnknownNameError("candidate", name, known)
     if dataset.origin.grow is not None:
-        raise UsageError(f"--follow is not for --algo {AUTO}: omit it")
+        raise UsageError(f"`follow=True` is not for `algo={AUTO!r}`: omit it")
     dataset = with_source(dataset, config.mask_from)
     if len(dataset.episodes) < FOLDS:
-        raise UsageError(f"--algo {AUTO} needs {FOLDS} episodes or more in the log")
+        raise UsageError(f"`algo={AUTO!r}` needs {FOLDS} episodes or more in the log")
     numbers = choose_seeds(out, seeds, seed, resume)
     parts: dict[str, Any] = {"algo": AUTO, "config": config.to_json()}
     # The estimates of all candidates are averages over the same seeds, so none can be added.

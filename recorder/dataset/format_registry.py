@@ -291,8 +291,8 @@ def target_format(path: str | Path, name: str | None) -> Format:
         form = format_named(name)
         if Path(path).suffix == ".mcap":
             raise UsageError(
-                f"{path} has the suffix of logs: choose another name for --to {name}, or omit --to"
-                " to write a log"
+                f"{path} has the suffix of logs: choose another name for `to={name!r}`, or omit"
+                " `to=` to write a log"
             )
         return form
     every = list(every_format())
@@ -302,7 +302,7 @@ def target_format(path: str | Path, name: str | None) -> Format:
     found = found or [form for form in every if form.suffix and form.suffix == suffix]
     if len(found) != 1:
         raise UsageError(
-            f"{path}: the format is not clear from the name; pass --to with one of"
+            f"{path}: the format is not clear from the name; pass `to=` with one of"
             f" {', '.join(form.name for form in every)}, or a name that ends with .mcap"
         )
     return found[0]

@@ -226,7 +226,7 @@ def _unknown_probabilities(dataset: Dataset) -> Iterator[Problem]:
             f"behavior_prob is unknown in {unknown} of {_count(len(dataset), 'step')}",
             _places(dataset, lambda episode: np.isnan(episode.behavior_probs)),
             "off-policy evaluation by importance sampling is not possible without"
-            " --estimate-behavior",
+            " `estimate_behavior=True`",
         )
     elif dataset.has_estimated_probs:
         yield _note(

@@ -330,7 +330,7 @@ def _delays(logs: Sequence[FinishedLog], metadata: LogMetadata | None, *, shift:
             if not shift:
                 raise LogError(
                     f"the episodes of {log.path} overlap in time with those of"
-                    f" {_overlapped(logs[:number], log)}; pass --shift (shift=True in Python) to"
+                    f" {_overlapped(logs[:number], log)}; pass `shift=True` to"
                     f" delay {log.path} until the earlier logs have ended"
                 )
             delay = end + max(gap, 1) - first

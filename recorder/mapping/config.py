@@ -458,7 +458,8 @@ class Mapping(_Part):
     reward: str = Field(
         default="0",
         description="Expression that can use the names of quantities, `next(NAME)` for the value at"
-        " the next step, and `action`; or a Python function `module:function`, with --trust-code.",
+        " the next step, and `action`; or, if the mapping is trusted, a Python function"
+        " `module:function`.",
     )
     episodes: Episodes = Field(default=Episodes(), description="Begin and end of the episodes.")
     behavior_prob: Quantity | None = Field(

@@ -214,7 +214,7 @@ def _reward_of(text: str, *, trust_code: bool) -> Reward:
         return lambda columns, following: expression.evaluate(columns, following).astype(np.float64)
     if not trust_code:
         raise UsageError(
-            f"the function '{text}' is Python code: pass --trust-code if you trust the mapping"
+            f"the function '{text}' is Python code: pass `trust_code=True` if you trust the mapping"
         )
     try:
         function = getattr(importlib.import_module(module), name)

@@ -223,7 +223,7 @@ def _left_out(plan: Plan, runs: Runs) -> list[Problem]:
                     f"{len(stream.failures)} of {counted(count, 'message')} cannot be decoded and"
                     f" are left out; the first is message {row} at {time_ns} ns: {reason}",
                     stream.topic,
-                    next="--strict refuses such bags",
+                    next="a mapping with `strict: true` refuses such bags",
                 )
             )
         if stream.bad_stamps:

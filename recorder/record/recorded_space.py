@@ -206,7 +206,7 @@ def _keys_cure(parts: dict[tuple[str | int, ...], spaces.Space[Any]]) -> str:
         good.append("/".join(map(str, path)))
     if not good:
         return "no part of the observation can be recorded"
-    return f"leave it out with keys={good} (--keys {','.join(good)})"
+    return f"leave it out with `keys={good}`"
 
 
 def value_at(observation: Any, path: Sequence[str | int]) -> Any:

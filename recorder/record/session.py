@@ -216,7 +216,7 @@ class _Parts:
         old = [path for path in family.parent.glob("*") if re.fullmatch(pattern, path.name)]
         if old and not (overwrite or append):
             raise OutputExistsError(
-                f"{min(old)} exists: choose another path, append, or pass --overwrite"
+                f"{min(old)} exists: choose another path, or pass `append=True` or `overwrite=True`"
             )
         for path in old if overwrite else ():
             check_target(path, overwrite=True)

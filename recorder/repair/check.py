@@ -65,7 +65,7 @@ def _note(path: Path) -> Problem:
     return Problem(
         "this is another robot's bag, not a log: its messages were decoded",
         "no topic /rl/step",
-        next="to check its transitions, pass --mapping FILE; `mcaprl convert --suggest BAG > FILE`"
+        next="to check its transitions, pass `mapping=FILE`; `mcaprl convert --suggest BAG > FILE`"
         " drafts one",
         file=str(path),
         severity="note",

@@ -177,5 +177,5 @@ def _add_plan(recovery: Recovery, plan: EpisodePlan) -> None:
     recovery.ended, recovery.strays = len(plan.ended), plan.strays
     if plan.episodes == 0:
         can_end = any(dropped.can_end for dropped in plan.dropped)
-        hint = "; pass --keep-unfinished to keep unfinished episodes" if can_end else ""
+        hint = "; pass `keep_unfinished=True` to keep unfinished episodes" if can_end else ""
         raise NoEpisodesError(f"{recovery.source} has no whole episode{hint}")

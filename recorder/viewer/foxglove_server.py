@@ -197,7 +197,9 @@ class ViewerServer:
         try:
             socket = create_server((HOST, port))
         except OSError as error:
-            raise UsageError(f"cannot listen on {HOST}:{port}: {error}; pass --port") from error
+            raise UsageError(
+                f"cannot listen on {HOST}:{port}: {error}; pass another `port=`"
+            ) from error
         start = partial(
             self._foxglove.start_server,
             name=name,

@@ -45,7 +45,7 @@ def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
     if path.suffix not in kinds:
         raise UnknownNameError("kind of output", path.suffix or path.name, kinds)
     if path.exists() and not overwrite:
-        raise OutputExistsError(f"{path} exists: choose another path, or pass --overwrite")
+        raise OutputExistsError(f"{path} exists: choose another path, or pass `overwrite=True`")
 
 
 def write_video(path: Path, images: Iterable[Image], fps: float) -> int:

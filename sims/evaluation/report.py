@@ -38,7 +38,7 @@ _PAIRS = (
     " the second; ties count half."
 )
 _CARDS = (
-    "env.reset(seed=...) starts the same episode. Episodes that --record writes to a log have the"
+    "env.reset(seed=...) starts the same episode. Episodes that are recorded to a log have the"
     " command that replays them instead. A cross marks an end before the time limit."
 )
 _FLAT_M = 1.0

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import shlex
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -101,8 +99,7 @@ def warn_of_cuts(results: Iterable[EpisodeResult], policy: str, sim: str) -> Non
     if cut:
         warnings.warn(
             f"{policy}: {len(cut)} of {count} episodes in {sim} reached the limit of {max(cut)}"
-            f" steps and were truncated ({STEP_LIMIT}); set another limit with --max-steps"
-            " (max_steps in Python)",
+            f" steps and were truncated ({STEP_LIMIT}); set another limit with `max_steps=N`",
             stacklevel=3,
         )
 
@@ -355,11 +352,11 @@ def check_fit(
             actual = observation_space
         if trained is not None and not same_form(trained, actual):
             name = env.spec.id if env.spec else "the environment"
-            options = as_options(_other_arguments(policy, env))
-            hint = f"; the policy was trained with other arguments: pass {options}"
+            others = _other_arguments(policy, env)
+            hint = f"; the policy was trained with other arguments: pass `sim_options={others!r}`"
             raise PolicyError(
                 f"{policy.name} was trained on {role} {trained}; {name} has"
-                f" {actual}{hint if options else ''}"
+                f" {actual}{hint if others else ''}"
             )
 
 
@@ -367,21 +364,6 @@ def _other_arguments(policy: BasePolicy, env: gym.Env[Any, Any]) -> dict[str, An
     """Return the arguments of the training environment that differ from those of `env`."""
     own = env.spec.kwargs if env.spec else {}
     return {key: value for key, value in policy.env_kwargs.items() if own.get(key) != value}
-
-
-def as_options(arguments: Mapping[str, Any]) -> str:
-    """Return the options of the command line for arguments of an environment.
-
-    >>> as_options({"observation": "depth", "continuous": False})
-    '--observation depth --env-arg continuous=false'
-    """
-    options = []
-    for key, value in arguments.items():
-        if key in ("observation", "rules") and isinstance(value, str):
-            options.append(f"--{key} {shlex.quote(value)}")
-        else:
-            options.append(f"--env-arg {shlex.quote(f'{key}={json.dumps(value, default=repr)}')}")
-    return " ".join(options)
 
 
 def same_form(space: spaces.Space[Any], other: spaces.Space[Any]) -> bool:

@@ -74,7 +74,7 @@ def test_a_converted_bag_is_an_equal_log(bag: Path, tmp_path: Path) -> None:
     assert not mcaprl.check(out).problems
     with pytest.raises(OutputExistsError):
         mcaprl.convert(lambda: pytest.fail("read too early"), out)
-    with pytest.raises(UsageError, match=r"x.mcap has the suffix of logs: .* for --to npz"):
+    with pytest.raises(UsageError, match=r"x.mcap has the suffix of logs: .* for `to='npz'`"):
         mcaprl.convert(out, tmp_path / "x.mcap", to="npz")
     with pytest.raises(UsageError, match="the format is not clear from the name"):
         mcaprl.convert(data, tmp_path / "robot.unknown")

@@ -22,7 +22,6 @@ from mcaprl.offline.algorithms.config import BCConfig
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.recorder.format.metadata import LogMetadata, as_json
 from mcaprl.sims import make_sim
-from mcaprl.sims.evaluation.rollout import as_options
 
 
 class Wide(gym.Env[Any, Any]):
@@ -231,7 +230,7 @@ def test_json_values() -> None:
 
 def test_a_run_is_evaluated_with_the_arguments_of_its_log(tmp_path: Path) -> None:
     run_folder = trained(tmp_path, width=3, scale=2.0)
-    advice = r"trained with other arguments: pass --env-arg width=3 --env-arg scale=2.0"
+    advice = r"trained with other arguments: pass `sim_options=\{'width': 3, 'scale': 2.0\}`"
     with (
         pytest.warns(UserWarning, match=r"was trained with width=3, scale=2.0, but Wide-v0 is"),
         pytest.raises(PolicyError, match=advice),
@@ -278,13 +277,6 @@ def test_own_sims_need_no_trust(tmp_path: Path) -> None:
     assert [s.mean_return for s in own.policies] == [s.mean_return for s in given.policies]
 
 
-def test_options_of_the_command_line() -> None:
-    arguments = {"observation": "depth", "continuous": False, "config": {"a b": 1}}
-    assert as_options(arguments) == (
-        "--observation depth --env-arg continuous=false --env-arg 'config={\"a b\": 1}'"
-    )
-
-
 class Noted(Wide):
     """An environment with a Dict of a vector and a text."""
 
@@ -305,7 +297,7 @@ def test_a_policy_of_some_keys_acts_in_the_whole_environment(
         log = tmp_path / "log.mcap"
         record = ["record", "Noted-v0", "--policy", "random", "--episodes", "2", "--out", str(log)]
         assert run(record) == 1
-        assert "leave it out with keys=['x'] (--keys x)" in capsys.readouterr().err
+        assert "leave it out with --keys x" in capsys.readouterr().err
         assert run([*record, "--keys", "x"]) == 0
         data = mcaprl.open(log)
         assert data.observation_space == spaces.Dict({"x": spaces.Box(-9, 9, (2,), np.float32)})

@@ -38,5 +38,5 @@ def test_pytorch_uses_the_given_threads_and_the_work_is_announced(threads: int) 
 
 
 def test_no_threads_are_refused() -> None:
-    with pytest.raises(UsageError, match="--threads 0"):
+    with pytest.raises(UsageError, match="`threads=0`"):
         mcaprl.estimate("random", crossing(), threads=0)

@@ -68,7 +68,9 @@ STEPPING: list[Callable[[Path, dict[str, Any]], Any]] = [
 def test_a_module_is_imported_only_with_trust(foreign: Path, step: Any) -> None:
     pytest.importorskip("imageio")
     log = recorded(foreign / "log.mcap")
-    with pytest.raises(UsageError, match=r"foreign_envs would be imported.*--trust-env.*--sim"):
+    with pytest.raises(
+        UsageError, match=r"foreign_envs would be imported.*`trust_env=True` or `sim='"
+    ):
         step(log, {})
     assert not Path("imported").exists()
     # Some commands fail later, because the environment lacks what they need.

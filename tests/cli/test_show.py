@@ -5,10 +5,15 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from contextlib import redirect_stdout
+from pathlib import Path
 
+import click
 import pytest
 
-from mcaprl.cli.show import echo, print_table
+import mcaprl
+from mcaprl.cli import cli, run
+from mcaprl.cli.show import as_options, echo, print_table
+from mcaprl.errors import LogError, OutputExistsError
 
 COLUMNS = ["policy", "mean return", "95 % interval", "IQM", "random 0, pilot 1", "success", "ends"]
 ROWS = [
@@ -62,3 +67,47 @@ def test_a_long_line_is_wrapped_between_words() -> None:
 def test_a_line_in_a_pipe_is_not_wrapped(capsys: pytest.CaptureFixture[str]) -> None:
     echo("word " * 100)
     assert capsys.readouterr().out == "word " * 100 + "\n"
+
+
+def test_a_function_names_its_argument_and_a_command_its_option(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.json"
+    path.touch()
+    with pytest.raises(OutputExistsError, match=r"choose another path, or pass `overwrite=True`$"):
+        mcaprl.layout("lane", path)
+    assert run(["layout", "lane", "--out", str(path)]) == 2
+    assert capsys.readouterr().err.endswith("choose another path, or pass --overwrite\n")
+
+
+def test_an_argument_in_a_quoted_message_or_a_table_becomes_an_option() -> None:
+    error = LogError(f"a: {LogError('pass `one_episode=True` or `dones=`')}")
+    assert as_options(str(error)) == "a: pass --one-episode or --dones"
+    shown = shown_in_terminal(lambda: print_table("", ["a"], [["pass `shift=True`"]]))
+    assert "│ pass --shift │" in " ".join(shown.split())
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        ("`algo='auto'` or `speed=0.5`", "--algo auto or --speed 0.5"),
+        ("`behavior='a`b'` is odd", "--behavior a`b is odd"),
+        ("`sources=`, `sim_options={'map_name': 'a b'}`", "--from, --env-arg 'map_name=\"a b\"'"),
+        ("`sim_options={'config': {'a b'…`", "--env-arg {'config': {'a b'…"),
+        ("set `missing`, or `x: 1`; `/rl/step`", "set `missing`, or `x: 1`; `/rl/step`"),
+    ],
+)
+def test_forms_of_arguments(message: str, expected: str) -> None:
+    assert as_options(message) == expected
+
+
+def test_every_argument_becomes_the_option_of_its_command() -> None:
+    options = [
+        option
+        for command in cli.commands.values()
+        for option in command.params
+        if isinstance(option, click.Option)
+    ]
+    others = {one.name for one in options if as_options(f"`{one.name}=`") not in one.opts}
+    # These options are not arguments of functions.
+    assert others == {"as_json", "source_format", "strict_mapping", "verifies"}

@@ -68,7 +68,7 @@ def test_a_run_has_the_policies_metrics_and_scores_of_all_seeds(tmp_path: Path) 
     assert policy.act(np.zeros((3, 12), np.float32)).shape == (3,)
     with pytest.raises(OutputExistsError):
         mcaprl.train_online("lane", folder, device="cpu", **SMALL)
-    with pytest.raises(TrainingError, match="was trained with --device"):
+    with pytest.raises(TrainingError, match="was trained with `device=`"):
         mcaprl.train_online("lane", folder, resume=True)
 
 
@@ -137,12 +137,12 @@ def test_agents_learn_to_keep_the_lane() -> None:
 @pytest.mark.parametrize(
     ("request_", "message"),
     [
-        ({"algo": "ppo"}, "--device trains double-dqn only: omit --algo ppo"),
-        ({"record": "log.mcap"}, "--record cannot be combined with --device"),
-        ({"resume": True}, "--resume cannot be combined with --device"),
-        ({"live": True}, "--live cannot be combined with --device"),
-        ({"sources": "log.mcap"}, "--from cannot be combined with --device"),
-        ({"eval_interval": 100}, "--eval-interval has no effect with --device"),
+        ({"algo": "ppo"}, "`device=` trains double-dqn only: omit `algo='ppo'`"),
+        ({"record": "log.mcap"}, "`record=` cannot be combined with `device=`"),
+        ({"resume": True}, "`resume=` cannot be combined with `device=`"),
+        ({"live": True}, "`live=` cannot be combined with `device=`"),
+        ({"sources": "log.mcap"}, "`sources=` cannot be combined with `device=`"),
+        ({"eval_interval": 100}, "`eval_interval=` has no effect with `device=`"),
         ({"observation": "depth"}, "has no argument observation"),
         ({"envs": 0}, "envs"),
     ],

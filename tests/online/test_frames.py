@@ -157,7 +157,7 @@ def test_a_stacking_offline_policy_initializes_an_agent(tmp_path: Path) -> None:
         assert model.replay_buffer.frames[""].shape[2:] == (12,)
     with (
         closing(agent(tmp_path, frame_stack=1)) as other,
-        pytest.raises(PolicyError, match=r"stacks 3 observations.*--frame-stack"),
+        pytest.raises(PolicyError, match=r"stacks 3 observations.*`frame_stack=3`"),
     ):
         other.start_from(None, policy)
 

@@ -237,5 +237,5 @@ def test_a_port_in_use_is_refused() -> None:
     task = Task.for_sim("lane", **SHORT)
     with closing(LiveTraining(task, port=0)) as live:
         port = int(live.stream.url.rpartition(":")[2])
-        with pytest.raises(UsageError, match=rf"cannot listen on 127.0.0.1:{port}.*--port"):
+        with pytest.raises(UsageError, match=rf"cannot listen on 127.0.0.1:{port}.*`port=`"):
             LiveTraining(task, port=port)

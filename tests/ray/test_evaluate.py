@@ -56,9 +56,9 @@ def test_the_command_prints_the_same_with_one_worker(
 
 
 def test_options_that_exclude_each_other(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="--record needs one process"):
+    with pytest.raises(UsageError, match="`record=` needs one process"):
         mcaprl.evaluate("random", SEEDED, episodes=1, ray=True, record=tmp_path / "a.mcap")
-    with pytest.raises(UsageError, match="--workers requires --ray"):
+    with pytest.raises(UsageError, match="`workers=` requires `ray=True`"):
         mcaprl.evaluate("random", SEEDED, episodes=1, workers=2)
 
 

@@ -119,7 +119,7 @@ def test_old_shards_are_replaced_only_on_request(
     """Record the same episodes with another number of workers and shards."""
     folder = tmp_path / "logs"
     shutil.copytree(recorded.folder, folder)
-    with pytest.raises(OutputExistsError, match="pass --overwrite"):
+    with pytest.raises(OutputExistsError, match="pass `overwrite=True`"):
         record(folder, 2)
     found = record(folder, 13, workers=1, shards=3, overwrite=True)
     assert found.episodes == 13
@@ -209,11 +209,11 @@ def test_an_error_of_the_sim_ends_the_recording(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"envs": 2}, "--envs is for recording without --ray"),
-        ({"append": True}, "--append is for recording without --ray"),
-        ({"rotate_mb": 1.0}, "--rotate-mb is for recording without --ray"),
-        ({"workers": 0}, "--workers 0: give"),
-        ({"shards": 0}, "--shards 0: give"),
+        ({"envs": 2}, "`envs=` is for recording without `ray=True`"),
+        ({"append": True}, "`append=` is for recording without"),
+        ({"rotate_mb": 1.0}, "`rotate_mb=` is for recording without"),
+        ({"workers": 0}, "`workers=0`: give"),
+        ({"shards": 0}, "`shards=0`: give"),
     ],
 )
 def test_options_that_exclude_each_other(
@@ -221,7 +221,7 @@ def test_options_that_exclude_each_other(
 ) -> None:
     with pytest.raises(UsageError, match=message):
         record(tmp_path / "a", 2, **options)
-    with pytest.raises(UsageError, match="requires --ray"):
+    with pytest.raises(UsageError, match="requires `ray=True`"):
         mcaprl.record(SEEDED, tmp_path / "b", policy="random", episodes=1, shards=2)
     with pytest.raises(UsageError, match="the name of a file"):
         record(tmp_path / "a.mcap", 2)

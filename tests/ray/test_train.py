@@ -145,7 +145,7 @@ def test_options_that_cannot_be_used_with_ray(logs: Path, tmp_path: Path) -> Non
     def train(data: Any = logs, **options: Any) -> None:
         mcaprl.train(data, tmp_path / "run", algo="bc", updates=1, **options)
 
-    with pytest.raises(UsageError, match="--workers requires --ray"):
+    with pytest.raises(UsageError, match="`workers=` requires `ray=True`"):
         train(ray=ClusterOptions(False, workers=2))
     first = mcaprl.open(logs).filter(lambda episode: episode.index == 0)
     with pytest.raises(UsageError, match="workers read logs: pass their paths"):
@@ -178,7 +178,9 @@ def test_a_training_whose_workers_die_is_one_line(
         for process in titled("ray::run_task"):
             os.kill(process, signal.SIGKILL)
 
-    with pytest.raises(ClusterError, match=r"the checkpoints are kept: continue with --resume \("):
+    with pytest.raises(
+        ClusterError, match=r"the checkpoints are kept: continue with `resume=True` \("
+    ):
         mcaprl.train(
             logs,
             tmp_path / "run",

@@ -115,7 +115,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     except SpaceError as error:
         if not lossy:
             raise SpaceError(
-                f"{error}; pass --lossy (lossy=True in Python) to write the actions unchanged"
+                f"{error}; pass `lossy=True` to write the actions unchanged"
             ) from error
         lost.append(f"{error}; the actions are written unchanged")
     leaves = observation_leaves(dataset.observation_space)

@@ -268,8 +268,7 @@ def _with_done(
     if dones is None:
         notes.append(
             f"'{name}' may also mark truncated episodes, and no other array says which; it is read"
-            " as termination (--dones truncated, or dones='truncated' in Python, reads it as"
-            " truncation)"
+            " as termination (`dones='truncated'` reads it as truncation)"
         )
     return done, last or done
 
@@ -283,8 +282,7 @@ def _unknown_kind(
         episodes = counted(int(others.sum()), "episode")
         notes.append(
             f"'{name}' ends {episodes}, and no array says whether they terminated; they are read as"
-            " truncated (--dones terminated, or dones='terminated' in Python, reads them as"
-            " terminated)"
+            " truncated (`dones='terminated'` reads them as terminated)"
         )
     return (others, is_cut) if dones == "terminated" else (none, is_cut | others)
 

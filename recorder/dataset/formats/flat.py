@@ -155,8 +155,8 @@ class _Steps:
             return
         raise LogError(
             f"nothing says where the episodes of {counted(self._count, 'row')} end: no end flag is"
-            " set; add the flags, or, if it is one episode, convert it with --one-episode"
-            " (one_episode=True in Python)"
+            " set; add the flags, or, if it is one episode, convert it with"
+            " `one_episode=True`"
         )
 
     def episodes(self, infos: Mapping[str, NDArray[Any]]) -> Iterator[EpisodeArrays]:

@@ -45,7 +45,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     if isinstance(dataset.observation_space, spaces.Dict):
         lost.append("a Dict observation becomes one array for each key, which D4RL cannot read")
     if lost and not lossy:
-        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the dataset")
+        raise SpaceError(f"{lost[0]}; pass `lossy=True` to write the dataset")
     lasts = np.cumsum(dataset.episode_lengths) - 1
     timeouts = dataset.truncated.copy()
     timeouts[lasts] |= ~dataset.terminated[lasts]

@@ -56,7 +56,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     space, renamed = with_names_for_hdf5(dataset.observation_space)
     lost += [f"the key '{key}' is renamed, because an archive cannot store it" for key in renamed]
     if lost and not lossy:
-        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the rest")
+        raise SpaceError(f"{lost[0]}; pass `lossy=True` to write the rest")
     finals = np.array([frames.stop - 1 for _, frames in episode_slices(dataset)])
     with zipfile.ZipFile(path, "w") as archive:
         leaves = leaves_of(dataset.observation_space)

@@ -70,7 +70,7 @@ def write(
     leaves = leaves_of(dataset.observation_space)
     columns, lost = _without_some_infos(dataset._transitions)
     if lost and not lossy:
-        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to leave it out")
+        raise SpaceError(f"{lost[0]}; pass `lossy=True` to leave it out")
     metadata = LogMetadata.from_strings(dataset.metadata)
     unwanted = [] if next_observations else [f"next_{name}" for name in observation_names(leaves)]
     writer = None

@@ -134,7 +134,7 @@ def test_the_command_estimates_what_a_log_lacks(
     refused = json.loads(capsys.readouterr().out)
     assert refused["behavior_estimate"] is None
     verdicts = [one["verdict"] for one in refused["estimates"]]
-    assert any("unknown; --estimate-behavior estimates it" in verdict for verdict in verdicts)
+    assert any("unknown; `estimate_behavior=True` estimates it" in verdict for verdict in verdicts)
     assert run([*command, "--estimate-behavior"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert len(found["behavior_estimate"]["folds"]) == 5

@@ -173,7 +173,7 @@ def test_unknown_probabilities_leave_only_the_model_estimate() -> None:
         assert found[name].value is None
         assert found[name].verdict == (
             f"refused: behavior_prob of 5 of {len(data)} steps is unknown;"
-            " --estimate-behavior estimates it"
+            " `estimate_behavior=True` estimates it"
         )
 
 

@@ -562,7 +562,7 @@ def test_other_data_are_accepted_on_request(tmp_path: Path) -> None:
         train(corridor(), config, tmp_path / "run", progress=StopAt(50))
     before = read_policy(tmp_path / "run" / "seed-0").encoder
     other = corridor({(1, 0): 3, (2, 1): 1, (3, 1): 2})
-    with pytest.raises(TrainingError, match=r"other data;.*--other-data"):
+    with pytest.raises(TrainingError, match=r"other data;.*`other_data=True`"):
         train(other, config, tmp_path / "run", resume=True, progress=silent)
     (summary,) = train(
         other, config, tmp_path / "run", resume=True, other_data=True, progress=silent

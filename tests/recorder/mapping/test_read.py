@@ -481,7 +481,7 @@ def test_a_reward_that_is_not_a_number_is_refused() -> None:
 
 
 def test_code_runs_only_if_it_is_trusted() -> None:
-    with pytest.raises(UsageError, match="pass --trust-code if you trust the mapping"):
+    with pytest.raises(UsageError, match="pass `trust_code=True` if you trust the mapping"):
         read(drive(), reward="tests.recorder.mapping.test_read:double_speed")
     chosen = mapping(reward="tests.recorder.mapping.test_read:double_speed")
     found = read_open_bag(drive(), chosen, trust_code=True)

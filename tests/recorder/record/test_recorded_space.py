@@ -112,7 +112,7 @@ def test_keys_select_the_recorded_parts(log_path: Path) -> None:
     with pytest.raises(
         SpaceError,
         match=r"observation\['mission'\] is a MissionSpace space.*leave it out with"
-        r" keys=\['direction', 'image'\] \(--keys direction,image\)",
+        r" `keys=\['direction', 'image'\]`",
     ):
         mcaprl.RecordMcap(Grid(), log_path)
     assert not log_path.exists()

@@ -271,7 +271,7 @@ def test_only_an_unfinished_episode(log_path: Path) -> None:
     damaged = damaged[: start[0]] + damaged[start[0] + start[1] :]
     log_path.write_bytes(damaged)
     out = log_path.with_name("out.mcap")
-    with pytest.raises(NoEpisodesError, match="no whole episode; pass --keep-unfinished"):
+    with pytest.raises(NoEpisodesError, match="no whole episode; pass `keep_unfinished=True`"):
         recover_log(log_path, out)
     assert not out.exists()
     recovery, data = recovered(log_path, damaged, keep_unfinished=True)

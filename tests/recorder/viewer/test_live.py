@@ -484,5 +484,5 @@ def test_a_port_in_use_is_refused(log: Path) -> None:
     player = Player([Track(McapReader(log))])
     with closing(LiveServer(player, port=0)) as server:
         port = int(server.url.rpartition(":")[2])
-        with pytest.raises(UsageError, match=rf"cannot listen on 127.0.0.1:{port}.*--port"):
+        with pytest.raises(UsageError, match=rf"cannot listen on 127.0.0.1:{port}.*`port=`"):
             LiveServer(player, port=port)

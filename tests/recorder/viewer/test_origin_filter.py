@@ -139,7 +139,7 @@ def test_messages_pass_through_the_filter(server: LiveServer) -> None:
 
 def test_a_port_in_use_is_one_clear_error(server: LiveServer) -> None:
     port = int(server.url.rpartition(":")[2])
-    with pytest.raises(UsageError, match=rf"cannot listen on 127.0.0.1:{port}.*--port"):
+    with pytest.raises(UsageError, match=rf"cannot listen on 127.0.0.1:{port}.*`port=`"):
         LiveServer(server._player, port=port)
 
 

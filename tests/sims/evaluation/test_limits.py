@@ -147,11 +147,11 @@ def test_an_argument_of_the_environment_may_have_the_same_name() -> None:
 
 
 def test_a_limit_must_be_positive(log_path: Path) -> None:
-    with pytest.raises(UsageError, match="--max-steps 0: give a number of at least 1"):
+    with pytest.raises(UsageError, match="`max_steps=0`: give a number of at least 1"):
         mcaprl.record("lane", log_path, episodes=1, max_steps=0)
-    with pytest.raises(UsageError, match="--max-steps -1"):
+    with pytest.raises(UsageError, match="`max_steps=-1`"):
         mcaprl.evaluate("random", "lane", max_steps=-1)
-    with pytest.raises(UsageError, match="--max-steps 0"):
+    with pytest.raises(UsageError, match="`max_steps=0`"):
         mcaprl.train_online("lane", log_path.with_suffix(""), max_steps=0)
 
 

@@ -102,7 +102,7 @@ def _losses(dataset: Dataset, *, lossy: bool, video: bool) -> list[str]:
             if features.feature_of(name, leaf, video=True).dtype == "video"
         ]
     if found and not lossy:
-        raise SpaceError(f"{found[0]}; pass --lossy (lossy=True in Python) to write the dataset")
+        raise SpaceError(f"{found[0]}; pass `lossy=True` to write the dataset")
     return found
 
 

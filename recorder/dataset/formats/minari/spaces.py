@@ -19,7 +19,7 @@ from mcaprl.recorder.format.spaces import Leaf, leaves_of, space_from_json
 # Shortest edge, in pixels, of the images that Minari may store as JPEG.
 _MIN_JPEG_EDGE = 32
 _STORABLE = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
-_REMEDY = "convert it with --lossy (lossy=True in Python) to {}"
+_REMEDY = "convert it with `lossy=True` to {}"
 
 
 class StoredSpace(NamedTuple):

@@ -51,7 +51,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
     info_names, lost_names = nested_names(infos)
     lost += [*_lost_options(dataset), *lost_infos, *lost_names]
     if lost and not lossy:
-        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the dataset")
+        raise SpaceError(f"{lost[0]}; pass `lossy=True` to write the dataset")
     leaves = observation_leaves(dataset.observation_space)
     keys = [leaf.path for leaf in observation_leaves(space)]
     columns = [leaf.of(dataset.frames) for leaf in leaves]

@@ -200,7 +200,7 @@ def test_actions_that_d3rlpy_does_not_have_are_refused(tmp_path: Path) -> None:
         )
         with pytest.raises(SpaceError, match=message):
             dataset.to_d3rlpy()
-        with pytest.raises(SpaceError, match="pass --lossy"):
+        with pytest.raises(SpaceError, match="pass `lossy=True`"):
             _write(dataset, tmp_path / "out.h5")
         assert not (tmp_path / "out.h5").exists()
 

@@ -153,7 +153,9 @@ def test_flags_without_any_end_are_refused_unless_it_is_one_episode(tmp_path: Pa
     for has_next in (False, True):
         for name in ("terminals", "dones", "is_last"):
             path = _write(tmp_path / "their.hdf5", {name: none}, has_next=has_next)
-            with pytest.raises(LogError, match=r"nothing says .* of 7 rows end: .*--one-episode"):
+            with pytest.raises(
+                LogError, match=r"nothing says .* of 7 rows end: .*`one_episode=True`"
+            ):
                 mcaprl.open(path)
     found = _open(
         _write(path, {"terminals": none}), "there are no timeouts", "no next", one_episode=True

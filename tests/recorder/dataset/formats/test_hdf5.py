@@ -109,7 +109,7 @@ def test_dict_observations_are_refused_or_written_by_key(tmp_path: Path) -> None
         terminated=[True, True],
         truncated=[False, False],
     )
-    with pytest.raises(SpaceError, match=r"a Dict observation.*--lossy"):
+    with pytest.raises(SpaceError, match=r"a Dict observation.*`lossy=True`"):
         data.to_hdf5(tmp_path / "toy.hdf5")
     assert not (tmp_path / "toy.hdf5").exists()
     sentence, _ = data.to_hdf5(tmp_path / "toy.hdf5", lossy=True)

@@ -275,7 +275,7 @@ def test_keys_that_hdf5_cannot_hold_are_refused_or_renamed(tmp_path: Path) -> No
         observation_space=space,
         action_space=spaces.Discrete(2),
     )
-    with pytest.raises(SpaceError, match=r"the key 'a/b' is renamed.*--lossy"):
+    with pytest.raises(SpaceError, match=r"the key 'a/b' is renamed.*`lossy=True`"):
         data.to_minari(tmp_path / "odd-v0")
     assert not (tmp_path / "odd-v0").exists()
     (sentence,) = data.to_minari(tmp_path / "odd-v0", lossy=True)
@@ -402,7 +402,7 @@ def _episode(
 @pytest.mark.parametrize("form", _FORMS)
 def test_texts_are_refused_or_left_out(minari: Any, form: str, tmp_path: Path) -> None:
     path = _episode(minari, form, spaces.Discrete(2), np.array([1, 0]), text=True)
-    message = r"observation\['mission'\] is a Text space; .*--lossy \(lossy=True .* leave it out"
+    message = r"observation\['mission'\] is a Text space; .*`lossy=True` .* leave it out"
     with pytest.raises(SpaceError, match=message):
         mcaprl.open(path)
     for read in (mcaprl.open, Dataset.from_minari):
@@ -429,7 +429,9 @@ def test_parts_of_an_action_are_refused_or_joined(minari: Any, form: str) -> Non
             "turn": np.array([[3], [-3]], np.float32),
         },
     )
-    with pytest.raises(SpaceError, match=r"action is a Dict space; .*--lossy .*to join its parts"):
+    with pytest.raises(
+        SpaceError, match=r"action is a Dict space; .*`lossy=True` to join its parts"
+    ):
         mcaprl.open(path)
     with (
         pytest.warns(UserWarning, match="the parts arm, turn of the action are joined"),

@@ -183,7 +183,7 @@ def test_infos_that_a_table_cannot_hold_are_refused(tmp_path: Path) -> None:
         dataset = _vectors(infos=[{"x": [value, value], "y": [1, None]}])
         with pytest.raises(SpaceError, match=message):
             dataset.to_arrow()
-        with pytest.raises(SpaceError, match=rf"{message}.*pass --lossy"):
+        with pytest.raises(SpaceError, match=rf"{message}.*pass `lossy=True`"):
             dataset.to_parquet(tmp_path / "out")
         (lost,) = dataset.to_parquet(tmp_path / "out", lossy=True, overwrite=True)
         assert lost.startswith("the info 'x' has")

@@ -444,7 +444,7 @@ def test_bins_are_for_suggestions(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "edges: [[" in capsys.readouterr().out
     assert run(["convert", str(bag), "--dry-run", "--bins", "3"]) == 2
     assert "--bins is for --suggest" in capsys.readouterr().err
-    with pytest.raises(UsageError, match="--bins 1: give a number of at least 2"):
+    with pytest.raises(UsageError, match="`bins=1`: give a number of at least 2"):
         mcaprl.suggest_mapping(bag, bins=1)
 
 
