@@ -86,7 +86,7 @@ def texts(path: Path) -> list[str]:
         for part in (node.values if isinstance(node, ast.JoinedStr) else [node.value])
     }
     joined = [
-        "".join(part.value if isinstance(part, ast.Constant) else "{}" for part in node.values)
+        "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values)
         for node in ast.walk(tree)
         if isinstance(node, ast.JoinedStr)
     ]
