@@ -160,7 +160,7 @@ def test_other_sims_and_devices_are_refused(tmp_path: Path) -> None:
         mcaprl.train_online("powerline", tmp_path / "run", device="cpu")
     with pytest.raises(UnknownNameError, match="device"):
         mcaprl.train_online("lane", tmp_path / "run", device="tpu")
-    with pytest.raises(UsageError, match="needs a SIM"):
+    with pytest.raises(UsageError, match="needs a sim"):
         mcaprl.train_online(None, tmp_path / "run", device="cpu")
     assert not (tmp_path / "run").exists()
 
