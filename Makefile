@@ -12,16 +12,17 @@ PIP := PYTHONWARNINGS=ignore:::setuptools.command.editable_wheel $(BIN)/python -
 QUICK := $(if $(filter true,$(CI)),,-m "not slow and not long")
 EXTRAS := sims,offline,online,report,tables,video,export,foxglove,bags,remote,ray,fast
 # What works with new versions of the dependencies: reading, recording, sims, learning and the API.
-CORE := tests/recorder tests/sims tests/offline tests/online tests/api
+NEWEST_TESTS := tests/recorder tests/sims tests/offline tests/online tests/api
 # A change of these files reinstalls the environments.
 SETTINGS := pyproject.toml constraints.txt setup.py recorder/columns/_native.c
 
-.PHONY: help demo test newest faults fuzz sanitize check bench bench-learning sim-grid docs docs-test vendor wheel clean
+.PHONY: help demo test core newest faults fuzz sanitize check bench bench-learning sim-grid docs docs-test vendor wheel clean
 
 help:
 	@echo "make demo             record a car, train on its log offline, evaluate, and write the replay"
 	@echo "make test             run the tests; with CI=true, also those that take minutes"
-	@echo "make newest           run the core tests with the newest version of every dependency (for a schedule)"
+	@echo "make core             run the tests of the main paths in two minutes; needs pip alone"
+	@echo "make newest           run most tests with the newest version of every dependency (for a schedule)"
 	@echo "make faults           run the fault tests at full size: kills, damaged files, changed inputs, failed writes"
 	@echo "make fuzz             fuzz the reader for ten minutes"
 	@echo "make sanitize         test the C code with AddressSanitizer and UndefinedBehaviorSanitizer (needs gcc)"
@@ -46,13 +47,16 @@ demo: $(VENV)/.demo
 test: $(VENV)/.dev $(VENV)/.lerobot $(VENV)/.s3 $(VENV)/.rivals tests/node/node_modules
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder $(QUICK)
 
+core: $(VENV)/.core
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m core tests
+
 # The environment is new each time, and constraints.txt does not apply.
 newest:
 	$(PYTHON) -m venv --clear $(NEWEST)
 	$(NEWEST)/bin/python -m pip install -qq --disable-pip-version-check --upgrade 'pip>=25.1'
 	$(NEWEST)/bin/python -m pip install -qq --disable-pip-version-check -e '.[$(EXTRAS)]' --group dev
 	$(NEWEST)/bin/python -m pip freeze --exclude-editable > $(NEWEST)/versions.txt
-	OMP_NUM_THREADS=1 $(NEWEST)/bin/python -m pytest -q -m "not slow and not long" $(CORE) \
+	OMP_NUM_THREADS=1 $(NEWEST)/bin/python -m pytest -q -m "not slow and not long" $(NEWEST_TESTS) \
 	  || { echo "the versions are in $(NEWEST)/versions.txt; compare them with constraints.txt"; exit 1; }
 
 faults: $(VENV)/.dev
@@ -124,6 +128,11 @@ $(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
 $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
 	@echo "installing into $(VENV)"
 	$(PIP) -e '.[$(EXTRAS)]' --group dev
+	@touch $@
+
+$(VENV)/.core: $(SETTINGS) | $(VENV)/bin/python
+	@echo "installing into $(VENV)"
+	$(PIP) -e '.[sims,offline]' pytest hypothesis
 	@touch $@
 
 # The libraries that the benchmarks compare with.

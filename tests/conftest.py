@@ -17,6 +17,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from mcaprl.ray.cluster import LOCAL, connect, local_settings
+from tests.support.paths import CORE
 
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -30,8 +31,17 @@ settings.register_profile(
 settings.load_profile("mcaprl")
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With `-m core`, import no other modules, which may need packages that are missing."""
+    is_core = collection_path.is_dir() or collection_path in CORE
+    return True if config.option.markexpr == "core" and not is_core else None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the examples, which take long, so that no process runs them alone at the end."""
+    """Mark the core tests, and start with the examples, which take long, not to end with them."""
+    for item in items:
+        if item.path in CORE:
+            item.add_marker("core")
     items.sort(key=lambda item: item.path.name != "test_examples.py")
 
 

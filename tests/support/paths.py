@@ -1,4 +1,4 @@
-"""Folders that tests read."""
+"""Folders that tests read, and the files of the core tests."""
 
 from __future__ import annotations
 
@@ -9,3 +9,4 @@ ROOT = TESTS.parent
 GOLDEN = TESTS / "golden"
 NODE = TESTS / "node"
 FUZZ_CORPUS = TESTS / "fuzz_corpus"
+CORE = {TESTS / name for name in (TESTS / "core.txt").read_text().split()}

@@ -8,6 +8,7 @@ import numpy as np
 
 from mcaprl.sims.geometry.paths import closed_path
 from mcaprl.sims.racer.course import Car, Track, placed
+from mcaprl.sims.racer.rules import drive, outcome_of
 
 
 def corridor(top_px: float = 100.0, bottom_px: float = 200.0) -> Track:
@@ -26,3 +27,9 @@ def car_in(
     """Return a car at a position; its next gate is the first gate."""
     car = placed(track, x_px, y_px, math.radians(heading_deg), speed_px, x_px / 10)
     return car._replace(next_gate=0.0)
+
+
+def outcome(before: Car, action: int, *, classic: bool) -> tuple[float, int]:
+    """Return the reward and the end of one step in the corridor."""
+    track = corridor()
+    return outcome_of(track, before, drive(track, before, action, classic, False), classic)

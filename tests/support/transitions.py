@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from mcaprl import Dataset
 from mcaprl.recorder.format.spaces import leaves_of
+from tests.support.recordings import assert_same_bits
 
 
 def is_plain(data: Dataset) -> bool:
@@ -32,17 +31,10 @@ def same_transitions(found: Dataset, data: Dataset, *, probs: bool = True) -> No
     """
     assert found.episode_lengths.tolist() == data.episode_lengths.tolist()
     is_index = data.actions.ndim == 1 and data.actions.dtype.kind in "iu"
-    same_bits(found.actions, data.actions.astype(np.int64) if is_index else data.actions)
+    assert_same_bits(found.actions, data.actions.astype(np.int64) if is_index else data.actions)
     names = ["rewards", "terminated", "truncated"]
     for name in [*names, "behavior_probs"] if probs else names:
-        same_bits(getattr(found, name), getattr(data, name))
+        assert_same_bits(getattr(found, name), getattr(data, name))
     mine, theirs = leaves_of(found.observation_space), leaves_of(data.observation_space)
     for leaf, other in zip(mine, theirs, strict=True):
-        same_bits(leaf.of(found.frames), other.of(data.frames))
-
-
-def same_bits(found: Any, expected: Any) -> None:
-    """Check that two arrays have the same dtype, shape and bytes."""
-    found, expected = np.asarray(found), np.asarray(expected)
-    assert (found.dtype, found.shape) == (expected.dtype, expected.shape)
-    assert found.tobytes() == expected.tobytes()
+        assert_same_bits(leaf.of(found.frames), other.of(data.frames))

@@ -239,7 +239,6 @@ def test_an_empty_selection(tmp_path: Path) -> None:
     assert (len(none), none.episodes) == (0, ())
     assert none.observations.shape == (0, 1)
     assert np.isnan(none.statistics.mean_return)
-    assert none.to_arrow().num_rows == 0
     with pytest.raises(LogError, match="no episodes"):
         none.save(tmp_path / "none.mcap")
     with pytest.raises(LogError, match="no data"):
@@ -271,6 +270,8 @@ def test_transition_table() -> None:
 
 
 def test_episode_table() -> None:
+    pytest.importorskip("pyarrow")
+    assert small().filter(lambda episode: False).to_arrow().num_rows == 0
     pytest.importorskip("pandas")
     frame = small().to_pandas("episodes")
     assert frame["total_reward"].tolist() == [3.0, -4.0, 0.75]

@@ -275,6 +275,7 @@ def test_existing_output_is_kept(log: Path, tmp_path: Path) -> None:
 
 def test_a_folder_with_other_files_is_not_replaced(log: Path, tmp_path: Path) -> None:
     """Only parts that an earlier run wrote are replaced: not the log, and not the user's notes."""
+    pytest.importorskip("pyarrow")
     before = log.read_bytes()
     with pytest.raises(OutputExistsError, match=r"files \(log.mcap\), which would be deleted"):
         mcaprl.split(log, tmp_path, episodes=2, overwrite=True)

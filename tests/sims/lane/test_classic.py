@@ -237,11 +237,3 @@ def test_fault_in_a_second_nothing_can_be_corrected() -> None:
     for action in (RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT):
         sim.reset(options={"pose": (60.0, 1.0, 0.0, 15.0)})
         assert sim.step(action)[4]["reason"] == "off_lane"
-
-
-def test_fault_half_of_the_image_codes_are_for_1_to_2_m() -> None:
-    sim = lane(observation="depth")
-    observation, _ = sim.reset(seed=0)
-    depth_m = sim.depth_image_m()
-    assert observation[:, :, 0][depth_m > 2.0].max() <= 127
-    assert observation[:, :, 0][depth_m > 50.0].max() <= 5

@@ -9,44 +9,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.depth import encode_depth
 from mcaprl.sims.lane.course import COURSE
-from mcaprl.sims.lane.env import LaneKeepingEnv
-
-
-def lane(**kwargs: Any) -> LaneKeepingEnv:
-    """Return the sim without wrappers."""
-    sim = make_sim("lane", **kwargs).unwrapped
-    assert isinstance(sim, LaneKeepingEnv)
-    return sim
-
-
-def test_random_starts_are_where_the_card_says() -> None:
-    sim = lane()
-    for seed in range(200):
-        _, info = sim.reset(seed=seed)
-        assert abs(info["lateral_offset_m"]) <= 1.5 + 1e-9
-        assert abs(info["heading_error_rad"]) <= 0.2 + 1e-9
-        assert 0.0 <= info["speed_m_s"] <= 10.0
-        assert info["progress_m"] == 0.0
-
-
-def test_starts_on_the_line_are_near_it_and_not_all_the_same() -> None:
-    sim = lane(start="line")
-    places = []
-    for seed in range(20):
-        sim.reset(seed=seed)
-        places.append(sim.telemetry())
-    assert all(abs(place["x_m"] - 2.0) < 1e-9 for place in places)
-    assert all(abs(place["y_m"] - 1.0) <= 0.3 for place in places)
-    assert all(place["speed_m_s"] == 0.0 for place in places)
-    assert len({place["y_m"] for place in places}) == 20
+from tests.support.sims import unwrapped
 
 
 def test_a_pose_is_kept() -> None:
-    sim = lane()
+    sim = unwrapped("lane")
     _, info = sim.reset(options={"pose": (130.0, -50.0, -math.pi / 2, 7.0)})
     expected = {
         "x_m": 130.0,
@@ -63,31 +33,6 @@ def test_a_pose_is_kept() -> None:
     assert info["speed_m_s"] == 7.0
     sim.reset(options={"pose": [130.0, -50.0, 0.0]})
     assert sim.telemetry()["speed_m_s"] == 0.0
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"pose": (50.0, 9.0, 0.0)}, "8.0 m from the path: the lane's edge is at 3.5 m"),
-        ({"pose": (50.0, 1.0, 0.0, -1.0)}, "speed_m_s must be 0 to 30, not -1.0"),
-    ],
-)
-def test_a_bad_pose_is_refused(options: dict[str, Any], words: str) -> None:
-    with pytest.raises(UsageError, match=words):
-        lane().reset(options=options)
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "words"),
-    [
-        ({"rules": "classics"}, "did you mean classic or classic-code\\?"),
-        ({"observation": "stat"}, "did you mean state\\?"),
-        ({"start": "pole"}, "known: None, anywhere, line"),
-    ],
-)
-def test_an_unknown_value_is_refused(kwargs: dict[str, str], words: str) -> None:
-    with pytest.raises(UnknownNameError, match=words):
-        lane(**kwargs)
 
 
 def last_step(env: gym.Env[Any, Any], action: int) -> tuple[float, bool, bool, dict[str, Any]]:
@@ -109,7 +54,7 @@ def test_leaving_the_lane_and_stalling_are_named_and_cost_5() -> None:
 
 
 def test_progress_counts_along_the_path() -> None:
-    sim = lane()
+    sim = unwrapped("lane")
     sim.reset(options={"pose": (20.0, 1.0, 0.0, 8.0)})
     total = 0.0
     for _ in range(20):
@@ -119,19 +64,6 @@ def test_progress_counts_along_the_path() -> None:
     assert total == pytest.approx(info["progress_m"] / 7.5)
 
 
-def test_the_camera_image_is_observed() -> None:
-    sim = lane(observation="depth")
-    seen, _ = sim.reset(seed=4)
-    assert seen.shape == (84, 84, 1)
-    assert seen.dtype == np.uint8
-    depth_m = sim.depth_image_m()
-    assert depth_m.shape == (84, 84)
-    assert depth_m.dtype == np.float32
-    np.testing.assert_array_equal(seen[:, :, 0], encode_depth(depth_m))
-    moved, *_ = sim.step(1)
-    np.testing.assert_array_equal(moved[:, :, 0], encode_depth(sim.depth_image_m()))
-
-
 @pytest.mark.parametrize(
     ("along_m", "turn"),
     [(10.0, -1), (129.9, -1), (130.1, -1), (511.0, -1), (513.0, 1), (1025.9, 1)],
@@ -139,7 +71,7 @@ def test_the_camera_image_is_observed() -> None:
 def test_a_dashboard_has_speed_steering_and_the_next_turn(along_m: float, turn: int) -> None:
     # The course passes the shared street twice. The first passage ends with a right turn. The
     # second passage, 512 m later, ends with a left turn.
-    sim = lane(observation="dashboard")
+    sim = unwrapped("lane", observation="dashboard")
     sim.reset(seed=4)
     sim.fleet._cars[0, 5] = along_m + 3 * COURSE.length_m
     sim.fleet._cars[0, 3] = 15.0
@@ -152,7 +84,7 @@ def test_a_dashboard_has_speed_steering_and_the_next_turn(along_m: float, turn: 
 
 
 def test_the_last_commands_are_observed_beside_the_image() -> None:
-    sim = lane(observation="depth-commands")
+    sim = unwrapped("lane", observation="depth-commands")
     seen, _ = sim.reset(options={"pose": (2.0, 1.0, 0.0, 5.0)})
     assert seen["depth"].tobytes() == encode_depth(sim.depth_image_m()).tobytes()
     assert seen["commands"].shape == (64,)
@@ -171,18 +103,10 @@ def test_the_last_commands_are_observed_beside_the_image() -> None:
 
 
 def test_commands_of_more_than_32_decisions_ago_are_not_observed() -> None:
-    sim = lane(observation="depth-commands")
+    sim = unwrapped("lane", observation="depth-commands")
     sim.reset(seed=0)
     for action in (0, 2, *[3] * 31):
         seen, *_ = sim.step(action)
     np.testing.assert_array_equal(seen["commands"], [1.0, 1.0] * 31 + [1.0, -1.0])
     seen, *_ = sim.step(3)
     np.testing.assert_array_equal(seen["commands"], [1.0, 1.0] * 32)
-
-
-def test_names_and_metadata_fit_the_sim() -> None:
-    sim = lane()
-    assert len(sim.action_meanings) == 6
-    assert len(sim.observation_names) == 12
-    assert lane(observation="depth").observation_names == ()
-    assert sim.step_duration_s * sim.metadata["render_fps"] == 1.0

@@ -4,49 +4,22 @@ from __future__ import annotations
 
 import math
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-import mcaprl.sims
 from mcaprl.sims.drawing.scene import Color, Kind, Shape
 from mcaprl.sims.drawing.top_view import patches, placed
 from mcaprl.sims.lane.scene import GRASS, PAINT
+from tests.support.sims import image_of, near
 
-ENV_ID = mcaprl.sims.SIMS["lane"]
 RED: Color = (1.0, 0.0, 0.0, 1.0)
-
-Image = NDArray[np.uint8]
-
-
-@pytest.fixture(autouse=True)
-def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-
-
-def image_at(pose: tuple[float, float, float]) -> Image:
-    """Return the image of a car at a pose."""
-    env = gym.make(ENV_ID, render_mode="rgb_array")
-    env.reset(options={"pose": pose})
-    image = env.render()
-    env.close()
-    assert isinstance(image, np.ndarray)
-    return image
-
-
-def near(image: Image, color: Color) -> NDArray[np.bool_]:
-    """Return which pixels have a color, up to rounding."""
-    wanted = np.round(255 * np.array(color[:3]))
-    return np.asarray(np.all(np.abs(image - wanted) <= 2, axis=-1))
 
 
 def test_the_car_is_in_the_middle_of_the_image() -> None:
-    image = image_at((50.0, 1.0, 0.0))
+    image = image_of("lane", (50.0, 1.0, 0.0))
     assert image.shape == (600, 600, 3)
-    assert image.dtype == np.uint8
     rows, columns = np.nonzero(near(image, PAINT))
     assert abs(rows.mean() - 300) < 12
     assert abs(columns.mean() - 300) < 12
@@ -55,32 +28,17 @@ def test_the_car_is_in_the_middle_of_the_image() -> None:
 def test_the_car_points_where_it_is_heading() -> None:
     """If the car heads along x, its image is wider than high; along y, it is higher than wide."""
     for yaw_rad, wide in ((0.0, True), (math.pi / 2, False)):
-        rows, columns = np.nonzero(near(image_at((50.0, 1.0, yaw_rad)), PAINT))
+        rows, columns = np.nonzero(near(image_of("lane", (50.0, 1.0, yaw_rad)), PAINT))
         assert (np.ptp(columns) > 1.5 * np.ptp(rows)) == wide
 
 
 def test_north_is_up_and_east_is_right() -> None:
     """The car is 10 m west of the corner at (130, 1), where a road leads north."""
-    grass = near(image_at((120.0, 1.0, 0.0)), GRASS)
+    grass = near(image_of("lane", (120.0, 1.0, 0.0)), GRASS)
     ten_meters_px = round(10 * 600 / 55)
     assert grass[300 - ten_meters_px // 2, 250]
     assert not grass[300, 300 + ten_meters_px]
     assert not grass[300 - ten_meters_px, 300 + ten_meters_px]
-
-
-def test_a_window_shows_each_step() -> None:
-    env = gym.make(ENV_ID, render_mode="human")
-    env.reset(seed=0)
-    env.step(1)
-    assert env.render() is None
-    env.close()
-
-
-def test_rendering_needs_a_mode() -> None:
-    """The environment is unwrapped, because Gymnasium's wrapper warns if there is no mode."""
-    env = gym.make(ENV_ID).unwrapped
-    env.reset(seed=0)
-    assert env.render() is None
 
 
 def test_patches_lie_in_the_order_of_their_heights() -> None:

@@ -176,12 +176,3 @@ def test_fault_in_5_seconds_nothing_can_be_corrected() -> None:
     for action in range(7):
         sim.reset(options={"pose": (*beside(2, 100.0, 0.0), -0.9, 1.8, 0.0)})
         assert sim.step(action)[4]["reason"] == "off_line"
-
-
-def test_fault_half_of_the_image_codes_are_for_1_to_2_m() -> None:
-    sim = make_sim("powerline", rules="classic", observation="depth").unwrapped
-    assert isinstance(sim, PowerlineEnv)
-    observation, _ = sim.reset(seed=0)
-    depth_m = sim.depth_image_m()
-    assert observation[:, :, 0][depth_m > 2.0].max() <= 127
-    assert observation[:, :, 0][depth_m > 20.0].max() <= 12

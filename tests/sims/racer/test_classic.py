@@ -14,14 +14,14 @@ from mcaprl.sims.racer.course import Track
 from mcaprl.sims.racer.env import RacerEnv
 from mcaprl.sims.racer.rays import BLOCK_SIZE, LENGTH, RAY_NAMES, RAYS, measure
 from mcaprl.sims.racer.rules import CRASH, DRIVING, NO_GATE, TIME_LIMIT, drive, observe, outcome_of
-from tests.support.racer_tracks import car_in, corridor
+from tests.support.racer_tracks import car_in, corridor, outcome
+from tests.support.sims import unwrapped
 
 NONE, FORWARD, LEFT, RIGHT, BACK = range(5)
 
 
 def classic(**kwargs: Any) -> RacerEnv:
-    sim = make_sim("racer", rules="classic", **kwargs).unwrapped
-    assert isinstance(sim, RacerEnv)
+    sim: RacerEnv = unwrapped("racer", rules="classic", **kwargs)
     return sim
 
 
@@ -34,44 +34,33 @@ def lengths_of(track: Track, x_px: float, y_px: float) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(
-    ("x_px", "y_px", "heading_deg", "speed_px", "action", "reward", "end"),
+    ("car", "action", "expected"),
     [
-        (50.0, 150.0, 0, 0, NONE, 0, DRIVING),
-        (50.0, 150.0, 0, 0, BACK, 0, DRIVING),
+        ((50.0, 150.0, 0, 0), NONE, (0, DRIVING)),
+        ((50.0, 150.0, 0, 0), BACK, (0, DRIVING)),
         # The gate at 300 is passed from 281, 19 pixels away, but not from 279 or 280.
-        (275.0, 150.5, 0, 4, BACK, 1, DRIVING),
-        (275.0, 150.5, 0, 2, BACK, 0, DRIVING),
-        (275.0, 150.0, 0, 3, BACK, 0, DRIVING),
-        (281.0, 150.5, 0, 0, NONE, 1, DRIVING),
+        ((275.0, 150.5, 0, 4), BACK, (1, DRIVING)),
+        ((275.0, 150.5, 0, 2), BACK, (0, DRIVING)),
+        ((275.0, 150.0, 0, 3), BACK, (0, DRIVING)),
+        ((281.0, 150.5, 0, 0), NONE, (1, DRIVING)),
         # The car moves from 295 to 305, and the gate at 300 is not ahead at the end of the step.
         # Facing the gate from the other side counts.
-        (295.0, 150.5, 0, 10, NONE, 0, DRIVING),
-        (310.0, 150.5, 180, 0, NONE, 1, DRIVING),
+        ((295.0, 150.5, 0, 10), NONE, (0, DRIVING)),
+        ((310.0, 150.5, 180, 0), NONE, (1, DRIVING)),
         # The car is near the gate, but faces sideways.
-        (290.0, 150.5, 90, 0, NONE, 0, DRIVING),
+        ((290.0, 150.5, 90, 0), NONE, (0, DRIVING)),
         # The gate at 600 is not the next one.
-        (590.0, 150.5, 0, 0, NONE, 0, DRIVING),
-        (500.0, 108.0, 0, 0, NONE, 0, DRIVING),
-        (500.0, 106.0, 0, 0, NONE, -1, CRASH),
-        (984.0, 150.0, 0, 0, FORWARD, 0, DRIVING),
-        (984.0, 150.0, 0, 0, BACK, -1, CRASH),
-        (985.0, 115.0, -45, 0, NONE, -2, CRASH),
-        (281.0, 106.5, 0, 0, NONE, 0, CRASH),
+        ((590.0, 150.5, 0, 0), NONE, (0, DRIVING)),
+        ((500.0, 108.0, 0, 0), NONE, (0, DRIVING)),
+        ((500.0, 106.0, 0, 0), NONE, (-1, CRASH)),
+        ((984.0, 150.0, 0, 0), FORWARD, (0, DRIVING)),
+        ((984.0, 150.0, 0, 0), BACK, (-1, CRASH)),
+        ((985.0, 115.0, -45, 0), NONE, (-2, CRASH)),
+        ((281.0, 106.5, 0, 0), NONE, (0, CRASH)),
     ],
 )
-def test_rewards_and_ends_by_hand(
-    x_px: float,
-    y_px: float,
-    heading_deg: float,
-    speed_px: float,
-    action: int,
-    reward: float,
-    end: int,
-) -> None:
-    track = corridor()
-    before = car_in(track, x_px, y_px, heading_deg, speed_px)
-    after = drive(track, before, action, True, False)
-    assert outcome_of(track, before, after, True) == (reward, end)
+def test_rewards_and_ends_by_hand(car: Any, action: int, expected: tuple[float, int]) -> None:
+    assert outcome(car_in(corridor(), *car), action, classic=True) == expected
 
 
 @pytest.mark.parametrize(
@@ -79,9 +68,8 @@ def test_rewards_and_ends_by_hand(
     [(98, 500, DRIVING), (99, 500, NO_GATE), (0, 999, DRIVING), (0, 9_999, TIME_LIMIT)],
 )
 def test_time_runs_out(idle: float, steps: float, end: int) -> None:
-    track = corridor()
-    before = car_in(track, 50.0, 150.0)._replace(idle_steps=idle, steps=steps)
-    assert outcome_of(track, before, drive(track, before, NONE, True, False), True) == (0, end)
+    before = car_in(corridor(), 50.0, 150.0)._replace(idle_steps=idle, steps=steps)
+    assert outcome(before, NONE, classic=True) == (0, end)
 
 
 def test_fault_forward_drives_backward() -> None:
@@ -136,7 +124,7 @@ def test_fault_a_joint_of_walls_costs_twice() -> None:
     track = corridor()
     before = car_in(track, 985.0, 115.0, -45)
     after = drive(track, before, NONE, True, False)
-    assert outcome_of(track, before, after, True)[0] == -2
+    assert outcome(before, NONE, classic=True)[0] == -2
     assert outcome_of(track, before, after, False)[0] == -1
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,54 +35,43 @@ from mcaprl.sims.racer.rules import (
     outcome_of,
     walls_hit,
 )
-from tests.support.racer_tracks import car_in, corridor
+from tests.support.racer_tracks import car_in, corridor, outcome
 
 NONE, FORWARD, LEFT, RIGHT, BACK = range(5)
 FORWARD_LEFT, FORWARD_RIGHT = 7, 8
 
 
 @pytest.mark.parametrize(
-    ("x_px", "y_px", "heading_deg", "speed_px", "action", "reward", "end"),
+    ("car", "action", "expected"),
     [
-        (50.0, 150.0, 0, 0, NONE, 0, DRIVING),
-        (50.0, 150.0, 0, 0, FORWARD, 0, DRIVING),
+        ((50.0, 150.0, 0, 0), NONE, (0, DRIVING)),
+        ((50.0, 150.0, 0, 0), FORWARD, (0, DRIVING)),
         # The car crosses the gate at x = 300: it moves from 295 to 301, or from 290 to 300.
-        (295.0, 150.0, 0, 4, FORWARD, 1, DRIVING),
-        (290.0, 150.0, 0, 8, FORWARD, 1, DRIVING),
+        ((295.0, 150.0, 0, 4), FORWARD, (1, DRIVING)),
+        ((290.0, 150.0, 0, 8), FORWARD, (1, DRIVING)),
         # The car moves from x = 289 to 299, which is before the gate at 300. Only crossing a gate
         # counts, not facing a gate that is near.
-        (289.0, 150.0, 0, 8, FORWARD, 0, DRIVING),
-        (285.0, 150.0, 0, 0, NONE, 0, DRIVING),
+        ((289.0, 150.0, 0, 8), FORWARD, (0, DRIVING)),
+        ((285.0, 150.0, 0, 0), NONE, (0, DRIVING)),
         # The car crosses the gate at 600, which is not the next gate.
-        (595.0, 150.0, 0, 10, NONE, 0, DRIVING),
+        ((595.0, 150.0, 0, 10), NONE, (0, DRIVING)),
         # The left side of the car is 7 pixels from its center, so it is at y = 101 in the first
         # case and at y = 99 in the second. The wall is at y = 100.
-        (500.0, 108.0, 0, 0, NONE, 0, DRIVING),
-        (500.0, 106.0, 0, 0, NONE, -1, CRASH),
+        ((500.0, 108.0, 0, 0), NONE, (0, DRIVING)),
+        ((500.0, 106.0, 0, 0), NONE, (-1, CRASH)),
         # The nose of the car is 15 pixels ahead of its center: at x = 999, and at x = 1001 after
         # FORWARD. The wall is at x = 1000.
-        (984.0, 150.0, 0, 0, NONE, 0, DRIVING),
-        (984.0, 150.0, 0, 0, FORWARD, -1, CRASH),
-        (984.0, 150.0, 0, 0, BACK, 0, DRIVING),
+        ((984.0, 150.0, 0, 0), NONE, (0, DRIVING)),
+        ((984.0, 150.0, 0, 0), FORWARD, (-1, CRASH)),
+        ((984.0, 150.0, 0, 0), BACK, (0, DRIVING)),
         # The car hits two walls in the corner, which is one crash.
-        (985.0, 115.0, -45, 0, NONE, -1, CRASH),
+        ((985.0, 115.0, -45, 0), NONE, (-1, CRASH)),
         # The car passes a gate and crashes in one step.
-        (295.0, 106.0, 0, 10, NONE, 0, CRASH),
+        ((295.0, 106.0, 0, 10), NONE, (0, CRASH)),
     ],
 )
-def test_rewards_and_ends_by_hand(
-    x_px: float,
-    y_px: float,
-    heading_deg: float,
-    speed_px: float,
-    action: int,
-    reward: float,
-    end: int,
-) -> None:
-    track = corridor()
-    before = car_in(track, x_px, y_px, heading_deg, speed_px)
-    after = drive(track, before, action, False, False)
-    assert outcome_of(track, before, after, False) == (reward, end)
+def test_rewards_and_ends_by_hand(car: Any, action: int, expected: tuple[float, int]) -> None:
+    assert outcome(car_in(corridor(), *car), action, classic=False) == expected
 
 
 @pytest.mark.parametrize(
@@ -96,16 +86,13 @@ def test_rewards_and_ends_by_hand(
     ],
 )
 def test_time_runs_out(idle: float, steps: float, x_px: float, reward: float, end: int) -> None:
-    track = corridor()
-    before = car_in(track, x_px, 150.0, 0, 2)._replace(idle_steps=idle, steps=steps)
-    after = drive(track, before, NONE, False, False)
-    assert outcome_of(track, before, after, False) == (reward, end)
+    before = car_in(corridor(), x_px, 150.0, 0, 2)._replace(idle_steps=idle, steps=steps)
+    assert outcome(before, NONE, classic=False) == (reward, end)
 
 
 def test_a_crash_has_priority_over_the_time_limit() -> None:
-    track = corridor()
-    before = car_in(track, 500.0, 106.0)._replace(idle_steps=99)
-    assert outcome_of(track, before, drive(track, before, NONE, False, False), False) == (-1, CRASH)
+    before = car_in(corridor(), 500.0, 106.0)._replace(idle_steps=99)
+    assert outcome(before, NONE, classic=False) == (-1, CRASH)
 
 
 def test_actions_by_hand() -> None:

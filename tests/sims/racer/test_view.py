@@ -4,51 +4,19 @@ from __future__ import annotations
 
 import math
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-import mcaprl.sims
-from mcaprl.sims.drawing.scene import Color
-from mcaprl.sims.racer.env import RacerEnv
 from mcaprl.sims.racer.scene import ASPHALT, GRASS, INK, KEY_PX, NEXT_GATE, PAINT, PANEL_PX, PRESSED
-from tests.support.sim_shapes import rotated
+from tests.support.sims import image_of, near, unwrapped
 
-ENV_ID = mcaprl.sims.SIMS["racer"]
 START = (5.0, 30.0, -math.pi / 2)
-
-Image = NDArray[np.uint8]
-
-
-@pytest.fixture(autouse=True)
-def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-
-
-def image_after(actions: list[int]) -> Image:
-    """Return the image of a car after actions from the start line."""
-    env = gym.make(ENV_ID, render_mode="rgb_array")
-    env.reset(options={"pose": START})
-    for action in actions:
-        env.step(action)
-    image = env.render()
-    env.close()
-    assert isinstance(image, np.ndarray)
-    return image
-
-
-def near(image: Image, color: Color) -> NDArray[np.bool_]:
-    """Return which pixels have a color, up to rounding."""
-    wanted = np.round(255 * np.array(color[:3]))
-    return np.asarray(np.all(np.abs(image - wanted) <= 2, axis=-1))
 
 
 def test_the_image_has_the_pixels_of_the_rules() -> None:
     """The rules and the image use the same pixels, such as (50, 300) for the car at the start."""
-    image = image_after([])
+    image = image_of("racer", START)
     assert image.shape == (600, 1000, 3)
-    assert image.dtype == np.uint8
     rows, columns = np.nonzero(near(image, PAINT))
     assert abs(rows.mean() - 300) < 8
     assert abs(columns.mean() - 50) < 3
@@ -63,7 +31,7 @@ def test_the_image_has_the_pixels_of_the_rules() -> None:
     [(0, []), (1, [(1, 0)]), (2, [(0, 1)]), (3, [(2, 1)]), (4, [(1, 1)]), (8, [(1, 0), (2, 1)])],
 )
 def test_the_keys_light_up(action: int, pressed: list[tuple[int, int]]) -> None:
-    image = image_after([1, action])
+    image = image_of("racer", START, [1, action])
     for key in ((1, 0), (0, 1), (1, 1), (2, 1)):
         column = PANEL_PX[0] + 115 + key[0] * (KEY_PX + 5) + 4
         row = PANEL_PX[1] + key[1] * (KEY_PX + 5) + 4
@@ -73,7 +41,7 @@ def test_the_keys_light_up(action: int, pressed: list[tuple[int, int]]) -> None:
 
 
 def test_score_speed_and_step_are_written() -> None:
-    ink = [np.all(image_after([1] * count) == INK, axis=-1) for count in (0, 5)]
+    ink = [np.all(image_of("racer", START, [1] * count) == INK, axis=-1) for count in (0, 5)]
     left, top = PANEL_PX
     for line in range(3):
         text = [each[top + 26 * line : top + 26 * (line + 1), left : left + 112] for each in ink]
@@ -82,40 +50,17 @@ def test_score_speed_and_step_are_written() -> None:
         assert np.array_equal(text[0], text[1]) == (line == 0)
 
 
-def test_a_window_shows_each_step() -> None:
-    env = gym.make(ENV_ID, render_mode="human")
-    env.reset(seed=0)
-    env.step(1)
-    assert env.render() is None
-    env.close()
-
-
-def test_rendering_needs_a_mode() -> None:
-    env = gym.make(ENV_ID).unwrapped
-    env.reset(seed=0)
-    assert env.render() is None
-
-
-def test_the_scene_is_in_meters_where_the_car_is() -> None:
-    sim = gym.make(ENV_ID).unwrapped
-    assert isinstance(sim, RacerEnv)
+def test_the_scene_has_walls_rays_and_the_speed() -> None:
+    sim = unwrapped("racer")
     sim.reset(options={"pose": START})
-    (frame,) = sim.frames()
-    assert (frame.name, frame.parent, frame.position) == ("car", "map", (5.0, 30.0, 0.0))
-    np.testing.assert_allclose(rotated(frame, (1, 0, 0)), [0, -1, 0], atol=1e-12)
     shapes = {shape.name: shape for shape in [*sim.static_scene(), *sim.scene()]}
     assert sum(name.startswith("wall_") for name in shapes) == 48
     assert (shapes["rays"].frame, shapes["rays"].points[0, :2].tolist()) == ("car", [0.0, 0.0])
     assert shapes["speed"].text == "0.0 m/s"
-    assert shapes["trail"].points[-1, :2].tolist() == [5.0, 30.0]
-    for name, shape in shapes.items():
-        if name.startswith("car_wheel"):
-            assert shape.points[:, 2].min() == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_hits_are_on_walls() -> None:
-    sim = gym.make(ENV_ID).unwrapped
-    assert isinstance(sim, RacerEnv)
+    sim = unwrapped("racer")
     sim.reset(seed=3)
     shapes = {shape.name: shape for shape in sim.scene()}
     np.testing.assert_array_equal(shapes["hits"].points, shapes["rays"].points)

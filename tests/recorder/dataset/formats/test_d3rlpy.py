@@ -24,8 +24,9 @@ from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of
 from tests.conftest import need
+from tests.support.recordings import assert_same_bits
 from tests.support.strategies import transitions
-from tests.support.transitions import is_plain, same_bits
+from tests.support.transitions import is_plain
 
 h5py = pytest.importorskip("h5py", reason="needs the extra interop")
 
@@ -120,11 +121,13 @@ def test_all_transitions_come_back(arguments: dict[str, Any]) -> None:
     assert found.episode_lengths.tolist() == dataset.episode_lengths.tolist()
     np.testing.assert_array_equal(found.rewards, dataset.rewards)
     assert found.terminated.tolist() == dataset.terminated.tolist()
-    same_bits(found.actions.reshape(-1), dataset.actions.astype(found.actions.dtype).reshape(-1))
+    assert_same_bits(
+        found.actions.reshape(-1), dataset.actions.astype(found.actions.dtype).reshape(-1)
+    )
     mine, theirs = leaves_of(found.observation_space), leaves_of(dataset.observation_space)
     for leaf, other in zip(mine, theirs, strict=True):
         steps, rows = leaf.of(found.frames)[found.frame_of_step], other.of(dataset.frames)
-        same_bits(np.sort(steps.ravel()), np.sort(rows[dataset.frame_of_step].ravel()))
+        assert_same_bits(np.sort(steps.ravel()), np.sort(rows[dataset.frame_of_step].ravel()))
 
 
 def test_the_layout_of_the_file(tmp_path: Path) -> None:

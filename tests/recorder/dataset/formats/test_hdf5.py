@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import assume, given, settings
 
 import mcaprl
 from mcaprl import Dataset
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.format.metadata import LogMetadata
-from tests.support.strategies import transitions
-from tests.support.transitions import is_plain, same_transitions
 
 h5py = pytest.importorskip("h5py", reason="needs the extra interop")
 
@@ -84,19 +80,6 @@ def test_the_arrays_are_those_of_d4rl(tmp_path: Path) -> None:
             *("observations", "next_observations", "actions", "rewards", "terminals", "timeouts"),
             "behavior_probs",
         }
-
-
-@pytest.mark.filterwarnings("ignore:.*may be of another episode")
-@settings(max_examples=30)
-@given(given_arrays=transitions())
-def test_any_transitions_come_back(given_arrays: dict[str, Any]) -> None:
-    data = Dataset.from_arrays(**given_arrays)
-    assume(is_plain(data))
-    has_flags = (data.terminated | data.truncated)[np.cumsum(data.episode_lengths) - 1].all()
-    assume(has_flags)
-    with TemporaryDirectory() as folder:
-        data.to_hdf5(f"{folder}/any.hdf5", lossy=True)
-        same_transitions(mcaprl.open(f"{folder}/any.hdf5"), data)
 
 
 def test_dict_observations_are_refused_or_written_by_key(tmp_path: Path) -> None:

@@ -29,8 +29,9 @@ from mcaprl.recorder.dataset.formats.lerobot.statistics import QUANTILES, descri
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of
 from tests.conftest import need
+from tests.support.recordings import assert_same_bits
 from tests.support.strategies import transitions
-from tests.support.transitions import is_plain, same_bits
+from tests.support.transitions import is_plain
 
 pa = pytest.importorskip("pyarrow", reason="needs the extra tables")
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -106,9 +107,9 @@ def _same_steps(first: Dataset, second: Dataset) -> None:
     is_index = second.actions.ndim == 1
     shape, dtype = second.actions.shape[1:], np.int64 if is_index else first.actions.dtype
     actions = first.actions[is_kept].reshape(-1, *shape)
-    same_bits(second.actions, actions.astype(dtype))
+    assert_same_bits(second.actions, actions.astype(dtype))
     for name in ("rewards", "behavior_probs"):
-        same_bits(getattr(second, name), getattr(first, name)[is_kept])
+        assert_same_bits(getattr(second, name), getattr(first, name)[is_kept])
     assert second.terminated.tolist() == first.terminated[is_kept].tolist()
     assert (
         second.truncated[np.cumsum(second.episode_lengths) - 1].tolist()
@@ -128,7 +129,7 @@ def _same_frames(first: Dataset, second: Dataset) -> None:
     for leaf, other in zip(mine, theirs, strict=True):
         rows = leaf.of(first.frames)[first.frame_of_step][is_kept]
         found = other.of(second.frames)[second.frame_of_step]
-        same_bits(found, rows.reshape(found.shape))
+        assert_same_bits(found, rows.reshape(found.shape))
 
 
 def test_all_frames_come_back_and_the_rest_is_said(tmp_path: Path) -> None:
@@ -151,9 +152,9 @@ def test_all_frames_come_back_and_the_rest_is_said(tmp_path: Path) -> None:
     for key in ("state", "front", "gray"):
         # The last observation before the termination is repeated, and the truncated episode ends
         # with the observation of its last frame.
-        same_bits(found.frames[key], dataset.frames[key][[0, 1, 2, 2, 4, 5]])
+        assert_same_bits(found.frames[key], dataset.frames[key][[0, 1, 2, 2, 4, 5]])
     depth = found.frames["arm.depth"][..., 0]
-    same_bits(depth, dataset.frames["arm"]["depth"][[0, 1, 2, 2, 4, 5]])
+    assert_same_bits(depth, dataset.frames["arm"]["depth"][[0, 1, 2, 2, 4, 5]])
     assert [e.summary.options for e in found.episodes] == [
         '{"task": "Arm-v0"}',
         '{"task": "turn"}',
@@ -393,8 +394,8 @@ def test_video_changes_pixels_and_so_needs_leave(tmp_path: Path) -> None:
         # In a video, a gray image has three equal channels.
         difference = np.abs(found.frames[key].astype(int) - dataset.frames[key][rows])
         assert difference.max() <= 8
-    same_bits(found.frames["arm.depth"][..., 0], dataset.frames["arm"]["depth"][rows])
-    same_bits(found.rewards, dataset.rewards[[0, 1, 2, 3]])
+    assert_same_bits(found.frames["arm.depth"][..., 0], dataset.frames["arm"]["depth"][rows])
+    assert_same_bits(found.rewards, dataset.rewards[[0, 1, 2, 3]])
 
 
 def test_what_lerobot_cannot_hold_is_refused_by_name_or_flattened(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from mcaprl.recorder.dataset.formats.minari.spaces import space_to_text
 from mcaprl.recorder.format.metadata import LogMetadata
 from tests.conftest import need
 from tests.recorder.dataset.formats.minari_sets import Cameras, collect
+from tests.support.recordings import assert_same_bits
 from tests.support.strategies import transitions
 from tests.support.transitions import same_transitions
 
@@ -59,9 +60,7 @@ def _same_tree(first: Any, second: Any) -> None:
         for key, part in first.items():
             _same_tree(part, second[key])
         return
-    first, second = np.asarray(first), np.asarray(second)
-    assert (first.dtype, first.shape) == (second.dtype, second.shape)
-    assert first.tobytes() == second.tobytes()
+    assert_same_bits(first, second)
 
 
 def _same_transitions(ours: Dataset, theirs: Any) -> None:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import assume, given, settings
 
 import mcaprl
 from mcaprl import Dataset
@@ -18,8 +16,7 @@ from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.format.metadata import LogMetadata
 from tests.recorder.dataset.formats.minari_sets import Cameras
-from tests.support.strategies import transitions
-from tests.support.transitions import is_plain, same_transitions
+from tests.support.transitions import same_transitions
 
 
 def _two_episodes() -> Dataset:
@@ -79,16 +76,6 @@ def test_numpy_reads_the_arrays_by_their_usual_names(tmp_path: Path) -> None:
         assert arrays["terminations"].tolist() == [False, True, False]
         assert arrays["episode_lengths"].tolist() == [2, 1]
         assert arrays["infos/lap"].tolist() == [7, 8, 9, 0, 1]
-
-
-@settings(max_examples=40)
-@given(given_arrays=transitions())
-def test_any_transitions_come_back(given_arrays: dict[str, Any]) -> None:
-    data = Dataset.from_arrays(**given_arrays)
-    assume(is_plain(data))
-    with TemporaryDirectory() as folder:
-        data.to_npz(f"{folder}/any.npz", lossy=True)
-        same_transitions(mcaprl.open(f"{folder}/any.npz"), data)
 
 
 def test_images_are_read_from_disk_block_by_block(tmp_path: Path) -> None:

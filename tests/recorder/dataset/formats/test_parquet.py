@@ -209,15 +209,6 @@ def test_a_part_of_the_observations(tmp_path: Path) -> None:
         _same(dataset, mcaprl.open(tmp_path / "out"))
 
 
-def test_images_on_disk_are_written(tmp_path: Path) -> None:
-    dataset = _recorded()
-    dataset.save(tmp_path / "log.mcap", compression="none")
-    mapped = mcaprl.open(tmp_path / "log.mcap", images="mapped")
-    assert mapped.storage != "memory"
-    mapped.to_parquet(tmp_path / "out")
-    _same(mapped, mcaprl.open(tmp_path / "out"))
-
-
 def test_a_row_is_a_transition_and_lists_have_their_shape(tmp_path: Path) -> None:
     _recorded().to_parquet(tmp_path / "out")
     table = pq.read_table(tmp_path / "out/transitions.parquet")
