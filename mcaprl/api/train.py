@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 MAPPING_NAME = "mapping.json"
 """Name of the file in a run folder that contains a copy of the mapping used for training."""
+_OF_OPEN = {"mapping", "trust_code", "definitions", "follow", "format", "weights"}
+"""Arguments of `mcaprl.open`, which are no settings of an algorithm."""
 
 
 def train(
@@ -101,6 +103,8 @@ def train(
 
     check_least(1, seeds=seeds, threads=threads)
     check_least(0, seed=seed)
+    for name in _OF_OPEN & settings.keys():
+        raise UsageError(f"`{name}=` is an argument of mcaprl.open: pass what it returns as data")
     cluster = ray if isinstance(ray, ClusterOptions) else ClusterOptions(ray)
     cluster.check()
     out = Path(out)

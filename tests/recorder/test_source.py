@@ -181,3 +181,9 @@ def test_info_and_check_of_datasets() -> None:
 def test_options_for_other_data_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=f"these options are for .*{message}"):
         mcaprl.open("logs", **options)
+
+
+def test_train_names_the_arguments_of_open(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"`mapping=` is an argument of mcaprl\.open"):
+        mcaprl.train("logs/a.mcap", tmp_path / "run", mapping="map.yaml")
+    assert not (tmp_path / "run").exists()
