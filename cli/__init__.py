@@ -1,6 +1,6 @@
 """Command-line interface; `mcaprl --help` lists the commands.
 
-User errors are printed as one line on stderr; `mcaprl.cli.exit_codes` lists the exit codes. Each
+User errors are printed as one line on stderr; `mcaprl.cli.help` lists the exit codes. Each
 command calls the functions of the public API that `mcaprl` lists. Torch and numba are imported only
 by the commands that need them.
 """
@@ -22,8 +22,7 @@ from mcaprl.cli.completion import completion
 from mcaprl.cli.convert import convert
 from mcaprl.cli.edit import filter_, merge, slice_, split
 from mcaprl.cli.evaluate import evaluate
-from mcaprl.cli.exit_codes import EXIT_CODES
-from mcaprl.cli.help import Program
+from mcaprl.cli.help import EXIT_CODES, Program
 from mcaprl.cli.logs import annotate, check, info, layout, recover
 from mcaprl.cli.record import record
 from mcaprl.cli.replay import replay

@@ -1,4 +1,7 @@
-"""Help texts of the program: groups of commands, groups of options, and examples."""
+"""Help texts of the program: groups of commands, groups of options, examples, and exit codes.
+
+docs/cli.md lists the exit codes.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,31 @@ from typing import Any, Final
 
 import click
 
+from mcaprl._interrupt import INTERRUPTED
 from mcaprl.cli.progress import quiet_option
+from mcaprl.errors import McaprlError, UsageError
+
+WITH_LOSSES: Final = 3
+"""Exit code of `recover` if data is lost."""
+
+EXIT_CODES: Final[dict[int, str]] = {
+    0: "Success.",
+    McaprlError.exit_code: (
+        "A log, policy, run or other file cannot be read, written or used. Also: `check`,"
+        " `info --strict` or `replay --verify` found a problem, and `recover` can keep nothing."
+    ),
+    UsageError.exit_code: (
+        "The request is invalid: an unknown command, option, name or policy, a value out of range,"
+        " options that exclude each other, an output that exists, or a package that is not"
+        " installed."
+    ),
+    WITH_LOSSES: "`recover` wrote a log, but some data is lost.",
+    INTERRUPTED: (
+        "The command was interrupted by Ctrl-C, SIGTERM or SIGHUP. The last line says what is kept."
+    ),
+}
+"""Meaning of each exit code."""
+
 
 SECTIONS: Final[dict[str, tuple[str, ...]]] = {
     "Record and learn": ("record", "train-online", "train-offline", "evaluate", "export"),

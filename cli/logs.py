@@ -10,8 +10,7 @@ import click
 
 import mcaprl
 from mcaprl.cli.completion import Name, sims
-from mcaprl.cli.exit_codes import WITH_LOSSES
-from mcaprl.cli.help import Command
+from mcaprl.cli.help import WITH_LOSSES, Command
 from mcaprl.cli.options import (
     PATH,
     bag_options,

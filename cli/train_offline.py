@@ -105,8 +105,7 @@ def train_offline(data: tuple[str, ...], out: Path, sweep: Path | None, **reques
         on_cluster = mcaprl.ClusterOptions(*cluster)
         summaries = mcaprl.train(read, out, ray=on_cluster, progress=report, **given)
     from mcaprl.offline.selection.choice import CHOICE_NAME, read_choice
-    from mcaprl.offline.training.curves import CURVES_NAME
-    from mcaprl.offline.training.metrics import describe_seeds
+    from mcaprl.offline.training.metrics import CURVES_NAME, describe_seeds
 
     if (out / CHOICE_NAME).exists():
         _print_choice(read_choice(out), given.get("report", ""))

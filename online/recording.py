@@ -21,7 +21,7 @@ from torch import nn
 
 from mcaprl.errors import LogError, NoStepsError, NotMcapError, OutputExistsError, UsageError
 from mcaprl.files import check_target
-from mcaprl.online.double_dqn import WarmDQN
+from mcaprl.online.algorithms import WarmDQN
 from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
 from mcaprl.recorder.repair.recover import recover_log
 

@@ -8,7 +8,7 @@ Arrows show how data flows through the modules:
     file -> reader -> log_reader -> dataset -> statistics, tables
                    -> check
     bag -> bags -> mapping -> dataset                                 (convert)
-    damaged file -> salvage -> valid_copy -> whole_episodes -> file   (recover)
+    damaged file -> salvage -> valid_copy -> recover -> file
 
 `chunks`, `message_rows`, `schema` and `messages` encode and decode logs. `spaces` and `metadata`
 describe the contents of a log. `scene` and `layout` define what viewers show.

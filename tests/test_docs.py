@@ -14,7 +14,7 @@ import mcaprl
 import mcaprl.errors
 from mcaprl._interrupt import INTERRUPTED
 from mcaprl.cli import cli
-from mcaprl.cli.exit_codes import WITH_LOSSES
+from mcaprl.cli.help import WITH_LOSSES
 
 ROOT = Path(__file__).parent.parent
 PAGES = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"]

@@ -20,7 +20,7 @@ import mcaprl
 from mcaprl.errors import LogError, McaprlError, PolicyError, TrainingError
 from mcaprl.offline.estimate.values import gamma_of_run
 from mcaprl.offline.selection.choice import read_choice
-from mcaprl.offline.training.curves import curve_panels
+from mcaprl.offline.training.metrics import curve_panels
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.format.infos import shape_of
 from mcaprl.recorder.format.metadata import LogMetadata

@@ -415,7 +415,7 @@ def learning_curves(names: Sequence[str]) -> list[Figure]:
     for folder in folders:
         if folder in online:
             continue
-        from mcaprl.offline.training.curves import curve_panels
+        from mcaprl.offline.training.metrics import curve_panels
 
         figures += [
             Figure.of(f"{folder.name}: {panel.caption}", panel.figure())

@@ -98,7 +98,7 @@ def train(
     from mcaprl.offline.batches.buffer import discrete_actions
     from mcaprl.offline.selection.config import AUTO, AutoConfig
     from mcaprl.offline.selection.race import select
-    from mcaprl.offline.training.curves import draw_curves
+    from mcaprl.offline.training.metrics import draw_curves
     from mcaprl.offline.training.train import train as train_dataset
 
     check_least(1, seeds=seeds, threads=threads)

@@ -27,7 +27,7 @@ from mcaprl.offline.algorithms.registry import ALGORITHMS
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
 from mcaprl.offline.policy import Policy, read_policy, save_policy
-from mcaprl.offline.training.curves import draw_curves
+from mcaprl.offline.training.metrics import draw_curves
 from mcaprl.offline.training.train import train
 from mcaprl.recorder.dataset.dataset import Dataset
 from tests.support.offline_tasks import ACTION_SPACE, N_CELLS, corridor, inner_observations

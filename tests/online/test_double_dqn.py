@@ -14,7 +14,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import Tensor
 
-from mcaprl.online.double_dqn import DoubleDQN
+from mcaprl.online.algorithms import DoubleDQN
 from mcaprl.online.zip_file import write_model
 
 

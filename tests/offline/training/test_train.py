@@ -32,8 +32,7 @@ from mcaprl.offline.algorithms.config import (
     IQLConfig,
 )
 from mcaprl.offline.policy import read_policy
-from mcaprl.offline.training.curves import draw_curves
-from mcaprl.offline.training.metrics import OfflineSummary, describe_seeds
+from mcaprl.offline.training.metrics import OfflineSummary, describe_seeds, draw_curves
 from mcaprl.offline.training.train import train
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset

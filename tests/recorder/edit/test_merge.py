@@ -20,8 +20,7 @@ import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import LogError, SpaceError, UsageError
 from mcaprl.recorder.columns.reader import McapReader, end_of
-from mcaprl.recorder.repair.check import check_log
-from mcaprl.recorder.repair.episode_check import IMPOSSIBLE_ACTION
+from mcaprl.recorder.repair.check import IMPOSSIBLE_ACTION, check_log
 from tests.recorder.edit.contents import messages_of
 from tests.support.foreign_logs import (
     PLAIN,

@@ -16,8 +16,7 @@ from mcap.writer import Writer
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import NoEpisodesError, UsageError
-from mcaprl.recorder.repair.check import check_log
-from mcaprl.recorder.repair.episode_check import IMPOSSIBLE_ACTION
+from mcaprl.recorder.repair.check import IMPOSSIBLE_ACTION, check_log
 from tests.recorder.edit.contents import messages_of
 from tests.recorder.edit.test_merge import sensor_log
 from tests.support.recordings import assert_same_bits, leaves_of, record

@@ -10,8 +10,7 @@ import pytest
 
 import mcaprl
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.repair.check import check_log
-from mcaprl.recorder.repair.episode_check import IMPOSSIBLE_ACTION
+from mcaprl.recorder.repair.check import IMPOSSIBLE_ACTION, check_log
 from tests.golden.make import CONTENTS, FILES, FOLDER, contents_of
 from tests.support.damage.faults import assert_is_known
 from tests.support.learner_topic import read_learner

@@ -1,11 +1,17 @@
-"""Writing of LeRobot datasets, version 3.0.
+"""Writing of LeRobot datasets, version 3.0: Parquet, JSON and video files, and statistics.
 
 Each transition is a row. LeRobot has no place for the observation after the last action.
+
+A statistic of an array has one number for each element of the last dimension. A statistic of images
+has one number for each channel, in shape (channels, 1, 1); for color images, the numbers are in
+[0, 1]. Image statistics are computed from at most `_MAX_IMAGES` evenly spaced images per episode.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -24,19 +30,216 @@ from mcaprl.recorder.dataset.formats.lerobot.features import (
     VIDEO_PATH,
     Feature,
 )
-from mcaprl.recorder.dataset.formats.lerobot.statistics import Stats, describe, pooled, sampled
-from mcaprl.recorder.dataset.formats.lerobot.tables import (
-    CHUNK_FILES,
-    MAX_FILE_BYTES,
-    ParquetFiles,
-    write_json,
-    write_table,
-    write_tasks,
-)
 from mcaprl.recorder.dataset.formats.lerobot.video import VideoWriter
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of
 from mcaprl.texts import counted
+
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
+"""Names of the statistics."""
+_MAX_IMAGES = 100
+_MAX_ELEMENTS = 1 << 22
+
+Stats = dict[str, NDArray[Any]]
+"""Statistics as arrays, by the names in `NAMES`."""
+
+
+def sampled(feature: Feature, count: int) -> NDArray[np.int64]:
+    """Return evenly spaced indexes of an episode's images, from which statistics are computed."""
+    limit = _MAX_ELEMENTS // math.prod(feature.shape) if feature.is_depth else _MAX_IMAGES
+    return _spread(count, min(max(limit, 1), _MAX_IMAGES))
+
+
+def describe(feature: Feature, values: NDArray[Any]) -> Stats:
+    """Return the statistics of the values (T, *shape)."""
+    channels = values.shape[3] if values.ndim == 4 else 1
+    rows = values.reshape(-1, channels if feature.is_image else feature.shape[-1])
+    if feature.is_image and values.dtype == np.uint8:
+        found = _of_levels(_histogram(values.reshape(len(values), -1, channels)))
+    else:
+        found = _of_numbers(rows.astype(np.float64))
+    if feature.is_image:
+        shape = (feature.shape[-1], 1, 1)
+        found = {n: np.broadcast_to(a.reshape(-1, 1, 1), shape) for n, a in found.items()}
+    elif rows.dtype.kind in "biu":
+        found |= {"min": rows.min(0), "max": rows.max(0)}
+    return found | {"count": np.array([len(values)], np.int64)}
+
+
+def pooled(episodes: Sequence[Stats]) -> Stats:
+    """Combine the statistics of the episodes into the statistics of all data.
+
+    Each quantile is the mean of the episodes' quantiles, weighted by the number of values of each
+    episode.
+    """
+    counts = np.array([episode["count"][0] for episode in episodes], np.float64)
+    column = {name: np.stack([e[name] for e in episodes]) for name in NAMES}
+    shares = (counts / counts.sum()).reshape(-1, *[1] * (column["mean"].ndim - 1))
+    with np.errstate(all="ignore"):
+        mean = (shares * column["mean"]).sum(0)
+        variance = (shares * (column["std"] ** 2 + (column["mean"] - mean) ** 2)).sum(0)
+        found = {name: (shares * column[name]).sum(0) for name in QUANTILES}
+        found |= {"min": column["min"].min(0), "max": column["max"].max(0)}
+        found |= {"mean": mean, "std": np.sqrt(variance)}
+    return found | {"count": column["count"].sum(0)}
+
+
+def _spread(count: int, limit: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))
+
+
+def _of_numbers(numbers: NDArray[np.float64]) -> Stats:
+    """Return the statistics (D,) of rows (N, D)."""
+    limit = max(_MAX_ELEMENTS // numbers.shape[1], 1)
+    few = numbers if len(numbers) <= limit else numbers[_spread(len(numbers), limit)]
+    # NumPy warns about NaN and infinite values, which have no finite mean.
+    with np.errstate(all="ignore"):
+        quantiles = np.quantile(few, list(QUANTILES.values()), axis=0)
+        return {
+            "min": numbers.min(0),
+            "max": numbers.max(0),
+            "mean": numbers.mean(0),
+            "std": numbers.std(0),
+            **dict(zip(QUANTILES, quantiles, strict=True)),
+        }
+
+
+def _histogram(images: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Return a histogram (C, 256) of the values in each channel of images (T, pixels, C)."""
+    counts = np.zeros((images.shape[2], 256), np.int64)
+    for image in images:
+        for channel, row in enumerate(counts):
+            row += np.bincount(image[:, channel], minlength=256)
+    return counts
+
+
+def _of_levels(counts: NDArray[np.int64]) -> Stats:
+    """Return the statistics (C,) of pixel values k / 255, given their histograms (C, 256)."""
+    levels = np.arange(256) / 255
+    total = int(counts[0].sum())
+    mean = counts @ levels / total
+    variance = (counts * (levels - mean[:, None]) ** 2).sum(1) / total
+    found = {"mean": mean, "std": np.sqrt(variance)}
+    ends = np.cumsum(counts, axis=1)
+
+    def at(rank: int) -> NDArray[np.float64]:
+        return levels[[int(np.searchsorted(row, rank, side="right")) for row in ends]]
+
+    for name, share in QUANTILES.items():
+        # Like `np.quantile`, interpolate linearly between the two values next to the quantile.
+        place = share * (total - 1)
+        low, high = at(math.floor(place)), at(math.ceil(place))
+        found[name] = low + (place - math.floor(place)) * (high - low)
+    return found | {"min": at(0), "max": at(total - 1)}
+
+
+MAX_FILE_BYTES = 100 << 20
+CHUNK_FILES = 1000
+"""Number of files in a folder."""
+
+
+class ParquetFiles:
+    """Writer of the data files, with one row group for each episode."""
+
+    def __init__(self, path: Path, every: list[Feature]) -> None:
+        """Create a writer; the first episode creates a file."""
+        self._path = path
+        self._stored = [feature for feature in every if feature.dtype != "video"]
+        self._number, self._file = -1, Path()
+        self._writer: Any = None
+
+    def add_episode(self, columns: dict[str, Any]) -> dict[str, int]:
+        """Write the columns of an episode, and return the indexes of its folder and its file."""
+        arrow = import_extra("pyarrow", "tables")
+        table = arrow.table(columns)
+        if self._writer is None or self._file.stat().st_size + table.nbytes > MAX_FILE_BYTES:
+            self._next_file(table.schema)
+        self._writer.write_table(table, row_group_size=len(table))
+        return {
+            "data/chunk_index": self._number // CHUNK_FILES,
+            "data/file_index": self._number % CHUNK_FILES,
+        }
+
+    def close(self) -> None:
+        """Finish the last file."""
+        if self._writer is not None:
+            self._writer.close()
+
+    def _next_file(self, schema: Any) -> None:
+        self.close()
+        self._number += 1
+        chunk, number = divmod(self._number, CHUNK_FILES)
+        self._file = self._path / DATA_PATH.format(chunk_index=chunk, file_index=number)
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        parquet = import_extra("pyarrow.parquet", "tables")
+        described = {f.name: _hugging_face(f) for f in self._stored}
+        text = json.dumps({"info": {"features": described}})
+        self._writer = parquet.ParquetWriter(
+            self._file,
+            schema.with_metadata({b"huggingface": text.encode()}),
+            compression="snappy",
+            write_page_checksum=True,
+            use_dictionary=[f.name for f in self._stored if not f.is_image],
+        )
+
+
+def write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
+    """Write the table of tasks; `tasks` contains the index of each task by its text."""
+    arrow = import_extra("pyarrow", "tables")
+    table = arrow.table({"task_index": list(tasks.values()), "task": list(tasks)})
+    # LeRobot reads this table with pandas, and needs the task texts as the index of the DataFrame.
+    metadata = {b"pandas": json.dumps(_TASKS_IN_PANDAS).encode()}
+    parquet = import_extra("pyarrow.parquet", "tables")
+    parquet.write_table(table.replace_schema_metadata(metadata), path)
+
+
+def _hugging_face(feature: Feature) -> dict[str, Any]:
+    """Return the description of a column for the library `datasets`."""
+    if feature.dtype == "image":
+        return {"_type": "Image"}
+    value = {"dtype": feature.dtype, "_type": "Value"}
+    if feature.shape == (1,):
+        return value
+    if len(feature.shape) == 1:
+        return {"feature": value, "length": feature.shape[0], "_type": "List"}
+    kind = f"Array{len(feature.shape)}D"
+    return {"shape": list(feature.shape), "dtype": feature.dtype, "_type": kind}
+
+
+def write_table(columns: dict[str, Any], path: Path) -> None:
+    """Write Arrow arrays by name as a Parquet file."""
+    arrow, parquet = import_extra("pyarrow", "tables"), import_extra("pyarrow.parquet", "tables")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    parquet.write_table(arrow.table(columns), path, write_page_checksum=True)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON; non-finite numbers become `NaN` and `Infinity`, which Python can read."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"{json.dumps(value, indent=4)}\n")
+
+
+def _pandas_column(name: str | None, field: str | None, kind: str, dtype: str) -> dict[str, Any]:
+    return {
+        "name": name,
+        "field_name": field,
+        "pandas_type": kind,
+        "numpy_type": dtype,
+        "metadata": {"encoding": "UTF-8"} if name is None else None,
+    }
+
+
+_TASKS_IN_PANDAS = {
+    "index_columns": ["task"],
+    "column_indexes": [_pandas_column(None, None, "unicode", "object")],
+    "columns": [
+        _pandas_column("task_index", "task_index", "int64", "int64"),
+        _pandas_column("task", "task", "unicode", "object"),
+    ],
+    "pandas_version": "2.2.0",
+}
+
 
 VERSION = "v3.0"
 MAX_VIDEO_BYTES = 200 << 20

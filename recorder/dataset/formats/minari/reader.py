@@ -29,9 +29,9 @@ from mcaprl.recorder.dataset.formats.minari.description import (
     MAIN,
     Description,
     data_folder,
+    may_be_jpeg,
     read_description,
 )
-from mcaprl.recorder.dataset.formats.minari.spaces import may_be_jpeg
 from mcaprl.recorder.dataset.values import flags
 from mcaprl.recorder.format.messages import MAX_SEED
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of, nest

@@ -23,9 +23,9 @@ import mcaprl
 from mcaprl import Dataset
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
-from mcaprl.recorder.dataset.formats.lerobot import tables, writer
+from mcaprl.recorder.dataset.formats.lerobot import writer
 from mcaprl.recorder.dataset.formats.lerobot.features import Feature
-from mcaprl.recorder.dataset.formats.lerobot.statistics import QUANTILES, describe, pooled, sampled
+from mcaprl.recorder.dataset.formats.lerobot.writer import QUANTILES, describe, pooled, sampled
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of
 from tests.conftest import need
@@ -332,8 +332,8 @@ def test_statistics_of_images_are_those_of_their_pixels(pixels: NDArray[np.uint8
 def test_a_file_ends_at_its_size_and_a_folder_at_its_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tables, "MAX_FILE_BYTES", 1)
-    monkeypatch.setattr(tables, "CHUNK_FILES", 2)
+    monkeypatch.setattr(writer, "MAX_FILE_BYTES", 1)
+    monkeypatch.setattr(writer, "CHUNK_FILES", 2)
     dataset = Dataset.concatenate([_cameras(), _cameras()])
     dataset.to_lerobot(tmp_path / "out")
     files = sorted(str(p.relative_to(tmp_path / "out")) for p in tmp_path.glob("out/data/*/*"))

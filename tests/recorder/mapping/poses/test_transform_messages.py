@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import open_bag
-from mcaprl.recorder.mapping.poses import messages as transform_messages
+from mcaprl.recorder.mapping.poses import transforms as transform_messages
 from mcaprl.recorder.mapping.poses.transforms import Transforms, transform_topic
 from tests.conftest import need
 
