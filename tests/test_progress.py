@@ -19,11 +19,17 @@ class Clock:
         return self.now_s
 
 
-def test_long_work_prints_lines_at_intervals(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Set the time of the progress by hand."""
     clock = Clock()
     monkeypatch.setattr(time, "monotonic", clock.monotonic)
+    return clock
+
+
+def test_long_work_prints_lines_at_intervals(
+    clock: Clock, capsys: pytest.CaptureFixture[str]
+) -> None:
     with terminal_bar("fitting", 1_000) as advance:
         for _ in range(100):
             clock.now_s += 0.5
@@ -39,21 +45,15 @@ def test_long_work_prints_lines_at_intervals(
 
 
 def test_work_without_a_total_prints_what_is_done(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    clock: Clock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    clock = Clock()
-    monkeypatch.setattr(time, "monotonic", clock.monotonic)
     with terminal_bar("reading", None) as advance:
         clock.now_s += 6
         advance(3)
     assert capsys.readouterr().err == "reading: 3\n"
 
 
-def test_lines_become_rare(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    clock = Clock()
-    monkeypatch.setattr(time, "monotonic", clock.monotonic)
+def test_lines_become_rare(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     with terminal_bar("reading", None) as advance:
         for _ in range(10_000):
             clock.now_s += 1
@@ -64,10 +64,8 @@ def test_lines_become_rare(
 
 
 def test_training_prints_lines_about_a_seed(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    clock: Clock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    clock = Clock()
-    monkeypatch.setattr(time, "monotonic", clock.monotonic)
     with terminal_progress("updates", "loss") as report:
         for done in range(100, 1_001, 100):
             clock.now_s += 2
@@ -80,10 +78,8 @@ def test_training_prints_lines_about_a_seed(
 
 
 def test_a_line_about_training_has_the_first_known_term(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    clock: Clock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    clock = Clock()
-    monkeypatch.setattr(time, "monotonic", clock.monotonic)
     with terminal_progress("steps", "score", "mean_return") as report:
         for score, mean_return in ((nan, nan), (nan, 21.5), (0.25, 21.5)):
             clock.now_s += 11
