@@ -103,8 +103,7 @@ def train(
 
     check_least(1, seeds=seeds, threads=threads)
     check_least(0, seed=seed)
-    for name in _OF_OPEN & settings.keys():
-        raise UsageError(f"`{name}=` is an argument of mcaprl.open: pass what it returns as data")
+    _refuse_arguments_of_open(settings)
     cluster = ray if isinstance(ray, ClusterOptions) else ClusterOptions(ray)
     cluster.check()
     out = Path(out)
@@ -145,6 +144,11 @@ def train(
     with suppress(MissingExtraError):
         draw_curves(out)
     return Run(out, summaries)
+
+
+def _refuse_arguments_of_open(settings: Mapping[str, Any]) -> None:
+    for name in _OF_OPEN & settings.keys():
+        raise UsageError(f"`{name}=` is an argument of mcaprl.open: pass what it returns as data")
 
 
 def train_online(
