@@ -113,7 +113,7 @@ def test_logs_without_the_module_can_be_appended_to(
         mcaprl.RecordMcap(make_sim("CartPole-v1"), log, append=True)
 
 
-def test_ids_are_of_one_environment_if_at_most_one_names_a_module() -> None:
+def test_ids_with_and_without_a_module_are_of_one_environment() -> None:
     assert same_env("a:Env-v0", "Env-v0")
     assert same_env("Env-v0", "a:Env-v0")
     assert not same_env("a:Env-v0", "b:Env-v0")

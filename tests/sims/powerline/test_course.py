@@ -151,5 +151,5 @@ def test_the_mesh_of_the_ground_is_near_the_ground() -> None:
             assert abs(-z - ground_height(x, y)) < 1.5
 
 
-def test_ros_axes_have_west_left_and_up_up() -> None:
+def test_axes_of_ros_are_north_west_up() -> None:
     assert to_ros(np.array([1.0, 2.0, 3.0])).tolist() == [1.0, -2.0, -3.0]
