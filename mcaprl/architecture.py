@@ -1,11 +1,10 @@
 """Architecture of networks, and the settings that select it. Importing this module loads no torch.
 
-Two encoders of images are available, which `ENCODERS` describes; images that are too small for them
-have the convolutions of `SMALL`. `nature` has the convolutions of
+Two encoders of images are available, which `ENCODERS` describes. `nature` has the convolutions of
 "Human-level control through deep reinforcement learning" (https://doi.org/10.1038/nature14236).
 `compact` first averages squares of pixels, so that the image's shorter edge has about 42 pixels; it
 has two small convolutions. A gradient step with `compact` takes a fraction of the time of a step
-with `nature`.
+with `nature`. Images that are too small for both have the convolutions of `SMALL`.
 """
 
 from __future__ import annotations

@@ -77,6 +77,7 @@ def limited(limit: int, command: Sequence[str], folder: Path, errors: Connection
             for limit in (2_000, 20_000, 40_000)
             for name, form in (("x-v0", "minari"), ("x.hdf5", "hdf5"), ("x.h5", "d3rlpy"))
         ),
+        (70_000, ["convert", LANE, "x-v0", "--to", "minari", "--lossy"], "x-v0"),
         (2_000, ["convert", LANE, "x", "--to", "lerobot", "--lossy"], "x"),
         (2_000, ["convert", LANE, "x.npz", "--lossy"], "x.npz"),
         (2_000, ["info", LOG, "--report"], "x"),

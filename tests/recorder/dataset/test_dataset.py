@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import mcaprl
 from mcaprl.errors import LogError, SpaceError, UsageError
 from mcaprl.recorder.dataset.format_registry import target_format, write_format
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.dataset.save import save_log
 from mcaprl.recorder.format.metadata import LogMetadata
 from tests.support.recordings import MIXED_SPACE, record
 
@@ -345,6 +347,10 @@ def test_times_from_0_are_kept(tmp_path: Path) -> None:
     assert mcaprl.open(tmp_path / "third.mcap").episodes[1].log_time_ns.tolist() == times[1]
     with pytest.raises(SpaceError, match="episode 0: log_time_ns are not times"):
         with_times([[-1, 0]])
+    # The times of a mapping may be before 1970.
+    early = dataclasses.replace(data._transitions, log_time_ns=data._transitions.log_time_ns - 1)
+    with pytest.raises(LogError, match="the first time is -1 ns; a log cannot have times before"):
+        save_log(tmp_path / "fourth.mcap", early, data._description)
 
 
 @pytest.mark.parametrize("suffix", ["", ".npz", ".hdf5", "parquet", "minari-v0"])

@@ -158,7 +158,7 @@ def test_episodes_on_a_gpu_are_those_of_the_cpu(name: str, options: dict[str, An
             continue
         found = type(here.batch)(*(values.copy_to_host() for values in there.batch))
         states, expected = (np.delete(one.states, error, 1) for one in (found, here.batch))
-        # docs/gpu.md states these bounds.
+        # docs/howto/gpu.md states these bounds.
         np.testing.assert_allclose(states, expected, rtol=0, atol=1e-9)
         np.testing.assert_allclose(found.rewards, here.batch.rewards, rtol=0, atol=1e-6)
         for array in ("terminated", "truncated", "steps", "episodes"):

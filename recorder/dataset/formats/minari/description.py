@@ -1,7 +1,7 @@
 """`metadata.json` of Minari datasets with their spaces, and their folder on this machine.
 
-Minari does not store the dtype of a Discrete space. The dtype is
-written in addition: Minari ignores it, and `space_from_text` reads it.
+Minari does not store the dtype of a Discrete space. It is written in addition: Minari ignores it,
+and `space_from_text` reads it.
 """
 
 from __future__ import annotations
