@@ -23,9 +23,11 @@ from mcaprl.progress import Advance, ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.open import find_logs
+from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.display import SCENE
 from mcaprl.recorder.record.layout import LAYOUT_NAME
+from mcaprl.recorder.record.panels import bounded_actions
 from mcaprl.recorder.source import Paths, open_data
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.log_layout import attached_layout
@@ -52,7 +54,7 @@ from mcaprl.recorder.viewer.video import (
 from mcaprl.storage.remote import as_path
 
 _Images = Iterator[NDArray[np.uint8]]
-_STILLS, _HEIGHTS_PX = 12, (16, 4320)
+_STILLS, _MOST_DIALS, _HEIGHTS_PX = 12, 8, (16, 4320)
 
 
 @dataclass(frozen=True)
@@ -279,10 +281,12 @@ def _of_scene(
     *,
     height: int | None,
 ) -> _Images:
-    from mcaprl.sims.drawing.chase_view import HEIGHT_PX, ChaseView
+    from mcaprl.sims.drawing.chase_view import HEIGHT_PX, ChaseView, Dial
     from mcaprl.sims.drawing.scene import Frame, Shape
 
     static, moving, last = [], [], SeenStep(0, 0)
+    bounded = bounded_actions(LogMetadata.from_strings(dataset.metadata))[:_MOST_DIALS]
+    actions = episode.actions.reshape(episode.length, -1)
     with closing(ChaseView(height or HEIGHT_PX)) as view:
         for moment in moments_of_episode(reader, episode, parts):
             if moment.step not in steps:
@@ -299,6 +303,11 @@ def _of_scene(
                 [Frame(**vars(seen)) for seen in moment.frames],
                 moment.follow,
                 _caption(dataset, episode, moment.step, moment.time_ns),
+                [
+                    Dial(one.name, float(actions[moment.step, one.index]), one.low, one.high)
+                    for one in bounded
+                    if moment.step < episode.length
+                ],
             )
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mcaprl.actions import joint_actions
 from mcaprl.base_policy import BasePolicy, batch_size
-from mcaprl.errors import PolicyError, UsageError
+from mcaprl.errors import PolicyError
 from mcaprl.files import read_json
 from mcaprl.frames import mapped, rows_of, stacked_frames
 from mcaprl.offline.algorithms.config import DQNConfig
@@ -33,10 +33,10 @@ def value_columns(
     policy: BasePolicy, episode: Episode, action_space: spaces.Space[Any], gamma: float
 ) -> Columns:
     """Return the fields (T, ...) of `recorder.format.schema.values_schema` for an episode."""
+    observations = policy_inputs(policy, episode)
     joint = joint_actions(action_space)
     if joint is None:
-        raise UsageError(f"values need discrete actions, got {action_space}")
-    observations = policy_inputs(policy, episode)
+        return _of_commands(policy, observations, episode, action_space, gamma)
     taken = joint.indexes(episode.actions)
     preference = probabilities = policy.action_probabilities(observations)
     best = probabilities[:-1].argmax(1)
@@ -59,6 +59,59 @@ def value_columns(
         "policy_action": best + joint.first,
         "agrees": best == taken,
     }
+
+
+def _of_commands(
+    policy: BasePolicy,
+    observations: Any,
+    episode: Episode,
+    action_space: spaces.Space[Any],
+    gamma: float,
+) -> Columns:
+    """Return the fields of a policy with Box actions, at observations (T + 1, ...)."""
+    steps = len(episode)
+    command = by_rows(policy.act, observations)
+    seen = rows_of(observations, slice(steps))
+    difference = _flat(command[:steps]) - _flat(episode.actions)
+    try:
+        q = policy.action_values(seen, episode.actions)
+        value = policy.action_values(observations, command)
+    except PolicyError:
+        q, value = np.full(steps, np.nan), np.full(steps + 1, np.nan)
+    try:
+        log_prob = policy.log_prob(seen, episode.actions)
+    except PolicyError:
+        log_prob = np.full(steps, np.nan)
+    ahead = np.where(episode.terminated, 0.0, gamma) * value[1:]
+    parts = np.square(difference / half_ranges(action_space, episode.actions))
+    return {
+        "policy_action": _flat(command[:steps]),
+        "difference": difference,
+        "q": q,
+        "value": value[:steps],
+        "advantage": q - value[:steps],
+        "td_error": episode.rewards + np.where(episode.terminated, 0.0, ahead) - q,
+        "distance": np.sqrt(parts.mean(1)),
+        "log_prob": log_prob,
+    }
+
+
+def half_ranges(space: spaces.Space[Any], actions: NDArray[Any]) -> NDArray[np.float64]:
+    """Return half of the range (n,) of each element of a Box; of the actions' where it is infinite.
+
+    An element without a range has 1.
+    """
+    assert isinstance(space, spaces.Box)
+    rows = _flat(actions)
+    low, high = (end.ravel().astype(np.float64) for end in (space.low, space.high))
+    low = np.where(np.isfinite(low), low, rows.min(0))
+    high = np.where(np.isfinite(high), high, rows.max(0))
+    half = (high - low) / 2
+    return np.where(half > 0, half, 1.0)
+
+
+def _flat(actions: NDArray[Any]) -> NDArray[np.float64]:
+    return np.asarray(actions, np.float64).reshape(len(actions), -1)
 
 
 def policy_inputs(policy: BasePolicy, episode: Episode) -> Any:

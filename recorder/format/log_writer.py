@@ -143,9 +143,9 @@ class LogTopics:
         channel = self.sink.add_channel(LEARNER_TOPIC, LEARNER_TYPE, LEARNER_TEXT)
         return TopicRows.of_text(LEARNER_TEXT, channel, most, self.sink.write_rows)
 
-    def values_rows(self, topic: str, actions: int, most: int = STEPS_PER_CHUNK) -> TopicRows:
+    def values_rows(self, topic: str, most: int = STEPS_PER_CHUNK) -> TopicRows:
         """Announce a topic with the message type of `values_schema`, and preallocate its rows."""
-        name, text = values_schema(actions, self._action_names)
+        name, text = values_schema(self.metadata.action_space, self._action_names)
         channel = self.sink.add_channel(topic, name, text)
         return TopicRows.of_text(text, channel, most, self.sink.write_rows)
 

@@ -34,6 +34,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from mcaprl.actions import joint_actions
 from mcaprl.errors import SpaceError
 from mcaprl.limits import MAX_CHUNK_BYTES
 from mcaprl.recorder.columns.cdr import ENCAPSULATION, ENCAPSULATION_BYTES, ROS_TO_NUMPY
@@ -131,8 +132,12 @@ def action_constants(names: Mapping[int, str]) -> dict[str, int]:
     return words
 
 
-def values_schema(actions: int, action_names: Mapping[int, str] | None = None) -> tuple[str, str]:
+def values_schema(
+    action_space: spaces.Space[Any], action_names: Mapping[int, str] | None = None
+) -> tuple[str, str]:
     """Return the type name and definition of `/rl/values`, a policy's evaluation of a step.
+
+    For a finite action space with A actions:
 
     float32[A] q            value of each action; NaN if the policy has none
     float32[A] preference   probability of each action; softmax of q if the policy is greedy
@@ -145,12 +150,32 @@ def values_schema(actions: int, action_names: Mapping[int, str] | None = None) -
 
     Values of a MultiDiscrete or MultiBinary space are numbered from 0, the last element changing
     fastest, as by `numpy.ravel_multi_index`.
+
+    For a Box with n elements:
+
+    float32[n] policy_action   command of the policy, in units of the action
+    float32[n] difference      `policy_action` minus the logged command
+    float32 q                  value of the logged command; NaN if the policy has none
+    float32 value              value of `policy_action`
+    float32 advantage          q minus `value`
+    float32 td_error           r + gamma value(next) - q
+    float32 distance           root mean square of `difference`, in halves of the range of each part
+    float32 log_prob           log density of the logged command; NaN if the policy has none
     """
-    fields = [("int64", 0, "policy_action"), ("float32", actions, "q")]
-    fields += [("float32", actions, "preference")]
-    fields += [("float32", 0, name) for name in ("value", "advantage", "td_error", "entropy")]
-    constants = {"policy_action": action_constants(action_names or {})}
-    return _named("Values", [*fields, ("bool", 0, "agrees")], constants)
+    if (joint := joint_actions(action_space)) is not None:
+        fields = [("int64", 0, "policy_action"), ("float32", joint.count, "q")]
+        fields += [("float32", joint.count, "preference")]
+        fields += [("float32", 0, name) for name in ("value", "advantage", "td_error", "entropy")]
+        constants = {"policy_action": action_constants(action_names or {})}
+        return _named("Values", [*fields, ("bool", 0, "agrees")], constants)
+    count = action_leaf(action_space).size
+    fields = [("float32", count, name) for name in ("policy_action", "difference")]
+    fields += [("float32", 0, name) for name in COMMAND_VALUES]
+    return _named("Values", fields)
+
+
+COMMAND_VALUES = ("q", "value", "advantage", "td_error", "distance", "log_prob")
+"""Fields of `values_schema` with one number for each step of a log with a Box action."""
 
 
 def message_dtype(text: str) -> np.dtype[Any] | None:

@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from gymnasium import spaces
+
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import observation_leaves
@@ -37,6 +39,7 @@ _NONE: Sequence[str] = ()
 _SPEED = "speed_m_s"
 # Suffixes of the telemetry names in the first plot. The speed is shown by a gauge instead.
 _WATCHED = ("offset_m", "steering_rad", "distance_m")
+_MOST_DIALS = 4
 # Values for environments without `view_settings`.
 CAMERA_M, TILT_DEG, _AROUND_M, DEPTH_M, _HIGHEST_M_S = 22.0, 73.0, 100.0, (0.0, 50.0), 30.0
 # Length of the vehicle's axes in the view from above, as a share of the visible height.
@@ -267,9 +270,7 @@ class _Screens:
         """Add a panel of recent logged and policy actions; return its node and relative height."""
         title = f"actions of the last {_LAST_S} s"
         if not self.metadata.action_names():
-            paths = panels.action_series(self.metadata)
-            panel = panels.plot(title, paths, isSynced=False, followingViewWidth=_LAST_S)
-            return self._put("Plot!action", panel), 0.25
+            return self._commands(title)
         rows = {"action": f"{panels.STEPS}.action"}
         for topic in self._values_topics():
             name = topic.removeprefix(VALUES_TOPIC).removeprefix("/")
@@ -278,6 +279,32 @@ class _Screens:
         panel = panels.state_transitions(title, rows, _LAST_S)
         share = panels.share_of_transitions(len(rows))
         return self._put("StateTransitions!actions", panel), share
+
+    def _commands(self, title: str) -> tuple[Node, float]:
+        """Add a plot of logged and policy commands, and dials of a Box action's elements."""
+        logged = panels.action_series(self.metadata)
+        paths = dict(logged)
+        bounded = panels.bounded_actions(self.metadata)[:_MOST_DIALS]
+        is_box = isinstance(self.metadata.action_space, spaces.Box)
+        for topic in self._values_topics() if is_box else ():
+            policy = topic.removeprefix(VALUES_TOPIC).removeprefix("/") or "policy"
+            for name, suffix in panels.action_parts(self.metadata).items():
+                paths[f"{name}, {policy}"] = f"{topic}.policy_action{suffix or '[0]'}"
+        shown = dict(list(paths.items())[: panels.MAX_SERIES])
+        panel = panels.plot(title, shown, isSynced=False, followingViewWidth=_LAST_S)
+        plot: Node = self._put("Plot!action", panel)
+        if not bounded:
+            return plot, 0.25
+        dials: list[Node] = []
+        for one in bounded:
+            dial = panels.gauge(one.name, logged[one.name], one.high, one.low)
+            dials.append(self._put(f"Gauge!action {one.name}", dial))
+        rows = [panels.stack(dials[k : k + 2], "row") for k in range(0, len(dials), 2)]
+        if len(rows) == 1:
+            return panels.weighted([(rows[0], 0.45), (plot, 0.55)], "column"), 0.4
+        # Two rows of dials and a plot do not fit into the smallest window.
+        tabs = panels.tabs({"over time": plot, "now": panels.stack(rows, "column")})
+        return self._put("Tab!actions", tabs), 0.42
 
     def _returns(self) -> list[tuple[Node, float]]:
         """Add the return of each episode, and an overview of the episodes."""
@@ -313,6 +340,8 @@ class _Screens:
     def _policy(self, topic: str) -> Node:
         """Add a policy's outputs over time, current Q-values, errors and agreement with the log."""
         title = topic.removeprefix("/rl/")
+        if isinstance(self.metadata.action_space, spaces.Box):
+            return self._policy_commands(topic, title)
         names = list(self.metadata.action_names().values())[: panels.MAX_SERIES]
         over_time: dict[str, Node] = {}
         for label, array in (("Q-values", "q"), ("probabilities", "preference")):
@@ -334,6 +363,28 @@ class _Screens:
             (self._put(f"Tab!{title} over time", panels.tabs(over_time)), 0.46),
             (panels.stack(pair, "row"), 0.3),
             (self._put(f"StateTransitions!{title}", agreement), 0.24),
+        ]
+        return panels.weighted(rows, "column")
+
+    def _policy_commands(self, topic: str, title: str) -> Node:
+        """Add a policy's commands beside the logged ones, their difference, and values of both."""
+        logged, over_time = panels.action_series(self.metadata), {}
+        differences: dict[str, str] = {}
+        for name, suffix in panels.action_parts(self.metadata).items():
+            place = suffix or "[0]"
+            paths = {"log": logged[name], "policy": f"{topic}.policy_action{place}"}
+            over_time[name] = self._plot(f"{title} {name}", f"{title}: {name}", paths)
+            differences[name] = f"{topic}.difference{place}"
+        values = {"Q of the log": f"{topic}.q", "Q of the policy": f"{topic}.value"}
+        errors = {name: f"{topic}.{name}" for name in ("td_error", "advantage")}
+        pair: list[Node] = [
+            self._plot(f"{title} q", f"{title}: Q of both commands", values),
+            self._plot(f"{title} errors", f"{title}: TD error, advantage", errors),
+        ]
+        rows: list[tuple[Node, float]] = [
+            (self._put(f"Tab!{title} over time", panels.tabs(over_time)), 0.4),
+            (self._plot(f"{title} difference", f"{title}: policy minus log", differences), 0.28),
+            (panels.stack(pair, "row"), 0.32),
         ]
         return panels.weighted(rows, "column")
 

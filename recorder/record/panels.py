@@ -9,8 +9,11 @@ slices are not used, because viewers join all elements of a slice into one line.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
+
+from gymnasium import spaces
 
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
@@ -58,9 +61,38 @@ def action_series(metadata: LogMetadata) -> dict[str, str]:
             for value, name in names.items()
         }
         return dict(list(taken.items())[:MAX_SERIES])
+    return {name: f"{STEPS}.action{suffix}" for name, suffix in action_parts(metadata).items()}
+
+
+def action_parts(metadata: LogMetadata) -> dict[str, str]:
+    """Return the suffix of the path of each element of an action, such as `[0]`, by its name."""
     leaf = action_leaf(metadata.action_space)
     suffixes = [f"[{index}]" for index in range(leaf.size)] if leaf.shape else [""]
-    return {f"action{suffix}": f"{STEPS}.action{suffix}" for suffix in suffixes[:MAX_SERIES]}
+    names = metadata.action_part_names or [f"action{suffix}" for suffix in suffixes]
+    return dict(list(zip(names, suffixes, strict=True))[:MAX_SERIES])
+
+
+class Bounded(NamedTuple):
+    """An element of a Box action with finite bounds."""
+
+    name: str
+    index: int
+    low: float
+    high: float
+
+
+def bounded_actions(metadata: LogMetadata) -> list[Bounded]:
+    """Return the elements of a Box action with finite bounds; none for other actions."""
+    space = metadata.action_space
+    if not isinstance(space, spaces.Box):
+        return []
+    ends = zip(space.low.ravel().tolist(), space.high.ravel().tolist(), strict=True)
+    parts = zip(action_parts(metadata), ends, strict=False)
+    return [
+        Bounded(name, index, *pair)
+        for index, (name, pair) in enumerate(parts)
+        if all(map(math.isfinite, pair))
+    ]
 
 
 def observation_series(metadata: LogMetadata) -> dict[str, str]:
@@ -156,12 +188,12 @@ def share_of_transitions(rows: int) -> float:
     return min(0.45, (rows * _TRANSITIONS_ROW_PX + _TRANSITIONS_REST_PX) / _SCREEN_PX)
 
 
-def gauge(title: str, path: str, highest: float) -> Panel:
-    """Return a gauge of a number from 0 to its highest value."""
+def gauge(title: str, path: str, highest: float, lowest: float = 0.0) -> Panel:
+    """Return a gauge of a number from its lowest to its highest value."""
     return _titled(
         title,
         path=path,
-        minValue=0,
+        minValue=lowest,
         maxValue=highest,
         colorMap="turbo",
         colorMode="colormap",

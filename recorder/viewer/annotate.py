@@ -62,7 +62,7 @@ class AnnotatedCopy:
             episodes: Pairs of an episode and its columns (T, ...) by field name.
         """
         self._refuse(topic)
-        rows = self._log.values_rows(topic, actions=episodes[0][1]["q"].shape[1])
+        rows = self._log.values_rows(topic)
         for episode, columns in episodes:
             rows.write_columns(episode.log_time_ns[:-1], columns)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.figures import COLORS, INK, PALE, Panel, save_panels, tick_labels, to_svg
@@ -16,8 +17,10 @@ from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.statistics import calibration
+from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.record.display import TELEMETRY
+from mcaprl.recorder.record.panels import action_parts, bounded_actions
 from mcaprl.recorder.source import open_data
 from mcaprl.texts import counted
 
@@ -29,6 +32,7 @@ _SHOWN_EPISODES: Final = 3
 """Maximum number of best episodes, and of worst episodes, on the page."""
 _MAP_CELLS = 80
 _MAX_ROWS = 60
+_SHOWN_PARTS: Final = 6
 
 
 def dataset_page(
@@ -102,10 +106,10 @@ def _panels(dataset: Dataset, tracks: Sequence[Positions]) -> list[Panel]:
         Panel("Steps per episode", partial(_histogram, values=statistics.lengths)),
         Panel("Return by episode, in the order of the log", by_episode),
     ]
-    for caption, counts in (
-        ("Actions taken", _actions_taken(dataset)),
-        ("End reasons", statistics.ends),
-    ):
+    if isinstance(dataset.action_space, spaces.Box):
+        found += _command_panels(dataset)
+    bars = {"Actions taken": _actions_taken(dataset), "End reasons": statistics.ends}
+    for caption, counts in ((caption, counts) for caption, counts in bars.items() if counts):
         size = (4.4, max(1.6, 0.28 * len(counts) + 0.8))
         found.append(Panel(caption, partial(_bars, counts=counts), size))
     places = np.concatenate([np.empty((0, 2)), *tracks])
@@ -200,6 +204,25 @@ def _actions_taken(dataset: Dataset) -> dict[str, int]:
     return {names.get(value, str(value)): count for value, count in counts.items()}
 
 
+def _command_panels(dataset: Dataset) -> list[Panel]:
+    """Return a histogram of each of the first elements of a Box action, over its range."""
+    metadata = LogMetadata.from_strings(dataset.metadata)
+    bounded = {one.index: (one.low, one.high) for one in bounded_actions(metadata)}
+    columns = dataset.actions.reshape(len(dataset), -1).T
+    return [
+        Panel(f"Action: {name}", partial(_commands_taken, values=column, ends=bounded.get(index)))
+        for index, (name, column) in enumerate(
+            zip(list(action_parts(metadata))[:_SHOWN_PARTS], columns, strict=False)
+        )
+    ]
+
+
+def _commands_taken(axes: Any, values: NDArray[Any], ends: tuple[float, float] | None) -> None:
+    axes.hist(values[np.isfinite(values)], bins=_BINS, range=ends, color=COLORS[0])
+    axes.set_ylabel("steps")
+    axes.yaxis.get_major_locator().set_params(integer=True)
+
+
 def _histogram(axes: Any, values: NDArray[Any]) -> None:
     axes.hist(values[np.isfinite(values)], bins=_BINS, color=COLORS[0])
     axes.set_ylabel("episodes")
@@ -207,10 +230,6 @@ def _histogram(axes: Any, values: NDArray[Any]) -> None:
 
 
 def _bars(axes: Any, counts: Mapping[str, int]) -> None:
-    if not counts:
-        axes.set_axis_off()
-        axes.text(0.5, 0.5, "actions: continuous", ha="center", color=INK)
-        return
     axes.barh(range(len(counts)), list(counts.values()), color=COLORS[0], height=0.7)
     axes.set_yticks(range(len(counts)), tick_labels(counts))
     axes.set_ylim(max(len(counts), 3) - 0.5, -0.5)

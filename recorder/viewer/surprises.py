@@ -14,6 +14,8 @@ from mcaprl.recorder.format.reading import Columns, McapReader, Topic
 from mcaprl.recorder.format.topics import STEP_TOPIC
 from mcaprl.recorder.record.layout import is_values_topic
 
+_OF_ACTIONS = ("td_error", "advantage", "entropy", "agrees")
+_OF_COMMANDS = ("td_error", "distance")
 SHOWN = 5
 """Maximum number of steps for each kind of `Surprise` and each topic."""
 
@@ -30,7 +32,8 @@ class Surprise:
         episode: Index of the episode in the log.
         step: Index of the step in the episode.
         value: For `td_error`, the TD error. For `disagreement`, the advantage of the logged action,
-            or the policy's normalized entropy if the policy has no Q-values.
+            or the policy's normalized entropy if the policy has no Q-values; for a Box action, the
+            distance between the two commands.
     """
 
     file: str
@@ -60,7 +63,8 @@ def moments_of(path: Path) -> list[Surprise]:
     found = []
     for name in topics:
         topic = Topic(reader, name)
-        columns = topic.read(("td_error", "advantage", "entropy", "agrees"))
+        is_finite = "agrees" in topic.fields
+        columns = topic.read(_OF_ACTIONS if is_finite else _OF_COMMANDS)
         for kind, row, value in (*_surprises(columns), *_disagreements(columns)):
             time_ns = int(topic.times[row])
             episode, step = places.get(time_ns, (-1, -1))
@@ -78,7 +82,15 @@ def _surprises(columns: Columns) -> Iterator[_Ranked]:
 
 
 def _disagreements(columns: Columns) -> Iterator[_Ranked]:
-    """Yield the disagreements with the lowest advantage; without Q-values, the lowest entropy."""
+    """Yield the disagreements with the lowest advantage; without Q-values, the lowest entropy.
+
+    Of Box actions, which hardly ever agree, yield those with the largest distance.
+    """
+    if "agrees" not in columns:
+        distances = columns["distance"]
+        for row in _largest(distances, distances > 0):
+            yield "disagreement", row, float(distances[row])
+        return
     differs = ~columns["agrees"].astype(bool)
     has_values = bool(np.isfinite(columns["advantage"]).any())
     numbers = columns["advantage"] if has_values else columns["entropy"]

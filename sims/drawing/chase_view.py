@@ -30,6 +30,7 @@ _FOCAL = 0.9
 """Focal length divided by the width of an image."""
 _SKY: Color = (0.55, 0.68, 0.80, 1.0)
 _INK, _PLATE = (255, 255, 255), (20, 22, 26)
+_BAR, _MARK, _BAR_PX = (70, 78, 90), (78, 152, 226), 160
 _DOT = np.array([[0.0, 0.0, -1e-3], [0.0, 0.0, 1e-3]])
 """Two ends that are almost the same point. A stroke between them is drawn as a dot."""
 _AT_ORIGIN = (np.eye(3), np.zeros(3))
@@ -42,6 +43,15 @@ class Pose(NamedTuple):
     """(3, 3) axes of the frame as columns."""
     at_m: Floats
     """(3,) position."""
+
+
+class Dial(NamedTuple):
+    """A number between its limits, drawn as a mark on a bar."""
+
+    name: str
+    value: float
+    low: float
+    high: float
 
 
 class _Text(NamedTuple):
@@ -79,8 +89,9 @@ class ChaseView:
         frames: Iterable[Frame],
         follow: str,
         lines: Sequence[str],
+        dials: Sequence[Dial] = (),
     ) -> NDArray[np.uint8]:
-        """Render one image, (height, width, 3)."""
+        """Render one image, (height, width, 3), with lines and dials in its corner."""
         if self._static.shapes is not static:
             self._static = _prepared(static)
         if self._moving.shapes is not moving:
@@ -102,7 +113,7 @@ class ChaseView:
         self._canvas.paste(self._painter.draw(joined(parts), far, eye, _SKY))
         for texts in (self._static.texts, self._moving.texts):
             self._write(texts, poses, body)
-        self._write_lines(lines)
+        self._write_lines(lines, dials)
         return self._canvas.finish()
 
     def close(self) -> None:
@@ -122,13 +133,28 @@ class ChaseView:
                         at_px = (round(across) - 5 * len(text), round(down))
                         self._canvas.text(text, at_px, 24, _INK)
 
-    def _write_lines(self, lines: Sequence[str]) -> None:
-        if lines:
-            height_px = 12 + 24 * len(lines)
-            wide_px = 24 + 9 * max(map(len, lines))
-            self._canvas.rectangle((0, 0, wide_px, height_px), _PLATE)
-            for row, line in enumerate(lines):
-                self._canvas.text(line, (12, 8 + 24 * row), 24, _INK)
+    def _write_lines(self, lines: Sequence[str], dials: Sequence[Dial]) -> None:
+        if not lines and not dials:
+            return
+        bar_px = 24 + 9 * max((len(dial.name) for dial in dials), default=0)
+        dials_px = bar_px + _BAR_PX + 12 if dials else 0
+        wide_px = max(24 + 9 * max(map(len, lines), default=0), dials_px)
+        self._canvas.rectangle((0, 0, wide_px, 12 + 24 * (len(lines) + len(dials))), _PLATE)
+        for row, line in enumerate([*lines, *(dial.name for dial in dials)]):
+            self._canvas.text(line, (12, 8 + 24 * row), 24, _INK)
+        for row, dial in enumerate(dials, len(lines)):
+            top_px = 10 + 24 * row
+            self._canvas.rectangle((bar_px, top_px, _BAR_PX, 12), _BAR)
+            if dial.low < 0 < dial.high:
+                self._canvas.rectangle((bar_px + _along(dial, 0.0), top_px, 1, 12), _INK)
+            at_px = bar_px + _along(dial, dial.value)
+            self._canvas.rectangle((at_px - 3, top_px - 2, 6, 16), _MARK)
+
+
+def _along(dial: Dial, value: float) -> int:
+    """Return the place of a value on the bar of a dial, in pixels."""
+    share = (value - dial.low) / (dial.high - dial.low)
+    return round(_BAR_PX * min(max(share, 0.0), 1.0))
 
 
 def poses_of(frames: Iterable[Frame]) -> dict[str, Pose]:

@@ -43,6 +43,7 @@ from mcaprl.recorder.record.layout import (
     VALUES_TOPIC,
     is_values_topic,
 )
+from mcaprl.recorder.record.panels import action_parts, bounded_actions
 from mcaprl.recorder.source import open_data
 from mcaprl.recorder.viewer.playback import Track
 from mcaprl.recorder.viewer.scene_reader import SeenFrame, SeenShape, frames_of, shapes_of
@@ -211,7 +212,7 @@ _SCENE_TYPES = {
     TF: "tf2_msgs/msg/TFMessage",
     TF_STATIC: "tf2_msgs/msg/TFMessage",
 }
-_VALUES_FIELDS = ("q", "preference", "policy_action", "value", "advantage", "td_error")
+_VALUES_FIELDS = ("q", "policy_action", "value", "advantage", "td_error")
 # If the images of one topic are larger than this without compression, some are left out.
 _MOST_IMAGE_BYTES = 2**26
 _MOST_CHANNELS = 4
@@ -251,6 +252,10 @@ class LogPage:
                 "policies": sorted({e.policy for e in episodes if e.policy}),
                 "actions": [actions[key] for key in sorted(actions)],
                 "first_action": min(actions, default=0),
+                "parts": list(action_parts(self._metadata)),
+                "limits": {
+                    one.name: [one.low, one.high] for one in bounded_actions(self._metadata)
+                },
                 "distance_m": _finite(view.get("distance_m"), CAMERA_M),
                 "tilt_deg": _finite(view.get("tilt_deg"), TILT_DEG),
                 "reasons": reasons,
@@ -313,8 +318,8 @@ class LogPage:
             columns = self._at_steps(topic, episode.log_time_ns[:-1])
             if set(_VALUES_FIELDS) <= set(columns):
                 name = topic.removeprefix(VALUES_TOPIC).lstrip("/")
-                values = {field: columns[field].T for field in _VALUES_FIELDS}
-                yield {"name": name, **values}
+                fields = [*_VALUES_FIELDS, "preference"]
+                yield {"name": name, **{f: columns[f].T for f in fields if f in columns}}
 
     def _depth_images(self, episode: Episode) -> Iterator[dict[str, Any]]:
         """Yield the depth images as numbers from 1 (near) to 255 (far). 0 means unknown."""

@@ -58,7 +58,7 @@ function show(data) {
   get("view").hidden = !data.scene;
   images = data.images.map((image) => new ImageView(get("images"), image));
   plots = plotsOf(data);
-  bars = data.policies.flatMap(barsOf);
+  bars = [...dialsOf(data), ...data.policies.filter(({ preference }) => preference).flatMap(barsOf)];
   get("log").hidden = !data.lines.texts.length;
   get("lines").append(...data.lines.texts.map((text, k) => lineOf(data.lines, text, k)));
   get("time").max = duration();
@@ -100,8 +100,10 @@ function plotsOf(data) {
         ...data.policies.map(({ name, policy_action: chosen }) =>
           ({ name: name || "policy", values: index(chosen), dash: [3, 3] })),
       ], { title: "Action", names: named ? log.actions : undefined })
-      : plot(rows(data.actions, []), { title: "Action" }),
+      : undefined,
+    ...(data.is_discrete ? [] : commandPlots(data, plot, rows)),
     ...data.policies.flatMap((policy) => {
+      if (!policy.preference) return valuePlots(policy, plot);
       const hasValues = policy.q.some(Number.isFinite);
       const errors = [{ name: "TD error", values: policy.td_error }, { name: "advantage", values: policy.advantage }];
       return [
@@ -113,7 +115,67 @@ function plotsOf(data) {
     }),
     ...data.plots.map(({ title, names, values }) =>
       plot(rows(values, names), { title: title[0].toUpperCase() + title.slice(1) })),
+  ].filter(Boolean);
+}
+
+/** Return the plots of a Box action: each element beside the policies' commands, if there are any. */
+function commandPlots({ actions, policies }, plot, rows) {
+  const own = policies.filter((policy) => !policy.preference);
+  if (!own.length) return [plot(rows(actions, log.parts), { title: "Action" })];
+  return log.parts.map((part, k) => plot([
+    { name: "log", values: row(actions, k) },
+    ...own.map(({ name, policy_action: command }) =>
+      ({ name: name || "policy", values: row(command, k), dash: [3, 3] })),
+  ], { title: `Action: ${part}` }));
+}
+
+/** Return the plots of a policy's values of the logged commands and of its own. */
+function valuePlots(policy, plot) {
+  if (!policy.q.some(Number.isFinite)) return [];
+  const values = [{ name: "log", values: policy.q }, { name: "policy", values: policy.value, dash: [3, 3] }];
+  const errors = [{ name: "TD error", values: policy.td_error }, { name: "advantage", values: policy.advantage }];
+  return [
+    plot(values, { title: titled("Q-values of both commands", policy) }),
+    plot(errors, { title: titled("TD error and advantage", policy) }),
   ];
+}
+
+/** Create a dial for each element of a Box action, with marks for the log and each policy. */
+function dialsOf({ actions, policies, is_discrete: isDiscrete }) {
+  if (isDiscrete || !log.parts.length || log.parts.length > MOST_BARS) return [];
+  const own = policies.filter((policy) => !policy.preference);
+  const box = element("div", { className: "bars" }, element("h2", { textContent: "Action" }));
+  const cells = log.parts.map((part, k) => {
+    const seen = [row(actions, k), ...own.map(({ policy_action: command }) => row(command, k))];
+    const [low, high] = log.limits[part] ?? ends(seen);
+    const dial = element("span", { className: "dial", title: `${short(low)} to ${short(high)}` });
+    const number = element("span", { className: "number" });
+    const marks = seen.map((_, m) => element("i", { className: m ? "policy" : "" }));
+    if (low < 0 && high > 0) {
+      const zero = element("i", { className: "zero" });
+      zero.style.left = `${(100 * -low) / (high - low)}%`;
+      dial.append(zero);
+    }
+    dial.append(...marks);
+    box.append(element("span", { className: "name", textContent: part, title: part }), dial, number);
+    return (step) => {
+      seen.forEach((values, m) => {
+        const share = (values[step] - low) / (high - low || 1);
+        marks[m].hidden = !Number.isFinite(share);
+        marks[m].style.left = `${100 * Math.min(Math.max(share, 0), 1)}%`;
+      });
+      number.textContent = short(step < seen[0].length ? seen[0][step] : NaN);
+    };
+  });
+  if (own.length) box.append(element("p", { className: "key", textContent: "dark: log; blue: policy" }));
+  get("policies").append(box);
+  return [(step) => cells.forEach((draw) => draw(step))];
+}
+
+/** Return the smallest and the largest finite number of some arrays. */
+function ends(arrays) {
+  const finite = arrays.flatMap((values) => Array.from(values).filter(Number.isFinite));
+  return [finite.reduce((a, b) => Math.min(a, b), Infinity), finite.reduce((a, b) => Math.max(a, b), -Infinity)];
 }
 
 /** Return a title with the name of the policy, if the log has several. */
@@ -215,7 +277,8 @@ function facts(step) {
   const actions = [...Array(episode.actions.shape[0]).keys()].map((k) => row(episode.actions, k)[step]);
   const action = step === episode.rewards.length ? "\u2013"
     : (episode.is_discrete && log.actions[actions[0] - log.first_action]) || actions.slice(0, 8).map(short).join(", ");
-  const rows = { action, reward: short(episode.rewards[step]), "return so far": short(episode.sums[step]) };
+  const hasDials = !episode.is_discrete && log.parts.length && log.parts.length <= MOST_BARS;
+  const rows = { ...(hasDials ? {} : { action }), reward: short(episode.rewards[step]), "return so far": short(episode.sums[step]) };
   if (step === episode.rewards.length) rows.end = log.reasons[log.reason[state.index]];
   get("facts").replaceChildren(...Object.entries(rows).flatMap(([name, value]) =>
     [element("dt", { textContent: name }), element("dd", { textContent: value })]));
