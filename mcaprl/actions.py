@@ -107,7 +107,7 @@ class JointActions:
         return np.asarray(values).reshape(len(values), len(self.sizes))
 
 
-def joint_actions(space: spaces.Space[Any]) -> JointActions | None:
+def joint_actions(space: spaces.Space[Any] | None) -> JointActions | None:
     """Return the numbering of a finite space; None for other spaces."""
     if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         return None
