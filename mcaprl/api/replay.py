@@ -304,7 +304,7 @@ def _of_scene(
                 moment.follow,
                 _caption(dataset, episode, moment.step, moment.time_ns),
                 [
-                    Dial(one.name, float(actions[moment.step, one.index]), one.low, one.high)
+                    Dial(one.name, float(actions[moment.step, one.index]), *one.ends)
                     for one in bounded
                     if moment.step < episode.length
                 ],

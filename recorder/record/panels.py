@@ -9,6 +9,7 @@ slices are not used, because viewers join all elements of a slice into one line.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple
 from gymnasium import spaces
 
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
+from mcaprl.recorder.format.spaces import action_leaf, observation_leaves, part_names
 
 MAX_SERIES = 24
 """Maximum number of series in a plot; further series are left out."""
@@ -68,7 +69,7 @@ def action_parts(metadata: LogMetadata) -> dict[str, str]:
     """Return the suffix of the path of each element of an action, such as `[0]`, by its name."""
     leaf = action_leaf(metadata.action_space)
     suffixes = [f"[{index}]" for index in range(leaf.size)] if leaf.shape else [""]
-    names = metadata.action_part_names or [f"action{suffix}" for suffix in suffixes]
+    names = part_names(metadata.action_space, metadata.action_part_names)
     return dict(list(zip(names, suffixes, strict=True))[:MAX_SERIES])
 
 
@@ -79,6 +80,13 @@ class Bounded(NamedTuple):
     index: int
     low: float
     high: float
+    is_leftward: bool
+    """Whether positive numbers point to the left, so that a dial has its highest number there."""
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Number at the left and at the right end of a dial."""
+        return (self.high, self.low) if self.is_leftward else (self.low, self.high)
 
 
 def bounded_actions(metadata: LogMetadata) -> list[Bounded]:
@@ -87,10 +95,11 @@ def bounded_actions(metadata: LogMetadata) -> list[Bounded]:
     if not isinstance(space, spaces.Box):
         return []
     ends = zip(space.low.ravel().tolist(), space.high.ravel().tolist(), strict=True)
-    parts = zip(action_parts(metadata), ends, strict=False)
+    units = itertools.chain(metadata.action_units, itertools.repeat(""))
+    parts = zip(action_parts(metadata), ends, units, strict=False)
     return [
-        Bounded(name, index, *pair)
-        for index, (name, pair) in enumerate(parts)
+        Bounded(name, index, *pair, unit.endswith("| left"))
+        for index, (name, pair, unit) in enumerate(parts)
         if all(map(math.isfinite, pair))
     ]
 

@@ -210,7 +210,7 @@ def _command_panels(dataset: Dataset) -> list[Panel]:
     bounded = {one.index: (one.low, one.high) for one in bounded_actions(metadata)}
     columns = dataset.actions.reshape(len(dataset), -1).T
     return [
-        Panel(f"Action: {name}", partial(_commands_taken, values=column, ends=bounded.get(index)))
+        Panel(f"Action {name}", partial(_commands_taken, values=column, ends=bounded.get(index)))
         for index, (name, column) in enumerate(
             zip(list(action_parts(metadata))[:_SHOWN_PARTS], columns, strict=False)
         )

@@ -46,12 +46,12 @@ class Pose(NamedTuple):
 
 
 class Dial(NamedTuple):
-    """A number between its limits, drawn as a mark on a bar."""
+    """A number drawn as a mark on a bar, with the numbers at the bar's two ends."""
 
     name: str
     value: float
-    low: float
-    high: float
+    left: float
+    right: float
 
 
 class _Text(NamedTuple):
@@ -145,7 +145,7 @@ class ChaseView:
         for row, dial in enumerate(dials, len(lines)):
             top_px = 10 + 24 * row
             self._canvas.rectangle((bar_px, top_px, _BAR_PX, 12), _BAR)
-            if dial.low < 0 < dial.high:
+            if dial.left * dial.right < 0:
                 self._canvas.rectangle((bar_px + _along(dial, 0.0), top_px, 1, 12), _INK)
             at_px = bar_px + _along(dial, dial.value)
             self._canvas.rectangle((at_px - 3, top_px - 2, 6, 16), _MARK)
@@ -153,7 +153,7 @@ class ChaseView:
 
 def _along(dial: Dial, value: float) -> int:
     """Return the place of a value on the bar of a dial, in pixels."""
-    share = (value - dial.low) / (dial.high - dial.low)
+    share = (value - dial.left) / (dial.right - dial.left)
     return round(_BAR_PX * min(max(share, 0.0), 1.0))
 
 

@@ -253,9 +253,7 @@ class LogPage:
                 "actions": [actions[key] for key in sorted(actions)],
                 "first_action": min(actions, default=0),
                 "parts": list(action_parts(self._metadata)),
-                "limits": {
-                    one.name: [one.low, one.high] for one in bounded_actions(self._metadata)
-                },
+                "limits": {one.name: list(one.ends) for one in bounded_actions(self._metadata)},
                 "distance_m": _finite(view.get("distance_m"), CAMERA_M),
                 "tilt_deg": _finite(view.get("tilt_deg"), TILT_DEG),
                 "reasons": reasons,

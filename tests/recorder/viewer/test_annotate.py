@@ -16,9 +16,10 @@ from gymnasium import spaces
 import mcaprl
 from mcaprl.base_policy import BasePolicy
 from mcaprl.cli import run
-from mcaprl.errors import LogError, PolicyError, UsageError
+from mcaprl.errors import LogError, PolicyError
 from mcaprl.offline.estimate.values import (
     gamma_of_run,
+    half_ranges,
     normalized_entropy,
     td_errors,
     value_columns,
@@ -135,8 +136,99 @@ def test_actions_with_an_offset_and_single_actions(episode: Any) -> None:
     assert found["policy_action"].tolist() == [0, -1, -1]
     assert found["agrees"].tolist() == [False, True, False]
     assert normalized_entropy(np.ones((2, 1), np.float32)).tolist() == [0.0, 0.0]
-    with pytest.raises(UsageError, match="discrete"):
-        value_columns(Table(), episode, spaces.Box(-1, 1), 0.5)
+
+
+class Line(BasePolicy):
+    """Policy whose command is half of the observation, with Q(s, a) = s - a^2 summed over a."""
+
+    name = "line"
+
+    def __init__(self, has_values: bool = True) -> None:
+        self._has_values = has_values
+
+    def act(self, observations: Any) -> Any:
+        return np.repeat(observations / 2, 2, axis=1)
+
+    def action_values(self, observations: Any, actions: Any) -> Any:
+        if not self._has_values:
+            raise PolicyError("no values")
+        return observations[:, 0] - np.square(actions).sum(1)
+
+    def log_prob(self, observations: Any, actions: Any) -> Any:
+        if not self._has_values:
+            raise PolicyError("no densities")
+        return np.full(len(actions), -1.5)
+
+
+COMMANDS = spaces.Box(np.array([-1, 0], np.float32), np.array([1, 4], np.float32))
+
+
+@pytest.fixture
+def commanded() -> mcaprl.Dataset:
+    places = np.arange(4.0, dtype=np.float32)[:, None]
+    return mcaprl.Dataset.from_arrays(
+        observations=places[:3],
+        actions=np.array([[0, 0], [1, 2], [-1, 1]], np.float32),
+        rewards=np.array([1.0, -1.0, 2.0]),
+        terminated=np.array([False, False, True]),
+        truncated=np.zeros(3, bool),
+        next_observations=places[1:],
+        action_space=COMMANDS,
+    )
+
+
+def test_values_of_commands_by_hand(commanded: mcaprl.Dataset) -> None:
+    """The policy's commands are (0, 0), (.5, .5), (1, 1) and, at the end, (1.5, 1.5).
+
+    Q of the log is 0, 1 - 5 and 2 - 2, Q of the policy 0, .5, 0 and -1.5. The TD errors with gamma
+    .5 are 1 + .5*.5 - 0, -1 + .5*0 + 4 and 2 - 0. The halves of the ranges are 1 and 2.
+    """
+    found = value_columns(Line(), commanded.episodes[0], COMMANDS, 0.5)
+    assert found["policy_action"].tolist() == [[0, 0], [0.5, 0.5], [1, 1]]
+    assert found["difference"].tolist() == [[0, 0], [-0.5, -1.5], [2, 0]]
+    assert found["q"].tolist() == [0.0, -4.0, 0.0]
+    assert found["value"].tolist() == [0.0, 0.5, 0.0]
+    assert found["advantage"].tolist() == [0.0, -4.5, 0.0]
+    assert found["td_error"].tolist() == [1.25, 3.0, 2.0]
+    means = [0.0, (0.5**2 + 0.75**2) / 2, 2.0]
+    assert found["distance"].tolist() == pytest.approx(np.sqrt(means).tolist())
+    assert found["log_prob"].tolist() == [-1.5] * 3
+
+
+def test_a_policy_without_values_has_commands_and_distances(commanded: mcaprl.Dataset) -> None:
+    found = value_columns(Line(has_values=False), commanded.episodes[0], COMMANDS, 0.5)
+    for name in ("q", "value", "advantage", "td_error", "log_prob"):
+        assert np.isnan(found[name]).all()
+    assert found["distance"][2] == pytest.approx(math.sqrt(2))
+
+
+def test_ranges_of_unbounded_commands_are_those_of_the_log() -> None:
+    actions = np.array([[0.0, 3.0], [4.0, 3.0]])
+    unbounded = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    assert half_ranges(unbounded, actions).tolist() == [2.0, 1.0]
+    half = spaces.Box(np.array([0.0, -np.inf]), np.array([np.inf, 5.0]), dtype=np.float64)
+    assert half_ranges(half, actions).tolist() == [2.0, 1.0]
+
+
+def test_annotated_commands_are_logged_and_the_farthest_are_listed(
+    commanded: mcaprl.Dataset, tmp_path: Path
+) -> None:
+    log, out = tmp_path / "log.mcap", tmp_path / "annotated.mcap"
+    commanded.save(log)
+    episode = mcaprl.open(log).episodes[0]
+    with annotated_copy(log, out) as copy:
+        copy.add_values("/rl/values", [(episode, value_columns(Line(), episode, COMMANDS, 0.5))])
+    columns = Topic(McapReader(out), "/rl/values").read(["policy_action", "value", "log_prob"])
+    assert columns["policy_action"].tolist() == [[0, 0], [0.5, 0.5], [1, 1]]
+    assert columns["value"].tolist() == [0.0, 0.5, 0.0]
+    found = [(one.kind, one.step, round(one.value, 3)) for one in moments_of(out)]
+    assert found[:3] == [("td_error", 1, 3.0), ("td_error", 2, 2.0), ("td_error", 0, 1.25)]
+    assert found[3:] == [("disagreement", 2, 1.414), ("disagreement", 1, 0.637)]
+    shown = check_layout(out)["configById"]
+    assert shown["Gauge!action action[1]"]["maxValue"] == 4
+    plotted = [series["value"] for series in shown["Plot!action"]["paths"]]
+    assert plotted[2:] == ["/rl/values.policy_action[0]", "/rl/values.policy_action[1]"]
+    assert "Plot!values difference" in shown
 
 
 def test_gamma_is_read_from_the_run(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ import mcaprl
 from mcaprl import limits
 from mcaprl.cli import run
 from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.format.schema import COMMAND_VALUES
 from mcaprl.recorder.record.display import SCENE
 from mcaprl.recorder.viewer.annotate import annotated_copy
 from mcaprl.recorder.viewer.page import server
@@ -310,6 +311,63 @@ def test_many_images_are_thinned_out(log: Path, monkeypatch: pytest.MonkeyPatch)
     image = unpacked(LogPage(log).episode(0))["images"][0]
     assert image["steps"].tolist() == [0, 3]
     assert image["pixels"][:, 2, 3, 1].tolist() == [0, 30]
+
+
+@pytest.fixture(scope="module")
+def commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of commands (gas from 0 to 4, turn from -1 to 1) with a policy's commands."""
+    folder = tmp_path_factory.mktemp("commands")
+    steps = np.arange(4.0, dtype=np.float32)
+    actions = np.stack([steps, np.array([1, 0, -1, 0.5], np.float32)], 1)
+    ends = np.arange(4) == 3
+    data = mcaprl.Dataset.from_arrays(
+        observations=steps[:, None],
+        actions=actions,
+        rewards=np.ones(4),
+        terminated=ends,
+        truncated=np.zeros(4, bool),
+        next_observations=steps[:, None] + 1,
+        action_space=spaces.Box(np.array([0, -1], np.float32), np.array([4, 1], np.float32)),
+        action_part_names=("gas", "turn"),
+        action_units=("", "right | left"),
+    )
+    data.save(folder / "plain.mcap")
+    values = {"policy_action": actions[::-1], "difference": actions[::-1] - actions}
+    values |= {name: np.arange(4.0) for name in COMMAND_VALUES}
+    with annotated_copy(folder / "plain.mcap", folder / "log.mcap") as copy:
+        copy.add_values("/rl/values", [(data.episodes[0], values)])
+    return folder / "log.mcap"
+
+
+def test_commands_have_names_and_limits(commands: Path) -> None:
+    """A dial has the direction of its name: the highest number of a turn to the left is left."""
+    found = unpacked(LogPage(commands).index())
+    assert found["parts"] == ["gas", "turn"]
+    assert found["limits"] == {"gas": [0, 4], "turn": [1, -1]}
+    (policy,) = unpacked(LogPage(commands).episode(0))["policies"]
+    assert "preference" not in policy
+    assert policy["policy_action"].tolist() == [[3, 2, 1, 0], [0.5, -1, 0, 1]]
+
+
+def test_the_browser_shows_commands_as_dials(browser: Browser, commands: Path) -> None:
+    with served(commands) as url:
+        browser.show(url)
+        wait_for_episode(browser)
+        browser.run("seek(episode.times[1])")
+        assert browser.problems == []
+        text = browser.run("document.body.innerText").lower()
+        for expected in ("action: gas", "action: turn", "q-values of both commands", "td error"):
+            assert expected in text, expected
+        places = browser.run(
+            "[...document.querySelectorAll('.dial i:not(.zero)')].map((i) => i.style.left)"
+        )
+        # Step 1: gas 1 of 4 and policy 2; turn 0 and policy -1, which is right.
+        assert places == ["25%", "50%", "50%", "100%"]
+        assert browser.run("document.querySelectorAll('.dial .zero').length") == 1
+        assert "action" not in browser.run("get('facts').innerText").lower()
+        browser.run("seek(episode.times[4])")
+        assert browser.run("document.querySelectorAll('.dial i[hidden]').length") == 4
+        assert browser.problems == []
 
 
 def test_the_browser_shows_an_episode(browser: Browser, log: Path) -> None:

@@ -256,6 +256,22 @@ def test_continuous_actions_are_plotted(tmp_path: Path) -> None:
     assert "StateTransitions!actions" not in panels
 
 
+@pytest.mark.parametrize("sim", ["lane", "racer", "powerline"])
+def test_commands_have_names_limits_and_dials(tmp_path: Path, sim: str) -> None:
+    """Up to two dials are above the plot; more of them are on a tab of their own."""
+    path = tmp_path / "log.mcap"
+    with closing(mcaprl.RecordMcap(make_sim(sim, actions="continuous"), path)) as env:
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+    names = mcaprl.open(path).action_part_names
+    panels = check_layout(path)["configById"]
+    dials = [panels[f"Gauge!action {name}"] for name in names]
+    assert {(dial["minValue"], dial["maxValue"]) for dial in dials} == {(-1, 1)}
+    paths = [f"/rl/step{{final==false}}.action[{k}]" for k in range(len(names))]
+    assert [dial["path"] for dial in dials] == paths_of(panels["Plot!action"]) == paths
+    assert ("Tab!actions" in panels) == (len(names) > 2)
+
+
 def test_images_of_any_environment_are_shown(tmp_path: Path) -> None:
     class Images(gym.Env[Any, Any]):
         observation_space = spaces.Dict(

@@ -25,7 +25,7 @@ from mcaprl.recorder.viewer.video import (
     write_video,
 )
 from mcaprl.sims import make_sim
-from mcaprl.sims.drawing.chase_view import HEIGHT_PX, ChaseView, chase_eye, poses_of
+from mcaprl.sims.drawing.chase_view import HEIGHT_PX, ChaseView, Dial, chase_eye, poses_of
 from mcaprl.sims.drawing.scene import Frame, Kind, Shape, yaw_rotation
 from mcaprl.sims.geometry.mesh import box_mesh
 from mcaprl.sims.lane.scene import static_shapes
@@ -49,6 +49,17 @@ def view() -> Any:
 
 def car_at(x_m: float, y_m: float = 0.0, yaw_rad: float = 0.0) -> list[Frame]:
     return [Frame("car", (x_m, y_m, 0.0), yaw_rotation(yaw_rad))]
+
+
+def test_a_dial_marks_a_number_on_a_bar(view: Any) -> None:
+    """The bar is 160 pixels wide, with its left end at 1 and its right end at -1."""
+    places = []
+    for value in (1.0, 0.0, -0.5, 7.0):
+        image = view.draw([], [], [], "", [], [Dial("turn", value, 1.0, -1.0)])
+        row = image[16, :, 2].astype(int) - image[16, :, 0]
+        places.append(round(float(np.flatnonzero(row[:300] > 100).mean())))
+    bar = 24 + 9 * len("turn")
+    assert places == pytest.approx([bar, bar + 80, bar + 120, bar], abs=1)
 
 
 def test_images_are_converted_for_the_encoder() -> None:

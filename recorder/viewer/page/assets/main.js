@@ -151,7 +151,7 @@ function dialsOf({ actions, policies, is_discrete: isDiscrete }) {
     const dial = element("span", { className: "dial", title: `${short(low)} to ${short(high)}` });
     const number = element("span", { className: "number" });
     const marks = seen.map((_, m) => element("i", { className: m ? "policy" : "" }));
-    if (low < 0 && high > 0) {
+    if (low * high < 0) {
       const zero = element("i", { className: "zero" });
       zero.style.left = `${(100 * -low) / (high - low)}%`;
       dial.append(zero);
