@@ -28,7 +28,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -207,8 +207,7 @@ class BoxActions:
         flat = np.asarray(values).reshape(len(values), -1)
         low, high = self._bounds
         inside = (flat >= low) & (flat <= high)
-        found: NDArray[np.bool_] = inside.all(1)
-        return found
+        return cast("NDArray[np.bool_]", inside.all(1))
 
     @property
     def _bounds(self) -> tuple[NDArray[Any], NDArray[Any]]:

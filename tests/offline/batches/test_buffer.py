@@ -268,9 +268,8 @@ def test_infinite_bounds_are_those_of_the_data() -> None:
     with pytest.warns(UserWarning, match=text):
         buffer = TransitionBuffer.from_dataset(dataset)
     # The finite bounds are those of the space.
-    np.testing.assert_allclose(
-        buffer.actions.numpy(), [[-0.6, -1], [1, 1], [0.2, -1 / 3], [-0.6, -1]], rtol=1e-6
-    )
+    expected = np.array([[-0.6, -1], [1, 1], [0.2, -1 / 3], [-0.6, -1]])
+    np.testing.assert_allclose(buffer.actions.numpy(), expected, rtol=1e-6)
     # Other data in the same scale need no warning, and stay in the range.
     other = TransitionBuffer.from_dataset(boxed([[9, 8], [5, -3]], space), box=buffer.box)
     assert other.actions.tolist() == [[1, 1], [1, -1]]
@@ -296,7 +295,8 @@ def test_actions_that_cannot_be_learned_are_refused(
 def test_actions_outside_a_box_are_clipped_if_wanted() -> None:
     dataset = boxed([[1, 0], [-1, 5]], WIDE)
     buffer = TransitionBuffer.from_dataset(dataset, Packing(clip_actions=True))
-    np.testing.assert_allclose(buffer.actions.numpy(), [[-0.8, 0], [-1, 1]], rtol=1e-6)
+    expected = np.array([[-0.8, 0], [-1, 1]])
+    np.testing.assert_allclose(buffer.actions.numpy(), expected, rtol=1e-6)
 
 
 def test_a_mask_for_the_actions_of_a_box_is_refused() -> None:
