@@ -17,6 +17,7 @@ from mcaprl.recorder.dataset.mapped import Frames
 from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.action_commands import ActionCommands, Command
+from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import MAX_NUMBERED_ACTIONS, LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of
@@ -192,7 +193,7 @@ def assembled(
         rewards=np.concatenate([run.rewards for run in runs])[steps],
         terminated=_at_ends(lengths, [each.terminated for each in summaries]),
         truncated=_at_ends(lengths, [each.truncated for each in summaries]),
-        behavior_probs=np.concatenate([run.probs for run in runs])[steps],
+        behavior=np.concatenate([run.behavior for run in runs])[steps],
         episodes=tuple(summaries),
     )
     return Dataset(transitions, metadata, origin=Origin(plan.bag.paths))
@@ -217,18 +218,19 @@ def _summary(
             f" {run.times_ns[segment.first + wrong[0]]} ns; it is not finite in {len(wrong)} of"
             f" {len(rewards)} steps of this episode: set `missing` for the quantities in `reward`"
         )
-    probs = run.probs[segment.first : segment.last]
-    # Unknown probabilities are NaN.
-    wrong = np.flatnonzero((probs <= 0) | (probs > 1))
+    values, kind = run.behavior[segment.first : segment.last], behavior_field(run.actions.space)
+    wrong = np.flatnonzero(kind.is_impossible(values))
     if len(wrong):
+        assert plan.behavior is not None
+        (key,) = plan.behavior.keys
         raise UsageError(
-            f"{plan.place.of('behavior_prob')}: the probability is {probs[wrong[0]]:g} at"
-            f" {run.times_ns[segment.first + wrong[0]]} ns; it is not above 0 and at most 1 in"
-            f" {len(wrong)} of {len(probs)} steps of this episode: use another field, `scale` or"
-            " `clip`, or remove behavior_prob"
+            f"{plan.place.of(key)}: the {kind.what} is {values[wrong[0]]:g} at"
+            f" {run.times_ns[segment.first + wrong[0]]} ns; it is not {kind.expected} in"
+            f" {len(wrong)} of {len(values)} steps of this episode: use another field, `scale` or"
+            f" `clip`, or remove {key}"
         )
     named = (name for name, holds in run.reasons.items() if holds[segment.last])
-    kind = "terminated" if segment.terminated else "truncated"
+    end = "terminated" if segment.terminated else "truncated"
     return EpisodeSummary(
         episode=number,
         length=segment.length,
@@ -237,7 +239,7 @@ def _summary(
         truncated=segment.truncated,
         start_time_ns=int(times_ns[0]),
         end_time_ns=int(times_ns[-1]),
-        reason=next(named, segment.reason or kind),
+        reason=next(named, segment.reason or end),
         policy=plan.mapping.meta.policy,
     )
 

@@ -467,6 +467,11 @@ class Mapping(_Part):
         description="Probability of the action under the policy that acted, above 0 and at most 1."
         " Its `align` is that of the action by default.",
     )
+    behavior_log_prob: Quantity | None = Field(
+        default=None,
+        description="Natural logarithm of the probability of the action, or of its density in the"
+        " action's own units, which a `box` has; instead of `behavior_prob`.",
+    )
     meta: Meta = Field(default=Meta(), description="Facts that the bag does not contain.")
     strict: bool = Field(
         default=False,
@@ -492,9 +497,20 @@ class Mapping(_Part):
         both = set(self.observation) & set(self.fields)
         if both:
             raise ValueError(f"'{min(both)}' is both in observation and in fields")
-        if self.behavior_prob is not None and self.behavior_prob.field is None:
-            raise ValueError("behavior_prob must be a field")
+        if self.behavior_prob is not None and self.behavior_log_prob is not None:
+            raise ValueError("give either behavior_prob or behavior_log_prob")
+        if self.behavior_prob is not None and self.action.box is not None:
+            raise ValueError("the actions of a box have densities: use behavior_log_prob")
+        if self.behavior is not None and self.behavior[1].field is None:
+            raise ValueError(f"{self.behavior[0]} must be a field")
         return self
+
+    @property
+    def behavior(self) -> tuple[str, Quantity] | None:
+        """Key and quantity of the probability or log density; None if unknown."""
+        keys = ("behavior_prob", "behavior_log_prob")
+        given = ((key, getattr(self, key)) for key in keys)
+        return next(((key, found) for key, found in given if found is not None), None)
 
     @property
     def quantities(self) -> dict[str, Quantity]:
@@ -506,7 +522,7 @@ MAPPING_SECTIONS: dict[str, type[BaseModel]] = {
     "The file": Mapping,
     "clock": Clock,
     "time, if it is a field": Stamp,
-    "An entry of observation or fields, and behavior_prob": Quantity,
+    "An entry of observation or fields, behavior_prob and behavior_log_prob": Quantity,
     "action": Action,
     "action.box": Limits,
     "episodes": Episodes,
