@@ -223,7 +223,7 @@ def part_name(part: int, names: Sequence[str] = ()) -> str:
     return f"action[{part}]" + (f" ({names[part]})" if part < len(names) else "")
 
 
-def joint_actions(space: spaces.Space[Any]) -> JointActions | None:
+def joint_actions(space: spaces.Space[Any] | None) -> JointActions | None:
     """Return the numbering of a finite space; None for other spaces."""
     if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         return None
