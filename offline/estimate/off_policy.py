@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mcaprl.base_policy import BasePolicy, RandomPolicy
 from mcaprl.errors import SpaceError, UsageError
-from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline.batches.buffer import TransitionBuffer, discrete_actions
 from mcaprl.offline.estimate.fqe import FQE, FQEConfig
 from mcaprl.offline.estimate.importance import (
     ESTIMATORS,
@@ -118,6 +118,7 @@ class OffPolicyEvaluator:
             TrainingError: There are no transitions, or a number is not finite.
             UsageError: There are too few episodes for cross-fitting.
         """
+        discrete_actions(dataset.action_space, "evaluation from the log alone")
         self._config = config or FQEConfig()
         self._seed = seed
         self._dataset = dataset
