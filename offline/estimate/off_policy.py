@@ -23,6 +23,7 @@ from mcaprl.offline.estimate.importance import (
     EpisodeTable,
     Floats,
     RatioEstimate,
+    check_space,
     effective_sample_size,
     mean_weight,
 )
@@ -118,6 +119,7 @@ class OffPolicyEvaluator:
             TrainingError: There are no transitions, or a number is not finite.
             UsageError: There are too few episodes for cross-fitting.
         """
+        check_space(dataset.action_space)
         self._config = config or FQEConfig()
         self._seed = seed
         self._dataset = dataset
