@@ -317,23 +317,18 @@ def test_many_images_are_thinned_out(log: Path, monkeypatch: pytest.MonkeyPatch)
 def commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log of commands (gas from 0 to 4, turn from -1 to 1) with a policy's commands."""
     folder = tmp_path_factory.mktemp("commands")
-    steps = np.arange(4.0, dtype=np.float32)
-    actions = np.stack([steps, np.array([1, 0, -1, 0.5], np.float32)], 1)
-    ends = np.arange(4) == 3
-    data = mcaprl.Dataset.from_arrays(
-        observations=steps[:, None],
-        actions=actions,
-        rewards=np.ones(4),
-        terminated=ends,
-        truncated=np.zeros(4, bool),
-        next_observations=steps[:, None] + 1,
-        action_space=spaces.Box(np.array([0, -1], np.float32), np.array([4, 1], np.float32)),
-        action_part_names=("gas", "turn"),
-        action_units=("", "right | left"),
-    )
-    data.save(folder / "plain.mcap")
+    actions = np.stack([np.arange(5), [1, 0, -1, 0.5, 0]], 1).astype(np.float32)
+    env = Driver()
+    env.action_space = spaces.Box(np.array([0, -1], np.float32), np.array([4, 1], np.float32))
+    env.action_part_names, env.action_units = ("gas", "turn"), ("", "right | left")
+    del env.action_meanings
+    with closing(mcaprl.RecordMcap(env, folder / "plain.mcap")) as recorder:
+        recorder.reset(seed=0)
+        for action in actions:
+            recorder.step(action)
+    data = mcaprl.open(folder / "plain.mcap")
     values = {"policy_action": actions[::-1], "difference": actions[::-1] - actions}
-    values |= {name: np.arange(4.0) for name in COMMAND_VALUES}
+    values |= {name: np.arange(5.0) for name in COMMAND_VALUES}
     with annotated_copy(folder / "plain.mcap", folder / "log.mcap") as copy:
         copy.add_values("/rl/values", [(data.episodes[0], values)])
     return folder / "log.mcap"
@@ -346,7 +341,7 @@ def test_commands_have_names_and_limits(commands: Path) -> None:
     assert found["limits"] == {"gas": [0, 4], "turn": [1, -1]}
     (policy,) = unpacked(LogPage(commands).episode(0))["policies"]
     assert "preference" not in policy
-    assert policy["policy_action"].tolist() == [[3, 2, 1, 0], [0.5, -1, 0, 1]]
+    assert policy["policy_action"].tolist() == [[4, 3, 2, 1, 0], [0, 0.5, -1, 0, 1]]
 
 
 def test_the_browser_shows_commands_as_dials(browser: Browser, commands: Path) -> None:
@@ -361,11 +356,11 @@ def test_the_browser_shows_commands_as_dials(browser: Browser, commands: Path) -
         places = browser.run(
             "[...document.querySelectorAll('.dial i:not(.zero)')].map((i) => i.style.left)"
         )
-        # Step 1: gas 1 of 4 and policy 2; turn 0 and policy -1, which is right.
-        assert places == ["25%", "50%", "50%", "100%"]
+        # Step 1: gas 1 of 4 and policy 3; turn 0 and policy .5, which is left.
+        assert places == ["25%", "75%", "50%", "25%"]
         assert browser.run("document.querySelectorAll('.dial .zero').length") == 1
         assert "action" not in browser.run("get('facts').innerText").lower()
-        browser.run("seek(episode.times[4])")
+        browser.run("seek(episode.times[5])")
         assert browser.run("document.querySelectorAll('.dial i[hidden]').length") == 4
         assert browser.problems == []
 
@@ -516,7 +511,7 @@ def test_a_log_without_a_scene_has_plots(browser: Browser, tmp_path: Path) -> No
             "Action",
             "Observation",
         ]
-        assert "0.5" in browser.run("get('facts').innerText")
+        assert "0.5" in browser.run("document.querySelector('.bars').innerText")
         assert browser.problems == []
 
 

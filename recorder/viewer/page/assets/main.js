@@ -175,7 +175,8 @@ function dialsOf({ actions, policies, is_discrete: isDiscrete }) {
 /** Return the smallest and the largest finite number of some arrays. */
 function ends(arrays) {
   const finite = arrays.flatMap((values) => Array.from(values).filter(Number.isFinite));
-  return [finite.reduce((a, b) => Math.min(a, b), Infinity), finite.reduce((a, b) => Math.max(a, b), -Infinity)];
+  const extreme = (choose, first) => finite.reduce((a, b) => choose(a, b), first);
+  return [extreme(Math.min, Infinity), extreme(Math.max, -Infinity)];
 }
 
 /** Return a title with the name of the policy, if the log has several. */
@@ -278,7 +279,8 @@ function facts(step) {
   const action = step === episode.rewards.length ? "\u2013"
     : (episode.is_discrete && log.actions[actions[0] - log.first_action]) || actions.slice(0, 8).map(short).join(", ");
   const hasDials = !episode.is_discrete && log.parts.length && log.parts.length <= MOST_BARS;
-  const rows = { ...(hasDials ? {} : { action }), reward: short(episode.rewards[step]), "return so far": short(episode.sums[step]) };
+  const sums = { reward: short(episode.rewards[step]), "return so far": short(episode.sums[step]) };
+  const rows = hasDials ? sums : { action, ...sums };
   if (step === episode.rewards.length) rows.end = log.reasons[log.reason[state.index]];
   get("facts").replaceChildren(...Object.entries(rows).flatMap(([name, value]) =>
     [element("dt", { textContent: name }), element("dd", { textContent: value })]));
