@@ -328,7 +328,7 @@ def _box_of(dataset: Dataset, packing: Packing) -> BoxActions:
     space = dataset.action_space
     assert isinstance(space, spaces.Box)
     _require_finite("actions", _is_finite(torch.from_numpy(np.asarray(dataset.actions))))
-    names = getattr(dataset, "action_part_names", ())
+    names = dataset.action_part_names
     actions = np.clip(dataset.actions, space.low, space.high)
     box = BoxActions.of(space, actions, names)
     unbounded = np.isinf([space.low.ravel(), space.high.ravel()]).any(0)
@@ -359,7 +359,7 @@ def _scaled(dataset: Dataset, box: BoxActions, packing: Packing) -> NDArray[np.f
         row = int(outside.argmax())
         low, high, flat = box.space.low.ravel(), box.space.high.ravel(), actions[row].ravel()
         part = int(((flat < low) | (flat > high)).argmax())
-        name = part_name(part, getattr(dataset, "action_part_names", ()))
+        name = part_name(part, dataset.action_part_names)
         raise SpaceError(
             f"{name} of row {row} is {flat[part]:g}, outside its bounds {low[part]:g} to"
             f" {high[part]:g}, as are the actions of {counted(int(outside.sum()), 'row')}; to clip"
