@@ -116,7 +116,7 @@ def main() -> None:
         ]
         name = "study.json" if arguments.study else "scores.json"
         _fill(folder / name, sim, paths, wanted, SMALL if arguments.study else {})
-        found = {sim: _read(arguments.folder / sim / name) for sim in SIMS}
+        found = {sim: read_cells(arguments.folder / sim / name) for sim in SIMS}
         if arguments.study:
             print(text := study_table(found))
             write_section("sim-settings", text)
@@ -137,7 +137,7 @@ def _fill(
         random = run(sim, [None])
         pilot = run(sim, [pilot_of(sim, folder, env)], env)
     for name, algo in wanted:
-        cells = _read(results)
+        cells = read_cells(results)
         row = cells.setdefault(name, {})
         if algo in row:
             continue
@@ -164,7 +164,12 @@ def learn(
     special = special(data) if callable(special) else special
     settings = settings_of(sim, name, {**shared, **special})
     train(data, settings, out, seeds=SEEDS, progress=lambda _: None)
-    score = normalize(run(sim, list(load_policies(out))), random, pilot)
+    return cell_of(run(sim, list(load_policies(out))), random, pilot)
+
+
+def cell_of(found: PolicyScore, random: PolicyScore, pilot: PolicyScore) -> Cell:
+    """Return the normalized score of all seeds, and those of each."""
+    score = normalize(found, random, pilot)
     assert score.normalized_score is not None
     assert score.normalized_interval is not None
     return {
@@ -216,7 +221,7 @@ def table(sim: str, cells: dict[str, dict[str, Cell]]) -> str:
     for name in NAMES:
         row = cells.get(name, {})
         behavior = f" ({row['behavior']['score']:.2f})" if row else ""
-        texts = [_text(row.get(algo)) for algo in ALGOS]
+        texts = [score_text(row.get(algo)) for algo in ALGOS]
         lines.append(f"| {name}{behavior} | {' | '.join(texts)} |")
     return "\n".join([*lines, ""])
 
@@ -229,7 +234,7 @@ def study_table(cells: dict[str, dict[str, dict[str, Cell]]]) -> str:
         for name in log_names(sim):
             row = of_sim.get(name, {})
             behavior = f" ({row['behavior']['score']:.2f})" if row else ""
-            texts = [_text(row.get(column)) for column in STUDY]
+            texts = [score_text(row.get(column)) for column in STUDY]
             lines.append(f"| {sim} {name}{behavior} | {' | '.join(texts)} |")
             for column, found in scores.items():
                 found.append(row[column]["score"] if column in row else np.nan)
@@ -255,14 +260,16 @@ def _interval_text(values: Any) -> str:
     return f"{values.mean():.2f} ({low:.2f} to {high:.2f}; n = {len(values)})"
 
 
-def _text(cell: Cell | None) -> str:
+def score_text(cell: Cell | None) -> str:
+    """Return a score with its interval; a dash for a missing cell."""
     if cell is None:
         return "-"
     low, high = cell["interval"]
     return f"{cell['score']:.2f} ({low:.2f} to {high:.2f})"
 
 
-def _read(path: Path) -> dict[str, dict[str, Cell]]:
+def read_cells(path: Path) -> dict[str, dict[str, Cell]]:
+    """Return the finished cells, by log and column."""
     found: dict[str, dict[str, Cell]] = json.loads(path.read_text()) if path.exists() else {}
     return found
 
