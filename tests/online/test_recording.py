@@ -23,7 +23,7 @@ from mcaprl.online.evaluation import FirstEpisodes
 from mcaprl.online.recording import behavior_probabilities, log_paths, recorded
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
-from mcaprl.online.vec_env import BatchedVecEnv
+from mcaprl.online.sb3 import BatchedVecEnv
 from mcaprl.online.zip_file import read_policy
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset

@@ -16,8 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from mcaprl.api.policies import load_policies
 from mcaprl.cli import run
 from mcaprl.errors import OutputExistsError, SpaceError, TrainingError, UnknownNameError, UsageError
-from mcaprl.online.algorithms import check_spaces
-from mcaprl.online.task import Task
+from mcaprl.online.task import Task, check_spaces
 from mcaprl.online.train import OnlineSummary, train
 from mcaprl.progress import TrainingProgress
 from mcaprl.runs import read_curve
