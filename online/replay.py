@@ -359,11 +359,11 @@ def averaged(images: Tensor, pool: int) -> Tensor:
     if pool == 1:
         return images
     height, width = (edge // pool * pool for edge in images.shape[1:3])
-    sums = torch.full((), pool**2 // 2, dtype=torch.int32, device=images.device)
+    sums = torch.zeros((), dtype=torch.int32, device=images.device)
     for row in range(pool):
         for column in range(pool):
-            sums = sums + images[:, row:height:pool, column:width:pool]
-    return (sums // pool**2).to(torch.uint8)
+            sums = sums + images[:, row:height:pool, column:width:pool].int()
+    return ((sums + pool**2 // 2) // pool**2).to(torch.uint8)
 
 
 def _shifted(observations: Observations, down: int, right: int) -> Observations:
