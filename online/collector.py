@@ -235,4 +235,4 @@ def epsilon_at(config: DQNConfig, steps: int) -> float:
     if config.exploration_decay:
         return max(last, first * float(config.exploration_decay**steps))
     done = steps / max(config.exploration_fraction * config.steps, 1)
-    return first + (last - first) * min(done, 1.0)
+    return last if done >= 1 else first + (last - first) * done

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from gymnasium import spaces
@@ -359,11 +359,9 @@ def averaged(images: Tensor, pool: int) -> Tensor:
     if pool == 1:
         return images
     height, width = (edge // pool * pool for edge in images.shape[1:3])
-    sums = torch.zeros((), dtype=torch.int32, device=images.device)
-    for row in range(pool):
-        for column in range(pool):
-            sums = sums + images[:, row:height:pool, column:width:pool].int()
-    return ((sums + pool**2 // 2) // pool**2).to(torch.uint8)
+    rows = sum(images[:, row:height:pool].int() for row in range(pool))
+    sums = sum(rows[:, :, column:width:pool] for column in range(pool))
+    return cast(Tensor, (sums + pool**2 // 2) // pool**2).to(torch.uint8)
 
 
 def _shifted(observations: Observations, down: int, right: int) -> Observations:

@@ -19,9 +19,9 @@ from mcaprl.frames import FrameStack, frame_rows, joined, stacked_frames, stacke
 from mcaprl.offline.algorithms.config import CQLConfig
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.agent import Agent
+from mcaprl.online.sb3 import BatchedVecEnv, StackedVecEnv
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
-from mcaprl.online.sb3 import BatchedVecEnv, StackedVecEnv
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims.evaluation.evaluate import Scale
 from mcaprl.sims.evaluation.rollout import EpsilonGreedy, rollout
