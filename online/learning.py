@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError, SpaceError, TrainingError, UsageError
-from mcaprl.frames import mapped, rows_of
+from mcaprl.frames import mapped
 from mcaprl.offline.algorithms.heads import build_head
 from mcaprl.offline.algorithms.learner import NotFiniteError
 from mcaprl.offline.batches.observations import ObservationEncoder
@@ -337,15 +337,14 @@ def fill_buffer(agents: Agents, dataset: Dataset) -> int:
     buffer.begin(encode(batch.observations))
     for row in range(rows):
         following = dataset.batch(steps[row + 1]) if row + 1 < rows else None
-        ended = np.flatnonzero(batch.terminated | batch.truncated)
         after = batch.next_observations if following is None else following.observations
         outcome = Outcome(
             torch.from_numpy(batch.rewards.astype(np.float32)),
             torch.from_numpy(batch.terminated),
             torch.from_numpy(batch.truncated),
             encode(after),
-            encode(rows_of(batch.next_observations, ended)),
-            torch.from_numpy(ended),
+            encode(batch.next_observations),
+            None,
         )
         buffer.add(torch.from_numpy(buffer.joint.indexes(batch.actions)), outcome)
         if following is not None:
