@@ -87,7 +87,8 @@ class Agent(ABC):
         self.resumed_at = 0
         self._task, self._env_id, self._folder, self._seed = task, env_id, folder, seed
         self._score, self._reported_at = math.nan, -1
-        self._began_s, self._scalars = 0.0, None
+        self._began_s = 0.0
+        self._scalars: ScalarsWriter | None = None
         with ExitStack() as stack:
             self.env: Any = stack.enter_context(closing(task.batch(task.config.envs)))
             self._recorder = None
@@ -163,8 +164,7 @@ class Agent(ABC):
         if self.steps >= self._task.config.steps:
             return
         self._began_s = time.perf_counter()
-        self._scalars = ScalarsWriter(self._folder, self.steps)
-        with closing(self._scalars):
+        with closing(ScalarsWriter(self._folder, self.steps)) as self._scalars:
             self._train(report)
             if self.steps > self._reported_at:
                 self._report(report)

@@ -181,13 +181,13 @@ class EpsilonGreedy(Behavior):
 
     def _random(self, observations: Observations) -> Tensor:
         """Draw allowed actions (W,) uniformly."""
-        mask, options = observations.mask, {"generator": self._generator}
+        mask, generator = observations.mask, self._generator
         if mask is None:
             drawn = torch.empty(
                 len(observations), dtype=torch.int64, device=observations.vector.device
             )
-            return drawn.random_(self._learner.n_actions, **options)
-        return torch.multinomial(mask.float(), 1, **options).squeeze(1)
+            return drawn.random_(self._learner.n_actions, generator=generator)
+        return torch.multinomial(mask.float(), 1, generator=generator).squeeze(1)
 
     def _probabilities(
         self, observations: Observations, actions: Tensor, values: Tensor | None, epsilon: float

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import torch
@@ -216,15 +217,15 @@ class ReplayBuffer(TransitionBuffer):
     def draw(self, count: int, generators: Sequence[torch.Generator]) -> Tensor:
         """Draw `count` rows for each agent, (K * count,), with one generator for all agents."""
         envs, device = self.width // self.agents, self.device
-        shape, options = (self.agents, count), {"generator": self.generator, "device": device}
-        drawn = torch.randint(self.stored * envs, shape, **options)
+        draw = partial(torch.randint, generator=self.generator, device=device)
+        drawn = draw(self.stored * envs, (self.agents, count))
         if self.image_shift:
-            most = self.image_shift
-            shifts = torch.randint(-most, most + 1, (2, 2), **options).tolist()
+            shifts = draw(-self.image_shift, self.image_shift + 1, (2, 2)).tolist()
             self.counts.shifts = tuple(map(tuple, shifts))
         slots = (self.steps - 1 - drawn // envs) % self.slots
         first = torch.arange(self.agents, device=device).unsqueeze(1) * envs
-        return (slots * self.width + first + drawn % envs).flatten()
+        rows: Tensor = slots * self.width + first + drawn % envs
+        return rows.flatten()
 
     def batch(self, rows: Tensor) -> Batch:
         """Return the transitions of rows (R,), with the shift of the last draw."""
@@ -258,7 +259,7 @@ class ReplayBuffer(TransitionBuffer):
         """Return the content and the state of the generator."""
         used = min(self.steps + 1, self.slots) * self.width
         next_places = self.places[1, :used]
-        finals = next_places[next_places >= len(self.actions)].unique()
+        finals = torch.unique(next_places[next_places >= len(self.actions)])
         assert isinstance(self.frames, Observations)
         parts = {
             f"frames.{number}": torch.cat([part[:used], part.index_select(0, finals)])
@@ -359,8 +360,8 @@ def averaged(images: Tensor, pool: int) -> Tensor:
     if pool == 1:
         return images
     height, width = (edge // pool * pool for edge in images.shape[1:3])
-    rows = sum(images[:, row:height:pool].int() for row in range(pool))
-    sums = sum(rows[:, :, column:width:pool] for column in range(pool))
+    rows: Any = sum(images[:, row:height:pool].int() for row in range(pool))
+    sums: Any = sum(rows[:, :, column:width:pool] for column in range(pool))
     return cast(Tensor, (sums + pool**2 // 2) // pool**2).to(torch.uint8)
 
 

@@ -129,10 +129,10 @@ class ModelAgent(Agent):
 
     def _make_model(self) -> BaseAlgorithm:
         task, config = self._task, self._task.config
-        env: VecEnv = BatchedVecEnv(self.env)
-        env.before_step = self._before_step
-        if config.frame_stack > 1:
-            env = StackedVecEnv(env, config.frame_stack)
+        batched = BatchedVecEnv(self.env)
+        batched.before_step = self._before_step
+        stack = config.frame_stack
+        env: VecEnv = batched if stack == 1 else StackedVecEnv(batched, stack)
         model = make_model(task.algo, config, env, self._seed)
         architecture = own_architecture(config, env.observation_space)
         space = self.env.single_observation_space

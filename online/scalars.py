@@ -7,6 +7,7 @@ import io
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TextIO
 
 from torch.utils.tensorboard import SummaryWriter
 
@@ -62,8 +63,8 @@ class ScalarsWriter:
         writer.writerows(self._rows)
         write_atomically(self._path, text.getvalue().encode(), TrainingError)
 
-    def _writer(self, file: object) -> csv.DictWriter[str]:
-        return csv.DictWriter(file, self._columns, lineterminator="\n")  # type: ignore[type-var]
+    def _writer(self, file: TextIO) -> csv.DictWriter[str]:
+        return csv.DictWriter(file, self._columns, lineterminator="\n")
 
 
 def _read(path: Path) -> list[dict[str, str]]:

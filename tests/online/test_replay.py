@@ -142,7 +142,8 @@ def test_a_batch_has_the_returns_and_stacks_of_the_recorded_steps(
             assert stack == reference.stack(t, e, frame_stack)
             assert batch.actions[row] == t % 4
             reward, discount, after = reference.transition(t, e, n_steps, frame_stack)
-            assert (batch.rewards[row], batch.discounts[row]) == (reward, discount)
+            assert batch.rewards[row] == reward
+            assert batch.discounts[row] == discount
             assert batch.next_observations.vector[row].tolist() == after
     assert torch.equal(buffer.draw(64, []), other.draw(64, []))
 
@@ -180,7 +181,7 @@ def test_images_are_stored_averaged_once_and_shifted_together() -> None:
     images = random.integers(256, size=(WIDTH, 84, 85, 1), dtype=np.uint8)
     speeds = random.normal(size=(WIDTH, 2)).astype(np.float32)
     encoded = buffer.encoder.encode({"depth": images, "speed": speeds})
-    assert buffer.frames.images[0].shape[1:] == (42, 42, 1)  # type: ignore[union-attr]
+    assert buffer.frames.images[0].shape[1:] == (42, 42, 1)
     buffer.begin(encoded)
     squares = images[:, :, :84].reshape(WIDTH, 42, 2, 42, 2, 1).astype(float)
     expected = np.floor(squares.mean((2, 4)) + 0.5)
@@ -192,13 +193,13 @@ def test_images_are_stored_averaged_once_and_shifted_together() -> None:
             torch.zeros(WIDTH), no, no, encoded, encoded.rows(torch.arange(0)), torch.arange(0)
         ),
     )
-    found = set()
+    found: set[tuple[int, int]] = set()
     for _ in range(40):
         rows = buffer.draw(4, [])
         batch = buffer.batch(rows)
         stored = buffer.frames.rows(rows).images[0]
         here, there = buffer.counts.shifts
-        found |= {here, there}
+        found.update((here, there))
         torch.testing.assert_close(batch.observations.images[0], shifted(stored, *here))
         torch.testing.assert_close(batch.next_observations.images[0], shifted(stored, *there))
         torch.testing.assert_close(batch.observations.vector, encoded.vector[rows])

@@ -168,7 +168,7 @@ def test_images_are_averaged_for_the_buffer(tmp_path: Path) -> None:
     data = mcaprl.open(path)
     with closing(agent(tmp_path, {"observation": "depth"}, envs=1)) as begun:
         begun.start_from(data, None)
-        frames = begun.agents.buffer.frames.images[0]  # type: ignore[union-attr]
+        frames = begun.agents.buffer.frames.images[0]
         assert frames.shape[1:] == (42, 42, 1)
         squares = data.observations.reshape(12, 42, 2, 42, 2)
         expected = np.floor(squares.mean((2, 4)) + 0.5)
