@@ -1,4 +1,4 @@
-"""Online learning with recording: DQN, Double DQN, PPO and A2C of Stable-Baselines3.
+"""Online learning with recording: Double DQN, and DQN, PPO and A2C of Stable-Baselines3.
 
 Importing this package does not import torch; the first use of one of its names does.
 
@@ -18,10 +18,13 @@ from mcaprl.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from mcaprl.online.agent import Agent
+    from mcaprl.online.collector import Collector
     from mcaprl.online.config import SIM_SETTINGS
     from mcaprl.online.curves import VALUES, CurvePoint, curve_figure, draw_curves, read_run
     from mcaprl.online.evaluation import FRESH_SEED, SELECTION_SEED, measure_scale
+    from mcaprl.online.learning import LearningAgent
     from mcaprl.online.live import LiveTraining
+    from mcaprl.online.replay import ReplayBuffer
     from mcaprl.online.task import Task
     from mcaprl.online.zip_file import describe_run, read_policy, save_policy
 
@@ -35,8 +38,11 @@ __all__ = [
     "SIM_SETTINGS",
     "VALUES",
     "Agent",
+    "Collector",
     "CurvePoint",
+    "LearningAgent",
     "LiveTraining",
+    "ReplayBuffer",
     "Task",
     "curve_figure",
     "describe_run",
@@ -52,9 +58,12 @@ __getattr__ = lazy_attributes(
     __name__,
     {
         "mcaprl.online.agent": ("Agent",),
+        "mcaprl.online.collector": ("Collector",),
         "mcaprl.online.curves": ("VALUES", "CurvePoint", "curve_figure", "draw_curves", "read_run"),
         "mcaprl.online.evaluation": ("FRESH_SEED", "SELECTION_SEED", "measure_scale"),
+        "mcaprl.online.learning": ("LearningAgent",),
         "mcaprl.online.live": ("LiveTraining",),
+        "mcaprl.online.replay": ("ReplayBuffer",),
         "mcaprl.online.config": ("SIM_SETTINGS",),
         "mcaprl.online.task": ("Task",),
         "mcaprl.online.zip_file": ("describe_run", "read_policy", "save_policy"),

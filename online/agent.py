@@ -1,60 +1,59 @@
-"""Agent of one seed: training, evaluation, recording and checkpoints."""
+"""Training of one seed: environments, log, evaluations, curve, best policy and checkpoints.
+
+The loop differs: `online.learning` has that of this package's learners, and `online.sb3` that of
+Stable-Baselines3's models.
+"""
 
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Callable
+import time
+from abc import ABC, abstractmethod
 from contextlib import ExitStack, closing
-from dataclasses import asdict
-from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, ClassVar
 
 import numpy as np
-from stable_baselines3 import DQN
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger, make_output_format
-from stable_baselines3.common.utils import ConstantSchedule
-from stable_baselines3.common.vec_env import VecEnv
+import torch
+from safetensors import SafetensorError
+from torch import Tensor
 
+from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import TrainingError
 from mcaprl.files import subfolder, write_atomically
-from mcaprl.frames import parts_of, parts_of_space
-from mcaprl.online.algorithms import make_model, own_architecture
-from mcaprl.online.checkpoint import load_checkpoint, save_checkpoint
-from mcaprl.online.config import DQNConfig
+from mcaprl.frames import mapped
+from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.online.curves import CurvePoint, write_curve
 from mcaprl.online.evaluation import Evaluation, FirstEpisodes
-from mcaprl.online.features import channels_first, inputs_of, normalize_images
-from mcaprl.online.live import LiveTraining
-from mcaprl.online.recording import ActionDescriber, recorded
+from mcaprl.online.live import LiveTraining, Shown
+from mcaprl.online.recording import recorded
+from mcaprl.online.scalars import ScalarsWriter
 from mcaprl.online.task import Task
-from mcaprl.online.vec_env import BatchedVecEnv, StackedVecEnv
-from mcaprl.online.warm_start import fill_buffer, take_weights
-from mcaprl.online.zip_file import describe_run, save_policy
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.runs import BEST_NAME, CHECKPOINT_NAME, CURVE_NAME, writing
+from mcaprl.runs import CHECKPOINT_NAME, CURVE_NAME, broken_checkpoint, writing
 from mcaprl.sims.evaluation.evaluate import Scale
-from mcaprl.sims.evaluation.rollout import episode_seed
+from mcaprl.storage.tensor_files import read_tensors
 
 LOG_INTERVAL = 1_000
 """Number of environment steps between two rows of scalars, and between two progress reports."""
 EVALUATIONS_NAME = "evaluations"
 CENTERING_STEPS = 2_000
 """Number of random steps before training; their images determine the image normalization."""
+BROKEN = (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError, IndexError)
+"""Errors of a checkpoint that cannot be read."""
 
 
-class Agent:
+class Agent(ABC):
     """Agent of one seed, with its training and evaluation environments.
 
     Attributes:
-        model: Model of SB3.
+        best_files: Names of the files of the best policy.
         resumed_at: Number of steps done by earlier sessions.
         points: All evaluations, including those of earlier sessions.
     """
+
+    best_files: ClassVar[tuple[str, ...]]
 
     def __init__(
         self,
@@ -65,10 +64,10 @@ class Agent:
         scale: Scale,
         *,
         record: Path | None = None,
-        resume: bool = False,
+        episodes: int | None = None,
         live: LiveTraining | None = None,
     ) -> None:
-        """Create an agent with new weights, its environments, and its log.
+        """Create the environments, and the log.
 
         Args:
             task: Algorithm, settings and environment.
@@ -77,8 +76,8 @@ class Agent:
             seed: Seed of the agent.
             scale: Mean returns that define the scores 0 and 1.
             record: Log to write; None records neither training nor evaluations.
-            resume: Whether to resume from the folder's checkpoint and append to the log, if they
-                exist.
+            episodes: Number of episodes that the log had at the checkpoint from which this session
+                continues, to which it appends; -1 for all of the log. None for a new log.
             live: Live view of the training.
 
         Raises:
@@ -86,46 +85,40 @@ class Agent:
         """
         self.points: list[CurvePoint] = []
         self.resumed_at = 0
-        self._has_pretrained_weights = False
-        self._task, self._folder, self._seed, self._scale = task, folder, seed, scale
-        self._resumes = resume
+        self._task, self._env_id, self._folder, self._seed = task, env_id, folder, seed
+        self._score, self._reported_at = math.nan, -1
+        self._began_s = 0.0
+        self._scalars: ScalarsWriter | None = None
         with ExitStack() as stack:
-            batch = stack.enter_context(closing(task.batch(task.config.envs)))
-            recorder = None
+            self.env: Any = stack.enter_context(closing(task.batch(task.config.envs)))
+            self._recorder = None
             if record is not None:
-                recorder = recorded(batch, record, algo=task.algo, seed=seed, resume=resume)
-            self._watched = live.watch(recorder or batch) if live is not None else None
-            recorded_env = self._watched or recorder or batch
-            env = stack.enter_context(closing(BatchedVecEnv(recorded_env)))
-            self._evaluated = FirstEpisodes(
-                task.evaluation_batch(task.config.eval_episodes), env_id
-            )
-            eval_env = stack.enter_context(closing(BatchedVecEnv(self._evaluated)))
-            self._eval_env = _stacked(eval_env, task.config.frame_stack)
-            stacked = _stacked(env, task.config.frame_stack)
-            self.model: BaseAlgorithm = make_model(task.algo, task.config, stacked, seed)
-            architecture = own_architecture(task.config, self.model.observation_space)
-            if architecture is not None and task.config.center_images:
-                center_images(self.model, task, seed)
-            self._describer = None
-            if recorder is not None:
-                self._describer = env.before_step = ActionDescriber(recorder, self.model)
-            if self._watched is not None:
-                self._watched.model = self.model
-                if self._describer is not None:
-                    self._watched.after_forward = self._describer.reset
+                self.env = self._recorder = recorded(
+                    self.env, record, algo=task.algo, seed=seed, episodes=episodes
+                )
+                stack.callback(self._recorder.close)
+            self._watched = None
+            if live is not None:
+                self.env = self._watched = live.watch(self.env)
+            evaluated = FirstEpisodes(task.evaluation_batch(task.config.eval_episodes), env_id)
+            self._evaluation = Evaluation(stack.enter_context(closing(evaluated)), scale)
             self._envs = stack.pop_all()
-        self._description = describe_run(
-            task.algo,
-            task.config.hidden,
-            batch.single_observation_space,
-            batch.single_action_space,
-            env_id,
-            task.sim_options,
-            task.config.frame_stack,
-            architecture,
-        )
 
+    @property
+    @abstractmethod
+    def steps(self) -> int:
+        """Number of finished environment steps, summed over all environments."""
+
+    @property
+    @abstractmethod
+    def policy(self) -> BasePolicy:
+        """Greedy policy with the current weights."""
+
+    @abstractmethod
+    def best_policy(self) -> BasePolicy:
+        """Read the policy with the best evaluation."""
+
+    @abstractmethod
     def start_from(self, data: Dataset | None, policy: Any) -> None:
         """Fill the replay buffer with logged transitions, copy a policy's weights, or do both.
 
@@ -137,19 +130,22 @@ class Agent:
             policy: Policy with Q-values, if any.
 
         Raises:
-            UsageError: The algorithm cannot start from the given data or policy.
+            UsageError: The algorithm cannot start from data or policies.
             SpaceError: The spaces differ.
             PolicyError: The policy's network differs from the agent's.
         """
-        model: Any = self.model
-        if data is not None:
-            fill_buffer(model, data)
-            model.learning_starts = 0
-        if policy is not None:
-            take_weights(model, policy, self._evaluated.single_observation_space)
-            model.learning_starts = cast(DQNConfig, self._task.config).learning_starts
-            model.exploration_rate = model.exploration_final_eps
-            self._use_final_exploration()
+
+    @abstractmethod
+    def scalars(self) -> dict[str, float]:
+        """Return the scalars of a row of `progress.csv`, under the names of SB3."""
+
+    @abstractmethod
+    def _train(self, report: ProgressCallback) -> None:
+        """Train until all steps are done."""
+
+    @abstractmethod
+    def _save_policy(self) -> None:
+        """Write the current policy to `best_files`."""
 
     def close(self) -> None:
         """Close the environments and the log."""
@@ -162,190 +158,121 @@ class Agent:
             report: Callback for progress, called every `LOG_INTERVAL` steps.
 
         Raises:
-            TrainingError: The checkpoint belongs to another task, or is broken.
+            TrainingError: The loss is not finite, or a file cannot be written.
         """
-        config = self._task.config
-        evaluation = Evaluation(
-            BaseAlgorithm._wrap_env(self._eval_env, 0),
-            interval=min(config.eval_interval, config.steps),
-            training_envs=config.envs,
-            scale=self._scale,
-            on_new_best=self._keep_best,
-            on_point=self._add_point,
-        )
-        if self._resumes and self._checkpoint.exists():
-            self._load(evaluation)
-        done = self.resumed_at = self.model.num_timesteps
-        if done >= config.steps:
+        self.resumed_at = self.steps
+        if self.steps >= self._task.config.steps:
             return
-        callbacks: list[BaseCallback] = [
-            evaluation,
-            _EveryInterval(LOG_INTERVAL, partial(self._report, report)),
-            _BetweenRollouts(config.checkpoint_interval, self._save),
-        ]
-        if isinstance(config, DQNConfig) and config.target_update_episodes:
-            callbacks.append(_TargetUpdateByEpisodes(config.target_update_episodes))
-        with writing(self._folder):
-            self.model.set_logger(_logger(self._folder, done))
-        try:
-            self.model.learn(
-                config.steps - done,
-                callback=callbacks,
-                log_interval=sys.maxsize,
-                reset_num_timesteps=done == 0,
-            )
-        finally:
-            with writing(self._folder):
-                self.model.logger.close()
-        self._save()
+        self._began_s = time.perf_counter()
+        with closing(ScalarsWriter(self._folder, self.steps)) as self._scalars:
+            self._train(report)
+            if self.steps > self._reported_at:
+                self._report(report)
+
+    def _after_step(self, before: int, report: ProgressCallback) -> None:
+        """Evaluate and report if this is due after a step that began at `before` steps."""
+        config, now = self._task.config, self.steps
+        if is_due(before, now, min(config.eval_interval, config.steps)):
+            self._evaluate()
+        if is_due(before, now, LOG_INTERVAL):
+            self._report(report)
+
+    def _evaluate(self) -> None:
+        """Add a point to the curve; keep the policy if it is the best so far."""
+        best = max((point.mean_return for point in self.points), default=-math.inf)
+        point = self._evaluation.point(self.policy, self.steps, best)
+        if point.best:
+            self._save_policy()
+        self.points.append(point)
+        self._score = point.score
+        if self._watched is not None:
+            self._watched.score = point.score
+        write_curve(self._folder / CURVE_NAME, self.points)
+        scalars = {
+            "eval/mean_reward": point.mean_return,
+            "eval/mean_ep_length": point.mean_length,
+            "eval/score": point.score,
+        }
+        assert self._scalars is not None
+        self._scalars.write(point.step, scalars)
+        if self._recorder is not None:
+            folder = self._folder / EVALUATIONS_NAME
+            with writing(folder):
+                subfolder(folder)
+            path = folder / f"step-{point.step:09d}.mcap"
+            self._evaluation.env.dataset().save(path, overwrite=True)
+
+    def _report(self, report: ProgressCallback) -> None:
+        """Write a row of scalars, and report the progress."""
+        self._reported_at = self.steps
+        seconds = time.perf_counter() - self._began_s
+        speed = (self.steps - self.resumed_at) / max(seconds, 1e-9)
+        times = {"time/time_elapsed": seconds, "time/fps": float(int(speed))}
+        assert self._scalars is not None
+        self._scalars.write(self.steps, {**times, **self.scalars()})
+        terms = {"score": math.nan, "mean_return": math.nan}
+        if self.points:
+            last = self.points[-1]
+            terms = {"score": last.score, "mean_return": last.mean_return}
+        report(TrainingProgress(self._seed, self.steps, self._task.config.steps, terms))
+
+    def _show(self, shown: Shown) -> None:
+        """Show this agent in the live view, if there is one."""
+        if self._watched is not None:
+            self._watched.shown = shown
 
     @property
     def _checkpoint(self) -> Path:
         return self._folder / CHECKPOINT_NAME
 
-    def _save(self) -> None:
-        points = [asdict(point) for point in self.points]
-        extra = {"points": points, "began_with_policy": self._has_pretrained_weights}
-        best = self._folder / BEST_NAME
-        content = best.read_bytes() if self.points and best.exists() else b""
-        save_checkpoint(self._checkpoint, self.model, self._task, extra, content)
+    def _best_content(self) -> dict[str, Tensor]:
+        """Return the contents of `best_files`; empty before the first evaluation."""
+        if not self.points:
+            return {}
+        return {
+            f"best.{name}": torch.from_numpy(
+                np.frombuffer((self._folder / name).read_bytes(), np.uint8).copy()
+            )
+            for name in self.best_files
+        }
 
-    def _load(self, evaluation: Evaluation) -> None:
-        extra, best = load_checkpoint(self._checkpoint, self.model, self._task)
-        if best:
-            # The best policy's file may be newer than the checkpoint. Restore the older content,
-            # because the evaluations after the checkpoint are repeated.
-            write_atomically(self._folder / BEST_NAME, best, TrainingError)
-        self.points = [CurvePoint(**point) for point in extra["points"]]
-        if extra["began_with_policy"]:
-            self._use_final_exploration()
-        done, envs = self.model.num_timesteps, self._task.config.envs
-        evaluation.resume(
-            done // envs, max((p.mean_return for p in self.points), default=-math.inf)
-        )
-        # The states of the environments cannot be restored. The new seed prevents the environments
-        # from repeating the first episodes.
-        assert self.model.env is not None
-        self.model.env.seed(episode_seed(self._seed, done))
+    def _restore_best(self, tensors: dict[str, Tensor], points: list[dict[str, Any]]) -> None:
+        """Restore the curve and the best policy of a checkpoint.
 
-    def _use_final_exploration(self) -> None:
-        self._has_pretrained_weights = True
-        model: Any = self.model
-        model.skips_random_steps = True
-        model.exploration_schedule = ConstantSchedule(model.exploration_final_eps)
-
-    def _keep_best(self) -> None:
-        save_policy(self._folder / BEST_NAME, self.model, self._description)
-
-    def _add_point(self, point: CurvePoint) -> None:
-        self.points.append(point)
-        if self._watched is not None:
-            self._watched.score = point.score
-        write_curve(self._folder / CURVE_NAME, self.points)
-        self.model.logger.record("eval/score", point.score)
-        with writing(self._folder):
-            self.model.logger.dump(point.step)
-        if self._describer is not None:
-            self._describer.reset()
-            folder = self._folder / EVALUATIONS_NAME
-            with writing(folder):
-                subfolder(folder)
-            path = folder / f"step-{point.step:09d}.mcap"
-            self._evaluated.dataset().save(path, overwrite=True)
-
-    def _report(self, report: ProgressCallback) -> None:
-        model: Any = self.model
-        with writing(self._folder):
-            model.dump_logs()
-        terms = {"score": math.nan, "mean_return": math.nan}
-        if self.points:
-            last = self.points[-1]
-            terms = {"score": last.score, "mean_return": last.mean_return}
-        steps = self._task.config.steps
-        report(TrainingProgress(self._seed, model.num_timesteps, steps, terms))
+        The files may be newer than the checkpoint; the evaluations after it are repeated.
+        """
+        self.points = [CurvePoint(**point) for point in points]
+        for name in self.best_files if self.points else ():
+            content = tensors[f"best.{name}"].numpy().tobytes()
+            write_atomically(self._folder / name, content, TrainingError)
 
 
-class _EveryInterval(BaseCallback):
-    """Callback that calls a function every `interval` environment steps, and at the end."""
-
-    def __init__(self, interval: int, function: Callable[[], None]) -> None:
-        super().__init__()
-        self._interval = interval
-        self._function = function
-        self._called_at = -1
-
-    def _on_training_start(self) -> None:
-        self._called_at = self.num_timesteps
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps // self._interval > self._called_at // self._interval:
-            self._call()
-        return True
-
-    def _on_training_end(self) -> None:
-        if self.num_timesteps > self._called_at:
-            self._call()
-
-    def _call(self) -> None:
-        self._called_at = self.model.num_timesteps
-        self._function()
+def is_due(before: int, now: int, interval: int) -> bool:
+    """Return whether a multiple of the interval was reached."""
+    return now // interval > before // interval
 
 
-class _TargetUpdateByEpisodes(BaseCallback):
-    """Callback that updates a DQN's target network every `episodes` finished episodes."""
-
-    def __init__(self, episodes: int) -> None:
-        super().__init__()
-        self._episodes = episodes
-        self._finished = 0
-
-    def _on_step(self) -> bool:
-        before = self._finished
-        self._finished += int(np.sum(self.locals["dones"]))
-        if self._finished // self._episodes > before // self._episodes:
-            model = cast(DQN, self.model)
-            model.q_net_target.load_state_dict(model.q_net.state_dict())
-        return True
+def read_checkpoint(path: Path, task: Task) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read the checkpoint of a task: tensors, and a description."""
+    try:
+        tensors, description = read_tensors(path)
+        task.identity.check_same(description, path)
+        if "episodes_in_log" not in description:
+            raise TrainingError(
+                f"cannot resume: {path} was written by an earlier version of mcaprl; resume it with"
+                " that version, or train into another folder"
+            )
+        return tensors, description
+    except BROKEN as error:
+        raise broken_checkpoint(path, error) from error
 
 
-class _BetweenRollouts(_EveryInterval):
-    """Callback that calls a function between rollouts, when all steps have been processed."""
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_start(self) -> None:
-        if self.model.num_timesteps - self._called_at >= self._interval:
-            self._call()
-
-    def _on_training_end(self) -> None:
-        pass
-
-
-def center_images(model: BaseAlgorithm, task: Task, seed: int) -> None:
-    """Set a model's image normalization to the statistics of `CENTERING_STEPS` random steps."""
+def center_images(encoder: ObservationEncoder, task: Task, seed: int) -> None:
+    """Normalize images to the statistics of `CENTERING_STEPS` random steps."""
     with closing(task.batch(task.config.envs)) as envs:
         envs.action_space.seed(seed)
         seen = [envs.reset(seed=seed)[0]]
         while len(seen) * task.config.envs < CENTERING_STEPS:
             seen.append(envs.step(envs.action_space.sample())[0])
-    space = envs.single_observation_space
-    vectors = inputs_of(channels_first(space))[0]
-    frames = {}
-    for key, part in parts_of_space(space).items():
-        if key not in vectors:
-            images = np.concatenate([parts_of(each)[key] for each in seen])
-            frames[key] = np.moveaxis(images, 1, -1) if channels_first(part) == part else images
-    if frames:
-        normalize_images(model.policy, frames, task.config.frame_stack)
-
-
-def _stacked(env: VecEnv, count: int) -> VecEnv:
-    return env if count == 1 else StackedVecEnv(env, count)
-
-
-def _logger(folder: Path, done: int) -> Logger:
-    """Return an SB3 logger that writes scalars to TensorBoard and to one CSV per session."""
-    suffix = f"-from-{done}" if done else ""
-    formats = [make_output_format(name, str(folder), suffix) for name in ("csv", "tensorboard")]
-    return Logger(folder=str(folder), output_formats=formats)
+    whole = mapped(lambda *parts: np.concatenate(parts), *seen)
+    encoder.center_images(encoder.arranged(whole))

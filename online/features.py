@@ -6,13 +6,12 @@ dueling networks or for layer normalization. The networks are those of offline l
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
 import torch
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecTransposeImage
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
@@ -109,31 +108,16 @@ def inputs_of(space: spaces.Space[Any]) -> tuple[list[str], list[ImageInput]]:
     return vectors, images
 
 
-def pools_of(space: spaces.Space[Any], architecture: Architecture) -> dict[str, int]:
-    """Return the network's average-pooling factor for the images of each key."""
-    vectors, images = inputs_of(space)
-    keys = [key for key in parts_of_space(space) if key not in vectors]
-    return {
-        key: architecture.encoder_of(image.shape).pool(image.shape)
-        for key, image in zip(keys, images, strict=True)
-    }
-
-
-def normalize_images(
-    policy: nn.Module, frames: Mapping[str, NDArray[np.uint8]], stack: int
-) -> None:
-    """Set a policy's image normalization to the mean and standard deviation of images.
+def normalize_images(policy: nn.Module, images: Sequence[ImageInput], stack: int) -> None:
+    """Set the image normalization of an SB3 policy with this package's networks.
 
     Args:
-        policy: Policy of SB3 with this package's networks.
-        frames: Images (N, height, width, channels) by key, in the order of the space.
+        policy: Policy of SB3.
+        images: Normalization of each image, in the order of the space.
         stack: Number of successive images that the network receives.
     """
-    shapes = {key: (*part.shape[1:], 1)[:3] for key, part in frames.items()}
-    inputs = [
-        ImageInput(shapes[key]).normalized_to(part).stacked(stack) for key, part in frames.items()
-    ]
+    large = [image.stacked(stack) for image in images if min(image.shape[:2]) >= MIN_IMAGE_EDGE]
     for module in policy.modules():
         if isinstance(module, NetworkFeatures):
-            for convolutions, image in zip(module.convolutions, inputs, strict=True):
+            for convolutions, image in zip(module.convolutions, large, strict=True):
                 convolutions.normalize(image)

@@ -9,20 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from typing import Any, cast
+from typing import Any, Protocol
 
-import numpy as np
 import torch
 from gymnasium.vector import SyncVectorEnv, VectorEnv
-from numpy.typing import NDArray
-from stable_baselines3 import DQN
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy
+from torch import Tensor
 
 from mcaprl.frames import rows_of
-from mcaprl.online.algorithms import check_spaces
-from mcaprl.online.recording import behavior_probabilities, exploration
-from mcaprl.online.task import Task
+from mcaprl.online.task import Task, check_spaces
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.record.session import reason_of
@@ -47,6 +41,27 @@ TRAINING_LABELS = {
 """Names of the metrics in `/rl/training`."""
 WATCHED = 0
 """Index of the environment in the live view."""
+
+
+class Shown(Protocol):
+    """What the live view shows of an agent, at the step that it is about to take."""
+
+    @property
+    def epsilon(self) -> float:
+        """Probability of a random action; NaN if the policy is stochastic."""
+
+    @property
+    def updates(self) -> int:
+        """Number of updates of the network."""
+
+    def probability(self) -> float:
+        """Return the probability of the action of the watched environment."""
+
+    def values(self) -> tuple[Tensor, Tensor, float]:
+        """Return the watched environment's Q-values (A,), preferences (A,), and state value."""
+
+    def metrics(self) -> dict[str, float]:
+        """Return the metrics of `TRAINING_LABELS` without the score."""
 
 
 class LiveTraining:
@@ -126,9 +141,8 @@ class WatchedBatch(VectorWrapper):
     """Wrapper of a batch of environments that shows the first one in the live view.
 
     Attributes:
-        model: Model of SB3 that trains in these environments; nothing is shown before it is set.
+        shown: Agent that trains in these environments; nothing is shown before it is set.
         score: Score of the last evaluation; NaN before the first one.
-        after_forward: Callback that runs after the live view has run a forward pass of the model.
     """
 
     def __init__(
@@ -144,14 +158,12 @@ class WatchedBatch(VectorWrapper):
         last action of this environment, or None after a reset.
         """
         super().__init__(env)
-        self.model: BaseAlgorithm | None = None
+        self.shown: Shown | None = None
         self.score = math.nan
-        self.after_forward: Callable[[], None] = lambda: None
         self._stream, self._algo, self._source = stream, algo, source
         self._observations: Any = None
         self._last_action: int | None = None
         self._episode = -1
-        self._loss = self._mean_q = math.nan
         self._begin_episode()
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
@@ -162,12 +174,12 @@ class WatchedBatch(VectorWrapper):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step all environments; show the watched transition if its episode is shown."""
-        stream, model = self._stream, self.model
-        if model is not None:
+        stream, shown = self._stream, self.shown
+        if shown is not None:
             if self._step == 0:
                 self._is_shown = stream.begin_episode(self._episode, self._algo)
             if stream.wants_metrics():
-                stream.show_metrics(self._metrics(model))
+                stream.show_metrics({**shown.metrics(), "score": self.score})
         before = self._before_step(actions) if self._is_shown else {}
         result = self.env.step(actions)
         observations, rewards, terminated, truncated, infos = result
@@ -196,39 +208,21 @@ class WatchedBatch(VectorWrapper):
         self._last_action = None
         self._is_shown = False
 
-    def _before_step(self, actions: NDArray[Any]) -> dict[str, Any]:
+    def _before_step(self, actions: Any) -> dict[str, Any]:
         """Return the fields of a `LiveStep` that are known before the step."""
-        model = self.model
-        assert model is not None
+        shown = self.shown
+        assert shown is not None
         is_shown = self._stream.look(self._source(self._last_action), self._return_so_far)
-        values = _values(model, actions[WATCHED : WATCHED + 1]) if is_shown else {}
-        probability = behavior_probabilities(model, actions)[WATCHED]
-        self.after_forward()
+        values = _values(shown, int(actions[WATCHED])) if is_shown else {}
+        probability = shown.probability()
         self._stream.pause()
         return {
             "observation": rows_of(self._observations, WATCHED),
             "action": actions[WATCHED],
-            "behavior": float(probability),
-            "epsilon": exploration(model),
-            "policy_version": cast(Any, model)._n_updates,
+            "behavior": probability,
+            "epsilon": shown.epsilon,
+            "policy_version": shown.updates,
             "values": values,
-        }
-
-    def _metrics(self, model: BaseAlgorithm) -> dict[str, float]:
-        """Return the metrics of `/rl/training`."""
-        logged = model.logger.name_to_value
-        self._loss = logged.get("train/loss", logged.get("train/value_loss", self._loss))
-        self._mean_q = logged.get("train/mean_q", self._mean_q)
-        returns = [episode["r"] for episode in model.ep_info_buffer or ()]
-        return {
-            "mean_return": float(np.mean(returns)) if returns else math.nan,
-            "score": self.score,
-            "loss": self._loss,
-            "epsilon": exploration(model),
-            "mean_q": self._mean_q,
-            "learning_rate": model.policy.optimizer.param_groups[0]["lr"],
-            "steps": model.num_timesteps,
-            "updates": cast(Any, model)._n_updates,
         }
 
     def _show_end(self, terminated: bool, truncated: bool, infos: dict[str, Any]) -> None:
@@ -244,24 +238,15 @@ class WatchedBatch(VectorWrapper):
             end_time_ns=0,
             reason=reason_of(None if reasons is None else reasons[WATCHED], terminated),
             policy=self._algo,
-            epsilon=math.nan if self.model is None else exploration(self.model),
+            epsilon=math.nan if self.shown is None else self.shown.epsilon,
         )
         self._stream.end_episode(summary)
 
 
-def _values(model: BaseAlgorithm, action: NDArray[Any]) -> dict[str, Any]:
+def _values(shown: Shown, taken: int) -> dict[str, Any]:
     """Return the learner's values for the watched environment, as fields of `values_schema`."""
-    observation = rows_of(model._last_obs, slice(WATCHED, WATCHED + 1))
-    tensor: Any = model.policy.obs_to_tensor(observation)[0]
-    with torch.inference_mode():
-        if isinstance(model, DQN):
-            q = model.q_net(tensor)[0]
-            preference, value = q.softmax(0), float(q.max())
-        else:
-            policy = cast(ActorCriticPolicy, model.policy)
-            preference = cast(Any, policy.get_distribution(tensor).distribution).probs[0]
-            q, value = torch.full_like(preference, torch.nan), float(policy.predict_values(tensor))
-    best, taken = int(preference.argmax()), int(action[0])
+    q, preference, value = shown.values()
+    best = int(preference.argmax())
     entropy = torch.special.entr(preference).sum() / math.log(max(len(preference), 2))
     return {
         "q": q.cpu().numpy(),

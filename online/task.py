@@ -7,19 +7,48 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gymnasium import Env
+from gymnasium import Env, spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from mcaprl.errors import TrainingError, UsageError
-from mcaprl.online.algorithms import find_algorithm
-from mcaprl.online.config import OnlineConfig, find_preset, settings_for
+from mcaprl.actions import joint_actions
+from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
+from mcaprl.frames import parts_of_space
+from mcaprl.online.config import CONFIGS, OnlineConfig, find_preset, settings_for
 from mcaprl.runs import CONFIG_NAME, RunIdentity, check_kind, read_config, run_to_resume
 from mcaprl.settings import check_settings, settings_from_json
 from mcaprl.sims import make_sims
 from mcaprl.sims.evaluation.rollout import make_limited, make_limited_sims
 
 DEFAULT_ALGO = "double-dqn"
-_MODE = AutoresetMode.SAME_STEP.value
+
+
+def find_config(algo: str) -> type[OnlineConfig]:
+    """Find the settings of an algorithm by its name."""
+    if algo not in CONFIGS:
+        raise UnknownNameError("algorithm", algo, CONFIGS)
+    return CONFIGS[algo]
+
+
+def check_spaces(
+    algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> None:
+    """Check that an algorithm supports the spaces of an environment."""
+    find_config(algo)
+    joint = joint_actions(action_space)
+    if joint is None or joint.shape:
+        hint = ""
+        if joint is not None:
+            hint = ": wrap the environment so that one Discrete action has all elements, or record"
+            hint += " and train offline (train-offline)"
+        raise SpaceError(f"{algo} needs discrete actions, got {action_space}{hint}")
+    if joint.first != 0:
+        raise SpaceError(
+            f"{algo} needs actions that start at 0, got {action_space}:"
+            " wrap the environment in gymnasium.wrappers.TransformAction"
+        )
+    for space in parts_of_space(observation_space).values():
+        if not isinstance(space, spaces.Box):
+            raise SpaceError(f"{algo} needs Box observations, or a Dict of them, got {space}")
 
 
 @dataclass(frozen=True)
@@ -54,7 +83,7 @@ class Task:
 
         Args:
             sim: Short name or Gymnasium id.
-            algo: Key of `ALGORITHMS`; None selects Double DQN.
+            algo: Key of `CONFIGS`; None selects Double DQN.
             sim_options: Arguments of the environment.
             **settings: Settings that replace the defaults.
 
@@ -63,7 +92,7 @@ class Task:
             UsageError: The algorithm has no such setting, or a setting is outside its range.
         """
         algo, options = algo or DEFAULT_ALGO, dict(sim_options or {})
-        config_type = find_algorithm(algo).config_type
+        config_type = find_config(algo)
         return cls._checked(algo, sim, options, settings_for(config_type, sim, options), settings)
 
     @classmethod
@@ -117,20 +146,20 @@ class Task:
         defaults: Mapping[str, Any],
         given: Mapping[str, Any],
     ) -> Task:
-        config_type = find_algorithm(algo).config_type
+        config_type = find_config(algo)
         check_settings(algo, config_type, given)
         return cls(algo, config_type(**{**defaults, **given}), sim, sim_options)
 
     def batch(self, count: int) -> VectorEnv[Any, Any, Any]:
         """Create a batch of environments, each reset in the step that ends its episode."""
+        options = {"autoreset_mode": AutoresetMode.SAME_STEP.value, **self.sim_options}
         if self.max_steps is not None:
-            return self.evaluation_batch(count)
-        return make_sims(self.sim, count, autoreset_mode=_MODE, **self.sim_options)
+            return make_limited_sims(self.sim, count, self.max_steps, **options)
+        return make_sims(self.sim, count, **options)
 
     def evaluation_batch(self, count: int) -> VectorEnv[Any, Any, Any]:
-        """Create a batch like `batch`, in which each episode ends."""
-        options = {"autoreset_mode": _MODE, **self.sim_options}
-        return make_limited_sims(self.sim, count, self.max_steps, **options)
+        """Create a batch of environments in which each episode ends, each reset a step later."""
+        return make_limited_sims(self.sim, count, self.max_steps, **self.sim_options)
 
     def evaluation_env(self) -> Env[Any, Any]:
         """Create an environment in which each episode ends."""

@@ -25,18 +25,15 @@ import gymnasium as gym
 from mcaprl.errors import TrainingError, UsageError
 from mcaprl.files import check_log_name, write_json
 from mcaprl.online.agent import Agent
-from mcaprl.online.algorithms import check_spaces
 from mcaprl.online.curves import IMAGE_NAME, SCORES_NAME, draw_curves, read_run
 from mcaprl.online.evaluation import FRESH_SEED, SELECTION_SEED, measure_scale
 from mcaprl.online.live import LiveTraining
 from mcaprl.online.recording import log_paths
-from mcaprl.online.task import Task
-from mcaprl.online.zip_file import read_policy
+from mcaprl.online.task import Task, check_spaces
 from mcaprl.progress import ProgressCallback, terminal_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.runs import (
-    BEST_NAME,
     RunSummary,
     choose_seeds,
     locked_run,
@@ -136,6 +133,17 @@ def train(
     return summaries
 
 
+def make_agent(task: Task, *arguments: Any, **options: Any) -> Agent:
+    """Create the agent of a task; the other arguments are those of `LearningAgent`."""
+    if task.algo == "double-dqn":
+        from mcaprl.online.learning import LearningAgent
+
+        return LearningAgent(task, *arguments, **options)
+    from mcaprl.online.sb3 import ModelAgent
+
+    return ModelAgent(task, *arguments, **options)
+
+
 @dataclass(frozen=True)
 class _Run:
     """Run folder, and the state that all seeds share."""
@@ -165,7 +173,7 @@ class _Run:
         folder = seed_folder(self.folder, seed)
         began_s = time.perf_counter()
         env_id = self.env.spec.id if self.env.spec else self.task.sim
-        agent = Agent(
+        agent = make_agent(
             self.task,
             env_id,
             folder,
@@ -180,7 +188,7 @@ class _Run:
             agent.learn(report)
         score = evaluate(
             self.env,
-            [read_policy(folder / BEST_NAME)],
+            [agent.best_policy()],
             name=self.task.algo,
             episodes=self.task.config.final_episodes,
             seed=FRESH_SEED,
@@ -190,7 +198,7 @@ class _Run:
             folder=folder,
             algo=self.task.algo,
             seed=seed,
-            steps=agent.model.num_timesteps,
+            steps=agent.steps,
             resumed_at=agent.resumed_at,
             seconds=time.perf_counter() - began_s,
             best_step=max(point.step for point in agent.points if point.best),

@@ -252,13 +252,31 @@ def _build(
             activation_fn=_ACTIVATIONS[description.activation],
         )
     network.load_state_dict(weights)
+    folder = path.resolve().parent
+    name = f"{folder.parent.name}/{folder.name}" if path.name == BEST_NAME else path.stem
+    return _policy(network, description, name, exact=exact)
+
+
+def policy_of(network: BasePolicy, description: dict[str, Any], name: str) -> Policy:
+    """Return the greedy policy of a model in training, which shares the weights of `network`.
+
+    `description` is that of `describe_run`.
+    """
+    found: _Description = as_type(_Description, {"network": "", **description}, OWN_NAME)
+    return _policy(network, found, name, exact=True)
+
+
+def _policy(network: BasePolicy, description: _Description, name: str, *, exact: bool) -> Policy:
+    """Wrap a network of SB3 as a policy; `exact` says whether the bounds of the space are known."""
+    observation_space = space_from_json(json.dumps(description.observation_space))
+    action_space = space_from_json(json.dumps(description.action_space))
+    frames = description.frame_stack
     network.set_training_mode(False)
     is_critic = isinstance(network, ActorCriticPolicy)
     inner: nn.Module = _Actor(network) if is_critic else cast(Any, network).q_net
     model = ModelNetwork(inner, channels_last(observation_space), frames)
-    folder = path.resolve().parent
     return Policy(
-        name=f"{folder.parent.name}/{folder.name}" if path.name == BEST_NAME else path.stem,
+        name=name,
         algo=description.algo,
         observation_space=observation_space if exact else None,
         action_space=action_space,
@@ -359,7 +377,10 @@ class ModelNetwork(nn.Module):
             else torch.cat(torch.unflatten(next(vectors), 2, box.shape or (1,)).unbind(1), -1)
             for key, box in self._parts.items()
         }
-        return cast(Tensor, self.network(whole_of(inputs)))
+        # A model in training may be on a GPU.
+        device = next(self.network.parameters()).device
+        moved = {key: part.to(device) for key, part in inputs.items()}
+        return cast(Tensor, self.network(whole_of(moved))).cpu()
 
 
 class _Actor(nn.Module):

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from mcaprl.device import Agents, device_task
+from mcaprl.device import device_task, make_agents
 from mcaprl.sims import make_device_sims
 
 SIMS = ("lane", "racer")
@@ -69,7 +69,7 @@ def _learning(sim: str, seeds: int) -> str:
     task = device_task(sim, envs=65_536 // seeds)
     config: Any = task.config
     sims = make_device_sims(sim, 65_536, device="cuda")
-    agents = Agents(sims, config, range(seeds), torch.device("cuda"))
+    agents = make_agents(sims, config, range(seeds), torch.device("cuda"))
     while agents.learner.step < 64:
         agents.step()
     counts: list[Any] = []

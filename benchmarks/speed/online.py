@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from mcaprl.online import SIM_SETTINGS, Agent, LiveTraining, Task
+from mcaprl.online import SIM_SETTINGS, LearningAgent, LiveTraining, Task
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import Scale
 
@@ -35,7 +35,9 @@ def training_s(task: Task, folder: Path, kind: str) -> tuple[float, int]:
     with closing(shown) if isinstance(shown, LiveTraining) else shown as live:
         viewer = _viewer(live.stream.url) if live is not None else None
         scale = Scale(0.0, 1.0)
-        agent = Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, scale, record=path, live=live)
+        agent = LearningAgent(
+            task, "mcaprl/LaneKeeping-v0", folder, 0, scale, record=path, live=live
+        )
         with closing(agent):
             began_s = time.process_time()
             agent.learn(_silent)

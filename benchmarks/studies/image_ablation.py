@@ -16,6 +16,7 @@ import argparse
 import json
 import time
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,15 +24,8 @@ import numpy as np
 import torch
 
 from mcaprl.files import write_json
-from mcaprl.online import (
-    FRESH_SEED,
-    SELECTION_SEED,
-    Agent,
-    Task,
-    measure_scale,
-    read_policy,
-)
-from mcaprl.runs import BEST_NAME
+from mcaprl.offline.batches.buffer import Batch
+from mcaprl.online import FRESH_SEED, SELECTION_SEED, LearningAgent, Task, measure_scale
 from mcaprl.sims import Scale, evaluate, make_sim
 
 MIRRORED: Final = "half of each batch mirrored"
@@ -67,21 +61,17 @@ class MirroredBuffer:
         """Return an attribute of the buffer."""
         return getattr(self._buffer, name)
 
-    def sample(self, *arguments: Any, **others: Any) -> Any:
-        """Sample a batch; rows 0, 2, 4, ... are mirrored."""
-        batch = self._buffer.sample(*arguments, **others)
+    def batch(self, rows: torch.Tensor) -> Batch:
+        """Return transitions; rows 0, 2, 4, ... are mirrored."""
+        batch = self._buffer.batch(rows)
+        actions = batch.actions.clone()
+        actions[::2] = torch.tensor(LANE_MIRROR)[actions[::2]]
         for observations in (batch.observations, batch.next_observations):
-            _mirror(observations)
-        batch.actions[::2] = torch.tensor(LANE_MIRROR)[batch.actions[::2]]
-        return batch
-
-
-def _mirror(observations: Any) -> None:
-    parts = observations if isinstance(observations, dict) else {"depth": observations}
-    parts["depth"][::2] = parts["depth"][::2].flip(-1)
-    if "motion" in parts:
-        # The numbers are speed, steering angle and direction of the next turn.
-        parts["motion"][::2, 1:] *= -1
+            for image in observations.images:
+                image[::2] = image[::2].flip(2)
+            # The numbers are speed, steering angle and direction of the next turn.
+            observations.vector[::2, 1:] *= -1
+        return replace(batch, actions=actions)
 
 
 def differs(variant: str, task: Task, default: Task) -> bool:
@@ -98,16 +88,15 @@ def run(variant: str, task: Task, seed: int, folder: Path, scales: tuple[Scale, 
     """Train a seed into a folder, and evaluate it."""
     folder.mkdir(parents=True, exist_ok=True)
     began_s = time.process_time()
-    with closing(Agent(task, task.sim, folder, seed, scales[0])) as agent:
+    with closing(LearningAgent(task, task.sim, folder, seed, scales[0])) as agent:
         if variant == MIRRORED:
-            model: Any = agent.model
-            model.replay_buffer = MirroredBuffer(model.replay_buffer)
+            buffer: Any = MirroredBuffer(agent.agents.buffer)
+            agent.agents.learner.buffer = buffer
         agent.learn(lambda _: None)
         points = [(point.step, point.score) for point in agent.points]
     seconds = time.process_time() - began_s
     with closing(make_sim(task.sim, **task.sim_options)) as env:
-        policy = read_policy(folder / BEST_NAME)
-        score = evaluate(env, [policy], name="", episodes=100, seed=FRESH_SEED)
+        score = evaluate(env, [agent.best_policy()], name="", episodes=100, seed=FRESH_SEED)
     fresh = scales[1].score(score.mean_return)
     return {"score": fresh, "curve": points, "cpu_minutes": seconds / 60, "ends": score.ends}
 

@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 import mcaprl
 from mcaprl.files import write_json
 from mcaprl.offline import FQEConfig, OffPolicyEvaluator
-from mcaprl.online import Agent, OnlinePolicy, Task, describe_run, read_policy, save_policy
+from mcaprl.offline.policy import Policy, read_policy, save_policy
+from mcaprl.online import LearningAgent, Task
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import Scale, episode_seed, make_sims
 
@@ -47,34 +48,27 @@ def train(sim: str, folder: Path, seed: int, steps: int) -> tuple[Path, list[Pat
     """Train, unless this was done before; return the log and the checkpoints."""
     log = folder / "training.mcap"
     every = steps // CHECKPOINTS
-    kept = [folder / f"step-{every * (k + 1)}.zip" for k in range(CHECKPOINTS)]
+    kept = [folder / f"step-{every * (k + 1)}" for k in range(CHECKPOINTS)]
     if kept[-1].exists():
         return log, kept
     folder.mkdir(parents=True)
     task = Task.for_sim(
         sim, steps=steps, eval_interval=steps, eval_episodes=1, checkpoint_interval=2 * steps
     )
-    batch = task.batch(1)
-    description = describe_run(
-        task.algo,
-        task.config.hidden,
-        batch.single_observation_space,
-        batch.single_action_space,
-        batch.spec.id if batch.spec else sim,
-        task.sim_options,
-    )
-    agent = Agent(task, description["env_id"], folder, seed, Scale(0.0, 1.0), record=log)
+    agent = LearningAgent(task, task.sim, folder, seed, Scale(0.0, 1.0), record=log)
 
     def keep(progress: TrainingProgress) -> None:
         if progress.done % every == 0:
-            save_policy(folder / f"step-{progress.done}.zip", agent.model, description)
+            path = folder / f"step-{progress.done}"
+            path.mkdir()
+            save_policy(path, agent.agents.learner, seed, task.sim, task.sim_options)
 
     with closing(agent):
         agent.learn(keep)
     return log, kept
 
 
-def true_values(sim: str, policy: OnlinePolicy) -> tuple[float, float]:
+def true_values(sim: str, policy: Policy) -> tuple[float, float]:
     """Return the greedy policy's mean discounted and undiscounted return over fresh episodes."""
     with closing(make_sims(sim, EPISODES)) as envs:
         each: Any = [episode_seed(FIRST_SEED, k) for k in range(EPISODES)]

@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING
 from mcaprl.lazy import lazy_attributes
 
 if TYPE_CHECKING:
-    from mcaprl.device.replay import ReplayBuffer
-    from mcaprl.device.training import Agents, device_task, fast_products, train
+    from mcaprl.device.training import device_task, fast_products, make_agents, train
 
-__all__ = ["Agents", "ReplayBuffer", "device_task", "fast_products", "train"]
+__all__ = ["device_task", "fast_products", "make_agents", "train"]
 
 __getattr__ = lazy_attributes(
     __name__,
     {
-        "mcaprl.device.replay": ("ReplayBuffer",),
-        "mcaprl.device.training": ("Agents", "device_task", "fast_products", "train"),
+        "mcaprl.device.training": ("device_task", "fast_products", "make_agents", "train"),
     },
 )

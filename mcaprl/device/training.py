@@ -1,7 +1,7 @@
 """Double DQN in which sims, replay buffer and networks of all seeds stay on one device.
 
-Algorithm and settings are those of `mcaprl.online`, and the networks and losses those of
-`mcaprl.offline`, which train all seeds at once. Each seed has its own environments and transitions.
+The loop is that of `mcaprl.online`, with all seeds at once. Each seed has its own environments and
+transitions.
 """
 
 from __future__ import annotations
@@ -13,19 +13,16 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from gymnasium import spaces
-from torch import Tensor
 
-from mcaprl.device.replay import ReplayBuffer
 from mcaprl.errors import TrainingError, UsageError
-from mcaprl.offline.algorithms.config import DoubleDQNConfig as LearnerConfig
-from mcaprl.offline.algorithms.dqn import DoubleDQN
 from mcaprl.offline.algorithms.learner import NotFiniteError
 from mcaprl.offline.batches.buffer import choose_device
-from mcaprl.offline.batches.observations import Observations
+from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.policy import read_policy, save_policy
 from mcaprl.offline.training.metrics import MetricsWriter
+from mcaprl.online.collector import DeviceEnvironments
 from mcaprl.online.config import DoubleDQNConfig
+from mcaprl.online.engine import Agents
 from mcaprl.online.evaluation import FRESH_SEED, measure_scale
 from mcaprl.online.task import Task
 from mcaprl.online.train import OnlineSummary, write_scores
@@ -33,7 +30,6 @@ from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progres
 from mcaprl.runs import locked_run, open_run, seed_folder
 from mcaprl.sims import DeviceSims, make_device_sims
 from mcaprl.sims.evaluation.evaluate import Scale, evaluate
-from mcaprl.sims.vehicle.device import Batch
 
 SETTINGS: Final[dict[str, Any]] = {
     "envs": 2_048,
@@ -56,7 +52,6 @@ _UNUSED: Final = (
     "exploration_decay",
     "frame_stack",
     "image_shift",
-    "max_grad_norm",
     "target_update_episodes",
 )
 """Settings that this training does not use."""
@@ -120,7 +115,7 @@ def train(
     with locked_run(folder, False), closing(task.evaluation_env()) as env:
         numbers = range(seed, seed + seeds)
         open_run(folder, task.identity, False, numbers, device=device)
-        agents = Agents(sims, config, numbers, place)
+        agents = make_agents(sims, config, numbers, place)
         began_s = time.perf_counter()
         env_id = env.spec.id if env.spec else task.sim
 
@@ -154,96 +149,15 @@ def fast_products() -> Iterator[None]:
         torch.set_float32_matmul_precision(before)
 
 
-class Agents:
-    """K agents, their environments, replay buffer and networks.
-
-    Attributes:
-        config: Settings of each agent.
-        learner: Learner of all agents.
-        steps: Number of finished steps of one agent, summed over its environments.
-    """
-
-    def __init__(
-        self, sims: DeviceSims, config: DoubleDQNConfig, seeds: range, device: torch.device
-    ) -> None:
-        """Create agents with new weights, and start their environments."""
-        space = sims.single_observation_space
-        assert isinstance(space, spaces.Box)
-        self.config, self._sims, self.steps = config, sims, 0
-        # The returns of the first steps must be known.
-        self._starts = max(config.learning_starts, (config.n_steps - 1) * config.envs)
-        updates = (config.steps - self._starts) // config.steps_per_update
-        learner_config = LearnerConfig(
-            updates=max(updates, 1),
-            batch_size=config.batch_size,
-            learning_rate=config.learning_rate,
-            final_learning_rate_fraction=config.final_learning_rate_fraction,
-            gamma=config.gamma,
-            n_steps=config.n_steps,
-            target_interval=max(config.target_update_interval // config.steps_per_update, 1),
-            hidden=config.hidden,
-            layer_norm=config.layer_norm,
-            dueling=config.dueling,
-        )
-        slots = max(config.buffer_size // config.envs, config.n_steps + 1)
-        self._replay = ReplayBuffer(
-            space,
-            sims.single_action_space,
-            learner_config,
-            len(seeds),
-            config.envs,
-            slots,
-            device,
-            seeds[0],
-        )
-        self.learner = DoubleDQN(learner_config, self._replay.transitions, seeds)
-        self._arrays = Batch(*(torch.as_tensor(array, device=device) for array in sims.batch))
-        self._generator = torch.Generator(device).manual_seed(seeds[0])
-        sims.reset()
-
-    @property
-    def epsilon(self) -> float:
-        """Probability of a random action."""
-        config = self.config
-        done = self.steps / max(config.exploration_fraction * config.steps, 1)
-        first, last = config.exploration_initial_eps, config.exploration_final_eps
-        return first + (last - first) * min(done, 1.0)
-
-    def step(self) -> Tensor:
-        """Take a step in each environment; then learn, unless it is too early.
-
-        Returns:
-            Mean reward (K,) of each agent.
-        """
-        arrays, config = self._arrays, self.config
-        arrays.actions.copy_(self._actions())
-        self._replay.add_actions(arrays.observations, arrays.actions)
-        self._sims.step()
-        self._replay.add_outcomes(
-            arrays.rewards, arrays.terminated, arrays.truncated, arrays.final_observations
-        )
-        before, self.steps = self.steps, self.steps + config.envs
-        if self.steps > self._starts:
-            every = config.steps_per_update
-            due = self.steps // every - before // every
-            for _ in range(min(due, self.learner.config.updates - self.learner.step)):
-                self.learner.update()
-        rewards: Tensor = arrays.rewards
-        return rewards.view(len(self.learner.seeds), -1).mean(1)
-
-    @torch.no_grad()
-    def _actions(self) -> Tensor:
-        """Return the actions (K * E,) of epsilon-greedy policies."""
-        observations, count = self._arrays.observations, int(self._sims.single_action_space.n)
-        drawn = torch.empty_like(self._arrays.actions)
-        drawn.random_(count, generator=self._generator)
-        epsilon = self.epsilon
-        if epsilon >= 1:
-            return drawn
-        best = self.learner.models["q"](Observations(observations)).argmax(1)
-        explores = torch.empty(len(best), device=best.device)
-        explores.uniform_(generator=self._generator)
-        return torch.where(explores < epsilon, drawn, best)
+def make_agents(
+    sims: DeviceSims, config: DoubleDQNConfig, seeds: range, device: torch.device
+) -> Agents:
+    """Create agents with new weights, and start their environments."""
+    encoder = ObservationEncoder(sims.single_observation_space, int(sims.single_action_space.n))
+    agents = Agents(config, encoder, sims.single_action_space, seeds, device)
+    agents.connect(DeviceEnvironments(sims, device))
+    agents.collector.begin(seeds[0])
+    return agents
 
 
 def _train(
@@ -265,7 +179,7 @@ def _train(
                 raise TrainingError(
                     f"update {error.update} of {folder}: {error}; lower the learning rate"
                 ) from error
-            rate = learner.config.learning_rate_at(max(learner.step - 1, 0))
+            rate = agents.learning_rate
             for seed, writer, mean in zip(seeds, writers, means, strict=True):
                 values = {"mean_reward": mean, "epsilon": agents.epsilon, "steps": agents.steps}
                 writer.write(learner.step, rate, values)
@@ -280,11 +194,11 @@ def _rewards_until(agents: Agents, stop: int) -> list[float]:
     Returns:
         Mean reward of each agent.
     """
-    rewards, count = agents.step(), 1
+    rewards, count = agents.step().rewards.clone(), 1
     while agents.steps < stop:
-        rewards += agents.step()
+        rewards += agents.step().rewards
         count += 1
-    means: list[float] = (rewards / count).tolist()
+    means: list[float] = (rewards / count).view(len(agents.learner.seeds), -1).mean(1).tolist()
     return means
 
 

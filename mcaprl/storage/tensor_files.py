@@ -41,6 +41,12 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, description
 
 
+def below(tensors: Mapping[str, Tensor], name: str) -> dict[str, Tensor]:
+    """Return the tensors whose names begin with `name` and a dot, without this prefix."""
+    prefix = f"{name}."
+    return {key.removeprefix(prefix): t for key, t in tensors.items() if key.startswith(prefix)}
+
+
 def check_finite(weights: Mapping[str, Tensor]) -> None:
     """Check that all weights are finite, as those of every policy of a training are."""
     for name, tensor in weights.items():

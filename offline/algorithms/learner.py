@@ -110,6 +110,8 @@ class Learner(ABC):
         target_networks: Target networks by the name of the model that they copy.
         scalars: Learned numbers by name, one per seed; see `add_scalar`.
         step: Number of finished updates.
+        learning_rate_at: Function from the number of finished updates to the learning rate.
+        max_grad_norm: Largest norm of the gradient of each seed's networks.
     """
 
     name: ClassVar[str]
@@ -130,6 +132,8 @@ class Learner(ABC):
         self.buffer = buffer
         self.seeds = tuple(seeds)
         self.step = 0
+        self.learning_rate_at: Callable[[int], float] = config.learning_rate_at
+        self.max_grad_norm = math.inf
         self.n_actions = buffer.n_actions
         channels = [image.shape[2] for image in buffer.encoder.image_inputs]
         self.architecture = config.architecture_for(channels)
@@ -197,7 +201,7 @@ class Learner(ABC):
         if not math.isfinite(terms["loss"].sum().item()):
             raise self._not_finite(self.seed_means(terms))
         for group in self.optimizer.param_groups:
-            rate = self.config.learning_rate_at(self.step) * group["rate_factor"]
+            rate = self.learning_rate_at(self.step) * group["rate_factor"]
             if isinstance(group["lr"], Tensor):
                 group["lr"].fill_(rate)
             else:
@@ -208,9 +212,13 @@ class Learner(ABC):
             self._captured.step()
         self.step += 1
         if self.target_networks and self.step % self._sync_interval == 0:
-            for name, target in self.target_networks.items():
-                target.sync(self.models[name])
+            self.sync_targets()
         return terms
+
+    def sync_targets(self) -> None:
+        """Copy the weights of all models to their target networks."""
+        for name, target in self.target_networks.items():
+            target.sync(self.models[name])
 
     def _gradients(self, rows: Tensor) -> dict[str, Tensor]:
         """Compute the gradients of all weights for rows (R,) of the buffer, on its device.
@@ -222,7 +230,20 @@ class Learner(ABC):
         self.optimizer.zero_grad()
         # A seed's loss depends only on that seed's weights, so one sum yields all gradients.
         torch.autograd.backward(terms["loss"].sum() / (len(rows) // len(self.seeds)))
+        if self.max_grad_norm < math.inf:
+            self._clip_gradients()
         return {name: term.detach() for name, term in terms.items()}
+
+    @torch.no_grad()
+    def _clip_gradients(self) -> None:
+        """Scale the gradients of each seed's networks down to the largest norm."""
+        found = [model.weights.grad for model in self.models.values()]
+        gradients = [gradient for gradient in found if gradient is not None]
+        norms = [torch.linalg.vector_norm(gradient, dim=1) for gradient in gradients]
+        norm = norms[0] if len(norms) == 1 else torch.linalg.vector_norm(torch.stack(norms), dim=0)
+        factors = (self.max_grad_norm / (norm + 1e-6)).clamp_(max=1.0).unsqueeze(1)
+        for gradient in gradients:
+            gradient.mul_(factors)
 
     def add_target_network(
         self, name: str, interval: int, *, next_states: bool = True, polyak: float = 1.0

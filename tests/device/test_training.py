@@ -12,9 +12,10 @@ import torch
 
 import mcaprl
 from mcaprl.cli import run
-from mcaprl.device.training import SETTINGS, Agents, device_task
+from mcaprl.device.training import SETTINGS, device_task, make_agents
 from mcaprl.errors import OutputExistsError, TrainingError, UnknownNameError, UsageError
 from mcaprl.online.config import DoubleDQNConfig
+from mcaprl.online.engine import Agents
 from mcaprl.runs import read_curves
 from mcaprl.sims import make_device_sims
 
@@ -47,7 +48,7 @@ def agents_of(seeds: int, device: str = "cpu", **settings: Any) -> Agents:
     config = device_task("lane", **{**SMALL, **settings}).config
     assert isinstance(config, DoubleDQNConfig)
     sims = make_device_sims("lane", seeds * config.envs, device=device, seed=3)
-    return Agents(sims, config, range(3, 3 + seeds), torch.device(device))
+    return make_agents(sims, config, range(3, 3 + seeds), torch.device(device))
 
 
 def test_a_run_has_the_policies_metrics_and_scores_of_all_seeds(tmp_path: Path) -> None:
@@ -61,8 +62,9 @@ def test_a_run_has_the_policies_metrics_and_scores_of_all_seeds(tmp_path: Path) 
     assert (config["device"], config["seeds"], config["seed"]) == ("cpu", 2, 5)
     curves = read_curves(folder, "metrics.csv")
     assert [curve["steps"][-1] for curve in curves] == [4_000, 4_000]
-    # 3,600 steps after the random ones, 32 steps for each update.
-    assert [curve["update"][-1] for curve in curves] == [112, 112]
+    # The random steps end after 400 steps. An update follows each multiple of 32 steps, the first
+    # after 416 and the last after 4,000.
+    assert [curve["update"][-1] for curve in curves] == [113, 113]
     policy = mcaprl.load_policy(folder)
     assert policy.env_id == "mcaprl/LaneKeeping-v0"
     assert policy.act(np.zeros((3, 12), np.float32)).shape == (3,)
@@ -75,7 +77,7 @@ def test_a_run_has_the_policies_metrics_and_scores_of_all_seeds(tmp_path: Path) 
 def test_the_same_seed_trains_the_same_weights() -> None:
     first, again = agents_of(2), agents_of(2)
     for _ in range(100):
-        rewards = [agents.step() for agents in (first, again)]
+        rewards = [agents.step().rewards for agents in (first, again)]
         torch.testing.assert_close(*rewards, rtol=0, atol=0)
     weights = [agents.learner.models["q"].weights.detach() for agents in (first, again)]
     torch.testing.assert_close(*weights, rtol=0, atol=0)
@@ -91,16 +93,7 @@ def test_updates_follow_the_random_steps_at_the_chosen_rate() -> None:
     # Step 26 is the first after 400 steps; every second step has an update then.
     assert updates[24] == 0
     assert updates[25:29] == [1, 1, 2, 2]
-    assert updates[-1] == agents.learner.config.updates == 112
-
-
-def test_updates_wait_until_returns_are_known() -> None:
-    agents = agents_of(1, n_steps=3, learning_starts=0, steps_per_update=16)
-    updates = []
-    for _ in range(4):
-        agents.step()
-        updates.append(agents.learner.step)
-    assert updates == [0, 0, 1, 2]
+    assert updates[-1] == 113
 
 
 def test_the_command_names_the_last_policy(
@@ -128,7 +121,7 @@ def test_epsilon_falls_linearly() -> None:
 
 def test_agents_learn_to_keep_the_lane() -> None:
     agents = agents_of(1, **LEARNING)
-    rewards = [float(agents.step()) for _ in range(60_000 // 64)]
+    rewards = [float(agents.step().rewards.mean()) for _ in range(60_000 // 64)]
     # Random cars leave the lane every few steps, which costs 5; a car that keeps it earns up to 1.
     assert np.mean(rewards[:60]) < -0.1
     assert np.mean(rewards[-300:]) > 0.1
@@ -174,6 +167,7 @@ def test_the_default_settings_are_valid() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
 def test_agents_learn_on_a_gpu() -> None:
     agents = agents_of(4, "cuda", **LEARNING)
-    rewards = torch.stack([agents.step() for _ in range(60_000 // 64)])
+    steps = [agents.step().rewards.view(4, -1).mean(1) for _ in range(60_000 // 64)]
+    rewards = torch.stack(steps)
     assert (rewards[:60].mean(0) < -0.1).all()
     assert (rewards[-300:].mean(0) > 0.1).all()

@@ -22,6 +22,7 @@ from mcaprl.api.policies import load_policy
 from mcaprl.architecture import Architecture
 from mcaprl.errors import PolicyError
 from mcaprl.frames import stacked_space
+from mcaprl.networks import ImageInput
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.policy import save_policy
@@ -107,7 +108,8 @@ def online(
     model = kind(policy, env, seed=seed, device="cpu", policy_kwargs=policy_kwargs, **others)
     if architecture is not None:
         images = drawn(observation_space, 9, seed=4)["camera"]
-        normalize_images(model.policy, {"camera": images}, stack)
+        camera = ImageInput(images.shape[1:]).normalized_to(images)
+        normalize_images(model.policy, [camera], stack)
     if not ours:
         model.save(path)
         return

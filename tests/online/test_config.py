@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from mcaprl.errors import UnknownNameError, UsageError
-from mcaprl.online.algorithms import ALGORITHMS, find_algorithm
 from mcaprl.online.config import (
+    CONFIGS,
     IMAGE_SETTINGS,
     SIM_SETTINGS,
     A2CConfig,
@@ -19,14 +19,14 @@ from mcaprl.online.config import (
     PPOConfig,
     settings_for,
 )
-from mcaprl.online.task import Task
+from mcaprl.online.task import Task, find_config
 from mcaprl.settings import field_help
 from mcaprl.sims import SIMS
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", CONFIGS)
 def test_every_setting_has_one_line_of_help(name: str) -> None:
-    config_type = ALGORITHMS[name].config_type
+    config_type = CONFIGS[name]
     lines = field_help(config_type)
     assert list(lines) == [field.name for field in dataclasses.fields(config_type)]
     assert all(line and "\n" not in line for line in lines.values())
@@ -84,7 +84,7 @@ def test_invalid_settings_are_refused(
 
 def test_an_unknown_algorithm_lists_the_known_ones() -> None:
     with pytest.raises(UnknownNameError, match="did you mean dqn"):
-        find_algorithm("dqm")
+        find_config("dqm")
 
 
 @pytest.mark.parametrize("sim", SIMS)

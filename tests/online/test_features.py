@@ -18,7 +18,8 @@ from stable_baselines3.common.torch_layers import NatureCNN
 import mcaprl
 from mcaprl.architecture import Architecture
 from mcaprl.errors import PolicyError, UsageError
-from mcaprl.online.agent import CENTERING_STEPS, Agent
+from mcaprl.networks import Convolutions, ImageInput
+from mcaprl.online.agent import CENTERING_STEPS
 from mcaprl.online.config import DoubleDQNConfig, PPOConfig
 from mcaprl.online.features import (
     NetworkDQNPolicy,
@@ -26,7 +27,10 @@ from mcaprl.online.features import (
     normalize_images,
     policy_arguments,
 )
+from mcaprl.online.learning import LearningAgent
+from mcaprl.online.sb3 import ModelAgent
 from mcaprl.online.task import Task
+from mcaprl.online.train import make_agent
 from mcaprl.online.zip_file import describe_run, read_policy, save_policy
 from mcaprl.sims.evaluation.evaluate import Scale
 
@@ -88,7 +92,7 @@ def test_files_contain_the_whole_network(
     model = model_of(env, architecture)
     observations = samples(env.observation_space)
     image = observations["depth"] if vector else observations
-    normalize_images(model.policy, {"depth": image}, 1)
+    normalize_images(model.policy, [ImageInput((84, 84, 1)).normalized_to(image)], 1)
     path = tmp_path / "model.zip"
     spaces_ = (env.observation_space, env.action_space)
     save_policy(
@@ -135,7 +139,7 @@ def test_images_have_mean_0_and_deviation_1_after_normalization() -> None:
     env = Camera()
     model = model_of(env, Architecture((8,), encoder="compact"))
     images = np.stack([np.full((84, 84, 1), value, np.uint8) for value in (100, 120)])
-    normalize_images(model.policy, {"": images}, 1)
+    normalize_images(model.policy, [ImageInput((84, 84, 1)).normalized_to(images)], 1)
     seen: list[torch.Tensor] = []
     extractor = model.q_net.features_extractor
     assert isinstance(extractor, NetworkFeatures)
@@ -162,54 +166,52 @@ def test_averaged_images_have_the_same_values() -> None:
     torch.testing.assert_close(values[0], values[1])
 
 
-def agent(folder: Path, observation: str, **settings: Any) -> Agent:
-    task = Task.for_sim("lane", None, {"observation": observation}, **{**SHORT, **settings})
-    return Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0))
+def agent(folder: Path, observation: str, algo: str = "double-dqn", **settings: Any) -> Any:
+    task = Task.for_sim("lane", algo, {"observation": observation}, **{**SHORT, **settings})
+    return make_agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0))
 
 
-def test_an_agent_centers_the_images_of_random_steps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("mcaprl.online.agent.CENTERING_STEPS", CENTERING_STEPS)
-    with closing(agent(tmp_path, "depth", frame_stack=2)) as begun:
+def networks_of(begun: Any) -> list[Any]:
+    """Return the network that learns, and its target network."""
+    if isinstance(begun, ModelAgent):
         model: Any = begun.model
-        (convolutions,) = model.q_net.features_extractor.convolutions
+        return [model.q_net, model.q_net_target]
+    return [model.networks[0] for model in begun.agents.learner.all_models().values()]
+
+
+@pytest.mark.parametrize("algo", ["dqn", "double-dqn"])
+def test_an_agent_centers_the_images_of_random_steps(tmp_path: Path, algo: str) -> None:
+    assert CENTERING_STEPS >= 1_000
+    with closing(agent(tmp_path, "depth", algo, frame_stack=2)) as begun:
+        found = [
+            part
+            for network in networks_of(begun)
+            for part in network.modules()
+            if isinstance(part, Convolutions)
+        ]
+        convolutions, target = found
         assert convolutions.shift.shape == (2, 42, 42)
         mean = convolutions.shift
         assert torch.equal(mean[0], mean[1]), "both frames of a stack have the same mean"
         # The sky above the street is 255, and the ground before the car is near.
         assert mean[0, 0, 20] > 200 > 100 > mean[0, -1, 20]
         assert 20 < convolutions.scale < 120
-        (target,) = model.q_net_target.features_extractor.convolutions
         assert torch.equal(target.shift, convolutions.shift)
-    assert CENTERING_STEPS >= 1_000
 
 
 def test_sb3s_network_is_used_if_it_is_asked_for(tmp_path: Path) -> None:
     plain = {"encoder": "nature", "center_images": False, "dueling": False, "layer_norm": False}
-    with closing(agent(tmp_path, "depth", **plain)) as begun:
-        model: Any = begun.model
-        assert isinstance(model.q_net.features_extractor, NatureCNN)
+    with closing(agent(tmp_path, "depth", "dqn", **plain)) as begun:
+        assert isinstance(begun.model.q_net.features_extractor, NatureCNN)
 
 
-@pytest.mark.parametrize("observation", ["dashboard", "depth-commands"])
-def test_a_resumed_agent_has_the_same_images(tmp_path: Path, observation: str) -> None:
-    """The replay buffer contains averaged images; the checkpoint contains their normalization."""
-    models: list[Any] = []
-    for resume in (False, True):
-        task = Task.for_sim("lane", None, {"observation": observation}, **SHORT)
-        scale = Scale(0.0, 1.0)
-        with closing(Agent(task, "a", tmp_path, 0, scale, resume=resume)) as begun:
-            if resume:
-                models[0].q_net.features_extractor.convolutions[0].shift += 1.0
-            begun.learn(lambda _: None)
-            models.append(begun.model)
-    first, second = (model.replay_buffer for model in models)
-    assert first.frames["depth"].shape[2:] == (1, 42, 42)
-    for key, part in first.columns().items():
-        np.testing.assert_array_equal(second.columns()[key], part)
-    shifts = [model.q_net.features_extractor.convolutions[0].shift for model in models]
-    torch.testing.assert_close(shifts[1] + 1.0, shifts[0])
+def test_settings_that_sb3_lacks_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="dqn of Stable-Baselines3 has no image_shift"):
+        agent(tmp_path, "depth", "dqn", image_shift=1)
+    with pytest.raises(UsageError, match="no n-step returns for Dict observations"):
+        agent(tmp_path, "dashboard", "dqn", n_steps=3)
+    with pytest.raises(UsageError, match="image_shift is for images"):
+        agent(tmp_path, "state", image_shift=1)
 
 
 @pytest.mark.parametrize(
@@ -267,11 +269,12 @@ def test_settings_of_networks_are_validated() -> None:
 def test_dueling_networks_learn_from_vectors(tmp_path: Path) -> None:
     settings = {**SHORT, "dueling": True, "layer_norm": True, "eval_interval": 50}
     task = Task.for_sim("lane", None, {}, **settings)
-    with closing(Agent(task, "mcaprl/LaneKeeping-v0", tmp_path, 0, Scale(0.0, 1.0))) as begun:
-        before = [value.clone() for value in begun.model.policy.parameters()]
+    with closing(make_agent(task, "Lane-v0", tmp_path, 0, Scale(0.0, 1.0))) as begun:
+        assert isinstance(begun, LearningAgent)
+        weights = begun.agents.learner.models["q"].weights
+        before = weights.clone()
         begun.learn(lambda _: None)
-        after = list(begun.model.policy.parameters())
-        assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
+        assert not torch.equal(weights, before)
 
 
 def test_parts_of_a_dict_reach_the_network_in_the_order_of_the_space() -> None:

@@ -18,10 +18,10 @@ from mcaprl.errors import PolicyError
 from mcaprl.frames import FrameStack, frame_rows, joined, stacked_frames, stacked_space
 from mcaprl.offline.algorithms.config import CQLConfig
 from mcaprl.offline.training.train import train as train_offline
-from mcaprl.online.agent import Agent
+from mcaprl.online.learning import LearningAgent
+from mcaprl.online.sb3 import BatchedVecEnv, StackedVecEnv
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
-from mcaprl.online.vec_env import BatchedVecEnv, StackedVecEnv
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims.evaluation.evaluate import Scale
 from mcaprl.sims.evaluation.rollout import EpsilonGreedy, rollout
@@ -111,25 +111,22 @@ def test_stacks_are_reset_at_each_environments_episode() -> None:
 
 
 def test_a_stacking_policy_acts_outside_as_it_does_in_training(tmp_path: Path) -> None:
-    """`evaluate` stacks frames in the policy; training stacks them in the batch wrapper."""
+    """`evaluate` stacks frames in the policy; training stacks them in the replay buffer."""
     task = Task.for_sim("lane", **SHORT)
     (summary,) = train(task, tmp_path / "run", record=tmp_path / "log.mcap", progress=silent)
-    path = summary.folder / "best_model.zip"
-    policy = mcaprl.load_policy(path)
+    policy = mcaprl.load_policy(summary.folder)
     assert policy.frame_stack == 3
     log = mcaprl.open(summary.folder / "evaluations" / f"step-{summary.best_step:09d}.mcap")
     for episode in log.episodes:
         policy.begin()
         acted = [int(policy.act(seen[None])[0]) for seen in episode.observations]
         assert acted == episode.actions.tolist()
-    model = DQN.load(path)
-    assert model.observation_space.shape == (36,)
     assert mcaprl.open(tmp_path / "log.mcap").observation_space.shape == (12,)
 
 
 def test_the_commands_accept_a_stacking_policy(tmp_path: Path) -> None:
     (summary,) = train(Task.for_sim("lane", **SHORT), tmp_path / "run", progress=silent)
-    path, log = str(summary.folder / "best_model.zip"), str(tmp_path / "log.mcap")
+    path, log = str(summary.folder), str(tmp_path / "log.mcap")
     assert run(["record", "lane", "--policy", path, "--episodes", "2", "--out", log]) == 0
     out = tmp_path / "annotated.mcap"
     assert run(["annotate", log, "--policy", path, "--out", str(out)]) == 0
@@ -150,11 +147,8 @@ def test_a_stacking_offline_policy_initializes_an_agent(tmp_path: Path) -> None:
     stacks = np.random.default_rng(0).normal(size=(5, 3, 12)).astype(np.float32)
     with closing(agent(tmp_path)) as begun:
         begun.start_from(mcaprl.open(tmp_path / "log.mcap"), policy)
-        model: Any = begun.model
-        with torch.inference_mode():
-            values = model.q_net(torch.from_numpy(stacks.reshape(5, 36))).numpy()
-        np.testing.assert_allclose(values, policy.q_values(stacks), rtol=1e-5, atol=1e-5)
-        assert model.replay_buffer.frames[""].shape[2:] == (12,)
+        np.testing.assert_array_equal(begun.policy.q_values(stacks), policy.q_values(stacks))
+        assert begun.agents.buffer.frames.vector.shape[1:] == (12,)
     with (
         closing(agent(tmp_path, frame_stack=1)) as other,
         pytest.raises(PolicyError, match=r"stacks 3 observations.*`frame_stack=3`"),
@@ -162,37 +156,17 @@ def test_a_stacking_offline_policy_initializes_an_agent(tmp_path: Path) -> None:
         other.start_from(None, policy)
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"observation": "depth"}, {"observation": "depth-commands"}]
-)
-def test_a_run_with_frames_is_resumed(tmp_path: Path, options: dict[str, Any]) -> None:
-    """The checkpoint restores the weights, the optimizer's moments and all frames."""
-    first = agent(tmp_path, options)
-    with closing(first):
-        first.learn(silent)
-    second = agent(tmp_path, options, resume=True)
-    with closing(second):
-        second.learn(silent)
-    assert second.resumed_at == 120
-    mine: Any = first.model
-    other: Any = second.model
-    for name, value in mine.policy.state_dict().items():
-        assert torch.equal(value, other.policy.state_dict()[name]), name
-    states = [m.policy.optimizer.state_dict()["state"] for m in (mine, other)]
-    weights = list(other.policy.optimizer.param_groups[0]["params"])
-    for number, moments in states[0].items():
-        for name, value in moments.items():
-            found = states[1][number][name]
-            assert torch.equal(value, found)
-            if found.ndim:
-                assert found.stride() == weights[number].stride()
-    kept = mine.replay_buffer.columns()
-    for name, column in other.replay_buffer.columns().items():
-        np.testing.assert_array_equal(column, kept[name], err_msg=name)
-
-
-def agent(folder: Path, options: Any = None, resume: bool = False, **settings: Any) -> Agent:
+def agent(folder: Path, **settings: Any) -> LearningAgent:
     (folder / "seed-0").mkdir(exist_ok=True)
-    task = Task.for_sim("lane", sim_options=options, **{**SHORT, **settings})
-    scale = Scale(0.0, 1.0)
-    return Agent(task, "mcaprl/LaneKeeping-v0", folder / "seed-0", 0, scale, resume=resume)
+    task = Task.for_sim("lane", **{**SHORT, **settings})
+    return LearningAgent(task, "mcaprl/LaneKeeping-v0", folder / "seed-0", 0, Scale(0.0, 1.0))
+
+
+def test_a_stacking_model_of_sb3_is_trained_and_read(tmp_path: Path) -> None:
+    (summary,) = train(Task.for_sim("lane", "dqn", **SHORT), tmp_path / "run", progress=silent)
+    model = DQN.load(summary.folder / "best_model.zip")
+    assert model.observation_space.shape == (36,)
+    policy = mcaprl.load_policy(summary.folder)
+    stacks = np.random.default_rng(0).normal(size=(5, 3, 12)).astype(np.float32)
+    acted = model.predict(stacks.reshape(5, 36), deterministic=True)[0]
+    np.testing.assert_array_equal(policy.act(stacks), acted)

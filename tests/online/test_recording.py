@@ -1,4 +1,4 @@
-"""Tests of recorded training: SB3's transitions, action probabilities and policy versions."""
+"""Tests of recorded training: transitions, action probabilities and policy versions."""
 
 from __future__ import annotations
 
@@ -9,22 +9,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 from stable_baselines3 import DQN, PPO
-from stable_baselines3.common.buffers import ReplayBuffer
 
 import mcaprl
 from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.offline.algorithms.config import CQLConfig
+from mcaprl.offline.policy import read_policy
 from mcaprl.offline.training.train import train as train_offline
-from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import FirstEpisodes
-from mcaprl.online.recording import behavior_probabilities, log_paths, recorded
+from mcaprl.online.recording import log_paths, recorded
+from mcaprl.online.sb3 import BatchedVecEnv, ModelAgent, behavior_probabilities
 from mcaprl.online.task import Task
-from mcaprl.online.train import train
-from mcaprl.online.vec_env import BatchedVecEnv
-from mcaprl.online.zip_file import read_policy
+from mcaprl.online.train import make_agent, train
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import read_curve
@@ -44,6 +43,7 @@ SHORT: dict[str, Any] = {
     "envs": 4,
 }
 LANE_ACTIONS = 6
+STORED = ("observations", "actions", "rewards", "next_observations", "dones", "timeouts")
 
 
 def silent(_: TrainingProgress) -> None:
@@ -51,68 +51,84 @@ def silent(_: TrainingProgress) -> None:
 
 
 def trained(
-    folder: Path, sim_options: dict[str, Any] | None = None, **settings: Any
-) -> tuple[Agent, Dataset]:
+    folder: Path,
+    sim_options: dict[str, Any] | None = None,
+    algo: str = "double-dqn",
+    **settings: Any,
+) -> tuple[Any, Dataset]:
     """Train an agent for a short time; return the agent and its log."""
     folder.mkdir()
-    task = Task.for_sim("lane", "dqn", sim_options, **{**SHORT, **settings})
+    task = Task.for_sim("lane", algo, sim_options, **{**SHORT, **settings})
     path = folder / "log.mcap"
-    agent = Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0), record=path)
+    agent = make_agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0), record=path)
     with closing(agent):
         agent.learn(silent)
     return agent, mcaprl.open(path)
 
 
 @pytest.fixture(scope="module")
-def usual(tmp_path_factory: pytest.TempPathFactory) -> tuple[Agent, Dataset, Path]:
+def usual(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Dataset, Path]:
     """Return an agent that was trained with `SHORT`, its log and its folder; tests change none."""
     folder = tmp_path_factory.mktemp("usual") / "run"
     return *trained(folder), folder
 
 
-def buffered_episodes(buffer: ReplayBuffer) -> list[dict[str, NDArray[Any]]]:
-    """Split the rows of SB3's buffer into episodes, in the order of their ends."""
-    episodes = []
-    for env in range(buffer.n_envs):
-        columns = {
-            name: getattr(buffer, name)[: buffer.size(), env]
-            for name in (
-                "observations",
-                "actions",
-                "rewards",
-                "next_observations",
-                "dones",
-                "timeouts",
-            )
-        }
-        ends = np.flatnonzero(columns["dones"]).tolist()
+def columns_of(agent: Any) -> dict[str, NDArray[Any]]:
+    """Return the content of a replay buffer, with an axis for the environments."""
+    if isinstance(agent, ModelAgent):
+        assert isinstance(agent.model, DQN)
+        buffer: Any = agent.model.replay_buffer
+        columns = {name: getattr(buffer, name)[: buffer.size()] for name in STORED}
+        return {**columns, "actions": columns["actions"][..., 0]}
+    buffer = agent.agents.buffer
+    rows = torch.arange(buffer.steps * buffer.width)
+    batch = buffer.batch(rows)
+    goes_on = buffer.goes_on.flatten()[rows].numpy()
+    columns = {
+        "observations": batch.observations.vector.numpy(),
+        "actions": batch.actions.numpy(),
+        "rewards": batch.rewards.numpy(),
+        "next_observations": batch.next_observations.vector.numpy(),
+        "dones": ~goes_on,
+        "timeouts": ~goes_on & (batch.discounts.numpy() > 0),
+    }
+    return {k: v.reshape(-1, buffer.width, *v.shape[1:]) for k, v in columns.items()}
+
+
+def buffered_episodes(agent: Any) -> list[dict[str, NDArray[Any]]]:
+    """Split the rows of a replay buffer into episodes, in the order of their ends."""
+    columns, episodes = columns_of(agent), []
+    size, envs = columns["dones"].shape
+    for env in range(envs):
+        ends = np.flatnonzero(columns["dones"][:, env]).tolist()
         starts = [0, *(end + 1 for end in ends)]
-        for start, end in zip(starts, [*ends, buffer.size() - 1], strict=True):
+        for start, end in zip(starts, [*ends, size - 1], strict=True):
             if start <= end:
-                part = {name: values[start : end + 1] for name, values in columns.items()}
+                part = {name: values[start : end + 1, env] for name, values in columns.items()}
                 # Episodes that were unfinished at the end of training come last.
-                episodes.append((end if end in ends else buffer.size(), env, part))
+                last = size if end == size - 1 and not bool(part["dones"][-1]) else end
+                cut = not isinstance(agent, ModelAgent) and end == size - 1 and part["timeouts"][-1]
+                episodes.append((size if cut else last, env, part))
     return [part for _, _, part in sorted(episodes, key=lambda episode: episode[:2])]
 
 
-@pytest.mark.parametrize("envs", [1, 4])
-def test_the_log_is_sb3s_replay_buffer_row_for_row(
-    usual: tuple[Agent, Dataset, Path], tmp_path: Path, envs: int
+@pytest.mark.parametrize(("algo", "envs"), [("dqn", 4), ("double-dqn", 1), ("double-dqn", 4)])
+def test_the_log_is_the_replay_buffer_row_for_row(
+    usual: tuple[Any, Dataset, Path], tmp_path: Path, algo: str, envs: int
 ) -> None:
-    agent, log = usual[:2] if envs == SHORT["envs"] else trained(tmp_path / "run", envs=envs)
-    assert isinstance(agent.model, DQN)
-    assert agent.model.replay_buffer is not None
-    episodes = buffered_episodes(agent.model.replay_buffer)
+    is_usual = (algo, envs) == ("double-dqn", SHORT["envs"])
+    agent, log = usual[:2] if is_usual else trained(tmp_path / "run", algo=algo, envs=envs)
+    episodes = buffered_episodes(agent)
     assert len(log) == sum(len(part["rewards"]) for part in episodes) == 800
     assert len(log.episodes) == len(episodes) > 10
     stored = {name: np.concatenate([part[name] for part in episodes]) for name in episodes[0]}
     np.testing.assert_array_equal(log.observations, stored["observations"])
     np.testing.assert_array_equal(log.next_observations, stored["next_observations"])
-    np.testing.assert_array_equal(log.actions, stored["actions"][:, 0])
+    np.testing.assert_array_equal(log.actions, stored["actions"])
     np.testing.assert_array_equal(log.rewards.astype(np.float32), stored["rewards"])
     np.testing.assert_array_equal(log.terminated, (stored["dones"] * (1 - stored["timeouts"])) == 1)
     timeouts = [episode.truncated[-1] for episode in log.episodes]
-    reported = [part["timeouts"][-1] == 1 or part["dones"][-1] == 0 for part in episodes]
+    reported = [bool(part["timeouts"][-1]) or not part["dones"][-1] for part in episodes]
     assert timeouts == reported
 
 
@@ -156,9 +172,9 @@ def test_a_log_is_in_its_place_throughout_its_recovery(
     with monkeypatch.context() as patch:
         patch.setattr(Path if operation == "unlink" else os, operation, killed)
         with pytest.raises(KeyboardInterrupt):
-            recorded(batch, path, algo="dqn", seed=0, resume=True)
+            recorded(batch, path, algo="dqn", seed=0, episodes=-1)
     assert path.read_bytes() == content
-    with closing(recorded(batch, path, algo="dqn", seed=0, resume=True)) as env:
+    with closing(recorded(batch, path, algo="dqn", seed=0, episodes=-1)) as env:
         assert env.episodes == 2
     assert (tmp_path / "log.mcap.damaged").read_bytes() == content
 
@@ -169,7 +185,7 @@ def test_a_log_killed_in_its_first_episode_begins_again(tmp_path: Path, length: 
     content = killed_log(path, 0)[:length]
     path.write_bytes(content)
     batch = Task.for_sim("lane").batch(1)
-    with closing(recorded(batch, path, algo="dqn", seed=0, resume=True)) as env:
+    with closing(recorded(batch, path, algo="dqn", seed=0, episodes=-1)) as env:
         env.reset(seed=0)
         env.step(np.zeros(1, np.int64))
     assert len(mcaprl.open(path)) == 1
@@ -179,12 +195,12 @@ def test_a_file_that_is_no_log_is_not_replaced(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     path.write_text("thesis")
     with pytest.raises(LogError, match="cannot be recovered"):
-        recorded(Task.for_sim("lane").batch(1), path, algo="dqn", seed=0, resume=True)
+        recorded(Task.for_sim("lane").batch(1), path, algo="dqn", seed=0, episodes=-1)
     assert path.read_text() == "thesis"
 
 
 def test_the_log_can_be_trained_on_offline(
-    usual: tuple[Agent, Dataset, Path], tmp_path: Path
+    usual: tuple[Any, Dataset, Path], tmp_path: Path
 ) -> None:
     _, log, _ = usual
     config = CQLConfig(updates=20, hidden=(8,), log_interval=10, gamma=0.5, target_interval=2)
@@ -193,13 +209,13 @@ def test_the_log_can_be_trained_on_offline(
 
 
 def test_probabilities_are_those_of_the_behavior_policy(
-    usual: tuple[Agent, Dataset, Path],
+    usual: tuple[Any, Dataset, Path],
 ) -> None:
     _, log, folder = usual
     learner = read_learner(folder / "log.mcap")
     epsilon, probs = learner.epsilon, log.behavior_probs
     warm_up = learner.policy_version == 0
-    # There are 160 random steps, and then four steps of the first policy decision.
+    # There are 160 random steps.
     assert (epsilon == 1.0).sum() == 160
     np.testing.assert_allclose(probs[epsilon == 1.0], 1 / LANE_ACTIONS)
     low, high = epsilon / LANE_ACTIONS, 1 - epsilon + epsilon / LANE_ACTIONS
@@ -223,7 +239,7 @@ def test_probabilities_do_not_depend_on_other_predictions(tmp_path: Path) -> Non
         steps=300,
     )
     epsilon = read_learner(tmp_path / "run" / "log.mcap").epsilon
-    greedy = read_policy(tmp_path / "run" / "best_model.zip").act(log.observations)
+    greedy = read_policy(tmp_path / "run").act(log.observations)
     expected = epsilon / LANE_ACTIONS + (1 - epsilon) * (log.actions == greedy)
     np.testing.assert_allclose(log.behavior_probs, expected, rtol=1e-6)
     assert 0.3 < (log.actions == greedy)[epsilon < 1].mean() < 0.9
@@ -257,15 +273,15 @@ def test_an_actors_probabilities_sum_to_one() -> None:
     env.close()
 
 
-def test_recording_changes_nothing(usual: tuple[Agent, Dataset, Path], tmp_path: Path) -> None:
+def test_recording_changes_nothing(usual: tuple[Any, Dataset, Path], tmp_path: Path) -> None:
     agent, _, _ = usual
-    train(Task.for_sim("lane", "dqn", **SHORT), tmp_path / "plain", progress=silent)
+    train(Task.for_sim("lane", **SHORT), tmp_path / "plain", progress=silent)
     plain = read_curve(tmp_path / "plain" / "seed-0" / "curve.csv")
     for name in set(plain) - {"score"}:
         assert plain[name].tolist() == [getattr(point, name) for point in agent.points]
 
 
-def test_each_evaluation_has_a_separate_log(usual: tuple[Agent, Dataset, Path]) -> None:
+def test_each_evaluation_has_a_separate_log(usual: tuple[Any, Dataset, Path]) -> None:
     agent, _, folder = usual
     paths = sorted((folder / "evaluations").iterdir())
     assert [path.name for path in paths] == ["step-000000400.mcap", "step-000000800.mcap"]
@@ -284,7 +300,7 @@ def test_each_evaluation_has_a_separate_log(usual: tuple[Agent, Dataset, Path]) 
 def test_first_episodes_are_those_of_single_environments(kwargs: dict[str, Any]) -> None:
     name, count = ("powerline", 2) if kwargs else ("lane", 4)
     envs = SyncVectorEnv(
-        [lambda: make_sim(name, **kwargs)] * count, autoreset_mode=AutoresetMode.SAME_STEP
+        [lambda: make_sim(name, **kwargs)] * count, autoreset_mode=AutoresetMode.NEXT_STEP
     )
     kept = FirstEpisodes(envs, "")
     kept.reset(seed=3)

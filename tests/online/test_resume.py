@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import hashlib
 import json
 import shutil
 import signal
@@ -10,6 +12,7 @@ import sys
 import textwrap
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +24,16 @@ from stable_baselines3 import DQN
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import TrainingError, UsageError
-from mcaprl.online.agent import Agent
+from mcaprl.frames import mapped
+from mcaprl.online.config import CONFIGS
+from mcaprl.online.learning import LearningAgent
 from mcaprl.online.task import Task
-from mcaprl.online.train import OnlineSummary, train
+from mcaprl.online.train import OnlineSummary, make_agent, train
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.open import GrowingLogs
 from mcaprl.runs import read_curve
 from mcaprl.sims.evaluation.evaluate import Scale
+from mcaprl.storage.tensor_files import read_tensors, write_tensors
 from tests.support.offline_tasks import corridor
 
 SHORT: dict[str, Any] = {
@@ -61,47 +67,74 @@ def stop_at(step: int) -> Callable[[TrainingProgress], None]:
     return report
 
 
-def agent_in(folder: Path, resume: bool, **settings: Any) -> Agent:
-    folder.mkdir(exist_ok=True)
-    task = Task.for_sim("lane", "dqn", **{**SHORT, **settings})
-    return Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0), resume=resume)
-
-
-def state_of(agent: Agent) -> dict[str, Any]:
-    """Return all state that training depends on, except the environments."""
-    model: Any = agent.model
-    buffer = model.replay_buffer
-    return {
-        "steps": model.num_timesteps,
-        "updates": model._n_updates,
-        "calls": model._n_calls,
-        "episodes": model._episode_num,
-        "epsilon": model.exploration_rate,
-        "weights": [value.tolist() for value in model.policy.state_dict().values()],
-        "moments": [
-            {name: value.tolist() for name, value in moments.items()}
-            for moments in model.policy.optimizer.state_dict()["state"].values()
-        ],
-        "buffer": [buffer.pos, buffer.full, buffer.observations.tolist(), buffer.dones.tolist()],
-        "torch": torch.rand(3).tolist(),
-        "numpy": np.random.rand(3).tolist(),  # noqa: NPY002
-        "action": int(model.action_space.sample()),
-    }
-
-
-@pytest.mark.parametrize("settings", [{}, {"n_steps": 3}, {"buffer_size": 1_000}])
-def test_a_checkpoint_restores_everything(tmp_path: Path, settings: dict[str, Any]) -> None:
-    first = agent_in(tmp_path / "run", False, **settings)
-    with closing(first):
+@pytest.mark.parametrize(
+    ("algo", "settings"),
+    [
+        ("double-dqn", {}),
+        ("double-dqn", {"n_steps": 3, "buffer_size": 1_000, "alpha": 0.5}),
+        ("double-dqn", {"target_update_episodes": 5, "exploration_decay": 0.999, "dueling": True}),
+        ("dqn", {}),
+        ("dqn", {"n_steps": 3}),
+        ("ppo", {"rollout_steps": 400, "batch_size": 50}),
+    ],
+)
+def test_a_checkpoint_restores_everything(
+    tmp_path: Path, algo: str, settings: dict[str, Any]
+) -> None:
+    """A finished run that is resumed writes the same checkpoint, which has all state."""
+    known = {field.name for field in fields(CONFIGS[algo])}
+    given = {name: value for name, value in {**SHORT, **settings}.items() if name in known}
+    task, path = Task.for_sim("lane", algo, **given), tmp_path / "checkpoint.safetensors"
+    scale = Scale(0.0, 1.0)
+    with closing(make_agent(task, "Lane-v0", tmp_path, 0, scale)) as first:
         first.learn(silent)
-    before = state_of(first)
-    second = agent_in(tmp_path / "run", True, **settings)
+    before = path.read_bytes()
     torch.manual_seed(7)
-    with closing(second):
+    with closing(make_agent(task, "Lane-v0", tmp_path, 0, scale, resume=True)) as second:
         second.learn(silent)
-    assert second.resumed_at == 2_000
-    assert second.points == first.points
-    assert state_of(second) == before
+        assert second.resumed_at == 2_000
+        assert second.points == first.points
+        path.unlink()
+        second._save()  # type: ignore[attr-defined]
+    assert path.read_bytes() == before
+
+
+def sha(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("sim_options", "settings"),
+    [
+        ({}, {"n_steps": 3}),
+        ({"observation": "dashboard"}, {"frame_stack": 2, "image_shift": 2, "batch_size": 8}),
+    ],
+)
+def test_a_stopped_run_ends_with_the_bits_of_an_uninterrupted_one(
+    tmp_path: Path, sim_options: dict[str, Any], settings: dict[str, Any]
+) -> None:
+    short = {**SHORT, "steps": 1_200, "checkpoint_interval": 350, **settings}
+    task = Task.for_sim("lane", None, sim_options, **short)
+    train(task, tmp_path / "a", record=tmp_path / "a.mcap", progress=silent)
+    with pytest.raises(Stopped):
+        train(task, tmp_path / "b", record=tmp_path / "b.mcap", progress=stop_at(1_000))
+    (summary,) = train(
+        task, tmp_path / "b", record=tmp_path / "b.mcap", resume=True, progress=silent
+    )
+    assert summary.resumed_at == 704
+    for name in (*LearningAgent.best_files, "curve.csv", "checkpoint.safetensors"):
+        whole, resumed = (tmp_path / run / "seed-0" / name for run in ("a", "b"))
+        assert sha(whole) == sha(resumed), name
+    check_same_logs(tmp_path / "a.mcap", tmp_path / "b.mcap")
+
+
+def check_same_logs(path: Path, other: Path) -> None:
+    """Check that two logs have the same episodes."""
+    one, two = mcaprl.open(path), mcaprl.open(other)
+    assert [e.length for e in one.episodes] == [e.length for e in two.episodes]
+    for name in ("actions", "rewards", "terminated", "truncated", "behavior_probs"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    mapped(np.testing.assert_array_equal, one.observations, two.observations)
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +142,7 @@ def resumed(tmp_path_factory: pytest.TempPathFactory) -> OnlineSummary:
     """Train, stop after 1,000 steps and resume; return the summary of a run for reading only."""
     out = tmp_path_factory.mktemp("resumed") / "run"
     settings = {**SHORT, "exploration_fraction": 1.0, "final_learning_rate_fraction": 0.1}
-    task = Task.for_sim("lane", "dqn", **settings)
+    task = Task.for_sim("lane", **settings)
     with pytest.raises(Stopped):
         train(task, out, progress=stop_at(1_000))
     (summary,) = train(task, out, resume=True, progress=silent)
@@ -133,8 +166,9 @@ def test_a_stopped_run_continues_from_its_last_checkpoint(resumed: OnlineSummary
     assert (resumed.resumed_at, resumed.steps) == (800, 2_000)
     curve = read_curve(resumed.folder / "curve.csv")
     assert curve["step"].tolist() == [400, 800, 1_200, 1_600, 2_000]
-    names = sorted(path.name for path in resumed.folder.glob("progress*"))
-    assert names == ["progress-from-800.csv", "progress.csv"]
+    with (resumed.folder / "progress.csv").open() as file:
+        steps = [int(row["time/total_timesteps"]) for row in csv.DictReader(file)]
+    assert steps == sorted(steps) == [400, 800, 1_000, 1_200, 1_600, 2_000, 2_000]
 
 
 def test_a_run_stopped_before_its_first_evaluation_continues(tmp_path: Path) -> None:
@@ -152,6 +186,15 @@ def test_the_best_policy_is_that_of_the_checkpoint(finished: Path) -> None:
     best.write_bytes(b"of an evaluation after the checkpoint")
     train(Task.for_sim("lane", "dqn", **SHORTER), finished, resume=True, progress=silent)
     assert best.read_bytes() == content
+
+
+def test_checkpoints_of_earlier_versions_are_refused_in_one_line(finished: Path) -> None:
+    path = finished / "seed-0" / "checkpoint.safetensors"
+    tensors, description = read_tensors(path)
+    del description["episodes_in_log"]
+    write_tensors(path, tensors, description)
+    with pytest.raises(TrainingError, match="was written by an earlier version of mcaprl; resume"):
+        train(Task.for_sim("lane", "dqn", **SHORTER), finished, resume=True, progress=silent)
 
 
 def test_resuming_a_missing_run_is_refused(
@@ -177,16 +220,13 @@ def test_a_second_training_in_the_folder_is_refused(tmp_path: Path) -> None:
 
 
 def test_epsilon_and_learning_rate_continue_to_decay(resumed: OnlineSummary) -> None:
-    text = (resumed.folder / "progress-from-800.csv").read_text().splitlines()
-    header, *rows = [line.split(",") for line in text]
-    rates = [
-        (float(row[header.index("time/total_timesteps")]), float(value))
-        for row in rows
-        if (value := row[header.index("rollout/exploration_rate")])
-    ]
-    assert rates
-    for step, epsilon in rates:
-        assert epsilon == pytest.approx(1 - 0.95 * step / 2_000, abs=0.01)
+    with (resumed.folder / "progress.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["train/learning_rate"]]
+    assert [row["time/total_timesteps"] for row in rows] == ["1000", "2000"]
+    for row in rows:
+        done = float(row["time/total_timesteps"]) / 2_000
+        assert float(row["rollout/exploration_rate"]) == pytest.approx(1 - 0.95 * done)
+        assert float(row["train/learning_rate"]) == pytest.approx(5e-4 * (1 - 0.9 * done))
 
 
 def test_a_finished_run_is_not_repeated(finished: Path) -> None:
@@ -222,6 +262,7 @@ def test_resuming_trains_all_seeds_of_the_run(
 
 
 def test_a_killed_run_continues(tmp_path: Path) -> None:
+    """The steps after the last checkpoint are taken and logged again, with the same bits."""
     code = f"""
         import sys, time
         from mcaprl.online.task import Task
@@ -232,7 +273,7 @@ def test_a_killed_run_continues(tmp_path: Path) -> None:
             if now.done >= 1_000:
                 time.sleep(60)
 
-        task = Task.for_sim("lane", "dqn", **{SHORT!r})
+        task = Task.for_sim("lane", **{SHORT!r})
         train(task, sys.argv[1], record=sys.argv[2], progress=report)
     """
     log = tmp_path / "log.mcap"
@@ -243,17 +284,33 @@ def test_a_killed_run_continues(tmp_path: Path) -> None:
             if int(line) >= 1_000:
                 process.send_signal(signal.SIGKILL)
                 break
-    task = Task.for_sim("lane", "dqn", **SHORT)
+    task = Task.for_sim("lane", **SHORT)
     logged = len(GrowingLogs([log]).dataset)
+    assert 800 < logged <= 1_000
     (summary,) = train(task, tmp_path / "run", record=log, resume=True, progress=silent)
     assert (summary.resumed_at, summary.steps) == (800, 2_000)
-    # The log has the steps before the kill, followed by those after it.
-    assert 800 < logged <= 1_000
-    assert len(mcaprl.open(log)) == logged + 1_200
+    assert len(mcaprl.open(log)) == 2_000
+    assert len(mcaprl.open(tmp_path / "log.mcap.uncut")) == logged
     assert (tmp_path / "log.mcap.damaged").exists()
+    train(task, tmp_path / "whole", record=tmp_path / "whole.mcap", progress=silent)
+    check_same_logs(log, tmp_path / "whole.mcap")
+    assert sha(summary.folder / "checkpoint.safetensors") == sha(
+        tmp_path / "whole" / "seed-0" / "checkpoint.safetensors"
+    )
 
 
-def test_a_log_is_appended_to(tmp_path: Path) -> None:
+def test_a_run_killed_before_its_first_checkpoint_begins_its_log_again(tmp_path: Path) -> None:
+    task, log = Task.for_sim("lane", **{**SHORT, "checkpoint_interval": 5_000}), tmp_path / "l.mcap"
+    with pytest.raises(Stopped):
+        train(task, tmp_path / "run", record=log, progress=stop_at(1_000))
+    before = mcaprl.open(log).rewards
+    train(task, tmp_path / "run", record=log, resume=True, progress=silent)
+    np.testing.assert_array_equal(mcaprl.open(tmp_path / "l.mcap.uncut").rewards, before)
+    assert len(mcaprl.open(log)) == 2_000
+
+
+def test_a_log_of_sb3_is_appended_to(tmp_path: Path) -> None:
+    """SB3 takes other steps after a resume, so the log keeps those after the checkpoint."""
     task, log = Task.for_sim("lane", "dqn", **SHORT), tmp_path / "log.mcap"
     with pytest.raises(Stopped):
         train(task, tmp_path / "run", record=log, progress=stop_at(1_000))
@@ -322,5 +379,9 @@ def test_a_folder_without_a_run_is_reported(tmp_path: Path) -> None:
         Task.of_run(tmp_path)
 
 
-def test_a_resumed_models_file_is_complete(resumed: OnlineSummary) -> None:
-    assert DQN.load(resumed.folder / "best_model.zip").num_timesteps == resumed.best_step
+def test_a_resumed_models_file_is_complete(tmp_path: Path) -> None:
+    task = Task.for_sim("lane", "dqn", **SHORT)
+    with pytest.raises(Stopped):
+        train(task, tmp_path / "run", progress=stop_at(1_000))
+    (summary,) = train(task, tmp_path / "run", resume=True, progress=silent)
+    assert DQN.load(summary.folder / "best_model.zip").num_timesteps == summary.best_step

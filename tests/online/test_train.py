@@ -16,12 +16,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from mcaprl.api.policies import load_policies
 from mcaprl.cli import run
 from mcaprl.errors import OutputExistsError, SpaceError, TrainingError, UnknownNameError, UsageError
-from mcaprl.online.algorithms import check_spaces
-from mcaprl.online.task import Task
+from mcaprl.online.evaluation import SELECTION_SEED
+from mcaprl.online.task import Task, check_spaces
 from mcaprl.online.train import OnlineSummary, train
 from mcaprl.progress import TrainingProgress
 from mcaprl.runs import read_curve
 from mcaprl.sims import make_sim
+from mcaprl.sims.evaluation.evaluate import evaluate
 
 SHORT: dict[str, Any] = {
     "steps": 600,
@@ -60,7 +61,8 @@ def test_a_run_writes_these_files(trained: OnlineSummary) -> None:
     }
     names = {path.name.split(".tfevents")[0] for path in (out / "seed-2").iterdir()}
     assert names == {
-        "best_model.zip",
+        "policy.json",
+        "policy.safetensors",
         "checkpoint.safetensors",
         "curve.csv",
         "progress.csv",
@@ -135,10 +137,21 @@ def test_the_last_score_equals_evaluates(
     assert mine["normalized_score"] == pytest.approx(trained.score, abs=1e-12)
 
 
-def test_the_saved_model_is_the_best_and_loads_in_sb3(trained: OnlineSummary) -> None:
-    model = DQN.load(trained.folder / "best_model.zip")
-    assert model.num_timesteps == trained.best_step
+def test_the_saved_policy_is_the_best(trained: OnlineSummary) -> None:
     (policy,) = load_policies(trained.folder.parent)
+    assert (policy.algo, policy.env_id) == ("double-dqn", "mcaprl/LaneKeeping-v0")
+    best = read_curve(trained.folder / "curve.csv")
+    (row,) = np.flatnonzero(best["step"] == trained.best_step)
+    score = evaluate(make_sim("lane"), [policy], name="", episodes=3, seed=SELECTION_SEED)
+    assert score.mean_return == pytest.approx(best["mean_return"][row])
+
+
+def test_the_saved_model_of_sb3_is_the_best_and_loads_there(tmp_path: Path) -> None:
+    task = Task.for_sim("lane", "dqn", **SHORT_DQN)
+    (summary,) = train(task, tmp_path / "run", progress=silent)
+    model = DQN.load(summary.folder / "best_model.zip")
+    assert model.num_timesteps == summary.best_step
+    (policy,) = load_policies(summary.folder.parent)
     observations = np.random.default_rng(0).uniform(-1, 1, (30, 12)).astype(np.float32)
     np.testing.assert_array_equal(
         policy.act(observations), model.predict(observations, deterministic=True)[0]
@@ -235,7 +248,7 @@ def test_the_command_trains_and_prints_a_row_for_each_seed(
     assert run([*command, *options]) == 0
     assert "dqn in lane" in capsys.readouterr().out
     with (out / "seed-1" / "curve.csv").open() as file:
-        assert [row["step"] for row in csv.DictReader(file)] == ["96", "192"]
+        assert [row["step"] for row in csv.DictReader(file)] == ["104", "200"]
 
 
 def test_the_command_accepts_only_an_algorithms_settings(

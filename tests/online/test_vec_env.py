@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from mcaprl.online.vec_env import BatchedVecEnv
+from mcaprl.online.sb3 import BatchedVecEnv
 from mcaprl.sims import SIMS, make_sim, make_sims
 from mcaprl.sims.evaluation.rollout import episode_seed
 

@@ -13,18 +13,21 @@ import torch
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3 import DQN
 
 import mcaprl
 from mcaprl.api.policies import load_policy
 from mcaprl.cli import run
 from mcaprl.errors import PolicyError, SpaceError, UsageError
+from mcaprl.frames import mapped
 from mcaprl.offline.algorithms.config import CQLConfig, DQNConfig
+from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.training.train import train as train_offline
-from mcaprl.online.agent import Agent
+from mcaprl.online.config import DoubleDQNConfig
+from mcaprl.online.engine import Agents
+from mcaprl.online.learning import LearningAgent, fill_buffer
+from mcaprl.online.sb3 import ModelAgent
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
-from mcaprl.online.warm_start import fill_buffer
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.sims.evaluation.evaluate import Scale
@@ -40,6 +43,7 @@ SHORT: dict[str, Any] = {
     "envs": 4,
 }
 FAST: dict[str, Any] = {"updates": 10, "log_interval": 10, "gamma": 0.5, "target_interval": 2}
+CPU = torch.device("cpu")
 VECTOR = spaces.Box(-np.inf, np.inf, (2,))
 
 
@@ -68,21 +72,13 @@ def numbered(lengths: list[int], space: spaces.Space[Any] = VECTOR) -> Dataset:
     )
 
 
-class Model(DQN):
-    """DQN for the transitions of `numbered`, without an environment."""
-
-    def __init__(self, envs: int, rows: int, **kwargs: Any) -> None:
-        super().__init__(
-            "MlpPolicy",
-            None,  # type: ignore[arg-type]
-            buffer_size=rows * envs,
-            device="cpu",
-            policy_kwargs={"net_arch": [4]},
-            _init_setup_model=False,
-            **kwargs,
-        )
-        self.observation_space, self.action_space, self.n_envs = VECTOR, spaces.Discrete(3), envs
-        self._setup_model()
+def agents_of(envs: int, rows: int, **settings: Any) -> Agents:
+    """Return an agent for the transitions of `numbered`."""
+    size = rows * envs
+    config = DoubleDQNConfig(
+        envs=envs, buffer_size=size, hidden=(4,), steps_per_update=envs, **settings
+    )
+    return Agents(config, ObservationEncoder(VECTOR, 3), spaces.Discrete(3), [0], CPU)
 
 
 @given(
@@ -91,46 +87,53 @@ class Model(DQN):
     rows=st.integers(1, 30),
 )
 def test_the_buffer_holds_the_last_transitions(lengths: list[int], envs: int, rows: int) -> None:
-    data, model = numbered(lengths), Model(envs, rows)
-    buffer = model.replay_buffer
-    assert buffer is not None
+    data, agents = numbered(lengths), agents_of(envs, rows, gamma=0.5)
+    buffer = agents.buffer
     if len(data) < envs:
         with pytest.raises(UsageError, match="are too few"):
-            fill_buffer(model, data)
+            fill_buffer(agents, data)
         return
-    taken = fill_buffer(model, data)
+    taken = fill_buffer(agents, data)
     filled = min(len(data) // envs, rows)
-    assert (taken, buffer.size()) == (filled * envs, filled)
-    numbers = buffer.observations[:filled, :, 0].T.ravel()
+    assert (taken, buffer.stored) == (filled * envs, filled)
+    # Training begins with new episodes, which ends those of the log.
+    buffer.begin(ObservationEncoder(VECTOR, 3).encode(np.zeros((envs, 2), np.float32)))
+    batch = buffer.batch(torch.arange(filled * envs))
+
+    def by_environment(column: torch.Tensor) -> Any:
+        return column.view(filled, envs).T.flatten().numpy()
+
+    numbers = by_environment(batch.observations.vector[:, 0])
     np.testing.assert_array_equal(numbers, np.arange(len(data) - taken, len(data)))
-    np.testing.assert_array_equal(buffer.next_observations[:filled, :, 1].T.ravel(), numbers + 1)
-    np.testing.assert_array_equal(buffer.actions[:filled, :, 0].T.ravel(), numbers % 3)
-    np.testing.assert_array_equal(buffer.rewards[:filled].T.ravel(), numbers)
-    for env in range(envs):
-        column = numbers[env * filled : (env + 1) * filled].astype(int)
-        dones, timeouts = buffer.dones[:filled, env], buffer.timeouts[:filled, env]
-        terminated = dones * (1 - timeouts)
-        np.testing.assert_array_equal(terminated, data.terminated[column])
-        assert dones[-1] == 1
-        np.testing.assert_array_equal(dones[:-1], (data.terminated | data.truncated)[column[:-1]])
+    rows_ = numbers.astype(int)
+    following = by_environment(batch.next_observations.vector[:, 1])
+    np.testing.assert_array_equal(following, numbers + 1)
+    np.testing.assert_array_equal(by_environment(batch.actions), rows_ % 3)
+    np.testing.assert_array_equal(by_environment(batch.rewards), numbers)
+    discounts = by_environment(batch.discounts)
+    np.testing.assert_array_equal(discounts, np.where(data.terminated[rows_], 0, 0.5))
+    goes_on = by_environment(buffer.goes_on[:filled].flatten()).reshape(envs, filled)
+    assert not goes_on[:, -1].any()
+    ends = (data.terminated | data.truncated)[rows_].reshape(envs, filled)
+    np.testing.assert_array_equal(goes_on[:, :-1], ~ends[:, :-1])
 
 
 def test_n_step_returns_end_where_the_log_was_cut() -> None:
-    model = Model(2, 3, n_steps=3, gamma=0.5)
-    fill_buffer(model, numbered([6]))
-    buffer: Any = model.replay_buffer
-    batch = buffer._get_samples(np.array([1] * 50))
-    # Row 1 of column 0 is transition 1, whose return 1 + .5 x 2 ends with the episode. Row 1 of
+    agents = agents_of(2, 3, n_steps=3, gamma=0.5)
+    fill_buffer(agents, numbered([6]))
+    agents.buffer.begin(ObservationEncoder(VECTOR, 3).encode(np.zeros((2, 2), np.float32)))
+    # Row 1 of column 0 is transition 1, whose return 1 + .5 x 2 ends with the part. Row 1 of
     # column 1 has the return 4 + .5 x 5.
-    assert set(batch.rewards[:, 0].tolist()) == {2.0, 6.5}
-    assert set(batch.discounts[:, 0].tolist()) == {0.25}
-    assert set(batch.dones[:, 0].tolist()) == {0.0}
+    batch = agents.buffer.batch(torch.tensor([2, 3]))
+    assert batch.rewards.tolist() == [2.0, 6.5]
+    assert batch.discounts.tolist() == [0.25, 0.25]
+    assert batch.next_observations.vector.tolist() == [[3, 3], [6, 6]]
 
 
 def test_other_spaces_are_refused() -> None:
     other = numbered([4], spaces.Box(-1e6, 1e6, (2,)))
     with pytest.raises(SpaceError, match="the logs have observation_space"):
-        fill_buffer(Model(2, 4), other)
+        fill_buffer(agents_of(2, 4), other)
 
 
 @pytest.fixture(scope="module")
@@ -143,37 +146,33 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def agent(folder: Path, algo: str = "double-dqn", **settings: Any) -> Agent:
-    task = Task.for_sim("lane", algo, **{**SHORT, **settings})
-    return Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0))
+def agent(folder: Path, sim_options: Any = None, **settings: Any) -> LearningAgent:
+    task = Task.for_sim("lane", None, sim_options, **{**SHORT, **settings})
+    return LearningAgent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0))
 
 
 def test_an_agent_starts_from_a_log(logs: Path, tmp_path: Path) -> None:
     data = mcaprl.open(logs)
     with closing(agent(tmp_path)) as begun:
         begun.start_from(data, None)
-        model: Any = begun.model
-        assert model.replay_buffer.size() == min(len(data) // 4, 51)
+        assert begun.agents.buffer.stored == min(len(data) // 4, 51)
         begun.learn(silent)
-        assert model._n_updates == 50
+        assert begun.updates == 50
 
 
-def test_images_are_transposed_for_the_buffer(tmp_path: Path) -> None:
+def test_images_are_averaged_for_the_buffer(tmp_path: Path) -> None:
     path = tmp_path / "depth.mcap"
     env = mcaprl.RecordMcap(mcaprl.sims.make_sim("lane", observation="depth"), path, scene=False)
     rollout(env, EpsilonGreedy(None, 1.0, env.action_space), seed=0, steps=12)
     env.close()
     data = mcaprl.open(path)
-    task = Task.for_sim("lane", "dqn", {"observation": "depth"}, **{**SHORT, "envs": 1})
-    begun = Agent(task, "mcaprl/LaneKeeping-v0", tmp_path, 0, Scale(0.0, 1.0))
-    with closing(begun):
+    with closing(agent(tmp_path, {"observation": "depth"}, envs=1)) as begun:
         begun.start_from(data, None)
-        buffer: Any = begun.model.replay_buffer  # type: ignore[attr-defined]
-        frames = buffer.frames[""]
-        assert frames.shape[1:] == (1, 1, 42, 42)
+        frames = begun.agents.buffer.frames.images[0]
+        assert frames.shape[1:] == (42, 42, 1)
         squares = data.observations.reshape(12, 42, 2, 42, 2)
         expected = np.floor(squares.mean((2, 4)) + 0.5)
-        np.testing.assert_array_equal(frames[:12, 0, 0], expected)
+        np.testing.assert_array_equal(frames[:12, ..., 0], expected)
 
 
 def test_an_agent_starts_from_an_offline_policy(logs: Path, tmp_path: Path) -> None:
@@ -183,27 +182,26 @@ def test_an_agent_starts_from_an_offline_policy(logs: Path, tmp_path: Path) -> N
     observations = mcaprl.open(logs).observations
     with closing(agent(tmp_path, learning_starts=100)) as begun:
         begun.start_from(None, policy)
-        model: Any = begun.model
+        learner, inputs = begun.agents.learner, begun._encoder.encode(observations)
+        values = begun.policy.q_values(observations)
         with torch.inference_mode():
-            values = model.q_net(torch.from_numpy(observations)).numpy()
-            target = model.q_net_target(torch.from_numpy(observations)).numpy()
-        np.testing.assert_allclose(values, policy.q_values(observations), rtol=1e-5, atol=1e-5)
-        np.testing.assert_array_equal(values, target)
+            target = learner.all_models()["q_target"](inputs).numpy()
+        np.testing.assert_array_equal(values, policy.q_values(observations))
+        np.testing.assert_allclose(target, values, rtol=1e-5, atol=1e-5)
         begun.learn(silent)
-        assert model.exploration_rate == pytest.approx(0.05)
+        assert begun.epsilon == 0.05
         # The four environments exceed 100 steps after 26 steps of the batch. Each of the 25 later
         # steps is one update.
-        assert model._n_updates == 25
-        acted = model.replay_buffer.actions[:25, :, 0]
-        seen = model.replay_buffer.observations[:25]
-        own = policy.act(seen.reshape(-1, 12)).reshape(acted.shape)
-        assert (acted == own).mean() > 0.9, "the first steps are its own"
+        assert begun.updates == 25
+        batch = begun.agents.buffer.batch(torch.arange(100))
+        own = policy.act(batch.observations.vector.numpy())
+        assert (batch.actions.numpy() == own).mean() > 0.9, "the first steps are its own"
 
 
 def test_an_agent_continues_from_an_online_policy(tmp_path: Path) -> None:
     task = Task.for_sim("lane", **{**SHORT, "learning_starts": 40})
     (summary,) = train(task, tmp_path / "first", progress=silent)
-    policy = load_policy(summary.folder / "best_model.zip")
+    policy = load_policy(summary.folder)
     again = Task.for_sim("lane", **{**SHORT, "steps": 8, "eval_interval": 4})
     (second,) = train(again, tmp_path / "second", policy=policy, progress=silent)
     assert second.steps == 8
@@ -222,7 +220,7 @@ def images_of(task: Task, folder: Path, count: int = 60) -> Path:
 def test_a_policy_from_images_keeps_its_values(
     tmp_path: Path, observation: str, frame_stack: int
 ) -> None:
-    """The agent's network includes the policy's normalization of images and vectors."""
+    """The agent takes over the policy's normalization of images and vectors."""
     both: dict[str, Any] = {"hidden": (8, 8), "frame_stack": frame_stack, "layer_norm": True}
     settings = {**SHORT, **both, "dueling": True, "envs": 1}
     task = Task.for_sim("lane", None, {"observation": observation}, **settings)
@@ -230,12 +228,21 @@ def test_a_policy_from_images_keeps_its_values(
     data = mcaprl.open(images_of(task, tmp_path))
     train_offline(data, config, tmp_path / "offline", progress=silent)
     policy = load_policy(tmp_path / "offline")
-    with closing(Agent(task, "mcaprl/LaneKeeping-v0", tmp_path, 0, Scale(0.0, 1.0))) as begun:
+    with closing(agent(tmp_path, {"observation": observation}, **settings)) as begun:
         begun.start_from(data, policy)
-        batch: Any = begun.model.replay_buffer.sample(8)  # type: ignore[attr-defined]
-        model: Any = begun.model
+        rows = begun.agents.buffer.draw(8, [])
+        observed = begun.agents.buffer.batch(rows).observations
         with torch.inference_mode():
-            values = model.q_net(batch.observations).numpy()
+            values = begun.agents.learner.outputs("q", observed).numpy()
+        stacks = np.maximum(rows.numpy()[:, None] - np.arange(frame_stack)[::-1], 0)
+        ends = data.terminated | data.truncated
+        if not ends[: rows.max()].any():
+            seen = mapped(
+                lambda part: part[stacks] if frame_stack > 1 else part[stacks[:, 0]],
+                data.observations,
+            )
+            # The buffer has rounded averages of the pixels.
+            np.testing.assert_allclose(values, policy.q_values(seen), rtol=0.1, atol=0.02)
         assert np.isfinite(values).all()
 
 
@@ -246,7 +253,7 @@ def test_a_policy_of_another_encoder_is_refused(tmp_path: Path) -> None:
     config = DQNConfig(**FAST, hidden=(8,), encoder="nature")
     train_offline(data, config, tmp_path / "offline", progress=silent)
     with (
-        closing(Agent(task, "mcaprl/LaneKeeping-v0", tmp_path, 0, Scale(0.0, 1.0))) as begun,
+        closing(agent(tmp_path, {"observation": "depth"}, **settings)) as begun,
         pytest.raises(PolicyError, match=r"1-32-64-64-8-6, but .* 1-16-32-8-6: .*encoder"),
     ):
         begun.start_from(None, load_policy(tmp_path / "offline"))
@@ -264,28 +271,50 @@ def test_a_policy_of_another_width_is_refused(logs: Path, tmp_path: Path) -> Non
 
 def test_weights_of_other_outputs_are_refused(tmp_path: Path) -> None:
     with closing(agent(tmp_path)) as begun:
-        model: Any = begun.model
+        network = begun.agents.learner.network("q", 0)
 
         class Doubled:
-            name, frame_stack = "doubled", 1
-            head = SimpleNamespace(networks={"q": model.q_net})
-            encoder = SimpleNamespace(width=0)
+            name, algo, frame_stack, encoder = "doubled", "", 1, None
+            head = SimpleNamespace(networks={"q": network})
 
             def q_values(self, observations: Any) -> Any:
-                return 2 * model.q_net(torch.from_numpy(observations)).detach().numpy()
+                return 2 * begun.policy.q_values(observations)
 
         with pytest.raises(PolicyError, match="a network of another architecture"):
             begun.start_from(None, Doubled())
 
 
-def test_ppo_accepts_neither_logs_nor_policies(logs: Path, tmp_path: Path) -> None:
-    task = Task.for_sim("lane", "ppo", steps=64, envs=4, rollout_steps=64)
-    begun = Agent(task, "mcaprl/LaneKeeping-v0", tmp_path, 0, Scale(0.0, 1.0))
-    with closing(begun):
-        with pytest.raises(UsageError, match="PPO cannot learn from logs"):
-            begun.start_from(mcaprl.open(logs), None)
-        with pytest.raises(UsageError, match="PPO has no Q-values"):
-            begun.start_from(None, object())
+def test_a_policy_of_sb3_initializes_an_agent(tmp_path: Path) -> None:
+    task = Task.for_sim("lane", "dqn", **{**SHORT, "learning_starts": 40})
+    (summary,) = train(task, tmp_path / "first", progress=silent)
+    policy = load_policy(summary.folder)
+    with closing(agent(tmp_path)) as begun:
+        begun.start_from(None, policy)
+        seen = np.random.default_rng(0).normal(size=(9, 12)).astype(np.float32)
+        np.testing.assert_allclose(
+            begun.policy.q_values(seen), policy.q_values(seen), rtol=1e-4, atol=1e-5
+        )
+
+
+def test_a_policy_without_values_is_refused(logs: Path, tmp_path: Path) -> None:
+    mcaprl.train(logs, tmp_path / "bc", algo="bc", updates=1, hidden=(8,))
+    with (
+        closing(agent(tmp_path)) as begun,
+        pytest.raises(PolicyError, match=r"seed-0 \(bc\) has no Q-values to start from"),
+    ):
+        begun.start_from(None, load_policy(tmp_path / "bc"))
+
+
+@pytest.mark.parametrize("algo", ["dqn", "ppo"])
+def test_models_of_sb3_start_from_neither_logs_nor_policies(
+    logs: Path, tmp_path: Path, algo: str
+) -> None:
+    settings: dict[str, Any] = {"rollout_steps": 64} if algo == "ppo" else {}
+    task = Task.for_sim("lane", algo, steps=64, envs=4, **settings)
+    with closing(ModelAgent(task, "mcaprl/LaneKeeping-v0", tmp_path, 0, Scale(0.0, 1.0))) as begun:
+        for data, policy in ((mcaprl.open(logs), None), (None, object())):
+            with pytest.raises(UsageError, match=f"{algo} of Stable-Baselines3 cannot start from"):
+                begun.start_from(data, policy)
 
 
 def test_the_command_accepts_logs_and_a_policy(

@@ -1,0 +1,421 @@
+"""Training of one seed with this package's learners, which resumes to the same bits.
+
+Gymnasium has no interface to save the state of an environment. Therefore, all environments start
+new episodes at each checkpoint, in every run, with seeds that depend on the seed of the agent and
+on the number of steps. The episodes that were going on are truncated, in the log and in the replay
+buffer.
+
+`checkpoint.safetensors` contains the learner, the replay buffer, the generators, the best policy
+and the counters. All are in one file, because two files would be inconsistent if the process were
+killed between the two writes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import asdict, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from mcaprl.base_policy import BasePolicy
+from mcaprl.errors import PolicyError, SpaceError, TrainingError, UsageError
+from mcaprl.frames import mapped
+from mcaprl.offline.algorithms.heads import build_head
+from mcaprl.offline.algorithms.learner import NotFiniteError
+from mcaprl.offline.batches.observations import ObservationEncoder
+from mcaprl.offline.policy import Policy, read_policy, save_policy
+from mcaprl.online.agent import BROKEN, Agent, center_images, is_due, read_checkpoint
+from mcaprl.online.collector import Choice, VectorEnvironments
+from mcaprl.online.config import DoubleDQNConfig
+from mcaprl.online.engine import Agents
+from mcaprl.online.live import WATCHED, LiveTraining
+from mcaprl.online.replay import Outcome
+from mcaprl.online.task import Task
+from mcaprl.progress import ProgressCallback
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.runs import CHECKPOINT_NAME, POLICY_NAME, broken_checkpoint
+from mcaprl.sims.evaluation.evaluate import Scale
+from mcaprl.sims.evaluation.rollout import episode_seed
+from mcaprl.storage.tensor_files import write_tensors
+
+_CHECKED = 64
+"""Number of observations on which a copied network must produce the same values."""
+
+
+class LearningAgent(Agent):
+    """Agent of one seed, trained by a learner of this package.
+
+    Attributes:
+        agents: Replay buffer, networks and loop of the single agent.
+    """
+
+    best_files = ("policy.safetensors", POLICY_NAME)
+
+    def __init__(
+        self,
+        task: Task,
+        env_id: str,
+        folder: Path,
+        seed: int,
+        scale: Scale,
+        *,
+        record: Path | None = None,
+        resume: bool = False,
+        live: LiveTraining | None = None,
+    ) -> None:
+        """Create an agent, its environments, and its log; the arguments are those of `Agent`.
+
+        With `resume`, it continues from the folder's checkpoint, if there is one.
+
+        Raises:
+            TrainingError: The checkpoint belongs to another task, or is broken.
+        """
+        path = folder / CHECKPOINT_NAME
+        found = read_checkpoint(path, task) if resume and path.exists() else None
+        episodes = None
+        if resume:
+            episodes = 0 if found is None else found[1]["episodes_in_log"]
+        super().__init__(
+            task, env_id, folder, seed, scale, record=record, episodes=episodes, live=live
+        )
+        try:
+            self._encoder = self._make_encoder(None if found is None else found[0])
+            self.agents = self._make_agents()
+            if found is not None:
+                try:
+                    self._load(*found)
+                except BROKEN as error:
+                    raise broken_checkpoint(path, error) from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _make_encoder(self, tensors: dict[str, Tensor] | None) -> ObservationEncoder:
+        """Return the encoder of a checkpoint, or a new one with the images of random steps."""
+        space: Any = self.env.single_observation_space
+        encoder = ObservationEncoder(space, int(self.env.single_action_space.n))
+        if tensors is not None:
+            _load_normalization(encoder, tensors)
+        elif self._task.config.center_images and encoder.image_inputs:
+            center_images(encoder, self._task, self._seed)
+        return encoder
+
+    def _make_agents(self) -> Agents:
+        config = cast(DoubleDQNConfig, self._task.config)
+        if config.image_shift and not self._encoder.image_inputs:
+            raise UsageError("image_shift is for images, but the observations have none")
+        agents = Agents(
+            config,
+            self._encoder,
+            self.env.single_action_space,
+            [self._seed],
+            torch.device("cpu"),
+        )
+        self._environments = VectorEnvironments(self.env, self._encoder)
+        agents.connect(self._environments)
+        agents.collector.before_step = self._before_step
+        self._choice: Choice | None = None
+        self._show(self)
+        return agents
+
+    @property
+    def steps(self) -> int:
+        """Number of finished environment steps, summed over all environments."""
+        return self.agents.steps
+
+    @cached_property
+    def policy(self) -> Policy:
+        """Greedy policy, whose networks share the weights of the learner."""
+        learner, seed = self.agents.learner, self._seed
+        networks = {name: learner.network(name, seed) for name in learner.policy_models}
+        return Policy(
+            name=self._task.algo,
+            algo=self._task.algo,
+            observation_space=self._encoder.space,
+            action_space=self.env.single_action_space,
+            env_id=self._env_id,
+            env_kwargs=self._task.sim_options,
+            frame_stack=self._task.config.frame_stack,
+            encoder=self._encoder,
+            head=build_head(learner.acts_by, networks, self.env.single_action_space).eval(),
+        )
+
+    def best_policy(self) -> BasePolicy:
+        """Read the policy with the best evaluation."""
+        return read_policy(self._folder)
+
+    def start_from(self, data: Dataset | None, policy: Any) -> None:
+        """Fill the replay buffer with logged transitions, copy a policy's weights, or do both."""
+        if self.agents.steps:
+            # The checkpoint has what the first session started from.
+            return
+        if policy is not None:
+            self._take_weights(policy)
+        if data is not None:
+            fill_buffer(self.agents, data)
+            self.agents.learning_starts = 0
+        if policy is not None:
+            self.agents.learning_starts = self.agents.config.learning_starts
+            self.agents.is_pretrained = True
+
+    def _take_weights(self, policy: Policy) -> None:
+        """Copy the network and the normalization of a policy."""
+        _check_fits(policy, self._encoder.space, self._task.config.frame_stack)
+        if type(policy.encoder) is ObservationEncoder:
+            self._encoder = policy.encoder
+            self.agents = self._make_agents()
+            self.__dict__.pop("policy", None)
+        theirs, learner = policy.head.networks["q"], self.agents.learner
+        ours = learner.network("q", self._seed)
+        if _weights_of(theirs) != _weights_of(ours):
+            raise PolicyError(
+                f"{policy.name} has layers {_chain(theirs)}, but the agent has {_chain(ours)}:"
+                " pass `hidden=`, `encoder=`, `channels=`, `dueling=` or `layer_norm=`"
+            )
+        for source, target in zip(_layers(theirs), _layers(ours), strict=True):
+            target.load_state_dict(source.state_dict())
+        learner.sync_targets()
+        observations = _sample_stacks(self._encoder.space, policy.frame_stack)
+        values = self.policy.q_values(observations)
+        if not np.allclose(values, policy.q_values(observations), rtol=1e-4, atol=1e-4):
+            raise PolicyError(
+                f"{policy.name} has a network of another architecture (for example, normalized"
+                " inputs): the agent's network produces other values with the same weights"
+            )
+
+    def scalars(self) -> dict[str, float]:
+        """Return the scalars of a row of `progress.csv`."""
+        episodes, agents, terms = self._environments.episodes, self.agents, self.agents.means()
+        found: dict[str, float] = {
+            "time/episodes": float(episodes.count),
+            "rollout/exploration_rate": agents.epsilon,
+            "train/n_updates": float(agents.learner.step),
+        }
+        if episodes.returns:
+            found["rollout/ep_rew_mean"] = float(np.mean(episodes.returns))
+            found["rollout/ep_len_mean"] = float(np.mean(episodes.lengths))
+        if terms:
+            found["train/learning_rate"] = agents.learning_rate
+        return found | {f"train/{name}": value for name, value in terms.items()}
+
+    def _train(self, report: ProgressCallback) -> None:
+        """Train until all steps are done."""
+        agents, config = self.agents, self._task.config
+        self._begin()
+        while agents.steps < config.steps:
+            before = agents.steps
+            try:
+                agents.step()
+            except NotFiniteError as error:
+                raise TrainingError(
+                    f"update {error.update} of {self._folder}: {error}; lower the learning rate"
+                ) from error
+            self._after_step(before, report)
+            ends = agents.steps >= config.steps
+            if ends or is_due(before, agents.steps, config.checkpoint_interval):
+                self._begin()
+                self._save()
+
+    def _begin(self) -> None:
+        """Start new episodes, whose seeds depend on the number of steps."""
+        self.agents.collector.begin(episode_seed(self._seed, self.agents.steps))
+
+    def _before_step(self, choice: Choice) -> None:
+        """Pass what the log and the live view show of a step."""
+        self._choice = choice
+        if self._recorder is not None:
+            self._recorder.epsilon = self.agents.epsilon
+            self._recorder.policy_version = self.agents.learner.step
+            self._recorder.behavior_probs = choice.probabilities().numpy()
+
+    def _save_policy(self) -> None:
+        """Write the current policy."""
+        learner = self.agents.learner
+        save_policy(self._folder, learner, self._seed, self._env_id, self._task.sim_options)
+
+    def _save(self) -> None:
+        """Replace the checkpoint."""
+        episodes = self._environments.episodes
+        description = {
+            **self._task.identity.parts,
+            "counters": self.agents.counters(),
+            "episodes_in_log": self._recorder.episodes if self._recorder is not None else 0,
+            "episodes": [episodes.count, list(episodes.returns), list(episodes.lengths)],
+            "points": [asdict(point) for point in self.points],
+        }
+        tensors = {
+            **self.agents.state(),
+            **_normalization_of(self._encoder),
+            **self._best_content(),
+        }
+        write_tensors(self._checkpoint, tensors, description)
+
+    def _load(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
+        """Restore a checkpoint."""
+        self.agents.load_state(tensors, description["counters"])
+        count, returns, lengths = description["episodes"]
+        episodes = self._environments.episodes
+        episodes.count = int(count)
+        episodes.returns, episodes.lengths = deque(returns, 100), deque(lengths, 100)
+        self._restore_best(tensors, description["points"])
+
+    # What the live view shows.
+
+    @property
+    def epsilon(self) -> float:
+        """Probability of a random action in this step."""
+        return self.agents.epsilon
+
+    @property
+    def updates(self) -> int:
+        """Number of updates of the network."""
+        return self.agents.learner.step
+
+    def probability(self) -> float:
+        """Return the probability of the action of the watched environment."""
+        assert self._choice is not None
+        return float(self._choice.probabilities()[WATCHED])
+
+    def values(self) -> tuple[Tensor, Tensor, float]:
+        """Return Q-values, preferences and the state's value in the watched environment.
+
+        They are those of the forward pass that chose the action, if there was one.
+        """
+        assert self._choice is not None
+        values = self._choice.values
+        if values is None:
+            with torch.no_grad():
+                values = self.agents.behavior.values(self.agents.buffer.now())
+        q = values[WATCHED]
+        return q, q.softmax(0), float(q.max())
+
+    def metrics(self) -> dict[str, float]:
+        """Return the metrics of `/rl/training`, without the score."""
+        terms, returns = self.agents.means(), self._environments.episodes.returns
+        return {
+            "mean_return": float(np.mean(returns)) if returns else np.nan,
+            "loss": terms.get("loss", np.nan),
+            "epsilon": self.epsilon,
+            "mean_q": terms.get("mean_q", np.nan),
+            "learning_rate": self.agents.learning_rate,
+            "steps": self.steps,
+            "updates": self.updates,
+        }
+
+
+def fill_buffer(agents: Agents, dataset: Dataset) -> int:
+    """Copy logged transitions into the empty replay buffer of a single agent.
+
+    The buffer has a column of successive steps for each environment. Therefore, the log is split
+    into parts of equal length, one for each environment. An episode that continues beyond the end
+    of a part counts as truncated at that end. If the log has more transitions than the buffer can
+    store, only the last ones are copied.
+
+    Returns:
+        Number of copied transitions, a multiple of the number of environments.
+    """
+    buffer = agents.buffer
+    for role, own in (
+        ("observation_space", buffer.encoder.space),
+        ("action_space", buffer.action_space),
+    ):
+        if getattr(dataset, role) != own:
+            raise SpaceError(
+                f"the logs have {role} {getattr(dataset, role)}, but the environment has {own}"
+            )
+    envs = buffer.width
+    rows = min(len(dataset) // envs, buffer.capacity)
+    if rows == 0:
+        raise UsageError(f"{len(dataset)} transitions are too few for {envs} environments")
+    steps = np.arange(len(dataset) - rows * envs, len(dataset)).reshape(envs, rows).T
+    encode, batch = buffer.encoder.encode, dataset.batch(steps[0])
+    buffer.begin(encode(batch.observations))
+    for row in range(rows):
+        following = dataset.batch(steps[row + 1]) if row + 1 < rows else None
+        after = batch.next_observations if following is None else following.observations
+        outcome = Outcome(
+            torch.from_numpy(batch.rewards.astype(np.float32)),
+            torch.from_numpy(batch.terminated),
+            torch.from_numpy(batch.truncated),
+            encode(after),
+            encode(batch.next_observations),
+            None,
+        )
+        buffer.add(torch.from_numpy(buffer.joint.indexes(batch.actions)), outcome)
+        if following is not None:
+            batch = following
+    return rows * envs
+
+
+def _check_fits(policy: Policy, space: Any, frame_stack: int) -> None:
+    """Check that an agent can take the weights of a policy."""
+    if "q" not in getattr(policy.head, "networks", {}):
+        raise PolicyError(f"{policy.name} ({policy.algo}) has no Q-values to start from")
+    if policy.frame_stack != frame_stack:
+        raise PolicyError(
+            f"{policy.name} stacks {policy.frame_stack} observations, but the agent stacks another"
+            f" number: pass `frame_stack={policy.frame_stack}`"
+        )
+
+
+def _sample_stacks(space: Any, count: int) -> Any:
+    """Sample observations (B, *shape), or stacks (B, count, *shape), to compare networks."""
+    space.seed(0)
+    drawn = [space.sample() for _ in range(_CHECKED * count)]
+    whole = mapped(lambda *parts: np.stack(parts), *drawn)
+    if count == 1:
+        return whole
+    return mapped(lambda part: part.reshape(_CHECKED, count, *part.shape[1:]), whole)
+
+
+def _normalization_of(encoder: ObservationEncoder) -> dict[str, Tensor]:
+    """Return the normalization of an encoder, for a checkpoint."""
+    found = {
+        "observation.shift": torch.from_numpy(encoder.shift),
+        "observation.scale": torch.from_numpy(encoder.scale),
+    }
+    for number, image in enumerate(encoder.image_inputs):
+        if image.shift is not None:
+            found[f"observation.image_{number}.shift"] = torch.from_numpy(image.shift)
+        found[f"observation.image_{number}.scale"] = torch.tensor(image.scale, dtype=torch.float64)
+    return found
+
+
+def _load_normalization(encoder: ObservationEncoder, tensors: dict[str, Tensor]) -> None:
+    encoder.shift = tensors["observation.shift"].numpy()
+    encoder.scale = tensors["observation.scale"].numpy()
+    encoder.image_inputs = [
+        replace(
+            image,
+            shift=None
+            if (shift := tensors.get(f"observation.image_{number}.shift")) is None
+            else shift.numpy(),
+            scale=float(tensors[f"observation.image_{number}.scale"]),
+        )
+        for number, image in enumerate(encoder.image_inputs)
+    ]
+
+
+def _layers(network: nn.Module) -> list[Any]:
+    """Return the layers with weights, from input to output."""
+    kinds = nn.Linear | nn.Conv2d | nn.LayerNorm
+    return [layer for layer in network.modules() if isinstance(layer, kinds)]
+
+
+def _weights_of(network: nn.Module) -> list[tuple[int, ...]]:
+    return [tuple(layer.weight.shape) for layer in _layers(network)]
+
+
+def _chain(network: nn.Module) -> str:
+    """Format the widths of the layers from the input to the output.
+
+    >>> _chain(nn.Sequential(nn.Linear(12, 256), nn.LayerNorm(256), nn.Linear(256, 6)))
+    '12-256-norm-6'
+    """
+    widths = ["norm" if len(shape) == 1 else str(shape[0]) for shape in _weights_of(network)]
+    return "-".join([str(_weights_of(network)[0][1]), *widths])
