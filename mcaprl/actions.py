@@ -1,4 +1,6 @@
-"""Finite action spaces as one list of actions, which are numbered from 0, and masks of them.
+"""Action spaces as networks use them: numbered actions, or numbers in [-1, 1]; and action masks.
+
+A finite action space is one list of actions, which are numbered from 0.
 
 A Discrete space of n actions has the indexes 0 to n - 1. A value of a MultiDiscrete or MultiBinary
 space is one joint action; the last element changes fastest, as in `numpy.ravel_multi_index`:
@@ -9,6 +11,12 @@ space is one joint action; the last element changes fastest, as in `numpy.ravel_
 >>> joint.indexes(np.array([[1, 2]])).tolist()
 [5]
 
+A value of a Box is a vector of numbers, each of which is scaled from its bounds to [-1, 1]:
+
+>>> box = BoxActions.of(spaces.Box(0, 10, (2,)))
+>>> box.scaled(np.array([[0, 7.5]])).tolist()
+[[-1.0, 0.5]]
+
 An action mask has the flags of the allowed actions, as a part of a Dict observation. Some
 environments return the flags as an info, or as another part. The setting `mask_from` names this
 source. A policy with such a source receives the Dict observation
@@ -18,15 +26,15 @@ source. A policy with such a source receives the Dict observation
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import PolicyError
+from mcaprl.errors import PolicyError, SpaceError
 
 MASK_KEY = "action_mask"
 """Key of the mask, as in PettingZoo; the value has one flag per action."""
@@ -107,7 +115,115 @@ class JointActions:
         return np.asarray(values).reshape(len(values), len(self.sizes))
 
 
-def joint_actions(space: spaces.Space[Any]) -> JointActions | None:
+@dataclass(frozen=True, eq=False)
+class BoxActions:
+    """Scaling of the actions of a Box to numbers in [-1, 1].
+
+    Attributes:
+        space: Box of floats.
+        low: (n,) float64, numbers of an action that are scaled to -1.
+        high: (n,) float64, numbers of an action that are scaled to 1.
+    """
+
+    space: spaces.Box
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        space: spaces.Box,
+        actions: NDArray[Any] | None = None,
+        names: Sequence[str] = (),
+    ) -> BoxActions:
+        """Return the scaling of a space.
+
+        Args:
+            space: Box of floats.
+            actions: (N, *shape) logged actions, whose minimum and maximum replace infinite bounds.
+            names: Names of the n parts of an action, for messages.
+
+        Raises:
+            SpaceError: The space has integers, a bound is infinite and there are no actions, or a
+                part of the actions never changes.
+        """
+        if np.dtype(space.dtype).kind != "f":
+            raise SpaceError(
+                f"{space} has integers: learning needs numbers or numbered actions; declare a Box"
+                " of floats that the environment rounds, or a MultiDiscrete space"
+            )
+        low, high = (bound.ravel().astype(np.float64) for bound in (space.low, space.high))
+        if actions is not None and len(actions):
+            flat = np.asarray(actions, np.float64).reshape(len(actions), -1)
+            least, most = flat.min(0), flat.max(0)
+            constant = (least == most) & (len(flat) > 1)
+            if constant.any():
+                part = int(constant.argmax())
+                raise SpaceError(
+                    f"{part_name(part, names)} is {least[part]:g} in all {len(flat)} rows: an"
+                    " action that never changes cannot be learned; remove it from the action"
+                )
+            low, high = np.where(np.isinf(low), least, low), np.where(np.isinf(high), most, high)
+        elif not np.isfinite([low, high]).all():
+            raise SpaceError(f"{space} has infinite bounds, which only logged actions replace")
+        empty = low >= high
+        if empty.any():
+            part = int(empty.argmax())
+            raise SpaceError(
+                f"{part_name(part, names)} has the bounds {low[part]:g} and {high[part]:g}: an"
+                " action that cannot change cannot be learned; remove it from the action"
+            )
+        return cls(space, low, high)
+
+    @property
+    def size(self) -> int:
+        """Number of numbers of an action, n."""
+        return len(self.low)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one value."""
+        return tuple(self.space.shape)
+
+    @property
+    def log_scale(self) -> float:
+        """Log density of an action in its units, minus the log density of the scaled action."""
+        return -float(np.log((self.high - self.low) / 2).sum())
+
+    def scaled(self, actions: NDArray[Any]) -> NDArray[np.float32]:
+        """Return actions (N, *shape) as numbers (N, n), within [-1, 1] if they are in the Box."""
+        flat = np.asarray(actions, np.float64).reshape(len(actions), -1)
+        return (2 * (flat - self.low) / (self.high - self.low) - 1).astype(np.float32)
+
+    def unscaled(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Return the actions (N, *shape) of numbers (N, n), in the units and dtype of the space."""
+        flat = self.low + (np.asarray(numbers, np.float64) + 1) / 2 * (self.high - self.low)
+        # The Box contains its bounds, also where they are rounded to its dtype.
+        values = np.clip(flat.astype(self.space.dtype), *self._bounds)
+        return values.reshape(len(numbers), *self.shape)
+
+    def contain(self, values: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return whether each of the values (N, *shape) is in the space; NaN is not."""
+        flat = np.asarray(values).reshape(len(values), -1)
+        low, high = self._bounds
+        inside = (flat >= low) & (flat <= high)
+        return cast("NDArray[np.bool_]", inside.all(1))
+
+    @property
+    def _bounds(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        return self.space.low.ravel(), self.space.high.ravel()
+
+
+def part_name(part: int, names: Sequence[str] = ()) -> str:
+    """Return how messages name a number of an action.
+
+    >>> part_name(1), part_name(1, ["pedal", "steering"])
+    ('action[1]', 'action[1] (steering)')
+    """
+    return f"action[{part}]" + (f" ({names[part]})" if part < len(names) else "")
+
+
+def joint_actions(space: spaces.Space[Any] | None) -> JointActions | None:
     """Return the numbering of a finite space; None for other spaces."""
     if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         return None

@@ -57,7 +57,7 @@ class BasePolicy:
         raise NotImplementedError
 
     def log_prob(self, observations: Any, actions: NDArray[Any]) -> NDArray[np.floating[Any]]:
-        """Return the log probabilities (B,) of actions (B, *shape).
+        """Return the log probabilities (B,) of actions (B, *shape); log densities in a Box.
 
         Raises:
             PolicyError: The policy has no probabilities, or the observations have another shape.
@@ -78,6 +78,17 @@ class BasePolicy:
             PolicyError: The policy has no Q-values, or the observations have another shape.
         """
         raise PolicyError(f"{self.name} has no Q-values")
+
+    def action_values(self, observations: Any, actions: NDArray[Any]) -> NDArray[np.floating[Any]]:
+        """Return the Q-values (B,) of actions (B, *shape).
+
+        Raises:
+            PolicyError: The policy has no Q-values, or the observations have another shape.
+        """
+        values = self.q_values(observations)
+        numbers = JointActions.of(cast(Any, self.action_space)).indexes(actions)
+        found: NDArray[np.floating[Any]] = values[np.arange(len(numbers)), numbers]
+        return found
 
     def action_probabilities(self, observations: Any) -> NDArray[np.floating[Any]]:
         """Return the probabilities (B, A) of all actions: 0 or 1 if the policy is greedy.

@@ -80,11 +80,13 @@ class RunIdentity:
         parts: Algorithm (`algo`), settings (`config`), and the data or sim, as plain JSON types.
         other_data: Whether `parts["data"]`, the fingerprint of the data, may differ.
         longer: Whether the run may be continued to a larger number of `updates`.
+        defaults: Default settings, which runs of earlier versions had without storing them.
     """
 
     parts: dict[str, Any]
     other_data: bool = False
     longer: bool = False
+    defaults: dict[str, Any] = field(default_factory=dict)
 
     def check_same(self, found: Mapping[str, Any], where: Path) -> None:
         """Check that the identity in a file is equal to this identity.
@@ -104,7 +106,7 @@ class RunIdentity:
             old, new = theirs.get(name), mine.get(name)
             if old == new or (name == "data" and self.other_data):
                 continue
-            if old is None and new == "":
+            if name not in theirs and new == self.defaults.get(name, ""):
                 # Earlier versions did not have this setting.
                 continue
             if name == "updates" and self.longer and isinstance(old, int):

@@ -1,4 +1,7 @@
-"""Offline learning from logs: DQN, Double DQN, CQL, BC, BCQ and IQL for discrete actions.
+"""Offline learning from logs.
+
+DQN, Double DQN, CQL, BC, BCQ and IQL learn discrete actions; BC, TD3+BC, ReBRAC and IQL those of a
+Box.
 
 Importing this package does not import torch; the first use of one of its names does.
 
@@ -28,7 +31,7 @@ if TYPE_CHECKING:
     from mcaprl.offline.algorithms.dqn import DoubleDQN
     from mcaprl.offline.algorithms.heads import build_head
     from mcaprl.offline.algorithms.learner import Learner
-    from mcaprl.offline.algorithms.registry import ALGORITHMS
+    from mcaprl.offline.algorithms.registry import ALGORITHMS, BOX_ALGORITHMS
     from mcaprl.offline.batches.buffer import TransitionBuffer
     from mcaprl.offline.estimate.evidence import EvidenceCollector, fqe_config
     from mcaprl.offline.estimate.fqe import FQEConfig
@@ -43,6 +46,7 @@ for _package in ("torch", "safetensors", "tensorboard"):
 
 __all__ = [
     "ALGORITHMS",
+    "BOX_ALGORITHMS",
     "CQL",
     "DETERMINISTIC",
     "ESTIMATORS",
@@ -76,7 +80,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.offline.algorithms.dqn": ("DoubleDQN",),
         "mcaprl.offline.algorithms.heads": ("build_head",),
         "mcaprl.offline.algorithms.learner": ("Learner",),
-        "mcaprl.offline.algorithms.registry": ("ALGORITHMS",),
+        "mcaprl.offline.algorithms.registry": ("ALGORITHMS", "BOX_ALGORITHMS"),
         "mcaprl.offline.batches.buffer": ("TransitionBuffer",),
         "mcaprl.offline.estimate.evidence": ("EvidenceCollector", "fqe_config"),
         "mcaprl.offline.estimate.fqe": ("FQEConfig",),

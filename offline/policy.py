@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from torch import Tensor
 
-from mcaprl.actions import OBSERVATION_KEY, has_source, joint_actions
+from mcaprl.actions import OBSERVATION_KEY, BoxActions, has_source, joint_actions
 from mcaprl.architecture import architecture_of
 from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
@@ -30,6 +30,7 @@ from mcaprl.files import as_type, parse_json, read_file, write_json
 from mcaprl.frames import FrameStack, mapped
 from mcaprl.networks import ImageInput, Network, check_size
 from mcaprl.offline.algorithms.heads import Head, build_head
+from mcaprl.offline.algorithms.iql import LOG_STD
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
 from mcaprl.recorder.format.action_commands import ActionCommands
@@ -107,6 +108,8 @@ class Policy(BasePolicy):
     def act(self, observations: Any) -> NDArray[Any]:
         """Return the best actions (B, *shape) in `action_space`; a tie selects the first action.
 
+        The actions of a Box are in its own units.
+
         Raises:
             PolicyError: The shape of the observations is not (B, *shape).
         """
@@ -121,11 +124,13 @@ class Policy(BasePolicy):
     def log_prob(self, observations: Any, actions: NDArray[Any]) -> NDArray[np.float32]:
         """Return the log probabilities (B,) of actions (B, *shape), which must be in the space.
 
+        For a Box, they are log densities in the action's own units; minus infinity outside the Box.
         A policy that selects by Q-values is greedy: minus infinity for all actions but that of
         `act`.
 
         Raises:
-            PolicyError: The observations have another shape.
+            PolicyError: The observations have another shape, or the policy outputs one action of a
+                Box, which has no density.
         """
         return cast(
             NDArray[np.float32], self.head.log_prob(self._inputs(observations), actions).numpy()
@@ -152,7 +157,22 @@ class Policy(BasePolicy):
         """
         values = self.head.q_values(self._inputs(observations))
         if values is None:
-            raise PolicyError(f"{self.name} ({self.algo}) has no Q-values, only probabilities")
+            lacking = "no Q-values, only probabilities"
+            if isinstance(self.action_space, spaces.Box):
+                lacking = f"no finite list of actions, but {self.action_space}: use action_values"
+            raise PolicyError(f"{self.name} ({self.algo}) has {lacking}")
+        return cast(NDArray[np.float32], values.numpy())
+
+    @torch.inference_mode()
+    def action_values(self, observations: Any, actions: NDArray[Any]) -> NDArray[np.float32]:
+        """Return the values (B,) of actions (B, *shape), in units of the logged rewards.
+
+        Raises:
+            PolicyError: The policy has no values, or the observations have another shape.
+        """
+        values = self.head.action_values(self._inputs(observations), actions)
+        if values is None:
+            raise PolicyError(f"{self.name} ({self.algo}) has no Q-values")
         return cast(NDArray[np.float32], values.numpy())
 
     @torch.inference_mode()
@@ -227,6 +247,9 @@ def save_policy(
         for name, network in networks.items()
         for key, value in network.state_dict().items()
     }
+    if LOG_STD in learner.scalars:
+        numbers = learner.scalars[LOG_STD].detach()[learner.seeds.index(seed), : buffer.n_actions]
+        weights[LOG_STD] = numbers.clone()
     weights["observation.shift"] = torch.from_numpy(buffer.encoder.shift)
     weights["observation.scale"] = torch.from_numpy(buffer.encoder.scale)
     for number, image in enumerate(buffer.encoder.image_inputs):
@@ -249,9 +272,22 @@ def save_policy(
         "mask_from": learner.config.mask_from,
         "observation_space": json.loads(space_to_json(buffer.encoder.space)),
         "action_space": json.loads(space_to_json(buffer.action_space)),
+        **_box_description(learner),
         **({"action_commands": action_commands.to_json()} if action_commands else {}),
     }
     write_json(folder / POLICY_NAME, description, TrainingError)
+
+
+def _box_description(learner: Learner) -> dict[str, Any]:
+    """Return what a policy for the actions of a Box needs in addition."""
+    box = learner.buffer.box
+    if box is None:
+        return {}
+    critics = {name: learner.architecture_of(name) for name in learner.critics}
+    return {
+        "action_range": [box.low.tolist(), box.high.tolist()],
+        "critics": {name: asdict(each) for name, each in critics.items()},
+    }
 
 
 @dataclass(frozen=True)
@@ -272,6 +308,8 @@ class _Description:
     action_commands: Any = None
     mask_from: str = ""
     reward_scale: float = 1.0
+    action_range: Any = None
+    critics: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.threshold) and 0 < self.reward_scale < math.inf):
@@ -310,25 +348,33 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
         raise ValueError(f"mask_from {mask_from!r} does not fit {observation_space}")
     check_actions(action_space)
     joint = joint_actions(action_space)
+    box = _box(action_space, description.action_range)
     encoder = ObservationEncoder(observation_space, joint.count if joint else 0)
     encoder.shift = weights.pop("observation.shift").numpy()
     encoder.scale = weights.pop("observation.scale").numpy()
     if not (encoder.scale > 0).all():
         raise ValueError("observation.scale is not positive")
-    stack, shape = description.frame_stack, description.architecture
+    stack = description.frame_stack
     check_elements(stack * sum(leaf.size for leaf in observation_leaves(observation_space)))
-    architecture = architecture_of(shape)
     encoder.image_inputs = [
         _image_input(image, number, weights) for number, image in enumerate(encoder.image_inputs)
     ]
     images = [image.stacked(stack) for image in encoder.image_inputs]
-    for outputs in description.outputs.values():
-        check_size(architecture, encoder.width * stack, images, math.prod(outputs), weights)
-    networks = {
-        name: Network(encoder.width * stack, images, tuple(outputs), architecture)
-        for name, outputs in description.outputs.items()
-    }
-    head = build_head(description.acts_by, networks, action_space, description.threshold)
+    log_std = weights.pop(LOG_STD, None)
+    if log_std is not None and (box is None or log_std.shape != (box.size,)):
+        raise ValueError(f"{LOG_STD} has shape {tuple(log_std.shape)}")
+    networks: dict[str, Network] = {}
+    for name, outputs in description.outputs.items():
+        architecture = architecture_of(description.critics.get(name, description.architecture))
+        width = encoder.width * stack
+        if name in description.critics and box is not None:
+            width += box.size
+        check_size(architecture, width, images, math.prod(outputs), weights)
+        networks[name] = Network(width, images, tuple(outputs), architecture)
+    threshold = description.threshold
+    head = build_head(
+        description.acts_by, networks, action_space, threshold, box=box, log_std=log_std
+    )
     head.networks.load_state_dict(weights)
     commands = description.action_commands
     return Policy(
@@ -347,6 +393,18 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
         else ActionCommands.from_json(commands, joint.count),
         mask_from=mask_from,
     )
+
+
+def _box(action_space: spaces.Space[Any], action_range: Any) -> BoxActions | None:
+    """Return the scaling of the actions of a Box."""
+    if not isinstance(action_space, spaces.Box):
+        return None
+    low, high = np.array(action_range, np.float64)
+    box = replace(BoxActions.of(action_space, np.stack([low, high])), low=low, high=high)
+    fits = low.shape == high.shape == (math.prod(action_space.shape),)
+    if not (fits and np.isfinite([low, high]).all() and (low < high).all()):
+        raise ValueError("action_range does not fit the action space")
+    return box
 
 
 def _image_input(image: ImageInput, number: int, weights: dict[str, Tensor]) -> ImageInput:

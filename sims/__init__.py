@@ -133,6 +133,13 @@ def make_device_sims(
         specs = [SIMS.find(env_id, loads=False) for env_id in SIMS.values()]
         able = " and ".join(one.name for one in specs if one and one.device_entry_point)
         raise UsageError(f"sim '{name}' cannot stay on a device; {able} can")
+    actions = kwargs.get("actions", gym.spec(_resolve(name)[0]).kwargs.get("actions", "discrete"))
+    if isinstance(actions, str):
+        if actions != "discrete":
+            raise UsageError(
+                f"device sims have discrete actions only: sim '{name}' has actions '{actions}'"
+            )
+        kwargs.pop("actions", None)
     module, _, attribute = spec.device_entry_point.partition(":")
     steps = max_episode_steps or spec.max_episode_steps or sys.maxsize
     options = {"num_envs": num_envs, "device": device, "seed": seed, "max_episode_steps": steps}

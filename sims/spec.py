@@ -38,6 +38,8 @@ class SimSpec:
     """Gymnasium id, as in `boats/Boat-v0`."""
     entry_point: str | Callable[..., gym.Env[Any, Any]]
     """Environment class, or `module:class`."""
+    continuous_id: str | None = None
+    """Id of the same environment with the argument `actions="continuous"`, if there is one."""
     vector_entry_point: str | None = None
     """`module:class` of the vector environment, if there is one."""
     device_entry_point: str | None = None
@@ -52,18 +54,26 @@ class SimSpec:
     """Module that the sim requires and that the extra `sims` installs."""
 
     def register(self) -> None:
-        """Register the environment with Gymnasium, unless its id is registered already.
+        """Register the environments with Gymnasium, unless their ids are registered already.
 
         Gymnasium's passive checker is disabled, because it slows down each step.
         """
-        if self.env_id not in gym.registry:
-            gym.register(
-                id=self.env_id,
-                entry_point=self.entry_point,
-                vector_entry_point=self.vector_entry_point,
-                max_episode_steps=self.max_episode_steps,
-                disable_env_checker=True,
-            )
+        for env_id in self.env_ids:
+            if env_id not in gym.registry:
+                is_continuous = env_id == self.continuous_id
+                gym.register(
+                    id=env_id,
+                    entry_point=self.entry_point,
+                    vector_entry_point=self.vector_entry_point,
+                    max_episode_steps=self.max_episode_steps,
+                    disable_env_checker=True,
+                    kwargs={"actions": "continuous"} if is_continuous else {},
+                )
+
+    @property
+    def env_ids(self) -> tuple[str, ...]:
+        """Gymnasium ids of the sim."""
+        return (self.env_id, self.continuous_id) if self.continuous_id else (self.env_id,)
 
     def make_pilot(self, env: gym.Env[Any, Any]) -> Any:
         """Return the sim's scripted policy for an unwrapped environment; the sim must have one."""
@@ -117,13 +127,13 @@ class SimCatalog(Mapping[str, str]):
                 failed import causes a warning.
         """
         specs = self._specs
-        if loads and all(spec.env_id != env_id for spec in specs.values()):
+        if loads and all(env_id not in spec.env_ids for spec in specs.values()):
             for name in self:
                 try:
                     self._spec(name)
                 except UsageError as error:
                     warnings.warn(str(error), stacklevel=2)
-        return next((spec for spec in specs.values() if spec.env_id == env_id), None)
+        return next((spec for spec in specs.values() if env_id in spec.env_ids), None)
 
     def _spec(self, name: str) -> SimSpec:
         if name not in self._specs:

@@ -25,6 +25,8 @@ from mcaprl.settings import check_settings, settings_from_json
 from mcaprl.storage.remote import check_upload, upload_all
 
 if TYPE_CHECKING:
+    from mcaprl.offline.algorithms.learner import Learner
+    from mcaprl.offline.algorithms.registry import Algorithm
     from mcaprl.offline.policy import Policy
     from mcaprl.offline.training.metrics import OfflineSummary
     from mcaprl.online.train import OnlineSummary
@@ -39,7 +41,7 @@ def train(
     data: Source,
     out: str | Path,
     *,
-    algo: str | None = None,
+    algo: str | type[Learner] | None = None,
     seeds: int | None = None,
     seed: int | None = None,
     threads: int = 1,
@@ -61,9 +63,10 @@ def train(
             a mapping, and with `follow` to also train on episodes that end during the training; or
             a function that returns it, which is called after the arguments are checked.
         out: Run folder to create.
-        algo: `dqn`, `double-dqn`, `cql`, `bc`, `bcq` or `iql`, or `auto`, which chooses among
-            them by the log. None selects `cql`; with `resume`, None selects the algorithm of
-            the run.
+        algo: `dqn`, `double-dqn`, `cql`, `bc`, `bcq` or `iql`, for the actions of a Box `bc`,
+            `td3-bc`, `rebrac` or `iql`, or `auto`, which chooses among them by the log; or a
+            subclass of `mcaprl.offline.Learner`. None selects `cql`, and `iql` for a Box; with
+            `resume`, None selects the algorithm of the run.
         seeds: Number of networks, which are trained in parallel. None selects 1; with `resume`,
             that of the run.
         seed: Seed of the first network; network k uses seed + k. None selects 0; with `resume`,
@@ -94,8 +97,7 @@ def train(
         ClusterError: The Ray cluster cannot be used, or workers died repeatedly.
         MissingExtraError: The packages of the `offline` extra, or Ray, are not installed.
     """
-    from mcaprl.offline.algorithms.registry import choose_algorithm
-    from mcaprl.offline.batches.buffer import discrete_actions
+    from mcaprl.offline.algorithms.registry import configured
     from mcaprl.offline.selection.config import AUTO, AutoConfig
     from mcaprl.offline.selection.race import select
     from mcaprl.offline.training.metrics import draw_curves
@@ -111,34 +113,37 @@ def train(
         earlier = run_to_resume(out)
         check_kind(out, earlier, "offline")
         was = earlier.get("algo", algo)
-        if algo not in (None, was):
+        if getattr(algo, "name", algo) not in (None, was):
             raise UsageError(
                 f"{out} is a run of {was}: resume it without algo, or choose another folder"
             )
-        algo = was
+        algo = algo or was
         settings = {**settings_from_json(earlier.get("config")), **settings}
     numbers = choose_seeds(out, seeds, seed, resume)
-    algo = algo or "cql"
-    defaults = AutoConfig() if algo == AUTO else choose_algorithm(algo, [AUTO])[1]
-    check_settings(algo, defaults, settings)
-    config = type(defaults)(**settings)
+    if algo == AUTO:
+        check_settings(algo, AutoConfig, settings)
+        chosen: AutoConfig | Algorithm = AutoConfig(**settings)
+    else:
+        chosen = configured(algo, settings, [AUTO])
     if algo == AUTO and (other_data or cluster.ray):
         raise UsageError(f"`{'other_data' if other_data else 'ray'}=` is not for `algo={algo!r}`")
     request: dict[str, Any] = {"resume": resume, "device": device, "progress": progress}
     with cluster.connected(), torch_threads(threads):
         dataset = opened(data, weighted=True, threads=threads)
-        discrete_actions(dataset.action_space)
+        if not isinstance(chosen, AutoConfig):
+            chosen = configured(algo, settings, space=dataset.action_space)
         if cluster.ray:
             from mcaprl.ray.tasks import train_on_ray
 
             request |= {"other_data": other_data, "threads": threads, "workers": cluster.workers}
-            summaries = train_on_ray(dataset, config, out.absolute(), seeds=numbers, **request)
+            assert not isinstance(chosen, AutoConfig)
+            summaries = train_on_ray(dataset, chosen, out.absolute(), seeds=numbers, **request)
         else:
             request |= {"seeds": len(numbers), "seed": numbers.start}
-            if isinstance(config, AutoConfig):
-                summaries = select(dataset, config, out, **request)[1]
+            if isinstance(chosen, AutoConfig):
+                summaries = select(dataset, chosen, out, **request)[1]
             else:
-                summaries = train_dataset(dataset, config, out, other_data=other_data, **request)
+                summaries = train_dataset(dataset, chosen, out, other_data=other_data, **request)
     if dataset.origin.mapping is not None:
         write_json(out / MAPPING_NAME, dataset.origin.mapping, TrainingError)
     with suppress(MissingExtraError):

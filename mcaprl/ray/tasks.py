@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from mcaprl.errors import ClusterError, McaprlError
-from mcaprl.offline.algorithms.config import TrainingConfig
+from mcaprl.offline.algorithms.registry import Algorithm
 from mcaprl.offline.training.metrics import OfflineSummary
 from mcaprl.offline.training.train import run_identity, start_run, train_seeds
 from mcaprl.progress import Advance, ProgressCallback, TrainingProgress
@@ -195,7 +195,7 @@ def _here() -> str:
 
 def train_on_ray(
     dataset: Dataset,
-    config: TrainingConfig,
+    algorithm: Algorithm,
     out: Path,
     *,
     seeds: range,
@@ -219,11 +219,11 @@ def train_on_ray(
     with locked_run(out, resume):
         paths = [out, *logs]
         check_machines(paths)
-        identity = run_identity(dataset, config, other_data)
-        start_run(dataset, config, out, identity, seeds, resume)
+        identity = run_identity(dataset, algorithm, other_data)
+        start_run(dataset, algorithm.config, out, identity, seeds, resume)
         try:
             return run_tasks(
-                partial(_train_seed, logs, config, out, identity, threads, device),
+                partial(_train_seed, logs, algorithm, out, identity, threads, device),
                 seeds,
                 workers=workers,
                 gpus=int(device == "cuda"),
@@ -242,7 +242,7 @@ def train_on_ray(
 
 def _train_seed(
     logs: dict[Path, float],
-    config: TrainingConfig,
+    algorithm: Algorithm,
     out: Path,
     identity: RunIdentity,
     threads: int,
@@ -261,7 +261,7 @@ def _train_seed(
         dataset = open_data(names, weights=list(logs.values()), threads=threads)
         (summary,) = train_seeds(
             dataset,
-            config,
+            algorithm,
             out,
             identity,
             seeds,

@@ -12,6 +12,8 @@ from mcaprl.entry_points import installed
 from mcaprl.offline.batches.packing import Packing
 
 ENTRY_POINT_GROUP: Final = "mcaprl.algorithms"
+HEADS: Final = ("deterministic", "gaussian", "mixture")
+"""What the network of a policy for a Box outputs."""
 ALPHA_RANGE: Final = (1e-4, 100.0)
 """Range of CQL's alpha if it is learned."""
 
@@ -39,6 +41,8 @@ class TrainingConfig(NetworkSettings):
     """updates between two rows of metrics"""
     mask_from: str = ""
     """source of the flags of allowed actions: info:NAME, or a key of the observation"""
+    clip_actions: bool = False
+    """clip logged actions outside a Box to its bounds; otherwise, they are an error"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -55,7 +59,17 @@ class TrainingConfig(NetworkSettings):
     @property
     def packing(self) -> Packing:
         """Settings for building transitions from the log."""
-        return Packing(self.frame_stack, self.normalize, self.center_images)
+        return Packing(
+            self.frame_stack,
+            self.normalize,
+            self.center_images,
+            clip_actions=self.clip_actions,
+        )
+
+    @property
+    def best_fraction(self) -> float:
+        """Fraction of the episodes with the largest returns that are learned from."""
+        return 1.0
 
 
 @dataclass(frozen=True)
@@ -95,13 +109,45 @@ class BootstrapConfig(TrainingConfig):
         After k updates, the value of a constant reward of 1 is (1 - gamma^(n k)) / (1 - gamma);
         the full return is 1 / (1 - gamma).
         """
-        target_updates = max(self.updates / self.target_interval, 1)
-        return float(1 - self.gamma ** (self.n_steps * target_updates))
+        return float(1 - self.gamma ** (self.n_steps * max(self.syncs, 1)))
+
+    @property
+    def syncs(self) -> float:
+        """Number of updates of the target network."""
+        return self.updates / self.target_interval
 
 
 @dataclass(frozen=True)
 class BCConfig(TrainingConfig):
-    """Settings of behavior cloning, the same as those of `TrainingConfig`."""
+    """Settings of behavior cloning."""
+
+    top: float = 1.0
+    """fraction of the episodes to learn from: those with the largest returns"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("top", 0 < self.top <= 1, "within (0, 1]")
+
+    @property
+    def best_fraction(self) -> float:
+        """Fraction of the episodes with the largest returns that are learned from."""
+        return self.top
+
+
+@dataclass(frozen=True)
+class BoxBCConfig(BCConfig):
+    """Settings of behavior cloning of the actions of a Box."""
+
+    normalize: bool = True
+    """normalize the network's inputs to mean 0 and standard deviation 1 over the data"""
+    head: str = "deterministic"
+    """what the network outputs: deterministic, gaussian, or mixture (of 5 Gaussians)"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("head", self.head in HEADS, f"one of {', '.join(HEADS)}")
 
 
 @dataclass(frozen=True)
@@ -184,6 +230,102 @@ class IQLConfig(BootstrapConfig):
         self._require("beta", self.beta >= 0, "at least 0")
 
 
+@dataclass(frozen=True)
+class ActorCriticConfig(BootstrapConfig):
+    """Settings of the algorithms with an actor and two critics, for the actions of a Box."""
+
+    hidden: tuple[int, ...] = (128, 128)
+    """widths of the hidden layers; for images, of the layers after the convolutions"""
+    normalize: bool = True
+    """normalize the network's inputs to mean 0 and standard deviation 1 over the data"""
+    scale_rewards: bool = True
+    """divide rewards by the standard deviation of the discounted returns of the log"""
+    target_interval: int = 1
+    """updates between two updates of the target networks"""
+    polyak: float = 0.02
+    """weight of the learning networks in an update of the target networks; 1 copies them"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("polyak", 0 < self.polyak <= 1, "within (0, 1]")
+
+    @property
+    def syncs(self) -> float:
+        """Number of updates of the target network, in which the values of n steps are added."""
+        return super().syncs * self.polyak
+
+
+@dataclass(frozen=True)
+class BoxIQLConfig(ActorCriticConfig):
+    """Settings of IQL for the actions of a Box."""
+
+    expectile: float = 0.7
+    """expectile of the action values that V estimates; 0.5 is the mean, near 1 the maximum"""
+    beta: float = 3.0
+    """inverse temperature of the advantage weights in cloning; 0 weights all actions equally"""
+    normalize_advantages: bool = True
+    """divide advantages by their root mean square in the batch, so that beta has no unit"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("expectile", 0 < self.expectile < 1, "within (0, 1)")
+        self._require("beta", self.beta >= 0, "at least 0")
+
+
+@dataclass(frozen=True)
+class TD3Config(ActorCriticConfig):
+    """Settings of TD3: delayed updates of the actor, and noise on the actions of targets."""
+
+    target_interval: int = 2
+    """updates between two updates of the target networks"""
+    policy_interval: int = 2
+    """updates of the critics per update of the actor"""
+    policy_noise: float = 0.2
+    """standard deviation of the noise on target actions, as a fraction of half the Box"""
+    noise_clip: float = 0.5
+    """largest noise on target actions, as a fraction of half the Box"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require_positive("policy_interval")
+        self._require("policy_noise", self.policy_noise >= 0, "at least 0")
+        self._require("noise_clip", self.noise_clip >= 0, "at least 0")
+
+
+@dataclass(frozen=True)
+class TD3BCConfig(TD3Config):
+    """Settings of TD3+BC."""
+
+    alpha: float = 2.5
+    """weight of the values, divided by their mean absolute value, beside the cloning error"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("alpha", self.alpha >= 0, "at least 0")
+
+
+@dataclass(frozen=True)
+class ReBRACConfig(TD3Config):
+    """Settings of ReBRAC."""
+
+    hidden: tuple[int, ...] = (128, 128, 128)
+    """widths of the hidden layers; for images, of the layers after the convolutions"""
+    actor_weight: float = 0.1
+    """weight of the actor's cloning error, beside the values over their mean absolute value"""
+    critic_weight: float = 0.01
+    """weight of the squared distance of next actions from the logged ones in targets"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("actor_weight", self.actor_weight >= 0, "at least 0")
+        self._require("critic_weight", self.critic_weight >= 0, "at least 0")
+
+
 CONFIGS: Final[dict[str, type[TrainingConfig]]] = {
     "dqn": DQNConfig,
     "double-dqn": DoubleDQNConfig,
@@ -192,17 +334,31 @@ CONFIGS: Final[dict[str, type[TrainingConfig]]] = {
     "bcq": BCQConfig,
     "iql": IQLConfig,
 }
-"""Settings of the built-in algorithms by name."""
+"""Settings of the built-in algorithms for finite action spaces by name."""
+BOX_CONFIGS: Final[dict[str, type[TrainingConfig]]] = {
+    "bc": BoxBCConfig,
+    "td3-bc": TD3BCConfig,
+    "rebrac": ReBRACConfig,
+    "iql": BoxIQLConfig,
+}
+"""Settings of the built-in algorithms for the actions of a Box by name."""
 
 
 def default_configs() -> dict[str, TrainingConfig]:
     """Return the default settings of the built-in algorithms and of those of installed packages.
 
+    Where an algorithm has other settings for a Box, these have the key `NAME (Box)`.
+
     Raises:
         UsageError: An entry point is broken.
     """
-    if not installed(ENTRY_POINT_GROUP):
-        return {name: config_type() for name, config_type in CONFIGS.items()}
-    from mcaprl.offline.algorithms.registry import all_algorithms  # This module imports torch.
+    configs = dict(CONFIGS)
+    for name, config_type in BOX_CONFIGS.items():
+        configs[f"{name} (Box)" if name in CONFIGS else name] = config_type
+    if installed(ENTRY_POINT_GROUP):
+        # This module imports torch.
+        from mcaprl.offline.algorithms.registry import all_algorithms
 
-    return {name: learner.config_type() for name, learner in all_algorithms().items()}
+        for learner in all_algorithms():
+            configs.setdefault(learner.name, learner.config_type)
+    return {name: config_type() for name, config_type in configs.items()}

@@ -38,7 +38,7 @@ class DQN(Learner):
 
     name = "dqn"
     config_type = DQNConfig
-    acts_by: ClassVar[str] = "q_values"
+    acts_by: str = "q_values"
     policy_models: ClassVar[tuple[str, ...]] = ("q",)
     can_be_captured = True
     config: DQNConfig

@@ -3,6 +3,14 @@
     q_values            argmax_a Q(s, a)                                      dqn, double-dqn, cql
     logits              pi(a|s) = softmax(logits)                             bc, iql
     filtered_q_values   argmax_a Q(s, a) of actions likely under the logits   bcq
+    deterministic       tanh(output), in a Box                                td3-bc, rebrac, bc
+    gaussian            normal distribution, truncated to a Box               iql, bc
+    mixture             mixture of such distributions                         bc
+
+The last three heads act by the mode of the distribution, or of its most likely component. Inside,
+actions are numbers in [-1, 1]. A normal distribution that is truncated to this interval has a
+finite density at the bounds, where sticks and pilots often are. (After a tanh, the density there
+would be infinite.)
 
 A policy uses the members of `Head` alone, so a head for another kind of action space is a class
 here and an entry in `HEADS`.
@@ -20,7 +28,14 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mcaprl.offline.algorithms.losses import allowed_only, likely_actions, mean_values
+from mcaprl.actions import BoxActions
+from mcaprl.errors import PolicyError
+from mcaprl.offline.algorithms.losses import (
+    allowed_only,
+    likely_actions,
+    mean_values,
+    truncated_normal_log_density,
+)
 from mcaprl.offline.batches.buffer import discrete_actions
 from mcaprl.offline.batches.observations import Observations
 
@@ -53,6 +68,9 @@ class Head(nn.Module):
 
     def probabilities(self, observations: Observations) -> Tensor | None:
         """Return the probabilities (B, A) of all actions; None if they are not finite in number."""
+
+    def action_values(self, observations: Observations, actions: NDArray[Any]) -> Tensor | None:
+        """Return the values (B,) of actions (B, *shape); None without a network of values."""
 
 
 class DiscreteHead(Head):
@@ -107,6 +125,14 @@ class DiscreteHead(Head):
         """Return the values (B, A) of all actions; None without a network of values."""
         return self.outputs("q", observations) if "q" in self.networks else None
 
+    def action_values(self, observations: Observations, actions: NDArray[Any]) -> Tensor | None:
+        """Return the values (B,) of actions (B, *shape); None without a network of values."""
+        values = self.q_values(observations)
+        if values is None:
+            return None
+        numbers = torch.from_numpy(self.joint.indexes(actions)).unsqueeze(1)
+        return values.gather(1, numbers).squeeze(1)
+
     def probabilities(self, observations: Observations) -> Tensor:
         """Return the probabilities (B, A) of all actions: 0 or 1 if the head is greedy."""
         scores = self.scores(observations)
@@ -150,6 +176,160 @@ class FilteredQ(DiscreteHead):
         return allowed_only(self.outputs("q", observations), likely)
 
 
+class BoxHead(Head):
+    """Head for the actions of a Box, from the outputs of the network `actor`.
+
+    Attributes:
+        box: Scaling of the actions to numbers in [-1, 1].
+        log_std: (n,) logarithms of the standard deviations, if they are the same in all states.
+    """
+
+    log_std: Tensor | None
+    _low: Tensor
+    _half: Tensor
+
+    def __init__(
+        self, networks: Mapping[str, nn.Module], box: BoxActions, log_std: Tensor | None = None
+    ) -> None:
+        """Wrap the networks."""
+        super().__init__(networks)
+        self.box = box
+        self.register_buffer("log_std", log_std)
+        # In float64, so that the bounds are the same numbers as in the space.
+        self.register_buffer("_low", torch.from_numpy(box.low), persistent=False)
+        half = torch.from_numpy((box.high - box.low) / 2)
+        self.register_buffer("_half", half, persistent=False)
+
+    @staticmethod
+    @abstractmethod
+    def output_shape(size: int) -> tuple[int, ...]:
+        """Return the shape of the outputs for actions of n numbers."""
+
+    @staticmethod
+    @abstractmethod
+    def best(outputs: Tensor) -> Tensor:
+        """Return the best actions (B, n), in [-1, 1]."""
+
+    @staticmethod
+    def log_density(outputs: Tensor, actions: Tensor, log_std: Tensor | None = None) -> Tensor:
+        """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
+        raise PolicyError("a deterministic policy has no density of actions")
+
+    def actions(self, observations: Observations) -> Tensor:
+        """Return the best actions (B, *shape), in the units and dtype of the space."""
+        numbers = self.best(self.networks["actor"](observations)).double()
+        values = torch.addcmul(self._low, numbers + 1, self._half)
+        dtype = getattr(torch, str(self.box.space.dtype))
+        return values.to(dtype).view(-1, *self.box.shape)
+
+    def log_prob(self, observations: Observations, actions: NDArray[Any]) -> Tensor:
+        """Return the log densities (B,) of actions (B, *shape), in their own units."""
+        outputs = self.networks["actor"](observations)
+        numbers = torch.from_numpy(self.box.scaled(actions)).clamp(-1, 1)
+        log_density = self.log_density(outputs, numbers, self.log_std) + self.box.log_scale
+        inside = torch.from_numpy(self.box.contain(actions))
+        return log_density.masked_fill(~inside, -torch.inf)
+
+    def action_values(self, observations: Observations, actions: NDArray[Any]) -> Tensor | None:
+        """Return the values (B,) of actions (B, *shape); None without a network of values."""
+        if "q" not in self.networks:
+            return None
+        numbers = torch.from_numpy(self.box.scaled(actions))
+        found: Tensor = self.networks["q"](observations.with_actions(numbers))
+        return found.squeeze(1)
+
+
+class Deterministic(BoxHead):
+    """One action per state, as the tanh of the outputs (B, n)."""
+
+    @staticmethod
+    def output_shape(size: int) -> tuple[int, ...]:
+        """Return the shape of the outputs for actions of n numbers."""
+        return (size,)
+
+    @staticmethod
+    def best(outputs: Tensor) -> Tensor:
+        """Return the actions (B, n)."""
+        return outputs.tanh()
+
+
+class Gaussian(BoxHead):
+    """Independent normal distributions, truncated to the Box: outputs are means and deviations.
+
+    The outputs (B, n) are means before a tanh; with deviations that depend on the state, the
+    outputs (B, 2, n) also have their logarithms.
+    """
+
+    @staticmethod
+    def output_shape(size: int) -> tuple[int, ...]:
+        """Return the shape of the outputs for actions of n numbers, with deviations."""
+        return (2, size)
+
+    @staticmethod
+    def best(outputs: Tensor) -> Tensor:
+        """Return the modes (B, n), which are the means before the truncation."""
+        return (outputs if outputs.ndim == 2 else outputs[:, 0]).tanh()
+
+    @staticmethod
+    def log_density(outputs: Tensor, actions: Tensor, log_std: Tensor | None = None) -> Tensor:
+        """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
+        raw = outputs[:, 1] if log_std is None else log_std
+        mean, log_std = Gaussian.best(outputs), bounded_log_std(raw)
+        return truncated_normal_log_density(actions, mean, log_std).sum(-1)
+
+
+class Mixture(BoxHead):
+    """Mixture of `COMPONENTS` truncated normal distributions, for demonstrations with several ways.
+
+    The outputs (B, C * (1 + 2 n)) are C logits, then the means before a tanh, and the logarithms of
+    the deviations. The action is the mode of the component with the largest weight.
+    """
+
+    @staticmethod
+    def output_shape(size: int) -> tuple[int, ...]:
+        """Return the shape of the outputs for actions of n numbers."""
+        return (COMPONENTS * (1 + 2 * size),)
+
+    @staticmethod
+    def best(outputs: Tensor) -> Tensor:
+        """Return the modes (B, n) of the components with the largest weights."""
+        means = Mixture._components(outputs)[:, :, 0]
+        largest = outputs[:, :COMPONENTS].argmax(1)
+        places = largest[:, None, None].expand(-1, 1, means.shape[2])
+        return means.gather(1, places).squeeze(1).tanh()
+
+    @staticmethod
+    def log_density(outputs: Tensor, actions: Tensor, log_std: Tensor | None = None) -> Tensor:
+        """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
+        mean, raw = Mixture._components(outputs).unbind(2)
+        log_densities = truncated_normal_log_density(
+            actions.unsqueeze(1), mean.tanh(), bounded_log_std(raw)
+        )
+        log_weights = outputs[:, :COMPONENTS].log_softmax(1)
+        return (log_weights + log_densities.sum(-1)).logsumexp(1)
+
+    @staticmethod
+    def _components(outputs: Tensor) -> Tensor:
+        """Return the means and deviations (B, C, 2, n) before they are bounded."""
+        return outputs[:, COMPONENTS:].view(len(outputs), COMPONENTS, 2, -1)
+
+
+COMPONENTS: Final = 5
+"""Number of components of a mixture."""
+_LOG_STD_CENTER, _LOG_STD_HALF = -2.0, 3.0
+
+
+def bounded_log_std(raw: Tensor) -> Tensor:
+    """Return log standard deviations from -5 to 1, and -2 for raw numbers of 0."""
+    return _LOG_STD_CENTER + _LOG_STD_HALF * (raw / _LOG_STD_HALF).tanh()
+
+
+BOX_HEADS: Final[dict[str, type[BoxHead]]] = {
+    "deterministic": Deterministic,
+    "gaussian": Gaussian,
+    "mixture": Mixture,
+}
+"""Heads for the actions of a Box."""
 HEADS: Final[dict[str, type[DiscreteHead]]] = {
     "q_values": GreedyQ,
     "logits": Categorical,
@@ -163,13 +343,26 @@ def build_head(
     networks: Mapping[str, nn.Module],
     action_space: spaces.Space[Any],
     threshold: float = 0.0,
-) -> DiscreteHead:
+    *,
+    box: BoxActions | None = None,
+    log_std: Tensor | None = None,
+) -> Head:
     """Return the head of a policy file or learner.
+
+    Args:
+        acts_by: Value of `Learner.acts_by`.
+        networks: Networks of the head by name.
+        action_space: Space of the actions.
+        threshold: Threshold of `FilteredQ`.
+        box: Scaling of the actions of a Box.
+        log_std: Logarithms (n,) of the deviations of `Gaussian`, unless the network outputs them.
 
     Raises:
         ValueError: There is no such head.
         SpaceError: The head does not support the action space.
     """
+    if box is not None and acts_by in BOX_HEADS:
+        return BOX_HEADS[acts_by](networks, box, log_std)
     if acts_by not in HEADS:
         raise ValueError(f"acts_by {acts_by!r} is not supported")
     return HEADS[acts_by](networks, action_space, threshold)

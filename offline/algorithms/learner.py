@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mcaprl.architecture import Architecture
 from mcaprl.networks import Network
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.losses import allowed_only
@@ -69,7 +70,10 @@ class CapturedUpdate:
         self._step.replay()
 
 
+N_CRITICS = 2
+"""Number of networks of a critic: the twins of TD3."""
 _MOMENTS = ("exp_avg", "exp_avg_sq")
+_STEPS = "steps"
 
 
 class NotFiniteError(ArithmeticError):
@@ -96,6 +100,9 @@ class Learner(ABC):
         config_type: Dataclass of the algorithm's settings.
         acts_by: Key of `heads.HEADS`: how the policy selects actions.
         policy_models: Names of the models that the policy needs.
+        continuous: Whether actions are those of a Box instead of a finite space.
+        critics: Names of the models that are ensembles of `N_CRITICS` networks Q(s, a), with an
+            action as an additional input.
         can_be_captured: Whether `losses` can be part of a CUDA graph: tensors have shapes that do
             not depend on values, and no value is read by the CPU.
         seeds: K seeds.
@@ -107,8 +114,10 @@ class Learner(ABC):
 
     name: ClassVar[str]
     config_type: ClassVar[type[TrainingConfig]]
-    acts_by: ClassVar[str]
+    acts_by: str
     policy_models: ClassVar[tuple[str, ...]]
+    continuous: ClassVar[bool] = False
+    critics: ClassVar[tuple[str, ...]] = ()
     can_be_captured: ClassVar[bool] = False
     config: TrainingConfig
 
@@ -121,14 +130,15 @@ class Learner(ABC):
         self.buffer = buffer
         self.seeds = tuple(seeds)
         self.step = 0
-        self.n_actions = buffer.joint.count
+        self.n_actions = buffer.n_actions
         channels = [image.shape[2] for image in buffer.encoder.image_inputs]
         self.architecture = config.architecture_for(channels)
         states = [np.random.SeedSequence(seed).generate_state(2, np.uint32) for seed in seeds]
         self.samplers = [torch.Generator().manual_seed(int(second)) for _, second in states]
         networks = [self._random_networks(int(first)) for first, _ in states]
         self.models: dict[str, Model] = {
-            name: build_model([mine[name] for mine in networks]) for name in networks[0]
+            name: build_model([each for mine in networks for each in mine[name]], len(members))
+            for name, members in networks[0].items()
         }
         self.target_networks: dict[str, TargetNetwork] = {}
         self._sync_interval = 0
@@ -215,7 +225,7 @@ class Learner(ABC):
         return {name: term.detach() for name, term in terms.items()}
 
     def add_target_network(
-        self, name: str, interval: int, *, next_states: bool = True
+        self, name: str, interval: int, *, next_states: bool = True, polyak: float = 1.0
     ) -> TargetNetwork:
         """Add a target network, synced with a model now and every `interval` updates.
 
@@ -223,30 +233,37 @@ class Learner(ABC):
             name: Name of the model.
             interval: Number of updates between two syncs, the same for all target networks.
             next_states: Whether the target network evaluates next states instead of states.
+            polyak: Weight of the model in a sync, in which the rest is the earlier target network.
         """
-        rows = self.config.batch_size * interval
+        # An average changes too often for a table, and an ensemble also depends on actions.
+        has_table = polyak == 1 and name not in self.critics
+        rows = self.config.batch_size * interval if has_table else 0
         self._sync_interval = interval
         self.target_networks[name] = TargetNetwork(
-            self.models[name], self.buffer, rows, next_states=next_states
+            self.models[name], self.buffer, rows, next_states=next_states, polyak=polyak
         )
         return self.target_networks[name]
 
-    def add_scalar(self, name: str, start: float, rate_factor: float) -> nn.Parameter:
-        """Add a number that each seed learns by its own Adam, such as a Lagrange multiplier.
+    def add_scalar(
+        self, name: str, start: float, rate_factor: float, size: int = 1
+    ) -> nn.Parameter:
+        """Add numbers that each seed learns by its own Adam, such as a Lagrange multiplier.
 
-        The number is saved in checkpoints. Weight decay does not apply to it. A loss reads it with
-        `scalar_rows`.
+        The numbers are saved in checkpoints. Weight decay does not apply to them. A loss reads them
+        with `scalar_rows`.
 
         Args:
             name: Name in `scalars` and in checkpoints.
             start: Value before the first update.
             rate_factor: Learning rate, as a multiple of the learning rate of the networks.
+            size: Number of numbers of each seed.
 
         Returns:
-            The numbers as (K, P); only the first column is used, see `models`.
+            The numbers as (K, P); only the first `size` columns are used, see `models`.
         """
+        width = size + -size % ALIGNMENT
         scalar = nn.Parameter(
-            torch.full((len(self.seeds), ALIGNMENT), start, device=self.buffer.device)
+            torch.full((len(self.seeds), width), start, device=self.buffer.device)
         )
         group = {
             "params": [scalar],
@@ -259,10 +276,31 @@ class Learner(ABC):
         self.scalars[name] = scalar
         return scalar
 
-    def scalar_rows(self, name: str, batch: Batch) -> Tensor:
-        """Return a learned number of `add_scalar` for each row (R,) of a batch."""
+    def scalar_rows(self, name: str, batch: Batch, size: int | None = None) -> Tensor:
+        """Return a learned number of `add_scalar` for each row of a batch, (R,) or (R, size)."""
         rows = len(batch.actions) // len(self.seeds)
-        return self.scalars[name][:, :1].expand(-1, rows).flatten()
+        found = self.scalars[name][:, None, : size or 1].expand(-1, rows, -1).flatten(0, 1)
+        return found.squeeze(1) if size is None else found
+
+    def noise(self, scale: float) -> Tensor:
+        """Draw normal noise (R, n) for the actions of a batch, from the generators of the seeds."""
+        shape = (self.config.batch_size, self.n_actions)
+        draws = [torch.randn(shape, generator=one) for one in self.samplers]
+        return torch.cat(draws).mul_(scale).to(self.buffer.device)
+
+    def is_due(self, interval: int) -> bool:
+        """Return whether the current update is the last one of `interval` updates.
+
+        Parts of the loss that are due less often, such as that of a delayed actor, are left out of
+        other updates. Weights without a gradient stay the same.
+        """
+        return (self.step + 1) % interval == 0
+
+    @property
+    def is_reported(self) -> bool:
+        """Whether the terms of the current update are written to the metrics."""
+        config, last = self.config, self.step + 1 == self.config.updates
+        return last or self.is_due(config.log_interval) or self.is_due(config.checkpoint_interval)
 
     def seed_means(self, terms: Mapping[str, Tensor]) -> list[dict[str, float]]:
         """Return the mean of each term for each seed.
@@ -275,6 +313,10 @@ class Learner(ABC):
     def batch_means(self, values: Tensor) -> Tensor:
         """Return each seed's mean (K,) of values (R,)."""
         return values.view(len(self.seeds), -1).mean(1)
+
+    def divided(self, values: Tensor, divisors: Tensor) -> Tensor:
+        """Divide the values (R,) of each seed by the seed's divisor (K,)."""
+        return (values.view(len(self.seeds), -1) / divisors.unsqueeze(1)).flatten()
 
     def outputs(self, name: str, observations: Observations) -> Tensor:
         """Return a model's outputs, with minus infinity for actions that are not allowed."""
@@ -290,8 +332,13 @@ class Learner(ABC):
         return {**self.models, **targets}
 
     def network(self, name: str, seed: int) -> Network:
-        """Return one seed's network, with its current weights."""
-        return self.models[name].networks[self.seeds.index(seed)]
+        """Return one seed's network, or the first one of its ensemble, with its current weights."""
+        model = self.models[name]
+        return model.networks[self.seeds.index(seed) * model.members]
+
+    def architecture_of(self, name: str) -> Architecture:
+        """Return the architecture of a model's networks; default: the same one for all models."""
+        return self.architecture
 
     def state(self, seed: int) -> dict[str, Tensor]:
         """Return the state of the training of one seed, without `step`.
@@ -306,6 +353,8 @@ class Learner(ABC):
         for name, weights in self._learned().items():
             moments = self.optimizer.state[weights]
             tensors |= {f"{name}.{moment}": moments[moment][k] for moment in _MOMENTS}
+            if int(moments["step"]) != self.step:
+                tensors[f"{name}.{_STEPS}"] = moments["step"]
         tensors["generator.sampler"] = self.samplers[k].get_state()
         return tensors
 
@@ -324,7 +373,8 @@ class Learner(ABC):
             _copy(weights[k], tensors[f"{name}.weights"])
         for name, weights in self._learned().items():
             state = self.optimizer.state[weights]
-            state["step"].fill_(step)
+            # Weights that had no gradient in some updates have their own number of steps.
+            state["step"].copy_(tensors.get(f"{name}.{_STEPS}", torch.tensor(float(step))))
             for moment in _MOMENTS:
                 _copy(state[moment][k], tensors[f"{name}.{moment}"])
         for target in self.target_networks.values():
@@ -352,16 +402,22 @@ class Learner(ABC):
             step = torch.tensor(0.0, device=tensor.device)
             self.optimizer.state[tensor] = {"step": step, **moments}
 
-    def _random_networks(self, seed: int) -> dict[str, Network]:
-        buffer, architecture = self.buffer, self.architecture
+    def _random_networks(self, seed: int) -> dict[str, list[Network]]:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             return {
-                name: Network(buffer.vector_width, buffer.image_inputs, shape, architecture).to(
-                    buffer.device
-                )
+                name: [self._random_network(name, shape) for _ in range(self._members(name))]
                 for name, shape in self.output_shapes().items()
             }
+
+    def _members(self, name: str) -> int:
+        return N_CRITICS if name in self.critics else 1
+
+    def _random_network(self, name: str, shape: tuple[int, ...]) -> Network:
+        buffer = self.buffer
+        width = buffer.vector_width + (self.n_actions if name in self.critics else 0)
+        network = Network(width, buffer.image_inputs, shape, self.architecture_of(name))
+        return network.to(buffer.device)
 
     def _not_finite(self, seed_means: Sequence[Mapping[str, float]]) -> NotFiniteError:
         """Return an error that names the first term of `losses` that is not finite."""

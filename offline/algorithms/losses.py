@@ -16,6 +16,11 @@ size, A the number of actions, N the number of quantiles.
     v_tm1           values (B, 1) of states
     logits_tm1      unnormalized log probabilities (B, A)
 
+Actions of a Box are numbers in [-1, 1], n of them per action. With E critics:
+
+    q_t_twins       values (E, B) of the next states and actions
+    q_tm1_twins     values (E, B) of the logged states and actions
+
 In the equations, s' and a' are the next state and action, and Q' is the network that evaluates
 them. With quantiles, the action with the largest mean is selected. Outputs of actions that are not
 allowed are minus infinity. A loss returns one value per transition; autograd computes its gradient.
@@ -23,9 +28,13 @@ allowed are minus infinity. A loss returns one value per transition; autograd co
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn import functional
+
+_LOG_SQRT_TAU = 0.5 * math.log(2 * math.pi)
 
 
 def q_learning_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor) -> Tensor:
@@ -145,6 +154,53 @@ def expectile_regression(v_tm1: Tensor, target_tm1: Tensor, expectile: float) ->
     _check_shape("v_tm1", v_tm1, (len(target_tm1), 1))
     error = target_tm1 - v_tm1.squeeze(1)
     return (expectile - (error < 0).float()).abs() * error.square()
+
+
+def clipped_double_q_target(
+    r_t: Tensor, discount_t: Tensor, q_t_twins: Tensor, penalty_t: Tensor | float = 0.0
+) -> Tensor:
+    """Return the target (B,) of TD3: r + discount (min_e Q'_e(s', a') - penalty).
+
+    See "Addressing Function Approximation Error in Actor-Critic Methods",
+    https://arxiv.org/abs/1802.09477. With the penalty on next actions unlike the logged ones, it is
+    that of "Revisiting the Minimalist Approach to Offline Reinforcement Learning", equation 3,
+    https://arxiv.org/abs/2305.09836.
+    """
+    _check_shape("r_t", r_t, (q_t_twins.shape[1],))
+    _check_shape("discount_t", discount_t, (q_t_twins.shape[1],))
+    return r_t + discount_t * (q_t_twins.amin(0) - penalty_t)
+
+
+def twin_regression(q_tm1_twins: Tensor, target_tm1: Tensor) -> Tensor:
+    """Return the sum over the critics of the squared errors (B,) of Q_e(s, a) - target."""
+    _check_shape("target_tm1", target_tm1, (q_tm1_twins.shape[1],))
+    return (q_tm1_twins - target_tm1).square().sum(0)
+
+
+def smoothed_actions(a_t: Tensor, noise: Tensor, limit: float) -> Tensor:
+    """Return actions (B, n) in [-1, 1] with noise that is clipped to `limit`: TD3's smoothing.
+
+    See "Addressing Function Approximation Error in Actor-Critic Methods", section 5.3,
+    https://arxiv.org/abs/1802.09477.
+    """
+    _check_shape("noise", noise, a_t.shape)
+    return (a_t + noise.clamp(-limit, limit)).clamp(-1, 1)
+
+
+def truncated_normal_log_density(actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
+    """Return the log densities of actions in [-1, 1], with the shape of the broadcast arguments.
+
+    The distribution is the normal one, given that the result is in [-1, 1]:
+
+        phi((a - mean) / std) / std / (Phi((1 - mean) / std) - Phi((-1 - mean) / std))
+
+    The mean is in [-1, 1], too. Then the difference of Phi is the sum of two numbers of at least 0,
+    and its logarithm is finite.
+    """
+    scaled = (actions - mean) * (-log_std).exp()
+    width = (-log_std).exp() * math.sqrt(0.5)
+    inside = 0.5 * (torch.erf((1 - mean) * width) + torch.erf((1 + mean) * width))
+    return -0.5 * scaled.square() - log_std - _LOG_SQRT_TAU - inside.log()
 
 
 def allowed_only(outputs: Tensor, mask: Tensor | None) -> Tensor:

@@ -3,6 +3,8 @@
 The P weights of each network are a row of one matrix (K, P), which is a leaf tensor of autograd.
 Therefore, the optimizer, the target network and a checkpoint each handle one tensor. Batches
 contain the rows of all seeds, ordered by seed: R = K * B rows.
+
+An ensemble has E networks for each seed, whose weights are successive parts of the seed's row.
 """
 
 from __future__ import annotations
@@ -33,17 +35,20 @@ class Model(ABC):
     """K networks whose weights are rows of one matrix, which is a leaf tensor of autograd.
 
     Attributes:
-        networks: K networks; their parameters share memory with `weights`.
-        weights: (K, P), one row of weights per network.
+        networks: K networks, or K * E networks of ensembles, ordered by seed; their parameters
+            share memory with `weights`.
+        members: Number of networks E of an ensemble; 1 if there is one network per seed.
+        weights: (K, P), one row of weights per seed.
         bulk_gain: Time per row in a small batch, divided by the time per row in a batch of a
             thousand rows.
     """
 
     bulk_gain: ClassVar[float] = 1.0
 
-    def __init__(self, networks: Sequence[Network]) -> None:
+    def __init__(self, networks: Sequence[Network], members: int = 1) -> None:
         """Move the weights of networks of one shape into one matrix."""
         self.networks = list(networks)
+        self.members = members
         parameters = dict(networks[0].named_parameters())
         self._names, self._shapes = list(parameters), [p.shape for p in parameters.values()]
         length = sum(parameter.numel() for parameter in parameters.values())
@@ -55,25 +60,51 @@ class Model(ABC):
             for parameter, part in parts:
                 part.copy_(parameter.detach().flatten())
                 parameter.data = part.view_as(parameter)
-        self.weights = nn.Parameter(weights)
+        self.weights = nn.Parameter(weights.view(-1, members * weights.shape[1]))
+
+    def __call__(
+        self, observations: Observations, *, frozen: bool = False, members: int | None = None
+    ) -> Tensor:
+        """Map the observations of all seeds to outputs (R, *output_shape), or (E, R) of ensembles.
+
+        Args:
+            observations: R observations, the same ones for all networks of an ensemble.
+            frozen: Whether gradients flow back to the observations only, and not to the weights.
+            members: Number of networks of an ensemble to evaluate; default: all.
+        """
+        weights = self.weights.detach() if frozen else self.weights
+        if self.members == 1:
+            return self._outputs(observations, weights, 1)
+        count = members or self.members
+        used = weights.view(len(weights), self.members, -1)[:, :count]
+        found = self._outputs(observations, used.flatten(0, 1), count)
+        # The rows are ordered by seed, then by network.
+        by_member = found.view(len(weights), count, -1).transpose(0, 1)
+        return by_member.reshape(count, len(observations))
 
     @abstractmethod
-    def __call__(self, observations: Observations) -> Tensor:
-        """Map the observations of all seeds to outputs (R, *output_shape)."""
+    def _outputs(self, observations: Observations, weights: Tensor, members: int) -> Tensor:
+        """Return the outputs of networks with these weights (K * members, P), ordered by network.
+
+        The networks of a seed have the same observations.
+        """
 
     def clone(self) -> Model:
         """Return another model with the same weights."""
-        return type(self)([copy.deepcopy(network) for network in self.networks])
+        return type(self)([copy.deepcopy(network) for network in self.networks], self.members)
 
 
 class AnyModel(Model):
     """Networks of any kind, evaluated one after the other."""
 
-    def __call__(self, observations: Observations) -> Tensor:
-        """Map the observations of all seeds to outputs (R, *output_shape)."""
-        parts = observations.split(len(observations) // len(self.networks))
-        seeds = zip(self.networks, self.weights.unbind(), parts, strict=True)
-        return torch.cat([self._apply(network, row, part) for network, row, part in seeds])
+    def _outputs(self, observations: Observations, weights: Tensor, members: int) -> Tensor:
+        seeds = len(weights) // members
+        parts = observations.split(len(observations) // seeds)
+        outputs = [
+            self._apply(self.networks[0], row, parts[number // members])
+            for number, row in enumerate(weights.unbind())
+        ]
+        return torch.cat(outputs)
 
     def _apply(self, network: Network, row: Tensor, observations: Observations) -> Tensor:
         """Apply one network with the weights in `row`; gradients flow back to the weight matrix."""
@@ -99,33 +130,35 @@ class StackedMLP(Model):
         matrices = [weights for weights in network.parameters() if weights.ndim == 2]
         return plain and all(one.is_cuda or min(one.shape) > 1 for one in matrices)
 
-    def __call__(self, observations: Observations) -> Tensor:
-        """Map the observations of all seeds to outputs (R, *output_shape)."""
+    def _outputs(self, observations: Observations, weights: Tensor, members: int) -> Tensor:
         # Store observations as columns (K, width, B). Autograd's weight gradients, dy x^T, then
         # have the layout of the weights and need no transposition.
-        seeds = len(self.networks)
+        count, seeds = len(weights), len(weights) // members
         columns = observations.vector.view(seeds, -1, observations.vector.shape[1]).mT
-        count = columns.shape[2]
-        if count == 1:
+        if members > 1:
+            columns = columns.unsqueeze(1).expand(-1, members, -1, -1).flatten(0, 1)
+        rows = columns.shape[2]
+        if rows == 1:
             # Add a second column, because matrix-vector products round differently for one seed
             # than for several.
             columns = columns.expand(-1, -1, 2)
-        parts = self.weights.split_with_sizes(self._sizes, 1)[:-1]
+        parts = weights.split_with_sizes(self._sizes, 1)[:-1]
         last = len(parts) // 2 - 1
         for layer, (matrix, bias) in enumerate(zip(parts[::2], parts[1::2], strict=True)):
-            matrices = matrix.view(seeds, *self._shapes[2 * layer])
+            matrices = matrix.view(count, *self._shapes[2 * layer])
             columns = torch.baddbmm(bias.unsqueeze(2), matrices, columns)
             columns = columns if layer == last else columns.relu_()
-        return columns[:, :, :count].mT.reshape(-1, *self.networks[0].output_shape)
+        return columns[:, :, :rows].mT.reshape(-1, *self.networks[0].output_shape)
 
 
-def build_model(networks: Sequence[Network]) -> Model:
-    """Return the fastest model for networks of one shape."""
-    return StackedMLP(networks) if StackedMLP.fits(networks[0]) else AnyModel(networks)
+def build_model(networks: Sequence[Network], members: int = 1) -> Model:
+    """Return the fastest model for networks of one shape; those of ensembles are (E,) per seed."""
+    kind = StackedMLP if StackedMLP.fits(networks[0]) else AnyModel
+    return kind(networks, members)
 
 
 class TargetNetwork:
-    """Copy of a model in training. The copy is updated at intervals.
+    """Copy of a model in training. At intervals, the copy is updated, or moved toward the model.
 
     Between two updates, the outputs do not change. Therefore, the outputs for the whole dataset are
     computed once after each update and then looked up, unless a forward pass for each batch is
@@ -133,16 +166,24 @@ class TargetNetwork:
 
     Attributes:
         model: K target networks.
+        polyak: Weight of the learning network in an update; 1 copies it.
     """
 
     def __init__(
-        self, model: Model, buffer: TransitionBuffer, rows_per_sync: int, *, next_states: bool
+        self,
+        model: Model,
+        buffer: TransitionBuffer,
+        rows_per_sync: int,
+        *,
+        next_states: bool,
+        polyak: float = 1.0,
     ) -> None:
         """Copy `model`, to evaluate the states or next states of a buffer.
 
         `rows_per_sync` is the approximate number of rows per seed between two calls of `sync`.
         """
         self.model = model.clone()
+        self.polyak = polyak
         self._buffer = buffer
         self._next_states = next_states
         # On a GPU, a CUDA graph contains the forward pass, which takes hardly any time there.
@@ -154,8 +195,11 @@ class TargetNetwork:
 
     @torch.no_grad()
     def sync(self, model: Model) -> None:
-        """Copy the weights of `model`."""
-        self.model.weights.copy_(model.weights)
+        """Copy the weights of `model`, or average them with a weight of `polyak`."""
+        if self.polyak == 1:
+            self.model.weights.copy_(model.weights)
+        else:
+            self.model.weights.lerp_(model.weights, self.polyak)
         self.reset()
 
     def reset(self) -> None:

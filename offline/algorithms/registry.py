@@ -1,65 +1,181 @@
 """Algorithms by name: the built-in ones, and those of installed packages.
 
 A package adds an algorithm with an entry point of the group `mcaprl.algorithms`, which maps
-the algorithm's name to its `Learner` subclass, `module:Class`.
+the algorithm's name to its `Learner` subclass, `module:Class`. A name may stand for two built-in
+algorithms: one for finite action spaces, and one for the actions of a Box.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any, Final, NamedTuple
+
+from gymnasium import spaces
 
 from mcaprl.entry_points import installed, load
-from mcaprl.errors import UnknownNameError, UsageError
-from mcaprl.offline.algorithms.bc import BC
+from mcaprl.errors import SpaceError, UnknownNameError, UsageError
+from mcaprl.offline.algorithms.bc import BC, BoxBC
 from mcaprl.offline.algorithms.bcq import BCQ
 from mcaprl.offline.algorithms.config import ENTRY_POINT_GROUP, TrainingConfig
 from mcaprl.offline.algorithms.cql import CQL
 from mcaprl.offline.algorithms.dqn import DQN, DoubleDQN
-from mcaprl.offline.algorithms.iql import IQL
+from mcaprl.offline.algorithms.iql import IQL, BoxIQL
 from mcaprl.offline.algorithms.learner import Learner
+from mcaprl.offline.algorithms.rebrac import ReBRAC
+from mcaprl.offline.algorithms.td3_bc import TD3BC
+from mcaprl.settings import check_settings
 
 ALGORITHMS: dict[str, type[Learner]] = {
     learner.name: learner for learner in (DQN, DoubleDQN, CQL, BC, BCQ, IQL)
 }
-"""The built-in algorithms."""
+"""The built-in algorithms for finite action spaces."""
+BOX_ALGORITHMS: dict[str, type[Learner]] = {
+    learner.name: learner for learner in (BoxBC, TD3BC, ReBRAC, BoxIQL)
+}
+"""The built-in algorithms for the actions of a Box."""
+_BUILT_IN: Final = [*ALGORITHMS.values(), *BOX_ALGORITHMS.values()]
+_DEFAULTS: Final = (CQL, BoxIQL)
+_SUGGESTED: Final = {False: "cql or iql", True: "iql or rebrac"}
 
 
-def all_algorithms() -> dict[str, type[Learner]]:
+class Algorithm(NamedTuple):
+    """An algorithm and its settings."""
+
+    learner_type: type[Learner]
+    config: TrainingConfig
+
+
+def all_algorithms() -> list[type[Learner]]:
     """Return the built-in algorithms and those of installed packages.
 
     Raises:
         UsageError: An entry point is broken.
     """
-    entries = installed(ENTRY_POINT_GROUP)
-    return ALGORITHMS | {name: load(entry, Learner, ALGORITHMS) for name, entry in entries.items()}
+    entries = installed(ENTRY_POINT_GROUP).values()
+    names = {learner.name for learner in _BUILT_IN}
+    return [*_BUILT_IN, *(load(entry, Learner, names) for entry in entries)]
 
 
-def choose_algorithm(
-    algo: str | TrainingConfig, others: Iterable[str] = ()
-) -> tuple[type[Learner], TrainingConfig]:
-    """Return an algorithm and its settings.
+def algorithms_named(
+    algo: str | type[Learner] | None, others: Iterable[str] = ()
+) -> list[type[Learner]]:
+    """Return the algorithms with a name; None for the default algorithms.
 
     Args:
-        algo: Name of an algorithm, for default settings; or an algorithm's config.
+        algo: Name of an algorithm, or a subclass of `Learner`.
         others: More names that the caller accepts, for the message about an unknown name.
 
     Raises:
         UnknownNameError: No algorithm has that name.
-        UsageError: No algorithm has a config of this type, or an entry point is broken.
+        UsageError: An entry point is broken, or the class lacks a name or settings.
     """
-    if isinstance(algo, str):
-        if algo in ALGORITHMS:
-            return ALGORITHMS[algo], ALGORITHMS[algo].config_type()
-        entries = installed(ENTRY_POINT_GROUP)
-        if algo not in entries:
-            raise UnknownNameError("algorithm", algo, [*ALGORITHMS, *entries, *others])
-        learner = load(entries[algo], Learner, ALGORITHMS)
-        return learner, learner.config_type()
-    algorithms = ALGORITHMS
-    if not any(type(algo) is learner.config_type for learner in algorithms.values()):
+    if algo is None:
+        return list(_DEFAULTS)
+    if not isinstance(algo, str):
+        return [_checked(algo)]
+    if found := [learner for learner in _BUILT_IN if learner.name == algo]:
+        return found
+    entries = installed(ENTRY_POINT_GROUP)
+    if algo not in entries:
+        known = dict.fromkeys(learner.name for learner in _BUILT_IN)
+        raise UnknownNameError("algorithm", algo, [*known, *entries, *others])
+    return [load(entries[algo], Learner, ALGORITHMS | BOX_ALGORITHMS)]
+
+
+def choose_algorithm(
+    algo: str | type[Learner] | TrainingConfig | Algorithm | None,
+    others: Iterable[str] = (),
+    *,
+    space: spaces.Space[Any] | None = None,
+) -> Algorithm:
+    """Return an algorithm and its settings.
+
+    Args:
+        algo: Name of an algorithm or subclass of `Learner`, for default settings; None for the
+            default algorithm; or an algorithm's config, or the result of this function.
+        others: More names that the caller accepts, for the message about an unknown name.
+        space: Action space of the data; None for any.
+
+    Raises:
+        UnknownNameError: No algorithm has that name.
+        UsageError: No algorithm has a config of this type, or an entry point is broken.
+        SpaceError: The algorithm does not support the action space.
+    """
+    if isinstance(algo, Algorithm):
+        found = [algo]
+    elif isinstance(algo, TrainingConfig):
+        found = [Algorithm(_learner_of(algo), algo)]
+    else:
+        named = algorithms_named(algo, others)
+        found = [Algorithm(learner, learner.config_type()) for learner in named]
+    if space is None:
+        return found[0]
+    is_box = isinstance(space, spaces.Box)
+    for each in found:
+        if each.learner_type.continuous == is_box:
+            return each
+    needed = "discrete actions" if is_box else "the actions of a Box"
+    raise SpaceError(
+        f"{found[0].learner_type.name} needs {needed}; for {_short(space)} use {_SUGGESTED[is_box]}"
+    )
+
+
+def configured(
+    algo: str | type[Learner] | None,
+    settings: dict[str, Any],
+    others: Iterable[str] = (),
+    *,
+    space: spaces.Space[Any] | None = None,
+) -> Algorithm:
+    """Return an algorithm with some settings; the arguments are those of `choose_algorithm`.
+
+    Without a space, the algorithm is one of those with this name that have the settings.
+
+    Raises:
+        UsageError: The algorithm has no such setting, or a setting is out of its range.
+    """
+    if space is not None:
+        named = [choose_algorithm(algo, others, space=space).learner_type]
+    else:
+        named = algorithms_named(algo, others)
+    errors: list[UsageError] = []
+    for learner in named:
+        try:
+            check_settings(learner.name, learner.config_type, settings)
+            return Algorithm(learner, learner.config_type(**settings))
+        except UsageError as error:
+            errors.append(error)
+    raise errors[0]
+
+
+def _learner_of(config: TrainingConfig) -> type[Learner]:
+    algorithms = _BUILT_IN
+    if not any(type(config) is learner.config_type for learner in algorithms):
         algorithms = all_algorithms()
-    for learner in algorithms.values():
-        if type(algo) is learner.config_type:
-            return learner, algo
-    known = ", ".join(learner.config_type.__name__ for learner in algorithms.values())
-    raise UsageError(f"no algorithm has a config of type {type(algo).__name__}; known: {known}")
+    for learner in algorithms:
+        if type(config) is learner.config_type:
+            return learner
+    known = ", ".join(learner.config_type.__name__ for learner in algorithms)
+    raise UsageError(f"no algorithm has a config of type {type(config).__name__}; known: {known}")
+
+
+def _checked(learner: type[Learner]) -> type[Learner]:
+    """Check that a class can be trained without an entry point."""
+    if not (isinstance(learner, type) and issubclass(learner, Learner)):
+        raise UsageError(f"{learner!r} is not an algorithm: pass a name or a subclass of Learner")
+    missing = [name for name in ("name", "config_type", "acts_by") if not hasattr(learner, name)]
+    if missing or learner.__abstractmethods__:
+        names = ", ".join([*missing, *sorted(learner.__abstractmethods__)])
+        raise UsageError(f"the algorithm {learner.__name__} does not define {names}")
+    if learner not in _BUILT_IN and any(each.name == learner.name for each in _BUILT_IN):
+        raise UsageError(
+            f"the algorithm {learner.__name__} has the name {learner.name!r} of a built-in one"
+        )
+    return learner
+
+
+def _short(space: spaces.Space[Any]) -> str:
+    """Return a space in messages: that of a Box without its bounds."""
+    if not isinstance(space, spaces.Box):
+        return f"{space}"
+    return f"Box{space.shape}" if len(space.shape) != 1 else f"Box({space.shape[0]},)"

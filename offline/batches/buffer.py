@@ -8,8 +8,9 @@ read.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mcaprl.actions import JointActions, joint_actions
+from mcaprl.actions import MASK_KEY, BoxActions, JointActions, joint_actions, part_name
 from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
 from mcaprl.frames import frame_rows
 from mcaprl.networks import ImageInput
@@ -39,7 +40,7 @@ MAX_JOINT_ACTIONS = 1_024
 """Largest number of combinations of a MultiDiscrete or MultiBinary space."""
 _BLOCK_ROWS = 1 << 18
 """Rows that are checked at once."""
-_ON_DEVICE = ("frames", "starts", "places", "actions", "returns")
+_ON_DEVICE = ("frames", "starts", "places", "actions", "returns", "next_rows")
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,8 @@ class Batch:
     Attributes:
         rows: (R,) int64, row numbers in the buffer.
         observations: R observations.
-        actions: (R,) int64 action indexes, starting at 0.
+        actions: (R,) int64 action indexes, starting at 0; of a Box (R, n) float32, scaled to
+            [-1, 1].
         rewards: (R,) float32, discounted sums of up to n rewards, divided by the buffer's
             `reward_scale`.
         discounts: (R,) float32, gamma to the power of the number of steps between the two
@@ -71,18 +73,23 @@ class TransitionBuffer:
 
     Attributes:
         encoder: Encoder that created the frames.
-        action_space: Action space of the log; all its values are numbered, see `joint`.
+        action_space: Action space of the log; the values of a finite space are numbered, see
+            `joint`, and those of a Box are scaled, see `box`.
         packing: Settings with which the transitions were built.
         frames: All observations, each stored once; images of a mapped dataset stay on disk.
         starts: (F,) int64, first frame of each frame's episode; empty if frames are not stacked.
         places: (2, N) int64, frame indexes of each transition's observation and next observation.
-        actions: (N,) int64 action indexes, starting at 0.
+        actions: (N,) int64 action indexes, starting at 0; of a Box (N, n) float32, scaled to
+            [-1, 1].
         returns: (2, N) float32, n-step rewards and discounts; see `Batch`.
         reward_scale: Divisor of the rewards in `returns`.
         drawable: (M,) int64, rows with a weight above 0; None if all weights are above 0.
         cumulative: (M,) float64, cumulative weights of the drawable rows; None if the weights are
             equal.
         is_fixed: Whether the transitions stay the same during training.
+        box: Scaling of the actions of a Box; None for a finite space.
+        next_rows: (N,) int64, row of the transition that starts at each transition's next
+            observation; -1 at the end of an episode. Empty for a finite space.
     """
 
     encoder: ObservationEncoder
@@ -97,6 +104,8 @@ class TransitionBuffer:
     drawable: Tensor | None = None
     cumulative: Tensor | None = None
     is_fixed: bool = True
+    box: BoxActions | None = None
+    next_rows: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
 
     @classmethod
     def from_dataset(
@@ -106,28 +115,33 @@ class TransitionBuffer:
         *,
         encoder: ObservationEncoder | None = None,
         reward_scale: float | None = None,
+        box: BoxActions | None = None,
         weights: NDArray[np.float64] | None = None,
     ) -> TransitionBuffer:
         """Pack a dataset.
 
         Args:
-            dataset: Dataset with discrete actions.
+            dataset: Dataset with actions of a finite space or of a Box.
             packing: Settings for building transitions; default: single steps and single frames.
             encoder: Encoder of other data, whose normalization is reused; default: a new one.
             reward_scale: Divisor of the rewards; default: see `packing.scale_rewards`.
+            box: Scaling of the actions of a Box; default: by the bounds of the space, and by the
+                data where they are infinite, with a warning.
             weights: (E,) relative sampling weight of each transition of an episode; default: all
                 equal.
 
         Raises:
-            SpaceError: The actions are not discrete or are outside their space, or no network
-                supports the observations.
+            SpaceError: The actions are outside their space or never change, or no network supports
+                the space or the observations.
             TrainingError: There are no transitions, a number is NaN or infinite, a logged action
                 was not allowed, or all weights are 0.
         """
         packing = packing or Packing()
-        joint = discrete_actions(dataset.action_space)
+        is_box = isinstance(dataset.action_space, spaces.Box)
+        joint = None if is_box else discrete_actions(dataset.action_space)
         if encoder is None:
-            encoder = ObservationEncoder(dataset.observation_space, joint.count)
+            n_actions = joint.count if joint else 0
+            encoder = ObservationEncoder(dataset.observation_space, n_actions)
             if packing.normalize and len(dataset):
                 encoder.normalize_to(dataset.frames)
             elif packing.center_images and len(dataset):
@@ -142,12 +156,11 @@ class TransitionBuffer:
         places, returns = n_step_returns(dataset, packing.n_steps, packing.gamma)
         returns[0] /= reward_scale
         frames = encoder.encode_frames(dataset.frames)
-        if not joint.contain(dataset.actions).all():
-            raise SpaceError(
-                f"the dataset has actions from {dataset.actions.min()} to {dataset.actions.max()},"
-                f" but its action space is {dataset.action_space}"
-            )
-        actions = joint.indexes(dataset.actions)
+        if joint is None:
+            box = box or _box_of(dataset, packing)
+            actions = torch.from_numpy(_scaled(dataset, box, packing))
+        else:
+            actions = torch.from_numpy(_numbered(dataset, joint))
         _require_finite("sums of rewards", _is_finite(torch.from_numpy(returns[0])))
         _check_data(dataset, frames, actions)
         buffer = cls(
@@ -157,9 +170,11 @@ class TransitionBuffer:
             frames=frames,
             starts=_first_frames(lengths + 1, packing.frame_stack),
             places=torch.from_numpy(places),
-            actions=torch.from_numpy(actions),
+            actions=actions,
             returns=torch.from_numpy(returns),
             reward_scale=reward_scale,
+            box=box,
+            next_rows=_next_rows(lengths, packing.n_steps if is_box else 0),
         )
         return buffer if weights is None else buffer.with_weights(np.repeat(weights, lengths))
 
@@ -169,8 +184,13 @@ class TransitionBuffer:
 
     @cached_property
     def joint(self) -> JointActions:
-        """Numbering of the actions: `actions` has the numbers."""
+        """Numbering of the actions of a finite space: `actions` has the numbers."""
         return discrete_actions(self.action_space)
+
+    @property
+    def n_actions(self) -> int:
+        """Number of actions of a finite space, A; length of an action of a Box, n."""
+        return self.joint.count if self.box is None else self.box.size
 
     @property
     def device(self) -> torch.device:
@@ -276,14 +296,14 @@ def choose_device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def discrete_actions(space: spaces.Space[Any]) -> JointActions:
-    """Return the numbering of the actions of a space.
+def discrete_actions(space: spaces.Space[Any], what: str = "this policy") -> JointActions:
+    """Return the numbering of the actions of a space; `what` needs it, for the message.
 
     Each combination of the elements of a MultiDiscrete or MultiBinary space is one action.
     """
     joint = joint_actions(space)
     if joint is None:
-        raise SpaceError(f"offline learning needs discrete actions, got {space}")
+        raise SpaceError(f"{what} needs discrete actions, got {space}")
     check_actions(space)
     if joint.shape and joint.count > MAX_JOINT_ACTIONS:
         raise SpaceError(
@@ -291,6 +311,69 @@ def discrete_actions(space: spaces.Space[Any]) -> JointActions:
             f" at most {MAX_JOINT_ACTIONS:,}: record with fewer or coarser actions"
         )
     return joint
+
+
+def _numbered(dataset: Dataset, joint: JointActions) -> NDArray[np.int64]:
+    """Return the numbers (N,) of the logged actions of a finite space."""
+    if not joint.contain(dataset.actions).all():
+        raise SpaceError(
+            f"the dataset has actions from {dataset.actions.min()} to {dataset.actions.max()},"
+            f" but its action space is {dataset.action_space}"
+        )
+    return joint.indexes(dataset.actions)
+
+
+def _box_of(dataset: Dataset, packing: Packing) -> BoxActions:
+    """Return the scaling of the logged actions of a Box; warn if the data replace its bounds."""
+    space = dataset.action_space
+    assert isinstance(space, spaces.Box)
+    _require_finite("actions", _is_finite(torch.from_numpy(np.asarray(dataset.actions))))
+    names = dataset.action_part_names
+    actions = np.clip(dataset.actions, space.low, space.high)
+    box = BoxActions.of(space, actions, names)
+    unbounded = np.isinf([space.low.ravel(), space.high.ravel()]).any(0)
+    if unbounded.any():
+        ranges = ", ".join(
+            f"{part_name(part, names)} {box.low[part]:g} to {box.high[part]:g}"
+            for part in np.flatnonzero(unbounded).tolist()
+        )
+        warnings.warn(
+            f"{space} has infinite bounds: the policy's actions stay in the range of the data:"
+            f" {ranges}",
+            stacklevel=3,
+        )
+    return box
+
+
+def _scaled(dataset: Dataset, box: BoxActions, packing: Packing) -> NDArray[np.float32]:
+    """Return the logged actions of a Box as numbers (N, n) in [-1, 1]."""
+    if MASK_KEY in getattr(dataset.observation_space, "spaces", ()):
+        raise SpaceError(
+            f"the observations have an {MASK_KEY}, but {box.space} has no numbered actions: remove"
+            " the mask from the observations, or record numbered actions"
+        )
+    actions = np.asarray(dataset.actions)
+    _require_finite("actions", _is_finite(torch.from_numpy(actions)))
+    outside = ~box.contain(actions)
+    if outside.any() and not packing.clip_actions:
+        row = int(outside.argmax())
+        low, high, flat = box.space.low.ravel(), box.space.high.ravel(), actions[row].ravel()
+        part = int(((flat < low) | (flat > high)).argmax())
+        name = part_name(part, dataset.action_part_names)
+        raise SpaceError(
+            f"{name} of row {row} is {flat[part]:g}, outside its bounds {low[part]:g} to"
+            f" {high[part]:g}, as are the actions of {counted(int(outside.sum()), 'row')}; to clip"
+            " actions to their bounds: `clip_actions=True`"
+        )
+    return box.scaled(actions).clip(-1, 1)
+
+
+def _next_rows(lengths: NDArray[np.int64], n_steps: int) -> Tensor:
+    """Return the row after n steps of each transition, -1 beyond its episode; empty for 0 steps."""
+    if not n_steps:
+        return torch.empty(0, dtype=torch.int64)
+    rows = np.arange(lengths.sum()) + n_steps
+    return torch.from_numpy(np.where(rows < np.repeat(np.cumsum(lengths), lengths), rows, -1))
 
 
 def _first_frames(counts: NDArray[np.int64], frame_stack: int) -> Tensor:
@@ -305,9 +388,7 @@ def _first_frames(counts: NDArray[np.int64], frame_stack: int) -> Tensor:
     return torch.from_numpy(np.repeat(np.cumsum(counts) - counts, counts))
 
 
-def _check_data(
-    dataset: Dataset, frames: Observations | FramesOnDisk, actions: NDArray[np.int64]
-) -> None:
+def _check_data(dataset: Dataset, frames: Observations | FramesOnDisk, actions: Tensor) -> None:
     """Raise if a number is not finite or a logged action is masked out."""
     # All at once, the comparison would need more memory than the frames.
     finite = torch.cat([_is_finite(block) for block in torch.split(frames.vector, _BLOCK_ROWS)])
@@ -317,7 +398,7 @@ def _check_data(
         _require_finite("next_observations", finite[rows + 1])
     if frames.mask is not None:
         rows = torch.from_numpy(dataset.frame_of_step)
-        allowed = frames.mask[rows, torch.from_numpy(actions)]
+        allowed = frames.mask[rows, actions]
         if not allowed.all():
             row = int(allowed.int().argmin())
             raise TrainingError(f"action {dataset.actions[row]} of row {row} is masked out")

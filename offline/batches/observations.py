@@ -83,6 +83,10 @@ class Observations:
         mask = None if self.mask is None else self.mask.view(rows, count, -1)[:, -1]
         return Observations(self.vector.reshape(rows, -1), images, mask)
 
+    def with_actions(self, actions: Tensor) -> Observations:
+        """Return the same observations with actions (B, n) after the numbers of their vectors."""
+        return replace(self, vector=torch.cat((self.vector, actions), 1))
+
     def to(self, device: torch.device) -> Observations:
         """Return the same observations on another device."""
         return self.like([part.to(device) for part in self.parts()])

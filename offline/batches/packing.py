@@ -18,6 +18,7 @@ class Packing:
         n_steps: Number of rewards in a return; returns at the end of an episode have fewer.
         scale_rewards: Whether rewards are divided by the standard deviation of the discounted
             returns of all transitions.
+        clip_actions: Whether logged actions outside a Box are clipped to its bounds.
     """
 
     frame_stack: int = 1
@@ -26,3 +27,4 @@ class Packing:
     gamma: float = 1.0
     n_steps: int = 1
     scale_rewards: bool = False
+    clip_actions: bool = False

@@ -71,7 +71,7 @@ class FQE(Learner):
 
     name = "fqe"
     config_type: ClassVar[type[TrainingConfig]] = FQEConfig
-    acts_by: ClassVar[str] = "q_values"
+    acts_by: str = "q_values"
     policy_models: ClassVar[tuple[str, ...]] = ("q",)
     config: FQEConfig
 

@@ -39,6 +39,7 @@ from mcaprl.errors import TrainingError, UnknownNameError, UsageError, import_ex
 from mcaprl.files import read_json, replacing_folder, subfolder, write_json
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.registry import choose_algorithm
+from mcaprl.offline.batches.buffer import discrete_actions
 from mcaprl.offline.estimate.evidence import (
     FOLDS,
     Evidence,
@@ -188,6 +189,7 @@ def select(
 
     The arguments are those of `mcaprl.offline.train` and `mcaprl.train`.
     """
+    discrete_actions(dataset.action_space, AUTO)
     if config.report:
         import_extra("jinja2", "report")
     known = [one.name for one in PORTFOLIO]

@@ -13,17 +13,17 @@ import warnings
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mcaprl.actions import has_source
+from mcaprl.actions import BoxActions, has_source
 from mcaprl.errors import TrainingError
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
-from mcaprl.offline.algorithms.registry import choose_algorithm
+from mcaprl.offline.algorithms.registry import Algorithm, choose_algorithm
 from mcaprl.offline.batches.buffer import TransitionBuffer, choose_device
 from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.policy import read_policy, save_policy
@@ -97,6 +97,8 @@ def read_checkpoint(folder: Path, identity: RunIdentity) -> Checkpoint | None:
         raise broken_checkpoint(path, error) from error
 
 
+_VALUES: Final = {"mean_q", "held_out_policy_q"}
+"""Terms that a diverging learner increases without limit."""
 CHECK_INTERVAL: Final = 500
 """Number of updates between two checks of logs that grow. After each check that finds new episodes,
 all data are packed again."""
@@ -104,7 +106,7 @@ all data are packed again."""
 
 def train(
     dataset: Dataset,
-    algo: str | TrainingConfig,
+    algo: str | type[Learner] | TrainingConfig | Algorithm,
     out: str | Path,
     *,
     seeds: int | None = None,
@@ -117,9 +119,10 @@ def train(
     """Train on a dataset; the same seed, data and machine produce the same weights.
 
     Args:
-        dataset: Dataset with discrete actions. If `mcaprl.open` follows its logs, episodes that end
-            during the training are added.
-        algo: Name such as `cql`, for default settings, or a config such as `CQLConfig(alpha=0.5)`.
+        dataset: Dataset with actions of a finite space or of a Box. If `mcaprl.open` follows its
+            logs, episodes that end during the training are added.
+        algo: Name such as `cql` or a subclass of `Learner`, for default settings; a config such as
+            `CQLConfig(alpha=0.5)`; or a class and its config, as an `Algorithm`.
         out: Folder of the run; it must be empty or not exist.
         seeds: Number of networks to train in parallel; they are independent of each other. None
             selects 1; with `resume`, that of the run.
@@ -146,18 +149,18 @@ def train(
     folder = Path(out)
     numbers = choose_seeds(folder, seeds, seed, resume)
     choose_device(device)
-    _, config = choose_algorithm(algo)
-    identity = run_identity(dataset, config, other_data)
+    algorithm = choose_algorithm(algo, space=dataset.action_space)
+    identity = run_identity(dataset, algorithm, other_data)
     with locked_run(folder, resume):
-        run = _prepared(dataset, config, folder, identity, device, reuses=resume)
-        start_run(dataset, config, folder, identity, numbers, resume)
+        run = _prepared(dataset, algorithm, folder, identity, device, reuses=resume)
+        start_run(dataset, algorithm.config, folder, identity, numbers, resume)
         with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
-            return run.train(config, numbers, report)
+            return run.train(numbers, report)
 
 
 def train_seeds(
     dataset: Dataset,
-    config: TrainingConfig,
+    algorithm: Algorithm,
     folder: Path,
     identity: RunIdentity,
     seeds: range,
@@ -169,15 +172,17 @@ def train_seeds(
 
     The seeds continue from their checkpoints. The other arguments are those of `train`.
     """
-    run = _prepared(dataset, config, folder, identity, device, reuses=True)
-    return run.train(config, seeds, report)
+    run = _prepared(dataset, algorithm, folder, identity, device, reuses=True)
+    return run.train(seeds, report)
 
 
-def run_identity(dataset: Dataset, config: TrainingConfig, other_data: bool) -> RunIdentity:
+def run_identity(dataset: Dataset, algorithm: Algorithm, other_data: bool) -> RunIdentity:
     """Return the identity of the run of a dataset, which may differ if its logs are followed."""
+    learner_type, config = algorithm
     data = with_source(dataset, config.mask_from).fingerprint
-    parts = {"algo": choose_algorithm(config)[0].name, "config": config.to_json(), "data": data}
-    return RunIdentity(parts, other_data or dataset.origin.grow is not None, longer=True)
+    parts = {"algo": learner_type.name, "config": config.to_json(), "data": data}
+    other_data = other_data or dataset.origin.grow is not None
+    return RunIdentity(parts, other_data, longer=True, defaults=type(config)().to_json())
 
 
 def start_run(
@@ -205,7 +210,7 @@ def with_source(dataset: Dataset, source: str) -> Dataset:
 
 def _prepared(
     dataset: Dataset,
-    config: TrainingConfig,
+    algorithm: Algorithm,
     folder: Path,
     identity: RunIdentity,
     device: str,
@@ -213,18 +218,15 @@ def _prepared(
     reuses: bool,
 ) -> _Run:
     """Pack the data of a run; with other data and `reuses`, in the scales of its policies."""
+    config = algorithm.config
     source, dataset = dataset, with_source(dataset, config.mask_from)
     held_out = choose_held_out(len(dataset.weights), config.held_out)
-    drawn = np.where(np.isin(np.arange(len(dataset.weights)), held_out), 0.0, dataset.weights)
-    reuses = reuses and identity.other_data
-    encoder, reward_scale = earlier_scales(folder) if reuses else (None, None)
-    buffer = TransitionBuffer.from_dataset(
-        dataset, config.packing, encoder=encoder, reward_scale=reward_scale, weights=drawn
-    ).to(choose_device(device))
+    scales = earlier_scales(folder) if reuses and identity.other_data else Scales()
+    buffer = _packed(dataset, config, scales, held_out).to(choose_device(device))
     gamma = buffer.packing.gamma
     validation = HeldOut(dataset, buffer, held_out, gamma) if len(held_out) else None
     limit = largest_return(dataset, gamma)
-    return _Run(folder, identity, source, buffer, validation, limit, held_out)
+    return _Run(folder, identity, algorithm, source, buffer, validation, limit, held_out)
 
 
 @dataclass(frozen=True)
@@ -234,6 +236,7 @@ class _Run:
     Attributes:
         folder: Folder of the run.
         identity: Algorithm, settings and data of the run.
+        algorithm: Algorithm and settings.
         dataset: Training data, including held-out episodes, without the masks of `mask_from`.
         buffer: The same data as tensors.
         held_out: Transitions for validation, if any.
@@ -243,17 +246,16 @@ class _Run:
 
     folder: Path
     identity: RunIdentity
+    algorithm: Algorithm
     dataset: Dataset
     buffer: TransitionBuffer
     held_out: HeldOut | None
     limit: float
     held_out_episodes: NDArray[np.int64]
 
-    def train(
-        self, config: TrainingConfig, seeds: range, report: ProgressCallback
-    ) -> list[OfflineSummary]:
+    def train(self, seeds: range, report: ProgressCallback) -> list[OfflineSummary]:
         """Train seeds, in parallel if their checkpoints are at the same update."""
-        learner_type, summaries = choose_algorithm(config)[0], []
+        (learner_type, config), summaries = self.algorithm, []
         for start in self._starts(seeds):
             learner = learner_type(config, self.buffer, list(start))
             for seed, checkpoint in start.items():
@@ -302,11 +304,12 @@ class _Run:
         """Train until metrics or a checkpoint must be written, and write them."""
         config = learner.config
         while True:
+            is_reported = learner.is_reported
             terms = self._update(learner)
-            last = learner.step == config.updates
-            checkpoint_due = last or learner.step % config.checkpoint_interval == 0
-            if checkpoint_due or learner.step % config.log_interval == 0:
+            if is_reported:
                 break
+        last = learner.step == config.updates
+        checkpoint_due = last or learner.step % config.checkpoint_interval == 0
         values = learner.seed_means(terms)
         if self.held_out is not None:
             validated = self.held_out.terms(learner)
@@ -361,36 +364,62 @@ class _Run:
     def _warn(self, before: list[dict[str, float]], now: list[dict[str, float]]) -> bool:
         """Warn about diverging values; return whether there was a warning."""
         for earlier, later in zip(before, now, strict=True):
-            if "mean_q" not in earlier:
-                continue
-            if message := divergence_warning(earlier["mean_q"], later["mean_q"], self.limit):
-                warnings.warn(f"{self.folder}: {message}", stacklevel=2)
-                return True
+            for name in _VALUES & earlier.keys():
+                if message := divergence_warning(earlier[name], later[name], self.limit):
+                    warnings.warn(f"{self.folder}: {message}", stacklevel=2)
+                    return True
         return False
 
 
-def earlier_scales(folder: Path) -> tuple[ObservationEncoder | None, float | None]:
-    """Return the encoder and the reward scale of the run in a folder, or None and None."""
+class Scales(NamedTuple):
+    """Scales of other data that a learner continues with; None for those of the training data.
+
+    The members are those of `TransitionBuffer`.
+    """
+
+    encoder: ObservationEncoder | None = None
+    reward_scale: float | None = None
+    box: BoxActions | None = None
+
+
+def earlier_scales(folder: Path) -> Scales:
+    """Return the scales of the run in a folder, if it has a policy."""
     policies = policy_files(folder)
     if not policies:
-        return None, None
+        return Scales()
     policy = read_policy(policies[0].parent)
-    return policy.encoder, policy.reward_scale
+    return Scales(policy.encoder, policy.reward_scale, getattr(policy.head, "box", None))
+
+
+def _packed(
+    dataset: Dataset, config: TrainingConfig, scales: Scales, held_out: NDArray[np.int64]
+) -> TransitionBuffer:
+    """Pack a dataset; draw from the best episodes, and not from those that are held out."""
+    weights = dataset.weights * best_episodes(dataset, config.best_fraction)
+    weights[held_out] = 0.0
+    return TransitionBuffer.from_dataset(
+        dataset, config.packing, weights=weights, **scales._asdict()
+    )
+
+
+def best_episodes(dataset: Dataset, fraction: float) -> NDArray[np.bool_]:
+    """Return a mask (E,) of the fraction of the episodes with the largest returns, at least one."""
+    lengths = dataset.episode_lengths
+    if fraction == 1 or not len(lengths):
+        return np.ones(len(lengths), bool)
+    returns = np.add.reduceat(dataset.rewards, np.cumsum(lengths) - lengths)
+    count = max(1, round(fraction * len(lengths)))
+    found: NDArray[np.bool_] = returns >= np.sort(returns)[-count]
+    return found
 
 
 def with_more_data(
     learner: Learner, dataset: Dataset, held_out_episodes: NDArray[np.int64]
 ) -> Learner:
     """Return a learner for the grown dataset, with the weights and state of `learner`."""
-    weights = dataset.weights.copy()
-    weights[held_out_episodes] = 0.0
-    buffer = TransitionBuffer.from_dataset(
-        dataset,
-        learner.config.packing,
-        encoder=learner.buffer.encoder,
-        reward_scale=learner.buffer.reward_scale,
-        weights=weights,
-    ).to(learner.buffer.device)
+    earlier = learner.buffer
+    scales = Scales(earlier.encoder, earlier.reward_scale, earlier.box)
+    buffer = _packed(dataset, learner.config, scales, held_out_episodes).to(earlier.device)
     grown = type(learner)(learner.config, buffer, learner.seeds)
     for seed in learner.seeds:
         grown.load_state(seed, learner.state(seed), learner.step)

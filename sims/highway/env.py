@@ -20,7 +20,8 @@ from mcaprl.sims.drawing.top_view import Body, FollowView
 from mcaprl.sims.highway import scene as highway_scene
 from mcaprl.sims.highway.course import FLIP, Course, Place, courses_of
 from mcaprl.sims.highway.scene import Car
-from mcaprl.sims.vehicle.arguments import Pose, check_action, check_name, pose_from
+from mcaprl.sims.vehicle.arguments import Pose, check_actions, check_name, pose_from
+from mcaprl.sims.vehicle.controls import KINDS, Controls
 from mcaprl.sims.vehicle.env import RENDER_MODES, RenderedEnv, RenderMode, before_end
 
 Floats = NDArray[np.float64]
@@ -38,6 +39,12 @@ ROADS: Final[dict[str, type]] = {
 ACTION_MEANINGS = ("straight", "right", "left", "slightly right", "slightly left")
 STEERING_RAD = np.radians([0.0, -24.0, 24.0, -6.0, 6.0])
 """Angle of the front wheels for each action; left is positive."""
+_PARTS = ("steering",), ("full angle, left positive",)
+CONTROLS: Final = {
+    "discrete": Controls(*_PARTS, ACTION_MEANINGS, STEERING_RAD[:, np.newaxis]),
+    "continuous": Controls(*_PARTS),
+}
+"""Controls by the argument `actions`. Commands of discrete actions are in radians."""
 LOOKAHEADS_M = (5.0, 10.0, 20.0, 40.0)
 SEEN_AHEAD_M = 50.0
 OBSERVATION_NAMES = (
@@ -77,7 +84,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
 
     ## Action Space
 
-    `Discrete(5)`: the angle of the front wheels.
+    `actions="discrete"`: `Discrete(5)`, the angle of the front wheels.
 
     | Action | Meaning | Steering |
     |---|---|---|
@@ -86,6 +93,10 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
     | 2 | left | 24 degrees to the left |
     | 3 | slightly right | 6 degrees to the right |
     | 4 | slightly left | 6 degrees to the left |
+
+    `actions="continuous"`, which is the default of `mcaprl/HighwayLaneContinuous-v0`: `Box(-1, 1)`
+    of 1 float32, the steering angle as a fraction of highway-env's maximum, left positive. The
+    maximum is 60 degrees in `lane-keeping-v0` and 45 degrees on racetracks.
 
     ## Observation Space
 
@@ -136,6 +147,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
     - `rules`: `"default"`.
     - `observation`: `"state"`.
     - `start`: `"anywhere"` or `"line"`.
+    - `actions`: `"discrete"` or `"continuous"`.
     - `render_mode`: None, `"human"` or `"rgb_array"`.
 
     ## Version History
@@ -145,7 +157,6 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
 
     metadata = METADATA
     success_reasons: ClassVar[tuple[str, ...]] = ("finished", "time_limit")
-    action_meanings = ACTION_MEANINGS
     observation_names = OBSERVATION_NAMES
 
     def __init__(
@@ -155,12 +166,14 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         observation: str = "state",
         start: str = "anywhere",
         render_mode: RenderMode | None = None,
+        actions: str = "discrete",
     ) -> None:
         """Make the environment; see "Arguments" of the class."""
         check_name("road", road, tuple(ROADS))
         check_name("rules", rules, ("default",))
         check_name("observation", observation, ("state",))
         check_name("start", start, ("anywhere", "line"))
+        check_actions(actions, KINDS, rules)
         super().__init__(render_mode)
         self._inner: Any = ROADS[road](config={"observation": _NO_OBSERVATION})
         frequency_hz = self._inner.config["policy_frequency"]
@@ -168,14 +181,16 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         self.metadata = {**METADATA, "render_fps": frequency_hz}
         self.courses = courses_of(self._inner.road.network)
         self.view_settings = {**_VIEW, **_view_from_above(self.courses)}
-        self._steering_range_rad = float(self._inner.action_type.steering_range[1])
-        self.action_space = spaces.Discrete(len(ACTION_MEANINGS))
+        self.steering_range_rad = float(self._inner.action_type.steering_range[1])
+        self.controls = controls = CONTROLS[actions]
+        self.action_space, self.action_meanings = controls.space, controls.meanings
+        self.action_part_names, self.action_units = controls.parts
         self.observation_space = spaces.Box(
             -OBSERVATION_LIMIT, OBSERVATION_LIMIT, (len(OBSERVATION_NAMES),), np.float32
         )
         self._start = start
         self._progress_m = 0.0
-        self._last_action = 0
+        self._steering_rad = 0.0
         self._reward = 0.0
         self._trail_m: deque[tuple[float, float]] = deque(maxlen=TRAIL_LENGTH)
         # State of the car before the last step.
@@ -219,19 +234,18 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
             self._put(pose_from_options(options, self.courses, others, car))
         elif self._start == "anywhere":
             self._put(drawn_pose(self.np_random, self.courses, others, car.speed_m_s))
-        self._progress_m, self._last_action, self._reward = 0.0, 0, 0.0
+        self._progress_m, self._steering_rad, self._reward = 0.0, 0.0, 0.0
         self._trail_m.clear()
         self._before = None
         return self._observe(), self._info()
 
-    def step(
-        self, action: int | np.integer[Any]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Advance the car by one decision."""
-        check_action(action, len(ACTION_MEANINGS))
-        self._last_action = int(action)
+        (steering,) = self.controls.read(action)
+        is_share = self.controls.commands is None
+        self._steering_rad = steering * self.steering_range_rad if is_share else steering
         # highway-env's angles are clockwise.
-        share = -STEERING_RAD[action] / self._steering_range_rad
+        share = -self._steering_rad / self.steering_range_rad
         _, reward, _, is_over, _ = self._inner.step(np.array([share]))
         self._before, before_m = self._car, self._along_m
         self._locate()
@@ -312,9 +326,8 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
 
     def telemetry(self) -> dict[str, float]:
         """Return the state of the car as named numbers; each name ends in its unit."""
-        steering_rad = float(STEERING_RAD[self._last_action])
         place = {"x_m": self._car.x_m, "y_m": self._car.y_m, "yaw_rad": self._car.yaw_rad}
-        return {**place, **self._info(), "steering_rad": steering_rad}
+        return {**place, **self._info(), "steering_rad": self._steering_rad}
 
     def static_scene(self) -> Sequence[Shape]:
         """Return the shapes that never change; the car's shapes are in the frame `car`."""
@@ -323,9 +336,8 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
     def scene(self) -> Sequence[Shape]:
         """Return the shapes that change with each step."""
         aims_m = [self.course.point(self._place.along_m + ahead) for ahead in LOOKAHEADS_M]
-        steering_rad = float(STEERING_RAD[self._last_action])
         return highway_scene.moving_shapes(
-            self._car, self.others, self._trail_m, aims_m, steering_rad
+            self._car, self.others, self._trail_m, aims_m, self._steering_rad
         )
 
     def static_frames(self) -> Sequence[Frame]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ BESIDE_M = 9.0
 class HighwayPilot(ScriptedPilot[HighwayLaneEnv]):
     """Scripted driver of the highway-lane sim's car."""
 
-    def choose(self) -> int:
+    def choose(self) -> Any:
         """Choose the action for the current state of the car.
 
         Let a point ahead be at distance d from the car, and l meters to the left of its heading.
@@ -34,6 +35,8 @@ class HighwayPilot(ScriptedPilot[HighwayLaneEnv]):
         # In highway-env, the wheelbase equals the car's length.
         slip_sine = car.length_m * left_m / (forward_m**2 + left_m**2)
         wanted_rad = math.atan(2.0 * math.tan(math.asin(min(max(slip_sine, -1.0), 1.0))))
+        if self.sim.controls.commands is None:
+            return [min(max(wanted_rad / self.sim.steering_range_rad, -1.0), 1.0)]
         return int(np.argmin(np.abs(STEERING_RAD - wanted_rad)))
 
     def _free_course(self) -> Course:

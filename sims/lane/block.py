@@ -15,14 +15,13 @@ from mcaprl.compiled import Arrays, array_at, compiled, inlined
 from mcaprl.sims.geometry.bicycle import Motion, roll_pose
 from mcaprl.sims.geometry.paths import Heading, heading_of, turned
 from mcaprl.sims.lane.rules import (
-    BRAKE,
     OBSERVATION_NAMES,
     STARTED_AT,
-    STEERING,
     SUBSTEP_S,
     SUBSTEPS,
     WHEELBASE_M,
     Car,
+    Command,
     acceleration,
     arrived,
     car_at,
@@ -32,12 +31,13 @@ from mcaprl.sims.lane.rules import (
     reward_of,
     seen_from,
     slip,
+    steering_for,
     store_car,
 )
 
 LANES = 32
 """Number of cars in a block."""
-_STEERING, _COS, _SIN, _BRAKING = 4, 9, 10, 11
+_STEERING, _COS, _SIN, _PEDAL = 4, 9, 10, 11
 _REWARD, _END, _SEEN, _SLIP, _TURN, _BLOCK_NUMBERS = 12, 13, 14, 26, 27, 28
 """Indices of a car's values in a block, and the number of values. Indices 0 to 8 are the fields
 of `Car`."""
@@ -46,7 +46,7 @@ of `Car`."""
 @compiled
 def step_cars(
     cars: NDArray[np.float64],
-    actions: NDArray[np.int64],
+    commands: NDArray[np.float64],
     rewards: NDArray[np.float64],
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
@@ -55,37 +55,40 @@ def step_cars(
 
     Args:
         cars: (N, 10) rows that begin with `Car`.
-        actions: (N,) 0 to 5.
+        commands: (N, 2) rows of `Command`.
         rewards: (N,) output.
         ends: (N,) output: DRIVING, OFF_LANE or STALL.
         observations: (N, 12) output.
     """
     first = 0
     if len(cars) >= LANES:
-        first = _step_blocks(cars, actions, rewards, ends, observations)
+        first = _step_blocks(cars, commands, rewards, ends, observations)
     for i in range(first, len(cars)):
-        car, rewards[i], ends[i] = advance(cars[i], actions[i])
+        command = Command(commands[i, 0], commands[i, 1])
+        car, rewards[i], ends[i] = advance(cars[i], command)
         observe(car, observations[i])
 
 
 @inlined
-def advance(row: NDArray[np.float64], action: int) -> tuple[Car, float, int]:
+def advance(row: NDArray[np.float64], command: Command) -> tuple[Car, float, int]:
     """Advance the car in a row of `step_cars`; return the car, its reward and its end."""
     before = car_at(row)
-    after = drive(before, action)
+    after = drive(before, command)
     store_car(after, row)
     return after, reward_of(before, after), end_of(after)
 
 
 @compiled
-def step_only_car(arrays: Arrays, action: int) -> tuple[float, int, float, float, float, float]:
+def step_only_car(
+    arrays: Arrays, pedal: float, steering: float
+) -> tuple[float, int, float, float, float, float]:
     """Advance a single car like `step_cars`; also return the values for its `info`.
 
     Returns:
         Reward, end, offset, heading error, speed and progress.
     """
     row = array_at(arrays, 0, (STARTED_AT + 1,), np.float64)
-    car, reward, end = advance(row, action)
+    car, reward, end = advance(row, Command(pedal, steering))
     array_at(arrays, 1, (1,), np.float64)[0] = reward
     array_at(arrays, 2, (1,), np.int64)[0] = end
     observe(car, array_at(arrays, 3, (len(OBSERVATION_NAMES),), np.float32))
@@ -96,7 +99,7 @@ def step_only_car(arrays: Arrays, action: int) -> tuple[float, int, float, float
 @compiled
 def _step_blocks(
     cars: NDArray[np.float64],
-    actions: NDArray[np.int64],
+    commands: NDArray[np.float64],
     rewards: NDArray[np.float64],
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
@@ -109,10 +112,9 @@ def _step_blocks(
             i = first + lane
             for k in range(9):
                 block[k * LANES + lane] = cars[i, k]
-            is_braking = actions[i] == BRAKE
-            block[_BRAKING * LANES + lane] = 1.0 if is_braking else 0.0
-            if not is_braking:
-                block[_STEERING * LANES + lane] = STEERING[actions[i]]
+            block[_PEDAL * LANES + lane] = commands[i, 0]
+            last = block[_STEERING * LANES + lane]
+            block[_STEERING * LANES + lane] = steering_for(commands[i, 1], last)
         _step_block(block)
         for lane in range(LANES):
             i = first + lane
@@ -171,7 +173,7 @@ def _step_block(block: NDArray[np.float64]) -> None:
             block[_SLIP * LANES + lane] = slip(block[_STEERING * LANES + lane], speed_m_s)
         for lane in range(LANES):
             before, slip_sine = _motion_in(block, lane), block[_SLIP * LANES + lane]
-            speed_up_m_s2 = acceleration(before.speed_m_s, block[_BRAKING * LANES + lane] > 0.0)
+            speed_up_m_s2 = acceleration(before.speed_m_s, block[_PEDAL * LANES + lane])
             after, turn_rad = roll_pose(before, slip_sine, speed_up_m_s2, WHEELBASE_M, SUBSTEP_S)
             block[lane], block[LANES + lane] = after.x_m, after.y_m
             block[2 * LANES + lane], block[3 * LANES + lane] = after.yaw_rad, after.speed_m_s

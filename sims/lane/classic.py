@@ -15,7 +15,6 @@ from mcaprl.compiled import compiled
 from mcaprl.sims.lane.course import COURSE
 from mcaprl.sims.lane.rays import touches
 from mcaprl.sims.lane.rules import (
-    BRAKE,
     COLLISION,
     DRIVING,
     LOW_REWARD,
@@ -23,6 +22,7 @@ from mcaprl.sims.lane.rules import (
     SLOW,
     SUBSTEP_S,
     Car,
+    Command,
     car_at,
     drive,
     observe,
@@ -63,26 +63,28 @@ def classic_reward(distance_m: float, speed_m_s: float) -> float:
 
 
 @compiled
-def classic_end(distance_m: float, speed_m_s: float, action: int, hit: bool, by_code: bool) -> int:
+def classic_end(
+    distance_m: float, speed_m_s: float, command: Command, hit: bool, by_code: bool
+) -> int:
     """Return the outcome of a step: DRIVING, OFF_LANE, LOW_REWARD, SLOW or COLLISION."""
     if distance_m > CLASSIC_LANE_M:
         return OFF_LANE
     if classic_reward(distance_m, speed_m_s) < LOWEST_REWARD:
         return LOW_REWARD
     if by_code:
-        return COLLISION if hit and action == STRAIGHT else DRIVING
-    return SLOW if speed_m_s <= SLOWEST_M_S and action != BRAKE else DRIVING
+        return COLLISION if hit and command.pedal > 0.0 and command.steering == 0.0 else DRIVING
+    return SLOW if speed_m_s <= SLOWEST_M_S and command.pedal > 0.0 else DRIVING
 
 
 @compiled
-def classic_decide(car: Car, action: int) -> tuple[Car, bool]:
+def classic_decide(car: Car, command: Command) -> tuple[Car, bool]:
     """Drive for one second; return the new state, and whether the body touched an obstacle.
 
     Obstacles do not stop the car.
     """
     hit = False
     for _ in range(CLASSIC_SUBSTEPS):
-        car = drive(car, action, 1)
+        car = drive(car, command, 1)
         hit = hit or touches(car)
     return car, hit
 
@@ -90,7 +92,7 @@ def classic_decide(car: Car, action: int) -> tuple[Car, bool]:
 @compiled
 def step_classic(
     cars: NDArray[np.float64],
-    actions: NDArray[np.int64],
+    commands: NDArray[np.float64],
     rewards: NDArray[np.float64],
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
@@ -98,9 +100,10 @@ def step_classic(
 ) -> None:
     """Advance N cars by one decision each, in place; arguments as in `step_cars`."""
     for i in range(len(cars)):
-        after, hit = classic_decide(car_at(cars[i]), actions[i])
+        command = Command(commands[i, 0], commands[i, 1])
+        after, hit = classic_decide(car_at(cars[i]), command)
         distance_m = classic_distance(after.x_m, after.y_m)
         rewards[i] = classic_reward(distance_m, after.speed_m_s)
-        ends[i] = classic_end(distance_m, after.speed_m_s, actions[i], hit, by_code)
+        ends[i] = classic_end(distance_m, after.speed_m_s, command, hit, by_code)
         observe(after, observations[i])
         store_car(after, cars[i])

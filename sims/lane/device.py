@@ -10,7 +10,7 @@ import numpy as np
 from mcaprl.compiled import compiled
 from mcaprl.sims.lane.block import advance
 from mcaprl.sims.lane.fleet import SHARES, LaneFleet, start_anywhere, start_on_line
-from mcaprl.sims.lane.rules import DRIVING, Car, observe, store_car
+from mcaprl.sims.lane.rules import ACTION_COMMANDS, DRIVING, Car, observe, store_car
 from mcaprl.sims.vehicle.device import Batch, DeviceSims, begin_episode, finish_step
 
 
@@ -93,7 +93,7 @@ def _start_car(batch: Batch, world: World, seed: Any, i: int, shares: Any) -> No
 
 @compiled
 def _step_car(batch: Batch, world: World, seed: Any, max_steps: int, i: int, shares: Any) -> None:
-    car, reward, end = advance(batch.states[i], batch.actions[i])
+    car, reward, end = advance(batch.states[i], ACTION_COMMANDS[batch.actions[i]])
     observe(car, batch.observations[i])
     if finish_step(batch, i, reward, end != DRIVING, False, max_steps):
         _start_car(batch, world, seed, i, shares)

@@ -15,7 +15,7 @@ from mcaprl.sims.drawing.top_view import Body, FollowView
 from mcaprl.sims.lane import scene as lane_scene
 from mcaprl.sims.lane.camera import IMAGE_SHAPE, LENS
 from mcaprl.sims.lane.fleet import LaneFleet
-from mcaprl.sims.lane.rules import DECISION_S, Car, wheel_angle
+from mcaprl.sims.lane.rules import DECISION_S, Car, Command, wheel_angle
 from mcaprl.sims.vehicle.batched import BatchedEnv
 from mcaprl.sims.vehicle.env import RENDER_MODES, RenderMode, VehicleEnv
 
@@ -44,9 +44,9 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
 
     ## Action Space
 
-    `Discrete(6)`. Actions 1 to 5 accelerate with 4 (1 - v / 30) m/s^2. The maximum steering angle
-    is 40 degrees at rest and decreases to 28 degrees at 120 km/h; the lateral acceleration is
-    limited to 9 m/s^2.
+    `actions="discrete"`: `Discrete(6)`. Actions 1 to 5 accelerate with 4 (1 - v / 30) m/s^2. The
+    maximum steering angle is 40 degrees at rest and decreases to 28 degrees at 120 km/h; the
+    lateral acceleration is limited to 9 m/s^2.
 
     | Action | Meaning | Steering |
     |---|---|---|
@@ -57,6 +57,17 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     | 4 | slightly right | 25 % to the right |
     | 5 | slightly left | 25 % to the left |
 
+    `actions="continuous"`, which is the default of `mcaprl/LaneKeepingContinuous-v0`: `Box(-1, 1)`
+    of 2 float32.
+
+    | Index | Part | 1 | -1 |
+    |---|---|---|---|
+    | 0 | pedal | accelerate with 4 (1 - v / 30) m/s^2 | brake with 8 m/s^2 |
+    | 1 | steering | maximum angle to the left | maximum angle to the right |
+
+    Accelerations are proportional to the pedal on each side of 0, where the car rolls. The discrete
+    actions are points of this space: pedal -1 or 1, and steering 0, 0.25 or 0.5.
+
     ## Observation Space
 
     `observation="state"`: `Box` of 12 float32.
@@ -66,7 +77,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     | 0 | distance from the path, left positive | 3.5 m | 4 |
     | 1 | heading error, left positive | pi / 2 rad | 2 |
     | 2 | speed | 30 m/s | 1 |
-    | 3 | last steering command, left positive | 50 % | 1 |
+    | 3 | last steering command, left positive | 50 % | 1; 2 if continuous |
     | 4, 5 | path point 5 m ahead: forward, left of the car | 5 m | 4 |
     | 6, 7 | path point 10 m ahead | 10 m | 4 |
     | 8, 9 | path point 20 m ahead | 20 m | 4 |
@@ -81,10 +92,11 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
 
     `observation="depth-commands"`: a `Dict` with two entries. `depth` is the same image. `commands`
     has 64 float32: two numbers for each of the last 32 decisions, newest first. The first number is
-    -1 for braking and 1 for accelerating. The second number is the steering command as in row 3 of
-    the table; braking does not change it. Both are 0 before the start of the episode. The image is
-    the only measurement, because an agent knows its own commands. The commands determine the speed,
-    except for the influence of the speed at the start, which decreases with time.
+    the pedal: -1 for braking and 1 for accelerating. The second number is the steering command as
+    in row 3 of the table; the action `brake` does not change it. Both are 0 before the start of the
+    episode. The image is the only measurement, because an agent knows its own commands. The
+    commands determine the speed, except for the influence of the speed at the start, which
+    decreases with time.
 
     `observation="rays"`: `Box` of 20 float32.
 
@@ -92,7 +104,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     |---|---|---|---|
     | 0 to 15 | distance to the next rail, barrier or house | see below | 0 to 1 |
     | 16 | speed | 30 m/s | 0 to 1 |
-    | 17 | last steering command, left positive | 50 % | 1 |
+    | 17 | last steering command, left positive | 50 % | 1; 2 if continuous |
     | 18, 19 | path point 20 m ahead: forward, left of the car | 20 m | 4 |
 
     The rays start at the car's center, in the directions 0, 10, -10, 20, -20, 30, -30, 45, -45, 60,
@@ -157,6 +169,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     - `rules`: `"default"`, `"classic"` or `"classic-code"`.
     - `observation`: `"state"`, `"depth"`, `"depth-commands"`, `"dashboard"` or `"rays"`.
     - `start`: `"anywhere"` or `"line"`; None means `"anywhere"`, or `"line"` in the classic rules.
+    - `actions`: `"discrete"` or `"continuous"`; only `"discrete"` in the classic rules.
     - `render_mode`: None, `"human"` or `"rgb_array"`.
 
     ## Version History
@@ -232,8 +245,8 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     def _state(self) -> Car:
         return self.car
 
-    def _moments(self, before: Any, action: int) -> list[Sequence[Frame]]:
-        return [_frames_of(car) for car in self.fleet.substeps(before, action)]
+    def _moments(self, before: Any, command: Sequence[float]) -> list[Sequence[Frame]]:
+        return [_frames_of(car) for car in self.fleet.substeps(before, Command(*command))]
 
     def _open_view(self, render_mode: RenderMode) -> FollowView:
         frames_per_s = self.metadata["render_fps"]

@@ -21,9 +21,10 @@ from mcaprl.sims.lane.classic import CLASSIC_DECISION_S, CLASSIC_SUBSTEPS, STRAI
 from mcaprl.sims.lane.course import COURSE, LANE_HALF_WIDTH_M, NEXT_TURN
 from mcaprl.sims.lane.rays import RAY_OBSERVATION_LIMIT, RAY_OBSERVATION_NAMES, observe_all_rays
 from mcaprl.sims.lane.rules import (
+    ACTION_COMMANDS,
     ACTION_MEANINGS,
     ALONG,
-    BRAKE,
+    COMMAND_UNITS,
     DECISION_S,
     DRIVING,
     MAX_SPEED_M_S,
@@ -33,12 +34,14 @@ from mcaprl.sims.lane.rules import (
     STARTED_AT,
     SUBSTEPS,
     Car,
+    Command,
     drive,
     located,
     observe,
     store_car,
 )
-from mcaprl.sims.vehicle.arguments import check_name, pose_from
+from mcaprl.sims.vehicle.arguments import check_actions, check_name, pose_from
+from mcaprl.sims.vehicle.controls import KINDS, Controls
 from mcaprl.sims.vehicle.draws import Generators, draw, spread
 from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
 
@@ -51,7 +54,15 @@ STEERING_SEEN = 3
 COMMANDS = 32
 """Number of decisions whose commands are observed with `depth-commands`: 8 s by default."""
 
-Step = Callable[[int], tuple[Any, float, int, dict[str, Any]]]
+CONTROLS = {
+    "discrete": Controls(
+        Command._fields, COMMAND_UNITS, ACTION_MEANINGS, np.array(ACTION_COMMANDS)
+    ),
+    "continuous": Controls(Command._fields, COMMAND_UNITS),
+}
+"""Controls by the argument `actions`."""
+
+Step = Callable[[Sequence[float]], tuple[Any, float, int, dict[str, Any]]]
 """Step of a fleet of one car; see `Fleet.step_one`."""
 
 
@@ -67,19 +78,21 @@ class LaneFleet(Fleet):
         rules: str = "default",
         observation: str = "state",
         start: str | None = None,
+        actions: str = "discrete",
     ) -> None:
         """Allocate N cars; `begin` starts them."""
         check_name("rules", rules, ("default", "classic", "classic-code"))
         check_name("observation", observation, OBSERVATIONS)
         check_name("start", start, (None, "anywhere", "line"))
+        check_actions(actions, KINDS, rules)
         self._classic, self._by_code = rules != "default", rules == "classic-code"
         self.has_barriers = not self._classic
         self._on_line = start == "line" or (self._classic and start is None)
         super().__init__(
             count,
-            _space(observation),
+            _space(observation, 1.0 if actions == "discrete" else 2.0),
             _NAMES.get(observation, ()),
-            ACTION_MEANINGS,
+            CONTROLS[actions],
             CLASSIC_DECISION_S if self._classic else DECISION_S,
         )
         self._cars = np.zeros((count, STARTED_AT + 1))
@@ -101,13 +114,13 @@ class LaneFleet(Fleet):
         """Return the state of a car."""
         return Car._make(self._cars[i, :STARTED_AT].tolist())
 
-    def substeps(self, before: Car, action: int) -> list[Car]:
+    def substeps(self, before: Car, command: Command) -> list[Car]:
         """Return the states of a car after each 0.05 s of a decision; the last is at the end."""
         if not self._classic:
-            return [drive(before, action, 1 + k) for k in range(SUBSTEPS)]
+            return [drive(before, command, 1 + k) for k in range(SUBSTEPS)]
         cars = [before]
         for _ in range(CLASSIC_SUBSTEPS):
-            cars.append(drive(cars[-1], action, 1))
+            cars.append(drive(cars[-1], command, 1))
         return cars[1:]
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
@@ -149,7 +162,7 @@ class LaneFleet(Fleet):
         self._step()
         if self._has_commands:
             self._commands[:, 1:] = self._commands[:, :-1]
-            self._commands[:, 0, 0] = np.where(self.actions == BRAKE, -1.0, 1.0)
+            self._commands[:, 0, 0] = self.commands[:, 0]
             self._commands[:, 0, 1] = self._states[:, STEERING_SEEN]
         if self.has_rays:
             observe_all_rays(self._cars, self._rays, self.has_barriers)
@@ -163,11 +176,11 @@ class LaneFleet(Fleet):
             return super().step_one
         # A function with local variables is faster than a method with attributes.
         arrays = (self._cars[0], self.rewards, self.ends, self._states[0])
-        drive, seen = ready_at(step_only_car, arrays, examples=(0,)), self._seen_only
+        drive, seen = ready_at(step_only_car, arrays, examples=(0.0, 0.0)), self._seen_only
         depth_m = self._depth_m
 
-        def step(action: int) -> tuple[Any, float, int, dict[str, Any]]:
-            reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = drive(action)
+        def step(command: Sequence[float]) -> tuple[Any, float, int, dict[str, Any]]:
+            reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = drive(*command)
             if depth_m:
                 depth_m.clear()
             # A dict display is faster than `dict(zip(CAR_INFO, ...))`.
@@ -203,7 +216,7 @@ class LaneFleet(Fleet):
         return seen, info
 
     def _kernel(self) -> tuple[Any, ...]:
-        arrays = (self._cars, self.actions, self.rewards, self.ends, self._states)
+        arrays = (self._cars, self.commands, self.rewards, self.ends, self._states)
         return (step_classic, *arrays, self._by_code) if self._classic else (step_cars, *arrays)
 
     @cached_property
@@ -288,20 +301,26 @@ class LaneFleet(Fleet):
         return dict(zip(CAR_INFO, values, strict=True))
 
 
-def _space(observation: str) -> spaces.Space[Any]:
+def _space(observation: str, steering: float) -> spaces.Space[Any]:
+    """Return the space of an observation; `steering` is the limit of the observed steering."""
     depth = spaces.Box(0, 255, (*IMAGE_SHAPE, 1), np.uint8)
     if observation == "depth":
         return depth
     if observation == "depth-commands":
-        return spaces.Dict({"depth": depth, "commands": spaces.Box(-1, 1, (2 * COMMANDS,))})
+        limits = np.tile(np.array([1.0, steering], np.float32), COMMANDS)
+        return spaces.Dict({"depth": depth, "commands": spaces.Box(-limits, limits)})
     if observation == "dashboard":
-        ends = np.array([[0, -1, -1], [1, 1, 1]], dtype=np.float32)
+        ends = np.array([[0, -steering, -1], [1, steering, 1]], dtype=np.float32)
         return spaces.Dict({"depth": depth, "motion": spaces.Box(*ends)})
     if observation == "state":
-        return spaces.Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
-    low = -RAY_OBSERVATION_LIMIT
+        limit = OBSERVATION_LIMIT.copy()
+        limit[STEERING_SEEN] = steering
+        return spaces.Box(-limit, limit)
+    limit = RAY_OBSERVATION_LIMIT.copy()
+    limit[-3] = steering
+    low = -limit
     low[:-3] = 0.0
-    return spaces.Box(low, RAY_OBSERVATION_LIMIT)
+    return spaces.Box(low, limit)
 
 
 SHARES = 4
@@ -365,7 +384,7 @@ def start_at_random(shares: NDArray[np.float64], on_line: bool, classic: bool) -
     if not on_line:
         return start_anywhere(shares)
     car = start_on_line(shares)
-    return drive(car, STRAIGHT, CLASSIC_SUBSTEPS) if classic else car
+    return drive(car, ACTION_COMMANDS[STRAIGHT], CLASSIC_SUBSTEPS) if classic else car
 
 
 @compiled

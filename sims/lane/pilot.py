@@ -13,9 +13,9 @@ from mcaprl.sims.geometry.paths import in_body_frame, leg_at, point_at
 from mcaprl.sims.lane.course import COURSE
 from mcaprl.sims.lane.env import LaneKeepingEnv
 from mcaprl.sims.lane.rules import (
+    ACTION_COMMANDS,
     BRAKE,
     DRIVING,
-    STEERING,
     SUBSTEP_S,
     SUBSTEPS,
     WHEELBASE_M,
@@ -60,8 +60,8 @@ def pursue(car: Car) -> int:
     slip_sine = WHEELBASE_M * left_m / (forward_m**2 + left_m**2)
     wanted_rad = steering_of(min(max(slip_sine, -1.0), 1.0))
     best, smallest_rad = BRAKE, math.inf
-    for action in range(BRAKE + 1, len(STEERING)):
-        error_rad = abs(wheel_angle(STEERING[action], car.speed_m_s) - wanted_rad)
+    for action in range(BRAKE + 1, len(ACTION_COMMANDS)):
+        error_rad = abs(wheel_angle(ACTION_COMMANDS[action].steering, car.speed_m_s) - wanted_rad)
         if error_rad < smallest_rad:
             best, smallest_rad = action, error_rad
     return best
@@ -72,7 +72,7 @@ def pursuit_value(car: Car, substeps: int = SUBSTEPS) -> float:
     """Return the number of decisions until pursuit fails, plus 0.1 times the total reward."""
     total = 0.0
     for survived in range(HORIZON):
-        after = drive(car, pursue(car), substeps)
+        after = drive(car, ACTION_COMMANDS[pursue(car)], substeps)
         if end_of(after) != DRIVING:
             return survived + 0.1 * total
         total += reward_of(car, after)
@@ -90,12 +90,12 @@ def choose(car: Car, substeps: int = SUBSTEPS) -> int:
     if pursuit_value(car, substeps) >= HORIZON:
         return pursue(car)
     best, most = BRAKE, -math.inf
-    for first in range(len(STEERING)):
-        middle = drive(car, first, substeps)
+    for first in range(len(ACTION_COMMANDS)):
+        middle = drive(car, ACTION_COMMANDS[first], substeps)
         if end_of(middle) != DRIVING:
             continue
-        for second in range(len(STEERING)):
-            after = drive(middle, second, substeps)
+        for second in range(len(ACTION_COMMANDS)):
+            after = drive(middle, ACTION_COMMANDS[second], substeps)
             value = pursuit_value(after, substeps) if end_of(after) == DRIVING else -1.0
             if value > most:
                 best, most = first, value

@@ -26,10 +26,27 @@ from mcaprl.sims.lane.course import (
 )
 
 ACTION_MEANINGS = ("brake", "straight", "right", "left", "slightly right", "slightly left")
-STEERING = (0.0, 0.0, -0.5, 0.5, -0.25, 0.25)
-"""Fractions of the maximum steering angle, left positive; action 0 keeps the last command."""
 BRAKE = 0
 
+
+class Command(NamedTuple):
+    """Command of a decision."""
+
+    pedal: float
+    """Fraction of the full throttle, or if negative, of the full brake; 0 lets the car roll."""
+    steering: float
+    """Fraction of the maximum steering angle, left positive; NaN keeps the last one."""
+
+
+ACTION_COMMANDS = (
+    Command(-1.0, math.nan),
+    Command(1.0, 0.0),
+    Command(1.0, -0.5),
+    Command(1.0, 0.5),
+    Command(1.0, -0.25),
+    Command(1.0, 0.25),
+)
+COMMAND_UNITS = ("full throttle or brake", "full angle, left positive")
 DECISION_S = 0.25
 SUBSTEPS = 5
 SUBSTEP_S = DECISION_S / SUBSTEPS
@@ -66,7 +83,7 @@ OBSERVATION_NAMES = (
     "steering",
     *(f"ahead_{ahead:.0f}m_{axis}" for ahead in LOOKAHEADS_M for axis in ("forward", "left")),
 )
-OBSERVATION_LIMIT = np.array([4, 2, 1, 1] + [4] * 8, dtype=np.float32)
+OBSERVATION_LIMIT = np.array([4, 2, 1, 2] + [4] * 8, dtype=np.float32)
 # Numba treats a tuple, but not an array, as a compile-time constant.
 _LIMITS: tuple[float, ...] = tuple(OBSERVATION_LIMIT.tolist())
 
@@ -153,37 +170,37 @@ def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Ca
 
 
 @inlined
-def driven(motion: Motion, steering: float, is_braking: bool) -> Motion:
+def driven(motion: Motion, steering: float, pedal: float) -> Motion:
     """Advance a motion by a substep of 0.05 s.
 
     The function has no branches, so that the compiler can vectorize loops over cars.
     """
     slip_sine = slip(steering, motion.speed_m_s)
-    acceleration_m_s2 = acceleration(motion.speed_m_s, is_braking)
+    acceleration_m_s2 = acceleration(motion.speed_m_s, pedal)
     return roll(motion, slip_sine, acceleration_m_s2, WHEELBASE_M, SUBSTEP_S)
 
 
 @inlined
-def acceleration(speed_m_s: float, is_braking: bool) -> float:
+def acceleration(speed_m_s: float, pedal: float) -> float:
     """Return the acceleration of a substep, m/s^2. A braking car stops, but does not reverse."""
-    throttle_m_s2 = THROTTLE_M_S2 * (1.0 - speed_m_s * (1.0 / MAX_SPEED_M_S))
-    brake_m_s2 = -min(BRAKE_M_S2, speed_m_s * (1.0 / SUBSTEP_S))
-    return brake_m_s2 if is_braking else throttle_m_s2
+    throttle_m_s2 = pedal * THROTTLE_M_S2 * (1.0 - speed_m_s * (1.0 / MAX_SPEED_M_S))
+    brake_m_s2 = -min(-pedal * BRAKE_M_S2, speed_m_s * (1.0 / SUBSTEP_S))
+    return brake_m_s2 if pedal < 0.0 else throttle_m_s2
 
 
 @inlined
-def steering_for(action: int, last: float) -> float:
-    """Return the steering command of an action; BRAKE keeps the command `last`."""
-    return last if action == BRAKE else STEERING[action]
+def steering_for(steering: float, last: float) -> float:
+    """Return the steering of a command, or `last` if the command keeps it."""
+    return last if math.isnan(steering) else steering
 
 
 @compiled
-def drive(car: Car, action: int, substeps: int = SUBSTEPS) -> Car:
-    """Return the car after an action that lasts `substeps` times 0.05 s."""
+def drive(car: Car, command: Command, substeps: int = SUBSTEPS) -> Car:
+    """Return the car after a command that lasts `substeps` times 0.05 s."""
     motion = moving(car.x_m, car.y_m, car.yaw_rad, car.speed_m_s)
-    steering = steering_for(action, car.steering)
+    steering = steering_for(command.steering, car.steering)
     for _ in range(substeps):
-        motion = driven(motion, steering, action == BRAKE)
+        motion = driven(motion, steering, command.pedal)
     return arrived(car, motion, steering, substeps)
 
 

@@ -39,8 +39,8 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
 
     ## Action Space
 
-    `Discrete(7)`. Each action changes the last commanded velocity by 0.5 m/s; a change that would
-    exceed 8 m/s is ignored. One decision lasts 0.5 s.
+    `actions="discrete"`: `Discrete(7)`. Each action changes the last commanded velocity by 0.5 m/s;
+    a change that would exceed 8 m/s is ignored. One decision lasts 0.5 s.
 
     | Action | Meaning |
     |---|---|
@@ -51,6 +51,13 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     | 4 | faster west (-y) |
     | 5 | faster up (-z) |
     | 6 | no change of the command |
+
+    `actions="continuous"`, which is the default of `mcaprl/PowerlineContinuous-v0`: `Box(-1, 1)` of
+    3 float32, the commanded velocity north, east and down in units of 8 m/s. A longer vector is
+    shortened to 8 m/s.
+
+    `actions="increments"`: `Box(-1, 1)` of 3 float32, the change of the commanded velocity north,
+    east and down in m/s. The discrete actions are points of this space.
 
     ## Observation Space
 
@@ -134,6 +141,8 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     - `wind_m_s`: maximum steady wind, 0 to 8; speed and direction are random in each episode.
     - `gust_m_s`: standard deviation of the gusts on each axis, 0 to 3; 0 in the classic rules.
       Wind and gusts have no effect on a point mass.
+    - `actions`: `"discrete"`, `"continuous"` or `"increments"`; only `"discrete"` in the classic
+      rules.
     - `render_mode`: None, `"human"` or `"rgb_array"`.
 
     ## Version History
@@ -196,7 +205,7 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     def _state(self) -> Flight:
         return self.flight
 
-    def _moments(self, before: Flight, action: int) -> list[Sequence[Frame]]:
+    def _moments(self, before: Flight, command: Sequence[float]) -> list[Sequence[Frame]]:
         return [powerline_scene.drone_frames(drone) for drone in self.fleet.drones_from(before)]
 
     def _open_view(self, render_mode: RenderMode) -> PowerlineView:

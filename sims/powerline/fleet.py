@@ -22,11 +22,13 @@ from mcaprl.sims.powerline.course import (
 from mcaprl.sims.powerline.quadrotor import PLANTS, Drone, fly
 from mcaprl.sims.powerline.rules import (
     ACTION_MEANINGS,
+    AXES,
     CHECK_S,
     CLASSIC_DECISION_S,
     CLASSIC_FIRST_COMMAND_M_S,
     CLASSIC_VELOCITY_STEP_M_S,
     DECISION_S,
+    DIRECTIONS,
     FIRST_COMMAND_M_S,
     FLIGHT_SIZE,
     FLYING,
@@ -48,11 +50,13 @@ from mcaprl.sims.powerline.rules import (
     store_bearings,
     store_flight,
 )
-from mcaprl.sims.vehicle.arguments import check_name, check_range, read_pose
+from mcaprl.sims.vehicle.arguments import check_actions, check_name, check_range, read_pose
+from mcaprl.sims.vehicle.controls import KINDS, Controls
 from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
 
 MAX_WIND_M_S = 8.0
 MAX_GUST_M_S = 3.0
+ACTION_KINDS = (*KINDS, "increments")
 MOTION = slice(3, 9)
 """Slice of the observation `state` in `motion`: velocity, and command minus velocity."""
 _INFO = ("lateral_offset_m", "vertical_offset_m", "line_distance_m", "speed_m_s", "progress_m")
@@ -74,6 +78,7 @@ class PowerlineFleet(Fleet):
         plant: str | None = None,
         wind_m_s: float = 0.0,
         gust_m_s: float = 0.0,
+        actions: str = "discrete",
     ) -> None:
         """Allocate N drones; `begin` starts them."""
         check_name("rules", rules, ("default", "classic"))
@@ -81,6 +86,7 @@ class PowerlineFleet(Fleet):
         check_name("camera", camera, CAMERAS)
         check_name("start", start, ("anywhere", "line"))
         check_name("plant", plant, (None, *PLANTS))
+        check_actions(actions, ACTION_KINDS, rules)
         self.classic = classic = rules == "classic"
         check_range("wind_m_s", wind_m_s, 0.0, MAX_WIND_M_S)
         check_range("gust_m_s", gust_m_s, 0.0, 0.0 if classic else MAX_GUST_M_S)
@@ -89,11 +95,12 @@ class PowerlineFleet(Fleet):
             count,
             _space(observation, classic),
             OBSERVATION_NAMES if observation == "state" else (),
-            ACTION_MEANINGS,
+            _controls(actions, self.velocity_step_m_s),
             CLASSIC_DECISION_S if classic else DECISION_S,
             noise_size=3 if gust_m_s else 0,
         )
         self._plant = PLANTS.index(plant or ("point" if classic else "quad"))
+        self._are_changes = actions != "continuous"
         self._on_line = start == "line"
         self._wind_m_s, self._gust_m_s = wind_m_s, float(gust_m_s)
         self._shows_state = observation == "state"
@@ -151,11 +158,11 @@ class PowerlineFleet(Fleet):
         self._depth_m.clear()
 
     def _kernel(self) -> tuple[Any, ...]:
-        before = (self._plant, self._flights, self.actions)
+        before = (self._plant, self._flights, self.commands)
         after = (self.rewards, self.ends, self._seen)
         if self.classic:
             return step_classic, *before, *after
-        return step_flights, *before, self._gust_m_s, self.noise, *after
+        return step_flights, *before, self._are_changes, self._gust_m_s, self.noise, *after
 
     def observation(self, i: int) -> Any:
         """Return the observation of drone i."""
@@ -198,6 +205,16 @@ class PowerlineFleet(Fleet):
         """Return the `info` of all drones."""
         *numbers, along_m = self._bearings.T.copy()
         return dict(zip(_INFO, (*numbers, along_m - self._started_at_m), strict=True))
+
+
+def _controls(actions: str, step_m_s: float) -> Controls:
+    """Return the controls of a kind of actions; discrete ones change the velocity by a step."""
+    if actions == "continuous":
+        return Controls(tuple(f"velocity_{axis}" for axis in AXES), ("8 m/s",) * 3)
+    changes = tuple(f"change_{axis}" for axis in AXES), ("1 m/s",) * 3
+    if actions == "increments":
+        return Controls(*changes)
+    return Controls(*changes, ACTION_MEANINGS, step_m_s * DIRECTIONS)
 
 
 def _space(observation: str, classic: bool) -> spaces.Space[Any]:

@@ -40,6 +40,7 @@ ACTION_MEANINGS = (
 )
 DIRECTIONS: NDArray[np.float64] = np.vstack([np.eye(3), -np.eye(3), np.zeros((1, 3))])
 """(7, 3) velocity change of each action along x, y and z, in units of the velocity step."""
+AXES = ("north", "east", "down")
 
 DECISION_S = 0.5
 CHECK_S = 0.1
@@ -143,11 +144,19 @@ def approach(plant: int, position_m: Vector, command_m_s: Vector, wind_m_s: Vect
 
 
 @compiled
-def commanded(command_m_s: Vector, action: int) -> Vector:
-    """Return the command after an action; ignore an action that would exceed 8 m/s."""
-    direction = vector_at(DIRECTIONS[action], 0)
-    changed = plus(command_m_s, times(VELOCITY_STEP_M_S, direction))
-    return changed if norm(changed) <= MAX_COMMAND_M_S else command_m_s
+def commanded(velocity_m_s: Vector, command: Vector, is_change: bool) -> Vector:
+    """Return the commanded velocity after a command.
+
+    Args:
+        velocity_m_s: Commanded velocity before.
+        command: Change of the velocity in m/s, which is ignored if the velocity would exceed 8 m/s;
+            or velocity in units of 8 m/s, which is shortened to 8 m/s.
+        is_change: Whether the command is a change.
+    """
+    if is_change:
+        changed = plus(velocity_m_s, command)
+        return changed if norm(changed) <= MAX_COMMAND_M_S else velocity_m_s
+    return times(MAX_COMMAND_M_S / max(norm(command), 1.0), command)
 
 
 @compiled
@@ -247,7 +256,8 @@ def store_bearings(flights: NDArray[np.float64], bearings: NDArray[np.float64]) 
 def step_flights(
     plant: int,
     flights: NDArray[np.float64],
-    actions: NDArray[np.int64],
+    commands: NDArray[np.float64],
+    is_change: bool,
     gust_m_s: float,
     noise: NDArray[np.float64],
     rewards: NDArray[np.float64],
@@ -259,7 +269,8 @@ def step_flights(
     Args:
         plant: QUAD or POINT.
         flights: (N, 33) rows of `Flight`.
-        actions: (N,) 0 to 6.
+        commands: (N, 3) commands; see `commanded`.
+        is_change: Whether the commands are changes of the velocity.
         gust_m_s: Standard deviation of the gusts.
         noise: (N, 3) standard normal numbers for the gusts; (N, 0) without gusts.
         rewards: (N,) output.
@@ -272,7 +283,7 @@ def step_flights(
             for k in range(3):
                 flights[i, GUST + k] = gust[k]
     befores_m = flights[:, FURTHEST].copy()
-    decide_all(plant, flights, actions, ends)
+    decide_all(plant, flights, commands, is_change, ends)
     for i in range(len(flights)):
         after = flight_at(flights[i])
         rewards[i] = reward_of(befores_m[i], after, ends[i])
@@ -281,23 +292,28 @@ def step_flights(
 
 @compiled
 def decide_all(
-    plant: int, flights: NDArray[np.float64], actions: NDArray[np.int64], ends: NDArray[np.int64]
+    plant: int,
+    flights: NDArray[np.float64],
+    commands: NDArray[np.float64],
+    is_change: bool,
+    ends: NDArray[np.int64],
 ) -> None:
-    """Fly N drones, (N, 33) rows of `Flight`, for half a second or until their episodes end.
+    """Fly N drones for half a second or until their episodes end; arguments as in `step_flights`.
 
     Write FLYING, OFF_LINE, COLLISION or FINISHED to `ends` (N,).
     """
     count = len(flights)
-    commands, winds = flights[:, COMMAND : COMMAND + 3], np.empty((count, 3))
+    velocities_m_s, winds = flights[:, COMMAND : COMMAND + 3], np.empty((count, 3))
     for i in range(count):
-        command = commanded(vector_at(flights[i], COMMAND), actions[i])
+        before = vector_at(flights[i], COMMAND)
+        velocity = commanded(before, vector_at(commands[i], 0), is_change)
         for k in range(3):
-            commands[i, k] = command[k]
+            velocities_m_s[i, k] = velocity[k]
             winds[i, k] = flights[i, WIND + k] + flights[i, GUST + k]
         ends[i] = FLYING
     for _ in range(round(DECISION_S / CHECK_S)):
         flying = np.flatnonzero(ends == FLYING)
-        fly_all(plant, flights, flying, commands, winds, CHECK_S)
+        fly_all(plant, flights, flying, velocities_m_s, winds, CHECK_S)
         for number in flying:
             position_m = vector_at(flights[number], 0)
             place = nearest_on_line(position_m)
@@ -344,14 +360,13 @@ def classic_reward(position_m: Vector, speed_m_s: float, hit: bool) -> float:
 
 
 @compiled
-def classic_decide(plant: int, flight: Flight, action: int) -> tuple[Flight, bool]:
-    """Fly for 5 s; the command is the measured velocity plus the velocity change of the action.
+def classic_decide(plant: int, flight: Flight, change_m_s: Vector) -> tuple[Flight, bool]:
+    """Fly for 5 s; the command is the measured velocity plus a change.
 
     Returns:
         State of the drone, and whether the drone collided.
     """
-    step = times(CLASSIC_VELOCITY_STEP_M_S, vector_at(DIRECTIONS[action], 0))
-    command = plus(flight.drone.velocity_m_s, step)
+    command = plus(flight.drone.velocity_m_s, change_m_s)
     wind = plus(flight.wind_m_s, flight.gust_m_s)
     drone, furthest_m, hit = flight.drone, flight.furthest_m, False
     for _ in range(round(CLASSIC_DECISION_S / CHECK_S)):
@@ -367,7 +382,7 @@ def classic_decide(plant: int, flight: Flight, action: int) -> tuple[Flight, boo
 def step_classic(
     plant: int,
     flights: NDArray[np.float64],
-    actions: NDArray[np.int64],
+    changes_m_s: NDArray[np.float64],
     rewards: NDArray[np.float64],
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
@@ -377,7 +392,8 @@ def step_classic(
     The wind is constant within an episode.
     """
     for i in range(len(flights)):
-        after, hit = classic_decide(plant, flight_at(flights[i]), actions[i])
+        change_m_s = vector_at(changes_m_s[i], 0)
+        after, hit = classic_decide(plant, flight_at(flights[i]), change_m_s)
         position_m = after.drone.position_m
         rewards[i] = classic_reward(position_m, norm(after.drone.velocity_m_s), hit)
         ends[i] = classic_end(position_m, hit)

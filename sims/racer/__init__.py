@@ -5,6 +5,7 @@ from mcaprl.sims.spec import SimSpec
 SPEC = SimSpec(
     name="racer",
     env_id="mcaprl/Racer-v0",
+    continuous_id="mcaprl/RacerContinuous-v0",
     entry_point="mcaprl.sims.racer.env:RacerEnv",
     vector_entry_point="mcaprl.sims.racer.env:BatchedRacerEnv",
     device_entry_point="mcaprl.sims.racer.device:DeviceRacer",

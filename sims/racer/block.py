@@ -16,6 +16,7 @@ from mcaprl.sims.racer.rays import BLOCK_SIZE, LENGTH, RAYS, measure
 from mcaprl.sims.racer.rules import (
     CORNER_PX_2,
     MAX_SPEED_PX,
+    Command,
     drive,
     edges_hit,
     observe_with,
@@ -32,7 +33,7 @@ StepResult = tuple[float, int, float, float, float, float, int]
 def step_cars(
     track: Track,
     cars: NDArray[np.float64],
-    actions: NDArray[np.int64],
+    commands: NDArray[np.float64],
     rewards: NDArray[np.float64],
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
@@ -44,7 +45,7 @@ def step_cars(
     Args:
         track: Track of all cars.
         cars: (N, 13) rows: a `Car`, then its distance along the path at the start.
-        actions: (N,) 0 to 8.
+        commands: (N, 2) rows of `Command`.
         rewards: (N,) output.
         ends: (N,) output: DRIVING, CRASH, NO_GATE or TIME_LIMIT.
         observations: (N, 19) output.
@@ -55,7 +56,8 @@ def step_cars(
     lengths_px = np.empty((len(cars), RAYS))
     for i in range(len(cars)):
         before = car_at(cars[i])
-        after = drive(track, before, actions[i], classic, drift)
+        command = Command(commands[i, 0], commands[i, 1])
+        after = drive(track, before, command, classic, drift)
         store_car(after, cars[i])
         hits = edges_hit(track, after) if _is_any_near(lines, after.x_px, after.y_px) else 0
         rewards[i], ends[i] = outcome_with(hits, before, after, classic)
@@ -108,21 +110,22 @@ def _write_codes(lengths_px: NDArray[np.float64], observations: NDArray[np.float
 def step_only_car(
     track: Track,
     cars: NDArray[np.float64],
-    actions: NDArray[np.int64],
+    commands: NDArray[np.float64],
     rewards: NDArray[np.float64],
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
     classic: bool,
     drift: bool,
-    action: int,
+    acceleration: float,
+    turn: float,
 ) -> StepResult:
     """Advance a single car with `step_cars`; also return the contents of its `info`.
 
     Returns:
         Reward, end, offset, heading error, speed, progress, and gates passed.
     """
-    actions[0] = action
-    step_cars(track, cars, actions, rewards, ends, observations, classic, drift)
+    commands[0, 0], commands[0, 1] = acceleration, turn
+    step_cars(track, cars, commands, rewards, ends, observations, classic, drift)
     car = car_at(cars[0])
     info = (car.offset_m, car.heading_error_rad, speed_of(car), car.along_m - cars[0, -1])
     return rewards[0], ends[0], *info, int(car.gates)

@@ -13,7 +13,7 @@ from mcaprl.sims.geometry.paths import Path
 from mcaprl.sims.racer.course import Car, Track, store_car
 from mcaprl.sims.racer.fleet import ANYWHERE, RacerFleet, start_anywhere, start_on_line
 from mcaprl.sims.racer.rays import BLOCK_SIZE
-from mcaprl.sims.racer.rules import CRASH, advance, observe_with
+from mcaprl.sims.racer.rules import ACTION_COMMANDS, CRASH, advance, observe_with
 from mcaprl.sims.vehicle.device import Batch, DeviceSims, begin_episode, finish_step, to_gpu
 
 
@@ -118,8 +118,8 @@ def _step_car(
     i: int,
     block: Any,
 ) -> None:
-    row, action, track = batch.states[i], batch.actions[i], world.track
-    car, reward, end = advance(track, row, action, False, world.drift)
+    row, command, track = batch.states[i], ACTION_COMMANDS[batch.actions[i]], world.track
+    car, reward, end = advance(track, row, command, False, world.drift)
     observe_with(track, car, False, block, batch.observations[i])
     terminated, truncated = end == CRASH, end > CRASH
     if finish_step(batch, i, reward, terminated, truncated, max_steps):

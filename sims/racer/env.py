@@ -13,7 +13,7 @@ from mcaprl.sims.drawing.shapes import car_moments
 from mcaprl.sims.racer import scene as racer_scene
 from mcaprl.sims.racer.course import Car, Track
 from mcaprl.sims.racer.fleet import RacerFleet
-from mcaprl.sims.racer.rules import STEP_S
+from mcaprl.sims.racer.rules import STEP_S, Command
 from mcaprl.sims.vehicle.batched import BatchedEnv
 from mcaprl.sims.vehicle.env import RENDER_MODES, RenderMode, VehicleEnv
 
@@ -40,7 +40,7 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
 
     ## Action Space
 
-    `Discrete(9)`. The speed changes by 2 pixels per step.
+    `actions="discrete"`: `Discrete(9)`. The speed changes by 2 pixels per step.
 
     | Action | Meaning | Speed | Turn |
     |---|---|---|---|
@@ -56,6 +56,14 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
 
     `actions=5` allows actions 0 to 4; `actions=8` allows all actions except `none`,
     renumbered from 0.
+
+    `actions="continuous"`, which is the default of `mcaprl/RacerContinuous-v0`: `Box(-1, 1)` of 2
+    float32. The discrete actions are points of this space.
+
+    | Index | Part | 1 | -1 |
+    |---|---|---|---|
+    | 0 | acceleration | 2 pixels per step faster | 2 pixels per step slower |
+    | 1 | turn | 15 degrees to the left | 15 degrees to the right |
 
     ## Observation Space
 
@@ -121,7 +129,7 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     - `rules`: `"default"` or `"classic"`.
     - `observation`: `"rays"`.
     - `start`: `"anywhere"` or `"line"`; None means `"anywhere"`, or `"line"` in the classic rules.
-    - `actions`: 5, 8 or 9.
+    - `actions`: `"discrete"` or 9, 8, 5, or `"continuous"`, which the classic rules do not have.
     - `drift`: whether the direction of travel lags behind the heading. It turns toward the heading
       by at most 100 / (speed + 1) degrees per step.
     - `track_seed`: None for the default track, or the seed of a random track, at least 0.
@@ -184,7 +192,7 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     def _state(self) -> Car:
         return self.car
 
-    def _moments(self, before: Car, action: int) -> list[Sequence[Frame]]:
+    def _moments(self, before: Car, command: Sequence[float]) -> list[Sequence[Frame]]:
         # By the rules, a car turns at once and then moves. A viewer shows an arc instead.
         start, end = racer_scene.pose_of(before), racer_scene.pose_of(self.car)
         return car_moments(start, end, self.step_duration_s)
@@ -195,7 +203,7 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
         return RacerView(render_mode, self.track)
 
     def _draw(self, view: RacerView) -> NDArray[np.uint8]:
-        return view.draw(self.car, self.trail, self.fleet.last_actions.item())
+        return view.draw(self.car, self.trail, Command(*self.fleet.commands[0].tolist()))
 
 
 class BatchedRacerEnv(BatchedEnv):

@@ -27,20 +27,30 @@ from mcaprl.sims.racer.course import (
     store_car,
 )
 from mcaprl.sims.racer.rules import (
+    ACTION_COMMANDS,
     ACTION_MEANINGS,
+    COMMAND_UNITS,
     MAX_SPEED_M_S,
     OBSERVATION_NAMES,
     REASONS,
     STEP_S,
     TRUNCATES,
+    Command,
     observe,
     walls_hit,
 )
-from mcaprl.sims.vehicle.arguments import check_name, pose_from
+from mcaprl.sims.vehicle.arguments import check_actions, check_name, pose_from
+from mcaprl.sims.vehicle.controls import Controls
 from mcaprl.sims.vehicle.draws import Generators, draw, spread
 from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
 
-ACTION_SETS = {5: (0, 1, 2, 3, 4), 8: (1, 2, 3, 4, 5, 6, 7, 8), 9: tuple(range(9))}
+_EVERY = tuple(range(len(ACTION_COMMANDS)))
+ACTION_SETS: dict[object, tuple[int, ...]] = {
+    "discrete": _EVERY,
+    9: _EVERY,
+    8: _EVERY[1:],
+    5: _EVERY[:5],
+}
 _INFO = (*CAR_INFO, "gates_passed")
 _ONLY = np.zeros(1, dtype=np.int64)
 """Index of the only car of a fleet of one, as an array."""
@@ -58,7 +68,7 @@ class RacerFleet(Fleet):
         rules: str = "default",
         observation: str = "rays",
         start: str | None = None,
-        actions: int = 9,
+        actions: int | str = "discrete",
         drift: bool = False,
         track_seed: int | None = None,
     ) -> None:
@@ -66,20 +76,18 @@ class RacerFleet(Fleet):
         check_name("rules", rules, ("default", "classic"))
         check_name("observation", observation, ("rays",))
         check_name("start", start, (None, "anywhere", "line"))
-        check_name("number of actions", actions, tuple(ACTION_SETS))
+        check_actions(actions, (*ACTION_SETS, "continuous"), rules)
         check_name("drift", drift, (False, True))
         self.classic = rules == "classic"
         self.track = _track_of(track_seed)
-        self.action_set = np.array(ACTION_SETS[actions], dtype=np.int64)
+        self.action_set = np.array(ACTION_SETS.get(actions, ()), dtype=np.int64)
         super().__init__(
             count,
             spaces.Box(-1.0, 1.0, (len(OBSERVATION_NAMES),), np.float32),
             OBSERVATION_NAMES,
-            tuple(ACTION_MEANINGS[action] for action in self.action_set),
+            _controls(self.action_set),
             STEP_S,
         )
-        self._numbers = ACTION_SETS[actions]
-        self.last_actions = np.zeros(count, dtype=np.int64)
         on_line = start == "line" or (self.classic and start is None)
         self._kind = ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE
         self._randoms = Generators(count)
@@ -101,7 +109,7 @@ class RacerFleet(Fleet):
         store_car(car, row)
         row[STARTED_AT] = car.along_m
         observe(self.track, car, self.classic, self._seen[i])
-        self.rewards[i], self.ends[i], self.last_actions[i] = 0.0, GOING_ON, 0
+        self.rewards[i], self.ends[i], self.commands[i] = 0.0, GOING_ON, 0.0
 
     def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
         """Start episodes of the chosen cars."""
@@ -111,7 +119,7 @@ class RacerFleet(Fleet):
     def _begin_chosen(self, chosen: NDArray[np.int64]) -> None:
         """Start episodes of the chosen cars, which all have a generator."""
         self._start_chosen(chosen)
-        self.rewards[chosen], self.ends[chosen], self.last_actions[chosen] = 0.0, GOING_ON, 0
+        self.rewards[chosen], self.ends[chosen], self.commands[chosen] = 0.0, GOING_ON, 0.0
 
     def start_one(
         self, random: np.random.Generator, options: dict[str, Any] | None
@@ -121,18 +129,17 @@ class RacerFleet(Fleet):
             return super().start_one(random, options)
         self._randoms.use(0, random)
         self._start_chosen(_ONLY)
-        self.rewards[0], self.ends[0], self.last_actions[0] = 0.0, GOING_ON, 0
+        self.rewards[0], self.ends[0], self.commands[0] = 0.0, GOING_ON, 0.0
         return self._observe_only(), self.info(0)
 
     def advance(self) -> None:
         """Advance all cars by one step."""
-        self.action_set.take(self.actions, out=self.last_actions, mode="clip")
         self._step()
 
-    def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
+    def step_one(self, command: Sequence[float]) -> tuple[Any, float, int, dict[str, Any]]:
         """Advance the car of a one-car fleet; one compiled call computes reward, end and `info`."""
         reward, end, offset_m, heading_error_rad, speed_m_s, progress_m, gates = self._drive_only(
-            self._numbers[action]
+            *command
         )
         # A dict display is faster than `dict(zip(_INFO, ...))`.
         info = {
@@ -150,7 +157,7 @@ class RacerFleet(Fleet):
     @property
     def _arguments(self) -> tuple[Any, ...]:
         outcome = (self.rewards, self.ends, self._seen)
-        return (self.track, self._cars, self.last_actions, *outcome, self.classic, self._drift)
+        return (self.track, self._cars, self.commands, *outcome, self.classic, self._drift)
 
     @cached_property
     def _start_chosen(self) -> Callable[[NDArray[np.int64]], None]:
@@ -160,8 +167,8 @@ class RacerFleet(Fleet):
     # Only a fleet of one car uses `_drive_only`.
 
     @cached_property
-    def _drive_only(self) -> Callable[[int], StepResult]:
-        return ready(step_only_car, *self._arguments, examples=(0,))
+    def _drive_only(self) -> Callable[[float, float], StepResult]:
+        return ready(step_only_car, *self._arguments, examples=(0.0, 0.0))
 
     def places(self) -> NDArray[np.float64]:
         """Return the positions of all cars, (N, 2) x and y in the map, meters."""
@@ -180,6 +187,15 @@ class RacerFleet(Fleet):
         values = np.empty((5, self.count))
         car_info(self._cars, values)
         return dict(zip(_INFO, (*values[:4], values[4].astype(np.int64)), strict=True))
+
+
+def _controls(action_set: NDArray[np.int64]) -> Controls:
+    """Return the controls with these discrete actions, or continuous ones if there are none."""
+    if not len(action_set):
+        return Controls(Command._fields, COMMAND_UNITS)
+    meanings = tuple(ACTION_MEANINGS[action] for action in action_set)
+    commands = np.array(ACTION_COMMANDS)[action_set]
+    return Controls(Command._fields, COMMAND_UNITS, meanings, commands)
 
 
 def _track_of(seed: int | None) -> Track:

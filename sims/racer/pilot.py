@@ -11,7 +11,7 @@ from mcaprl.compiled import compiled
 from mcaprl.sims.racer.course import Car, Track
 from mcaprl.sims.racer.env import RacerEnv
 from mcaprl.sims.racer.rays import BLOCK_SIZE, CENTER_RAYS, CENTER_RAYS_RAD, LENGTH, measure
-from mcaprl.sims.racer.rules import MAX_SPEED_PX, SPEED_CHANGE_PX, THROTTLE, TURN
+from mcaprl.sims.racer.rules import ACTION_COMMANDS, MAX_SPEED_PX, SPEED_CHANGE_PX
 from mcaprl.sims.vehicle.env import ScriptedPilot
 
 ROOM_EXPONENT = 1.17
@@ -39,15 +39,16 @@ def choose(track: Track, car: Car, allowed: NDArray[np.int64], classic: bool) ->
             weights += weight
             moments += weight * CENTER_RAYS_RAD[i]
     aim_rad = moments / weights
-    turn = 0 if abs(aim_rad) <= TURN_BEYOND_RAD else int(math.copysign(1.0, aim_rad))
+    turn = 0.0 if abs(aim_rad) <= TURN_BEYOND_RAD else math.copysign(1.0, -aim_rad)
     wanted_px = min(max((lengths_px[0] - STOP_PX) * SPEED_PER_PX, SLOWEST_PX), MAX_SPEED_PX)
     lacking_px = wanted_px - car.speed_px
-    throttle = 0
+    acceleration = 0.0
     if abs(lacking_px) > 0.5 * SPEED_CHANGE_PX:
-        throttle = int(math.copysign(1.0, -lacking_px if classic else lacking_px))
+        acceleration = math.copysign(1.0, -lacking_px if classic else lacking_px)
     best, least = allowed[0], math.inf
     for action in allowed:
-        misses = 2 * abs(TURN[action] - turn) + abs(THROTTLE[action] - throttle)
+        command = ACTION_COMMANDS[action]
+        misses = 2.0 * abs(command.turn - turn) + abs(command.acceleration - acceleration)
         if misses < least:
             best, least = action, misses
     return int(best)

@@ -6,6 +6,7 @@ Coordinates are those of the image: y points down, so angles are clockwise.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +47,29 @@ ACTION_MEANINGS = (
     "forward left",
     "forward right",
 )
-THROTTLE = (0, 1, 0, 0, -1, -1, -1, 1, 1)
-TURN = (0, 0, -1, 1, 0, 1, -1, -1, 1)
-"""Turn of each action, in units of 15 degrees; right is positive."""
+
+
+class Command(NamedTuple):
+    """Command of a step."""
+
+    acceleration: float
+    """Change of speed, in units of 2 pixels per step."""
+    turn: float
+    """Turn, in units of 15 degrees, left positive."""
+
+
+ACTION_COMMANDS = (
+    Command(0.0, 0.0),
+    Command(1.0, 0.0),
+    Command(0.0, 1.0),
+    Command(0.0, -1.0),
+    Command(-1.0, 0.0),
+    Command(-1.0, -1.0),
+    Command(-1.0, 1.0),
+    Command(1.0, 1.0),
+    Command(1.0, -1.0),
+)
+COMMAND_UNITS = ("2 px/step", "15 degrees, left positive")
 
 STEP_S = 0.1
 TURN_RAD = math.radians(15.0)
@@ -122,14 +143,15 @@ def is_near(wall: NDArray[np.float64], car: Car) -> bool:
 
 
 @compiled
-def drive(track: Track, car: Car, action: int, classic: bool, drift: bool) -> Car:
-    """Return the car after one action; if it passed the next gate, increase its count of gates.
+def drive(track: Track, car: Car, command: Command, classic: bool, drift: bool) -> Car:
+    """Return the car after one command; if it passed the next gate, increase its count of gates.
 
     In the classic rules, forward and back are swapped.
     """
-    throttle = -THROTTLE[action] if classic else THROTTLE[action]
+    # A subtraction from 0 returns 0 for 0, but a negation returns -0.
+    throttle = 0.0 - command.acceleration if classic else command.acceleration
     speed_px = min(max(car.speed_px + SPEED_CHANGE_PX * throttle, -MAX_SPEED_PX), MAX_SPEED_PX)
-    heading_rad = wrap_angle(car.heading_rad + TURN_RAD * TURN[action])
+    heading_rad = wrap_angle(car.heading_rad + (0.0 - TURN_RAD * command.turn))
     course_rad = heading_rad
     if drift:
         limit_rad = DRIFT_RAD * MAX_SPEED_PX / (abs(car.speed_px) + 1.0)
@@ -223,11 +245,11 @@ def observe_with(
 
 @inlined
 def advance(
-    track: Track, row: NDArray[np.float64], action: int, classic: bool, drift: bool
+    track: Track, row: NDArray[np.float64], command: Command, classic: bool, drift: bool
 ) -> tuple[Car, float, int]:
     """Advance the car in a row of `block.step_cars`; return the car, its reward and its end."""
     before = car_at(row)
-    after = drive(track, before, action, classic, drift)
+    after = drive(track, before, command, classic, drift)
     store_car(after, row)
     reward, end = outcome_of(track, before, after, classic)
     return after, reward, end

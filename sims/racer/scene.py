@@ -27,7 +27,7 @@ from mcaprl.sims.racer.course import (
     to_map,
 )
 from mcaprl.sims.racer.rays import ray_ends
-from mcaprl.sims.racer.rules import STEP_S, THROTTLE, TURN, speed_of
+from mcaprl.sims.racer.rules import STEP_S, Command, speed_of
 
 Floats = NDArray[np.float64]
 
@@ -131,15 +131,15 @@ class RacerView:
         self._static = patches(static_shapes(track))
 
     def draw(
-        self, car: Car, trail_m: Sequence[tuple[float, ...]], action: int
+        self, car: Car, trail_m: Sequence[tuple[float, ...]], command: Command
     ) -> NDArray[np.uint8]:
-        """Render the track, the car and its last action, (600, 1000, 3)."""
+        """Render the track, the car and its last command, (600, 1000, 3)."""
         moving = patches(moving_shapes(self._track, car, trail_m))
         for patch in sorted([*self._static, *moving], key=lambda each: each.top_m):
             self._fill(patch, car)
         self._canvas.flatten()
         self._write(car)
-        self._draw_keys(action)
+        self._draw_keys(command)
         return self._canvas.finish()
 
     def close(self) -> None:
@@ -160,18 +160,20 @@ class RacerView:
         self._canvas.text(f"speed {car.speed_px:.0f}", (left, top + 26), 32, INK)
         self._canvas.text(f"step {int(car.steps)}", (left, top + 52), 32, INK)
 
-    def _draw_keys(self, action: int) -> None:
+    def _draw_keys(self, command: Command) -> None:
+        """Draw the four keys, each filled up to the share of the command in its direction."""
         pressed = {
-            "forward": THROTTLE[action] > 0,
-            "back": THROTTLE[action] < 0,
-            "left": TURN[action] < 0,
-            "right": TURN[action] > 0,
+            "forward": command.acceleration,
+            "back": -command.acceleration,
+            "left": command.turn,
+            "right": -command.turn,
         }
         left, top = PANEL_PX[0] + 115, PANEL_PX[1]
         for name, (column, row) in _KEYS.items():
             box_px = (left + column * (KEY_PX + 5), top + row * (KEY_PX + 5), KEY_PX, KEY_PX)
-            if pressed[name]:
-                self._canvas.rectangle(box_px, PRESSED)
+            if (height_px := round(KEY_PX * pressed[name])) > 0:
+                below_px = (box_px[0], box_px[1] + KEY_PX - height_px, KEY_PX, height_px)
+                self._canvas.rectangle(below_px, PRESSED)
             self._canvas.rectangle(box_px, INK, edge_px=2)
             middle_px = (box_px[0] + KEY_PX // 2, box_px[1] + KEY_PX // 2)
             self._canvas.arrowhead(middle_px, _ARROWS[name], INK)

@@ -27,6 +27,16 @@ def check_name(argument: str, value: object, allowed: Sequence[object]) -> None:
         raise UnknownNameError(argument, str(value), [str(name) for name in allowed])
 
 
+def check_actions(actions: object, allowed: Sequence[object], rules: str) -> None:
+    """Validate the argument `actions`; the published rules have discrete actions only."""
+    check_name("actions", actions, allowed)
+    if not isinstance(actions, int) and actions != "discrete" and rules != "default":
+        raise UsageError(
+            f"actions '{actions}' need the rules 'default': the rules '{rules}' are published with"
+            " discrete actions"
+        )
+
+
 def check_range(argument: str, value: float, low: float, high: float) -> None:
     """Validate that a number is in [low, high]."""
     if not low <= value <= high:

@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -70,10 +69,11 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         self.fleet = fleet = self.fleet_type(num_envs, **kwargs)
         self.step_duration_s = fleet.step_duration_s
-        self.action_meanings = fleet.action_meanings
+        self.action_meanings = fleet.controls.meanings
+        self.action_part_names, self.action_units = fleet.controls.parts
         self.observation_names = fleet.observation_names
         self.single_observation_space = fleet.observation_space
-        self.single_action_space = spaces.Discrete(len(fleet.action_meanings))
+        self.single_action_space = fleet.controls.space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._truncates = np.array(fleet.truncates)
@@ -120,7 +120,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Advance each vehicle by one step.
 
         Args:
-            actions: (N,) integers.
+            actions: (N,) integers, or (N, P) parts of continuous actions.
 
         Raises:
             UsageError: The actions are invalid, or autoreset is disabled and an ended episode was

@@ -108,7 +108,7 @@ class DeviceSims(ABC):
         self.num_envs, self.device = num_envs, device
         self.max_episode_steps = max_episode_steps
         self.single_observation_space = fleet.observation_space
-        self.single_action_space = spaces.Discrete(len(fleet.action_meanings))
+        self.single_action_space = spaces.Discrete(len(fleet.controls.meanings))
         self._seed = np.uint64(seed)
         allocate = _gpu().device_array if device == "cuda" else np.zeros
         seen = (num_envs, len(fleet.observation_names))

@@ -6,20 +6,20 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from operator import index
-from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, cast
+from typing import Any, ClassVar, Final, Generic, Literal, Protocol, TypeVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.actions import JointActions
+from mcaprl.actions import joint_actions
 from mcaprl.base_policy import BasePolicy
-from mcaprl.sims.vehicle.arguments import check_action, check_name
+from mcaprl.sims.vehicle.arguments import check_name
 from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
 
 RenderMode = Literal["human", "rgb_array"]
 RENDER_MODES = ("human", "rgb_array")
+FLOAT: Final = np.dtype(np.float32)
 
 
 class View(Protocol):
@@ -90,19 +90,23 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         super().__init__(render_mode)
         self.fleet = fleet = self.fleet_type(1, **kwargs)
         self.step_duration_s = fleet.step_duration_s
-        self.action_meanings = fleet.action_meanings
+        self.controls = controls = fleet.controls
+        self.action_meanings = controls.meanings
+        self.action_part_names, self.action_units = controls.parts
         self.observation_names = fleet.observation_names
-        self.action_space = spaces.Discrete(len(fleet.action_meanings))
+        self.action_space = controls.space
         self.observation_space = fleet.observation_space
         self._noise_size = fleet.noise.shape[1]
         # Copy attributes of the fleet, so that a step needs one attribute lookup instead of two.
-        self._n_actions = len(fleet.action_meanings)
+        commands = controls.commands
+        self._commands = None if commands is None else list(map(tuple, commands.tolist()))
+        self._n_actions, self._n_parts = len(controls.meanings), (len(controls.names),)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
         self._is_watched = render_mode == "human"
-        # The current state, and the state before the last step with that step's action. They are
+        # The current state, and the state before the last step with that step's command. They are
         # set only if `_is_watched` is true.
         self._now: Any = None
-        self._last_step: tuple[Any, int] | None = None
+        self._last_step: tuple[Any, Sequence[float]] | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -121,24 +125,40 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
             self._watch()
         return started
 
-    def step(self, action: int | np.integer[Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance the vehicle by one decision.
 
         Raises:
             UsageError: There is no such action.
         """
-        try:
-            number = index(action)
-        except TypeError:
-            number = -1
-        if not 0 <= number < self._n_actions:
-            # `check_action` raises the error. It is called only here because it is slow.
-            number = check_action(action, self._n_actions)
+        # `Controls.read` returns the same command, but is slow.
+        commands, command = self._commands, None
+        if commands is None:
+            if (
+                type(action) is np.ndarray
+                and action.dtype == FLOAT
+                and action.shape == self._n_parts
+            ):
+                parts = action.tolist()
+                for part in parts:
+                    if not -1.0 <= part <= 1.0:
+                        break
+                else:
+                    command = parts
+        else:
+            try:
+                number = index(action)
+            except TypeError:
+                number = -1
+            if 0 <= number < self._n_actions:
+                command = commands[number]
+        if command is None:
+            command = self.controls.read(action)
         if self._noise_size:
             self.fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
-        observation, reward, end, info = self.fleet.step_one(number)
+        observation, reward, end, info = self.fleet.step_one(command)
         if self._is_watched:
-            self._last_step = (self._now, number)
+            self._last_step = (self._now, command)
             self._watch()
         if end == GOING_ON:
             return observation, reward, False, False, info
@@ -174,7 +194,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
             return []
         return before_end(self._moments(*self._last_step), self.step_duration_s)
 
-    def imitate(self, fleet: AnyFleet, j: int, action: int | None) -> None:
+    def imitate(self, fleet: AnyFleet, j: int, action: Any) -> None:
         """Copy the state of vehicle j of a fleet, so that this environment shows the vehicle.
 
         Call this method after each step of the vehicle.
@@ -188,7 +208,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         self._is_watched = True
         if action is None:
             self._trail.clear()
-        self._last_step = None if action is None else (self._now, action)
+        self._last_step = None if action is None else (self._now, self.fleet.commands[0].tolist())
         self._watch()
 
     @abstractmethod
@@ -196,12 +216,12 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         """Return a copy of the state of the vehicle."""
 
     @abstractmethod
-    def _moments(self, before: Any, action: int) -> list[Frames]:
+    def _moments(self, before: Any, command: Sequence[float]) -> list[Frames]:
         """Return the moving coordinate frames at equal intervals in the last step and at its end.
 
         Args:
             before: State of the vehicle before the step.
-            action: Action of the step.
+            command: Command of the step.
         """
 
     def _watch(self) -> None:
@@ -241,8 +261,8 @@ class ScriptedPilot(BasePolicy, ABC, Generic[AnySim]):
         self.sim = sim
         self.action_space = getattr(sim, "action_space", None)
 
-    def act(self, observations: Any) -> NDArray[np.int64]:
-        """Return the action, shape (1,), for the current state of the environment.
+    def act(self, observations: Any) -> NDArray[Any]:
+        """Return the action (1, *shape) for the current state of the environment.
 
         Args:
             observations: Observations with a leading dimension of 1, or a dict of them.
@@ -253,13 +273,19 @@ class ScriptedPilot(BasePolicy, ABC, Generic[AnySim]):
         rows = next(iter(observations.values())) if isinstance(observations, dict) else observations
         if len(rows) != 1:
             raise ValueError(f"a pilot drives one environment, not {len(rows)}")
-        return np.array([self.choose()], dtype=np.int64)
+        space = self.action_space
+        return np.array([self.choose()], dtype=np.int64 if space is None else space.dtype)
 
-    def action_probabilities(self, observations: Any) -> NDArray[np.float64]:
-        """Return the probabilities (1, A) of the actions: 1 for that of `act`."""
-        joint = JointActions.of(cast(Any, self.action_space))
+    def action_probabilities(self, observations: Any) -> NDArray[np.floating[Any]]:
+        """Return the probabilities (1, A) of the actions: 1 for that of `act`.
+
+        Raises:
+            PolicyError: The actions are continuous.
+        """
+        if (joint := joint_actions(self.action_space)) is None:
+            return super().action_probabilities(observations)
         return np.eye(joint.count)[joint.indexes(self.act(observations))]
 
     @abstractmethod
-    def choose(self) -> int:
+    def choose(self) -> Any:
         """Choose the action for the current state."""

@@ -11,8 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.compiled import compiled, ready
-from mcaprl.errors import UsageError
+from mcaprl.compiled import ready
+from mcaprl.sims.vehicle.controls import Controls
 
 GOING_ON = 0
 """Value of `Fleet.ends` while an episode runs."""
@@ -27,9 +27,9 @@ class Fleet(ABC):
         count: Number of vehicles N.
         observation_space: Observation space of one vehicle.
         observation_names: Names of the observed numbers; empty for images.
-        action_meanings: Meaning of each action.
+        controls: Parts of a command, and the actions.
         step_duration_s: Simulated time of one step.
-        actions: (N,) valid actions of the next step.
+        commands: (N, P) valid commands of the next step.
         rewards: (N,) rewards of the last step; 0 after a start.
         ends: (N,) indices in `reasons`; `GOING_ON` while the episode runs.
         noise: (N, K) standard normal numbers that the environment draws for the next step. If steps
@@ -48,7 +48,7 @@ class Fleet(ABC):
         count: int,
         observation_space: spaces.Space[Any],
         observation_names: tuple[str, ...],
-        action_meanings: tuple[str, ...],
+        controls: Controls,
         step_duration_s: float,
         noise_size: int = 0,
     ) -> None:
@@ -56,9 +56,9 @@ class Fleet(ABC):
         self.count = count
         self.observation_space = observation_space
         self.observation_names = observation_names
-        self.action_meanings = action_meanings
+        self.controls = controls
         self.step_duration_s = step_duration_s
-        self.actions = np.zeros(count, dtype=np.int64)
+        self.commands = np.zeros((count, len(controls.names)))
         self.rewards = np.zeros(count)
         self.ends = np.zeros(count, dtype=np.int64)
         self.noise = np.zeros((count, noise_size))
@@ -83,40 +83,38 @@ class Fleet(ABC):
         """Set the actions of the next step.
 
         Args:
-            actions: (N,) integers.
+            actions: (N,) integers, or (N, P) parts of continuous actions.
 
         Raises:
-            UsageError: The number of actions is wrong, or an action is not an integer from 0 to the
-                number of actions - 1. The attribute `actions` is then invalid.
+            UsageError: The number of actions is wrong, or an action is not valid. The attribute
+                `commands` is then invalid.
         """
-        numbers = np.asarray(actions)
-        if numbers.shape != (self.count,) or numbers.dtype.kind not in "iu":
-            raise UsageError(
-                f"actions must be an array of {self.count} integers,"
-                f" not {numbers.dtype} of shape {numbers.shape}"
-            )
-        self.actions[:] = numbers
-        most = len(self.action_meanings)
-        if self._largest_action() >= most:
-            wrong = numbers[(numbers < 0) | (numbers >= most)][0]
-            raise UsageError(f"action {wrong} does not exist: actions are 0 to {most - 1}")
+        controls = self.controls
+        found = controls.array(actions, (self.count,))
+        given, read = self._given
+        given[:] = found
+        wrong = read()
+        if wrong >= 0:
+            raise controls.error(found, wrong)
 
     @cached_property
-    def _largest_action(self) -> Callable[[], np.uint64]:
-        """Function that returns the largest element of `actions`, as an unsigned number."""
-        return ready(_largest, self.actions)
+    def _given(self) -> tuple[NDArray[Any], Callable[[], int]]:
+        """Array for the actions of a step, and the function that writes their commands."""
+        space = self.controls.space
+        actions = np.zeros((self.count, *(space.shape or ())), space.dtype)
+        return actions, self.controls.reader(actions, self.commands)
 
     @abstractmethod
     def advance(self) -> None:
-        """Advance each vehicle by one step with its action in `actions`."""
+        """Advance each vehicle by one step with its command in `commands`."""
 
-    def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
-        """Advance the only vehicle of a fleet of one, with a valid action.
+    def step_one(self, command: Sequence[float]) -> tuple[Any, float, int, dict[str, Any]]:
+        """Advance the only vehicle of a fleet of one, with a valid command.
 
         Returns:
             Observation, reward, element of `ends`, and `info`.
         """
-        self.actions[0] = action
+        self.commands[0] = command
         self.advance()
         return self.observation(0), self.rewards.item(), self.ends.item(), self.info(0)
 
@@ -195,13 +193,3 @@ class Fleet(ABC):
     @abstractmethod
     def infos(self) -> dict[str, NDArray[Any]]:
         """Return the `info` of all vehicles, each value as a new (N,) array."""
-
-
-@compiled
-def _largest(numbers: NDArray[np.int64]) -> np.uint64:
-    """Return the largest of N numbers as unsigned numbers; negative ones are 2**63 or more."""
-    # NumPy takes several times as long for as few numbers as there are vehicles.
-    largest = np.uint64(0)
-    for number in numbers.view(np.uint64):
-        largest = max(largest, number)
-    return largest

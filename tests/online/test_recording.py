@@ -30,7 +30,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import read_curve
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.evaluate import Scale
-from mcaprl.sims.lane.rules import STEERING
+from mcaprl.sims.lane.rules import ACTION_COMMANDS
 from tests.support.learner_topic import read_learner
 
 SHORT: dict[str, Any] = {
@@ -122,7 +122,7 @@ def test_logged_commands_are_those_of_the_logged_actions(tmp_path: Path) -> None
     for episode in log.episodes:
         commands = np.zeros((episode.length + 1, 32, 2), np.float32)
         for step, action in enumerate(episode.actions.tolist()):
-            steering = commands[step, 0, 1] if action == 0 else 2 * STEERING[action]
+            steering = commands[step, 0, 1] if action == 0 else 2 * ACTION_COMMANDS[action].steering
             commands[step + 1, 0] = -1 if action == 0 else 1, steering
             commands[step + 1, 1:] = commands[step, :-1]
         expected = commands.reshape(-1, 64)

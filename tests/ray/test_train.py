@@ -156,8 +156,8 @@ def test_options_that_cannot_be_used_with_ray(logs: Path, tmp_path: Path) -> Non
         train(ray=ClusterOptions(workers=3))
     with pytest.raises(ClusterError, match="the cluster has 0 GPUs for 1 worker:"):
         train(ray=True, device="cuda")
-    with pytest.raises(SpaceError, match="needs discrete actions, got Box"):
-        train(GOLDEN / "multi-binary.mcap", ray=True)
+    with pytest.raises(SpaceError, match="dqn needs discrete actions"):
+        mcaprl.train(GOLDEN / "multi-binary.mcap", tmp_path / "run", algo="dqn", ray=True)
     assert not (tmp_path / "run").exists()
 
 

@@ -24,7 +24,7 @@ from mcaprl.sims import SIMS, make_sim
 from mcaprl.sims.drawing.depth import encode_depth
 from mcaprl.sims.evaluation.pilots import make_pilot
 from mcaprl.sims.powerline.course import POINTS_M, point_on_line
-from tests.support.sims import batched, check_shape, rotated, unwrapped
+from tests.support.sims import action_of, batched, check_shape, rotated, unwrapped
 
 Trace = list[tuple[bytes, float, bool, bool, dict[str, Any]]]
 
@@ -36,14 +36,21 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("lane", {"observation": "rays"}),
     ("lane", {"rules": "classic", "start": "anywhere"}),
     ("lane", {"rules": "classic-code", "observation": "depth"}),
+    ("lane", {"actions": "continuous"}),
+    ("lane", {"actions": "continuous", "observation": "rays"}),
+    ("lane", {"actions": "continuous", "observation": "depth-commands"}),
     ("racer", {}),
     ("racer", {"rules": "classic", "start": "anywhere"}),
     ("racer", {"actions": 5, "drift": True, "track_seed": 3}),
+    ("racer", {"actions": "continuous"}),
     ("powerline", {}),
     ("powerline", {"observation": "depth", "camera": "front"}),
     ("powerline", {"plant": "point", "wind_m_s": 4.0, "gust_m_s": 1.0}),
     ("powerline", {"rules": "classic"}),
+    ("powerline", {"actions": "continuous"}),
+    ("powerline", {"actions": "increments", "gust_m_s": 1.0}),
     ("highway-lane", {}),
+    ("highway-lane", {"actions": "continuous"}),
     ("highway-lane", {"road": "racetrack-v0"}),
 ]
 ON_THE_GROUND = ("lane", "racer", "highway-lane")
@@ -69,12 +76,11 @@ def as_bytes(observation: Any) -> bytes:
     return bytes(observation.tobytes())
 
 
-def actions_of(env: gym.Env[Any, Any], chosen: list[int]) -> list[int]:
-    assert isinstance(env.action_space, spaces.Discrete)
-    return [number % int(env.action_space.n) for number in chosen]
+def actions_of(env: gym.Env[Any, Any], chosen: list[int]) -> list[Any]:
+    return [action_of(env.action_space, number) for number in chosen]
 
 
-def trace(env: gym.Env[Any, Any], seed: int, actions: list[int]) -> Trace:
+def trace(env: gym.Env[Any, Any], seed: int, actions: list[Any]) -> Trace:
     """Return all results of an episode, with observations as bytes."""
     observation, info = env.reset(seed=seed)
     steps: Trace = [(as_bytes(observation), 0.0, False, False, info)]
@@ -156,7 +162,7 @@ def test_an_observation_is_a_copy(name: str, kwargs: dict[str, Any]) -> None:
     sim = unwrapped(name, **kwargs)
     first, _ = sim.reset(seed=0)
     kept = as_bytes(first)
-    sim.step(1)
+    sim.step(action_of(sim.action_space, 1))
     assert as_bytes(first) == kept
 
 
@@ -168,7 +174,7 @@ def test_every_end_has_one_cause_and_a_reason(name: str, kwargs: dict[str, Any])
         sim.reset(seed=seed)
         terminated = truncated = False
         for _ in range(LONGEST):
-            _, _, terminated, truncated, info = sim.step(int(sim.action_space.sample()))
+            _, _, terminated, truncated, info = sim.step(sim.action_space.sample())
             assert ("reason" in info) == (terminated or truncated)
             if terminated or truncated:
                 break
@@ -180,7 +186,7 @@ def test_every_shape_can_be_drawn(name: str, kwargs: dict[str, Any]) -> None:
     sim = unwrapped(name, **kwargs)
     sim.reset(seed=0)
     names = [shape.name for shape in sim.scene()]
-    sim.step(1)
+    sim.step(action_of(sim.action_space, 1))
     shapes = [*sim.static_scene(), *sim.scene()]
     frames = {"map", *(frame.name for frame in [*sim.static_frames(), *sim.frames()])}
     for shape in shapes:
@@ -349,6 +355,7 @@ def test_starts_on_the_line_are_near_it_and_not_all_the_same(
         ("powerline", {}),
         ("powerline", {"observation": "depth"}),
         ("highway-lane", {}),
+        ("highway-lane", {"actions": "continuous"}),
     ],
 )
 def test_actions_of_the_pilot_have_a_leading_dimension_of_one(
@@ -359,8 +366,9 @@ def test_actions_of_the_pilot_have_a_leading_dimension_of_one(
     pilot = make_pilot(env)
     actions = pilot.act(batched(observation))
     assert pilot.name == "pilot"
-    assert actions.shape == (1,)
-    assert actions.dtype == np.int64
+    assert actions.shape == (1, *(env.action_space.shape or ()))
+    assert actions.dtype == env.action_space.dtype
+    assert env.action_space.contains(actions[0])
     with pytest.raises(ValueError, match="not 2"):
         pilot.act(batched(observation, 2))
 
@@ -369,7 +377,10 @@ def test_actions_of_the_pilot_have_a_leading_dimension_of_one(
 def test_names_and_metadata_fit_the_sim(name: str, kwargs: dict[str, Any]) -> None:
     sim = unwrapped(name, **kwargs)
     sim.reset(seed=0)
-    assert len(sim.action_meanings) == sim.action_space.n
+    is_discrete = isinstance(sim.action_space, spaces.Discrete)
+    assert len(sim.action_meanings) == (sim.action_space.n if is_discrete else 0)
+    parts = 0 if is_discrete else sim.action_space.shape[0]
+    assert (len(set(sim.action_part_names)), len(sim.action_units)) == (parts, parts)
     # Only vectors have names.
     is_vector = len(sim.observation_space.shape or ()) == 1
     names = sim.observation_names
@@ -380,7 +391,7 @@ def test_names_and_metadata_fit_the_sim(name: str, kwargs: dict[str, Any]) -> No
         assert sim.step_duration_s * sim.metadata["render_fps"] == pytest.approx(1.0)
     assert {"x_m", "y_m", "speed_m_s"} <= set(sim.telemetry())
     before = sim.telemetry()
-    sim.step(1)
+    sim.step(action_of(sim.action_space, 1))
     assert before.keys() == sim.telemetry().keys()
     assert all(type(value) is float and math.isfinite(value) for value in before.values())
 
@@ -389,8 +400,9 @@ def test_names_and_metadata_fit_the_sim(name: str, kwargs: dict[str, Any]) -> No
 def test_the_time_limit_truncates_without_a_reason(name: str, kwargs: dict[str, Any]) -> None:
     env = make_sim(name, max_episode_steps=2, **kwargs)
     env.reset(seed=1)
-    assert env.step(0)[3] is False
-    _, _, terminated, truncated, info = env.step(0)
+    action = action_of(env.action_space, 0)
+    assert env.step(action)[3] is False
+    _, _, terminated, truncated, info = env.step(action)
     assert (terminated, truncated) == (False, True)
     assert "reason" not in info
 
@@ -409,13 +421,24 @@ def test_each_sim_has_a_time_limit_and_a_pilot(name: str) -> None:
 def test_an_invalid_action_is_refused(name: str, kwargs: dict[str, Any]) -> None:
     sim = unwrapped(name, **kwargs)
     sim.reset(seed=0)
+    if not isinstance(sim.action_space, spaces.Discrete):
+        zeros = np.zeros(sim.action_space.shape, np.float32)
+        for wrong, words in [(math.nan, "NaN"), (1.001, r"1\.00100005"), (-math.inf, "-inf")]:
+            parts = zeros.copy()
+            parts[-1] = wrong
+            problem = f"action: {sim.action_part_names[-1]} is {words}; it must be -1 to 1"
+            with pytest.raises(UsageError, match=problem):
+                sim.step(parts)
+        for other in (np.zeros(9, np.float32), 0, "left", zeros.astype(complex), None):
+            with pytest.raises(UsageError, match=f"numbers .{sim.action_part_names[0]}.*not"):
+                sim.step(other)
+        return
     last = int(sim.action_space.n) - 1
     for action in (-1, last + 1):
         with pytest.raises(UsageError, match=f"actions are 0 to {last}"):
             sim.step(action)
-    if name in BATCHED:
-        with pytest.raises(UsageError, match="is not an integer"):
-            sim.step(1.5)
+    with pytest.raises(UsageError, match="is not an integer"):
+        sim.step(1.5)
 
 
 @pytest.mark.parametrize("name", SIMS)
@@ -434,9 +457,11 @@ def test_an_unknown_value_is_refused_with_the_known_ones(name: str, argument: st
         ("racer", {"rules": "clasic"}, "did you mean classic\\? known: classic, default"),
         ("racer", {"observation": "depth"}, "unknown observation 'depth': known: rays"),
         ("racer", {"start": "pole"}, "known: None, anywhere, line"),
-        ("racer", {"actions": 7}, "unknown number of actions '7': known: 5, 8, 9"),
+        ("racer", {"actions": 7}, "unknown actions '7': .*known: 5, 8, 9, continuous, discrete"),
         ("racer", {"drift": "yes"}, "unknown drift 'yes': known: False, True"),
         ("racer", {"render_mode": "ansi"}, "known: None, human, rgb_array"),
+        ("powerline", {"actions": "velocity"}, "known: continuous, discrete, increments"),
+        ("highway-lane", {"actions": "sticks"}, "known: continuous, discrete"),
         ("powerline", {"rules": "clasic"}, "unknown rules 'clasic': did you mean classic"),
         ("powerline", {"camera": "up"}, "known: down, front"),
         ("powerline", {"plant": "plane"}, "known: None, point, quad"),

@@ -37,7 +37,7 @@ def test_a_recorded_episode_can_be_repeated(
         observation, _ = again.reset(seed=episode.seed)
         for k in range(len(episode.actions)):
             check_equal(row(episode.observations, k), observation)
-            observation, reward, terminated, truncated, _ = again.step(int(episode.actions[k]))
+            observation, reward, terminated, truncated, _ = again.step(episode.actions[k])
             check_equal(row(episode.next_observations, k), observation)
             assert np.float64(episode.rewards[k]).tobytes() == np.float64(reward).tobytes()
             assert (episode.terminated[k], episode.truncated[k]) == (terminated, truncated)

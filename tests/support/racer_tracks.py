@@ -8,7 +8,7 @@ import numpy as np
 
 from mcaprl.sims.geometry.paths import closed_path
 from mcaprl.sims.racer.course import Car, Track, placed
-from mcaprl.sims.racer.rules import drive, outcome_of
+from mcaprl.sims.racer.rules import ACTION_COMMANDS, drive, outcome_of
 
 
 def corridor(top_px: float = 100.0, bottom_px: float = 200.0) -> Track:
@@ -32,4 +32,5 @@ def car_in(
 def outcome(before: Car, action: int, *, classic: bool) -> tuple[float, int]:
     """Return the reward and the end of one step in the corridor."""
     track = corridor()
-    return outcome_of(track, before, drive(track, before, action, classic, False), classic)
+    after = drive(track, before, ACTION_COMMANDS[action], classic, False)
+    return outcome_of(track, before, after, classic)

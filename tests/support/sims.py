@@ -6,6 +6,7 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.sims import make_sim
@@ -20,6 +21,15 @@ DRAWN_BY_POINTS = {"line": 1, "segments": 2, "triangles": 3, "points": 1, "spher
 def unwrapped(name: str, /, **kwargs: Any) -> Any:
     """Return a sim without wrappers."""
     return make_sim(name, **kwargs).unwrapped
+
+
+def action_of(space: spaces.Space[Any], number: int) -> Any:
+    """Return an action of a space that depends on a number only."""
+    if isinstance(space, spaces.Discrete):
+        return number % int(space.n)
+    drawn = np.random.default_rng(number).uniform(-1.0, 1.0, space.shape)
+    # Some parts are at their limits.
+    return np.clip(1.2 * drawn, -1.0, 1.0).astype(np.float32)
 
 
 def batched(observation: Any, count: int = 1) -> Any:

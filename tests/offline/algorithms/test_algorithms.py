@@ -28,7 +28,7 @@ from mcaprl.offline.algorithms.config import (
 )
 from mcaprl.offline.algorithms.dqn import DQN, DoubleDQN
 from mcaprl.offline.algorithms.heads import build_head
-from mcaprl.offline.algorithms.iql import IQL
+from mcaprl.offline.algorithms.iql import IQL, normalized
 from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import ALGORITHMS
 from mcaprl.offline.batches.buffer import TransitionBuffer
@@ -77,7 +77,7 @@ def best(learner: Learner, observations: NDArray[np.float32], seed: int | None =
     networks = {name: learner.network(name, seed) for name in learner.policy_models}
     threshold = getattr(learner.config, "threshold", 0.0)
     head = build_head(learner.acts_by, networks, learner.buffer.action_space, threshold)
-    scores = head.scores(Observations(torch.from_numpy(observations)))
+    scores = cast(Tensor, head.scores(Observations(torch.from_numpy(observations))))
     found: list[int] = scores.argmax(1).tolist()
     return found
 
@@ -293,9 +293,9 @@ def test_normalized_advantages_do_not_depend_on_the_unit_of_the_reward() -> None
     assert learner.config.normalize_advantages
     advantages = torch.tensor([3.0, -4.0, 0.0, 0.0, 30.0, -40.0, 0.0, 0.0])
     # The advantages of the two seeds have the root mean squares 2.5 and 25.
-    found = learner.normalized(advantages).tolist()
+    found = normalized(learner, advantages).tolist()
     assert found == pytest.approx([1.2, -1.6, 0, 0] * 2)
-    assert learner.normalized(torch.zeros(8)).tolist() == [0] * 8
+    assert normalized(learner, torch.zeros(8)).tolist() == [0] * 8
 
 
 def test_bcq_with_threshold_one_imitates_and_with_zero_is_double_dqn() -> None:

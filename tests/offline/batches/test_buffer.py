@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from mcaprl.actions import MASK_KEY
 from mcaprl.errors import McaprlError, SpaceError, TrainingError
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.packing import Packing
@@ -245,11 +246,88 @@ def test_a_logged_action_that_is_masked_is_refused() -> None:
         TransitionBuffer.from_dataset(masked([1, 0, 1]))
 
 
-def test_continuous_actions_are_refused() -> None:
-    actions = np.zeros((4, 1), np.float32)
-    dataset = numbered(4, actions=actions, action_space=spaces.Box(-1, 1, (1,)))
-    with pytest.raises(SpaceError, match="needs discrete actions, got Box"):
+def boxed(actions: list[list[float]], space: spaces.Box, **changes: Any) -> Dataset:
+    """Make transitions with these actions of a Box."""
+    columns = {"actions": np.array(actions, space.dtype), "action_space": space, **changes}
+    return numbered(len(actions), **columns)
+
+
+WIDE = spaces.Box(np.array([0, -4], np.float32), np.array([10, 4], np.float32))
+
+
+def test_actions_of_a_box_are_scaled_by_its_bounds() -> None:
+    buffer = TransitionBuffer.from_dataset(boxed([[0, -4], [5, 0], [7.5, 1], [10, 4]], WIDE))
+    assert whole(buffer).actions.tolist() == [[-1, -1], [0, 0], [0.5, 0.25], [1, 1]]
+    assert buffer.n_actions == 2
+
+
+def test_infinite_bounds_are_those_of_the_data() -> None:
+    space = spaces.Box(np.array([0, -np.inf]), np.array([np.inf, 8]), dtype=np.float64)
+    dataset = boxed([[1, 2], [5, 8], [3, 4], [1, 2]], space)
+    text = r"action\[0\] 0 to 5, action\[1\] 2 to 8"
+    with pytest.warns(UserWarning, match=text):
+        buffer = TransitionBuffer.from_dataset(dataset)
+    # The finite bounds are those of the space.
+    expected = np.array([[-0.6, -1], [1, 1], [0.2, -1 / 3], [-0.6, -1]])
+    np.testing.assert_allclose(buffer.actions.numpy(), expected, rtol=1e-6)
+    # Other data in the same scale need no warning, and stay in the range.
+    other = TransitionBuffer.from_dataset(boxed([[9, 8], [5, -3]], space), box=buffer.box)
+    assert other.actions.tolist() == [[1, 1], [1, -1]]
+
+
+@pytest.mark.parametrize(
+    ("actions", "space", "message"),
+    [
+        ([[1, 0], [2, 0]], WIDE, r"action\[1\] is 0 in all 2 rows: .*remove it"),
+        ([[1, 0], [2, 5]], WIDE, r"action\[1\] of row 1 is 5, outside its bounds -4 to 4, as are"),
+        ([[1, 0], [-1, 2]], WIDE, r"action\[0\] of row 1 is -1, .* of 1 row; .*clip_actions=True"),
+        ([[1], [2]], spaces.Box(1, 1, (1,)), r"action\[0\] is 1 in all 2 rows"),
+        ([[1], [2]], spaces.Box(0, 9, (1,), np.int32), "has integers"),
+    ],
+)
+def test_actions_that_cannot_be_learned_are_refused(
+    actions: list[list[float]], space: spaces.Box, message: str
+) -> None:
+    with pytest.raises(SpaceError, match=message):
+        TransitionBuffer.from_dataset(boxed(actions, space))
+
+
+def test_actions_outside_a_box_are_clipped_if_wanted() -> None:
+    dataset = boxed([[1, 0], [-1, 5]], WIDE)
+    buffer = TransitionBuffer.from_dataset(dataset, Packing(clip_actions=True))
+    expected = np.array([[-0.8, 0], [-1, 1]])
+    np.testing.assert_allclose(buffer.actions.numpy(), expected, rtol=1e-6)
+
+
+def test_a_mask_for_the_actions_of_a_box_is_refused() -> None:
+    frames = {"a": np.zeros((2, 1), np.float32), MASK_KEY: np.ones((2, 2), np.int8)}
+    dataset = boxed(
+        [[1, 0], [2, 2]],
+        WIDE,
+        observations=frames,
+        next_observations=frames,
+        observation_space=spaces.Dict(
+            {"a": spaces.Box(-1, 1, (1,)), MASK_KEY: spaces.MultiBinary(2)}
+        ),
+    )
+    with pytest.raises(SpaceError, match="action_mask"):
         TransitionBuffer.from_dataset(dataset)
+
+
+@pytest.mark.parametrize(("n_steps", "rows"), [(1, [1, 2, -1, 4, -1]), (2, [2, -1, -1, -1, -1])])
+def test_the_next_row_is_in_the_same_episode(n_steps: int, rows: list[int]) -> None:
+    observations = np.array([0, 1, 2, 10, 11], np.float32)[:, None]
+    ends = np.array([False, False, True, False, True])
+    dataset = boxed(
+        [[k, k % 2] for k in range(5)],
+        WIDE,
+        observations=observations,
+        next_observations=observations + 1,
+        terminated=ends,
+        truncated=~ends & False,
+    )
+    buffer = TransitionBuffer.from_dataset(dataset, Packing(n_steps=n_steps))
+    assert buffer.next_rows.tolist() == rows
 
 
 def test_an_action_outside_its_space_is_refused() -> None:

@@ -289,8 +289,7 @@ def test_a_log_of_commands_is_continued(tmp_path: Path) -> None:
 def test_estimates_say_what_they_need(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the extra offline")
     data = Dataset.concatenate([made()] * 6)
-    message = r"importance sampling needs discrete actions, got Box.*: evaluate policies in the env"
-    with pytest.raises(SpaceError, match=message):
+    with pytest.raises(SpaceError, match=r"from the log alone needs discrete actions, got Box"):
         mcaprl.estimate("random", data)
-    with pytest.raises(SpaceError, match=message):
+    with pytest.raises(SpaceError, match=r"estimating behavior_prob needs discrete actions, got"):
         mcaprl.estimate("random", data, estimate_behavior=True)

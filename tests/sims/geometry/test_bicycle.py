@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from highway_env.vehicle.kinematics import Vehicle
@@ -10,15 +12,15 @@ from hypothesis import strategies as st
 
 from mcaprl.sims.geometry.bicycle import moving, roll, slip_of
 from mcaprl.sims.lane.rules import (
+    ACTION_COMMANDS,
     ACTION_MEANINGS,
-    BRAKE,
     BRAKE_M_S2,
     MAX_SPEED_M_S,
-    STEERING,
     SUBSTEP_S,
     SUBSTEPS,
     THROTTLE_M_S2,
     WHEELBASE_M,
+    Command,
     drive,
     located,
     wheel_angle,
@@ -52,23 +54,28 @@ def test_each_step_of_a_trajectory_agrees(
         assert ours[:4] == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
-@given(st.floats(0.0, 30.0), st.lists(st.integers(0, 5), min_size=1, max_size=40))
+DECISIONS = st.sampled_from(ACTION_COMMANDS) | st.builds(
+    Command, st.floats(-1, 1), st.floats(-1, 1)
+)
+
+
+@given(st.floats(0.0, 30.0), st.lists(DECISIONS, min_size=1, max_size=40))
 @settings(max_examples=50)
-def test_each_decision_of_a_drive_agrees(speed_m_s: float, actions: list[int]) -> None:
+def test_each_decision_of_a_drive_agrees(speed_m_s: float, commands: list[Command]) -> None:
     """Both cars also have the same wheel angle (`wheel_angle`), throttle and brake."""
     theirs = their_car(20.0, 1.0, 0.0, speed_m_s)
     ours = located(moving(20.0, 1.0, 0.0, speed_m_s), 0.0, 20.0, 0.0)
     steering = 0.0
-    for action in actions:
-        steering = steering if action == BRAKE else STEERING[action]
+    for command in commands:
+        steering = steering if math.isnan(command.steering) else command.steering
         for _ in range(SUBSTEPS):
-            push_m_s2 = THROTTLE_M_S2 * (1 - theirs.speed / MAX_SPEED_M_S)
-            stop_m_s2 = -min(BRAKE_M_S2, theirs.speed / SUBSTEP_S)
-            acceleration_m_s2 = stop_m_s2 if action == BRAKE else push_m_s2
+            push_m_s2 = command.pedal * THROTTLE_M_S2 * (1 - theirs.speed / MAX_SPEED_M_S)
+            stop_m_s2 = -min(-command.pedal * BRAKE_M_S2, theirs.speed / SUBSTEP_S)
+            acceleration_m_s2 = stop_m_s2 if command.pedal < 0 else push_m_s2
             angle_rad = wheel_angle(steering, theirs.speed)
             theirs.act({"steering": angle_rad, "acceleration": acceleration_m_s2})
             theirs.step(SUBSTEP_S)
-        ours = drive(ours, action)
+        ours = drive(ours, command)
         assert (ours.x_m, ours.y_m) == pytest.approx(tuple(theirs.position), abs=1e-6)
         assert np.cos(ours.yaw_rad) == pytest.approx(np.cos(theirs.heading), abs=1e-6)
         assert np.sin(ours.yaw_rad) == pytest.approx(np.sin(theirs.heading), abs=1e-6)
@@ -77,8 +84,8 @@ def test_each_decision_of_a_drive_agrees(speed_m_s: float, actions: list[int]) -
 
 @pytest.mark.parametrize("action", range(len(ACTION_MEANINGS)))
 def test_actions_turn_in_the_named_direction(action: int) -> None:
-    after = drive(located(moving(20.0, 1.0, 0.0, 8.0), 0.0, 20.0, 0.0), action)
+    after = drive(located(moving(20.0, 1.0, 0.0, 8.0), 0.0, 20.0, 0.0), ACTION_COMMANDS[action])
     meaning = ACTION_MEANINGS[action]
     assert (after.yaw_rad > 0) == ("left" in meaning)
     assert (after.yaw_rad < 0) == ("right" in meaning)
-    assert (after.speed_m_s < 8.0) == (action == BRAKE)
+    assert (after.speed_m_s < 8.0) == (meaning == "brake")

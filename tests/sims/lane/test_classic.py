@@ -18,7 +18,16 @@ from mcaprl.sims.lane.classic import (
 )
 from mcaprl.sims.lane.course import COURSE
 from mcaprl.sims.lane.env import LaneKeepingEnv
-from mcaprl.sims.lane.rules import BRAKE, COLLISION, DRIVING, LOW_REWARD, OFF_LANE, SLOW, located
+from mcaprl.sims.lane.rules import (
+    ACTION_COMMANDS,
+    BRAKE,
+    COLLISION,
+    DRIVING,
+    LOW_REWARD,
+    OFF_LANE,
+    SLOW,
+    located,
+)
 
 STRAIGHT, RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT = range(1, 6)
 
@@ -79,8 +88,9 @@ def test_rewards_and_ends_by_hand(
 ) -> None:
     distance_m = classic_distance(x_m, y_m)
     assert classic_reward(distance_m, speed_m_s) == pytest.approx(reward, abs=2e-6)
-    assert classic_end(distance_m, speed_m_s, action, hit, False) == text
-    assert classic_end(distance_m, speed_m_s, action, hit, True) == code
+    command = ACTION_COMMANDS[action]
+    assert classic_end(distance_m, speed_m_s, command, hit, False) == text
+    assert classic_end(distance_m, speed_m_s, command, hit, True) == code
 
 
 @pytest.mark.parametrize(
@@ -107,7 +117,7 @@ def test_the_distance_is_to_the_nearest_infinite_line(
 def test_a_decision_takes_one_second() -> None:
     """At full throttle, v(t) = 30 - 20 e^(-4 t / 30) from 10 m/s; Euler steps last 0.05 s."""
     car = located(moving(20.0, 1.0, 0.0, 10.0), 0.0, 20.0, 0.0)
-    after, hit = classic_decide(car, STRAIGHT)
+    after, hit = classic_decide(car, ACTION_COMMANDS[STRAIGHT])
     assert not hit
     assert after.speed_m_s == pytest.approx(30.0 - 20.0 * (1.0 - 0.2 / 30.0) ** 20)
     assert lane().step_duration_s == 1.0

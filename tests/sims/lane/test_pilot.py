@@ -10,7 +10,7 @@ from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.pilots import make_pilot
 from mcaprl.sims.geometry.bicycle import moving
 from mcaprl.sims.lane.pilot import HORIZON, choose, pursue, pursuit_value
-from mcaprl.sims.lane.rules import DRIVING, drive, end_of, located
+from mcaprl.sims.lane.rules import ACTION_COMMANDS, DRIVING, drive, end_of, located
 from tests.support.sims import piloted
 
 
@@ -33,7 +33,7 @@ def test_it_searches_where_pursuit_would_fail() -> None:
     assert pursuit_value(car) < HORIZON
     assert choose(car) != pursue(car)
     for _ in range(HORIZON):
-        car = drive(car, choose(car))
+        car = drive(car, ACTION_COMMANDS[choose(car)])
         assert end_of(car) == DRIVING
 
 

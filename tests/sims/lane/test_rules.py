@@ -15,13 +15,14 @@ from mcaprl.sims.lane.block import step_cars
 from mcaprl.sims.lane.course import COURSE
 from mcaprl.sims.lane.fleet import start_at_random
 from mcaprl.sims.lane.rules import (
-    BRAKE,
+    ACTION_COMMANDS,
     DRIVING,
     OBSERVATION_LIMIT,
     OFF_LANE,
     STALL,
     WHEELBASE_M,
     Car,
+    Command,
     car_at,
     drive,
     driven,
@@ -32,7 +33,7 @@ from mcaprl.sims.lane.rules import (
     wheel_angle,
 )
 
-STRAIGHT, RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT = 1, 2, 3, 4, 5
+BRAKE, STRAIGHT, RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT = ACTION_COMMANDS
 
 
 def placed(x_m: float, y_m: float, yaw_rad: float, speed_m_s: float, near_m: float) -> Car:
@@ -85,7 +86,7 @@ def test_no_speed_makes_more_than_9_m_s2_sideways(steering: float, speed_m_s: fl
 @given(st.floats(-1, 1), st.floats(0, 30))
 def test_a_car_turns_by_less_than_five_degrees_in_a_substep(steering: float, v_m_s: float) -> None:
     """`paths.turned` is accurate up to 12 degrees."""
-    moved = driven(moving(0.0, 0.0, 0.0, v_m_s), steering, False)
+    moved = driven(moving(0.0, 0.0, 0.0, v_m_s), steering, 1.0)
     assert abs(moved.yaw_rad) < math.radians(5.0)
 
 
@@ -103,6 +104,23 @@ def test_braking_takes_2_m_s_in_a_quarter_second_and_stops_at_0() -> None:
     assert car.speed_m_s == pytest.approx(1.0)
     assert car.x_m == pytest.approx(50.0 + 0.05 * (3.0 + 2.6 + 2.2 + 1.8 + 1.4))
     assert drive(car, BRAKE).speed_m_s == 0.0
+
+
+def test_a_light_pedal_brakes_or_accelerates_lightly_and_no_pedal_lets_the_car_roll() -> None:
+    car = placed(50.0, 1.0, 0.0, 15.0, 50.0)
+    assert drive(car, Command(-0.25, 0.0)).speed_m_s == pytest.approx(15.0 - 0.25 * 2.0)
+    # At half the maximum speed, half of the throttle remains.
+    slowly = drive(car, Command(0.5, 0.0), 1)
+    assert slowly.speed_m_s == pytest.approx(15.0 + 0.05 * 0.5 * 4.0 * 0.5)
+    assert drive(car, Command(0.0, 0.0)).speed_m_s == 15.0
+    assert drive(placed(50.0, 1.0, 0.0, 0.01, 50.0), Command(-0.1, 0.0)).speed_m_s == 0.0
+
+
+def test_a_command_steers_by_a_fraction_of_the_full_angle() -> None:
+    car = drive(placed(50.0, 1.0, 0.0, 5.0, 50.0), Command(0.2, 0.8))
+    assert car.steering == 0.8
+    assert observed(car)[3] == pytest.approx(1.6)
+    assert drive(car, Command(-0.2, -1.0)).steering == -1.0
 
 
 def test_braking_keeps_the_last_steering() -> None:
@@ -179,20 +197,23 @@ def test_observations_stay_inside_their_limits() -> None:
     assert np.all(np.abs(observed(far)) <= OBSERVATION_LIMIT)
 
 
+COMMANDS = st.sampled_from(ACTION_COMMANDS) | st.builds(Command, st.floats(-1, 1), st.floats(-1, 1))
+
+
 @given(
-    st.lists(st.tuples(st.floats(5, 120), st.integers(0, 5)), min_size=1, max_size=6),
+    st.lists(st.tuples(st.floats(5, 120), COMMANDS), min_size=1, max_size=6),
     st.sampled_from([1, 12]),
 )
-def test_many_cars_drive_as_one_does(starts: list[tuple[float, int]], copies: int) -> None:
+def test_many_cars_drive_as_one_does(starts: list[tuple[float, Command]], copies: int) -> None:
     # The copies fill more than a block.
     starts = starts * copies
     cars = np.array([placed(x_m, 1.5, 0.1, 8.0, x_m) for x_m, _ in starts])
-    actions = np.array([action for _, action in starts])
+    commands = [command for _, command in starts]
     rewards, ends = np.zeros(len(cars)), np.zeros(len(cars), dtype=np.int64)
     observations = np.zeros((len(cars), 12), dtype=np.float32)
-    alone = [drive(car_at(row), action) for row, action in zip(cars, actions, strict=True)]
+    alone = [drive(car_at(row), command) for row, command in zip(cars, commands, strict=True)]
     before = [car_at(row) for row in cars]
-    step_cars(cars, actions, rewards, ends, observations)
+    step_cars(cars, np.array(commands), rewards, ends, observations)
     for i, car in enumerate(alone):
         assert car_at(cars[i]) == car
         assert rewards[i] == reward_of(before[i], car)

@@ -15,6 +15,7 @@ from mcaprl.sims.powerline.env import PowerlineEnv
 from mcaprl.sims.powerline.quadrotor import POINT
 from mcaprl.sims.powerline.rules import (
     COLLISION,
+    DIRECTIONS,
     FLYING,
     OFF_LINE,
     begin,
@@ -26,6 +27,11 @@ from mcaprl.sims.powerline.rules import (
 
 ZERO = Vector(0.0, 0.0, 0.0)
 NORTH, SOUTH, NOTHING = 0, 3, 6
+
+
+def changed(action: int) -> Vector:
+    """Return the velocity change of an action, m/s."""
+    return Vector(*(0.25 * DIRECTIONS[action]).tolist())
 
 
 def beside(leg: int, along_m: float, distance_m: float) -> Vector:
@@ -98,14 +104,14 @@ def test_an_action_changes_the_measured_velocity() -> None:
     """
     flight = begin(point_on_line(150.0), Vector(1.0, 0.0, 0.0), ZERO)
     flight = flight._replace(command_m_s=Vector(4.0, 4.0, 4.0))
-    after, hit = classic_decide(POINT, flight, NORTH)
+    after, hit = classic_decide(POINT, flight, changed(NORTH))
     assert not hit
     assert after.drone.velocity_m_s == pytest.approx((1.25 - 0.25 * math.exp(-10), 0.0, 0.0))
 
 
 def test_a_decision_lasts_5_seconds() -> None:
     flight = begin(point_on_line(150.0), Vector(1.0, 0.0, 0.0), ZERO)
-    after, _ = classic_decide(POINT, flight, NOTHING)
+    after, _ = classic_decide(POINT, flight, changed(NOTHING))
     assert after.drone.position_m.x == pytest.approx(flight.drone.position_m.x + 5.0)
     assert classic().step_duration_s == 5.0
 
@@ -137,7 +143,7 @@ def test_fault_flying_to_and_fro_has_a_higher_return_than_following() -> None:
     assert classic_reward(place, 10.0, False) == pytest.approx(10.0)
     assert classic_reward(place, 2.0, False) == pytest.approx(2.0)
     backwards = begin(place, Vector(-2.0, -1.0, 0.0), ZERO)
-    after, _ = classic_decide(POINT, backwards, SOUTH)
+    after, _ = classic_decide(POINT, backwards, changed(SOUTH))
     assert classic_reward(after.drone.position_m, 2.25, False) > 0.0
 
 
@@ -166,7 +172,7 @@ def test_fault_commands_keep_the_effect_of_wind() -> None:
     sim = make_sim("powerline", rules="classic", plant="quad").unwrapped
     assert isinstance(sim, PowerlineEnv)
     flight = begin(point_on_line(300.0), ZERO, Vector(0.0, 4.0, 0.0))
-    drift = classic_decide(0, flight, NOTHING)[0].drone.velocity_m_s
+    drift = classic_decide(0, flight, changed(NOTHING))[0].drone.velocity_m_s
     assert abs(drift.y) > 1e-3
 
 

@@ -24,6 +24,7 @@ from mcaprl.sims.powerline.course import (
 from mcaprl.sims.powerline.quadrotor import POINT, QUAD
 from mcaprl.sims.powerline.rules import (
     COLLISION,
+    DIRECTIONS,
     FINISHED,
     FLIGHT_SIZE,
     FLYING,
@@ -47,11 +48,14 @@ ZERO = Vector(0.0, 0.0, 0.0)
 UP, NOTHING = 5, 6
 
 
+CHANGES = 0.5 * DIRECTIONS
+
+
 def decide(plant: int, flight: Flight, action: int) -> tuple[Flight, int]:
     """Fly one drone for a decision; return the drone, and the outcome of the decision."""
     row, ends = np.zeros((1, FLIGHT_SIZE)), np.zeros(1, dtype=np.int64)
     store_flight(flight, row[0])
-    decide_all(plant, row, np.array([action]), ends)
+    decide_all(plant, row, CHANGES[[action]], True, ends)
     return flight_at(row[0]), int(ends[0])
 
 
@@ -86,13 +90,31 @@ def observed(flight: Flight) -> list[float]:
 def test_actions_change_the_command_by_half_a_meter_per_second(
     action: int, expected: tuple[float, float, float]
 ) -> None:
-    assert commanded(Vector(1.0, -0.5, -1.0), action) == expected
+    change = Vector(*CHANGES[action].tolist())
+    assert commanded(Vector(1.0, -0.5, -1.0), change, True) == expected
 
 
 def test_a_command_beyond_8_m_s_is_ignored() -> None:
     fast = Vector(8.0, 0.0, 0.0)
-    assert commanded(fast, 0) == commanded(fast, 1) == fast
-    assert commanded(fast, 3) == (7.5, 0.0, 0.0)
+    north, east, _, south = (Vector(*change) for change in CHANGES[:4].tolist())
+    assert commanded(fast, north, True) == commanded(fast, east, True) == fast
+    assert commanded(fast, south, True) == (7.5, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        ((0.5, -0.25, 0.0), (4.0, -2.0, 0.0)),
+        ((0.0, 0.0, -1.0), (0.0, 0.0, -8.0)),
+        # The norm of (1, -1, 1) is the square root of 3.
+        ((1.0, -1.0, 1.0), (8 / math.sqrt(3), -8 / math.sqrt(3), 8 / math.sqrt(3))),
+    ],
+)
+def test_a_velocity_is_commanded_in_units_of_8_m_s_and_shortened_to_8_m_s(
+    command: tuple[float, float, float], expected: tuple[float, float, float]
+) -> None:
+    found = commanded(Vector(1.0, 2.0, 3.0), Vector(*command), False)
+    assert found == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -247,7 +269,7 @@ def test_many_drones_fly_as_one_does(starts: list[tuple[float, int]], gust_m_s: 
     noise = np.random.default_rng(1).standard_normal((len(rows), 3))
     rewards, ends = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
     observations = np.zeros((len(rows), 18), dtype=np.float32)
-    step_flights(QUAD, rows, actions, gust_m_s, noise, rewards, ends, observations)
+    step_flights(QUAD, rows, CHANGES[actions], True, gust_m_s, noise, rewards, ends, observations)
     for i, flight in enumerate(flights):
         before = flight._replace(gust_m_s=next_gust(flight.gust_m_s, gust_m_s, noise[i]))
         after, end = decide(QUAD, before, actions[i])

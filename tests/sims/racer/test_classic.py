@@ -13,7 +13,16 @@ from mcaprl.sims.evaluation.pilots import make_pilot
 from mcaprl.sims.racer.course import Track
 from mcaprl.sims.racer.env import RacerEnv
 from mcaprl.sims.racer.rays import BLOCK_SIZE, LENGTH, RAY_NAMES, RAYS, measure
-from mcaprl.sims.racer.rules import CRASH, DRIVING, NO_GATE, TIME_LIMIT, drive, observe, outcome_of
+from mcaprl.sims.racer.rules import (
+    ACTION_COMMANDS,
+    CRASH,
+    DRIVING,
+    NO_GATE,
+    TIME_LIMIT,
+    drive,
+    observe,
+    outcome_of,
+)
 from tests.support.racer_tracks import car_in, corridor, outcome
 from tests.support.sims import unwrapped
 
@@ -123,7 +132,7 @@ def test_fault_rays_are_squeezed_into_a_fifth_of_their_range() -> None:
 def test_fault_a_joint_of_walls_costs_twice() -> None:
     track = corridor()
     before = car_in(track, 985.0, 115.0, -45)
-    after = drive(track, before, NONE, True, False)
+    after = drive(track, before, ACTION_COMMANDS[NONE], True, False)
     assert outcome(before, NONE, classic=True)[0] == -2
     assert outcome_of(track, before, after, False)[0] == -1
 
@@ -135,10 +144,10 @@ def test_fault_a_gate_crossed_unseen_is_lost() -> None:
     """
     track = corridor()
     car = car_in(track, 295.0, 150.5, 0, 10)
-    over = drive(track, car, NONE, True, False)
+    over = drive(track, car, ACTION_COMMANDS[NONE], True, False)
     assert over.x_px == 305.0
     assert (over.gates, over.next_gate) == (0.0, 0.0)
-    assert drive(track, car, NONE, False, False).gates == 1.0
+    assert drive(track, car, ACTION_COMMANDS[NONE], False, False).gates == 1.0
 
 
 def test_fault_every_episode_starts_equally() -> None:

@@ -24,12 +24,14 @@ from mcaprl.sims.racer.rays import (
     ray_ends,
 )
 from mcaprl.sims.racer.rules import (
+    ACTION_COMMANDS,
     ACTION_MEANINGS,
     CRASH,
     DRIVING,
     NO_GATE,
     OBSERVATION_NAMES,
     TIME_LIMIT,
+    Command,
     drive,
     observe,
     outcome_of,
@@ -98,7 +100,10 @@ def test_a_crash_has_priority_over_the_time_limit() -> None:
 def test_actions_by_hand() -> None:
     track = corridor()
     car = car_in(track, 500.0, 150.0, 0, 4)
-    moves = {action: drive(track, car, action, False, False) for action in range(9)}
+    moves = {
+        action: drive(track, car, command, False, False)
+        for action, command in enumerate(ACTION_COMMANDS)
+    }
     assert [moves[action].speed_px for action in range(9)] == [4, 6, 4, 4, 2, 2, 2, 6, 6]
     turns = [round(math.degrees(moves[action].heading_rad)) for action in range(9)]
     assert turns == [0, 0, -15, 15, 0, 15, -15, -15, 15]
@@ -112,22 +117,37 @@ def test_actions_by_hand() -> None:
 def test_speed_is_limited_both_ways() -> None:
     track = corridor()
     car = car_in(track, 500.0, 150.0, 0, 9)
-    assert drive(track, car, FORWARD, False, False).speed_px == 10.0
-    assert drive(track, car._replace(speed_px=-9.0), BACK, False, False).speed_px == -10.0
+    assert drive(track, car, ACTION_COMMANDS[FORWARD], False, False).speed_px == 10.0
+    assert (
+        drive(track, car._replace(speed_px=-9.0), ACTION_COMMANDS[BACK], False, False).speed_px
+        == -10.0
+    )
+
+
+def test_parts_of_a_command_scale_speed_change_and_turn() -> None:
+    track = corridor()
+    car = car_in(track, 500.0, 150.0, 0, 4)
+    moved = drive(track, car, Command(-0.25, 0.4), False, False)
+    assert moved.speed_px == 3.5
+    # Left is positive in commands, and negative in the image, whose y points down.
+    assert math.degrees(moved.heading_rad) == pytest.approx(-6.0)
+    assert moved.y_px == pytest.approx(150.0 - 3.5 * math.sin(math.radians(6.0)))
 
 
 def test_a_drifting_course_follows_by_100_over_speed_plus_1_degrees() -> None:
     """At 9 pixels per step, the course turns by 10 degrees; after two turns of 15 it lags by 10."""
     track = corridor()
     car = car_in(track, 500.0, 150.0, 0, 9)
-    once = drive(track, car, RIGHT, False, True)
-    twice = drive(track, once, RIGHT, False, True)
+    once = drive(track, car, ACTION_COMMANDS[RIGHT], False, True)
+    twice = drive(track, once, ACTION_COMMANDS[RIGHT], False, True)
     assert math.degrees(once.heading_rad) == pytest.approx(15.0)
     assert math.degrees(once.course_rad) == pytest.approx(10.0)
     assert once.y_px == pytest.approx(150 + 9 * math.sin(math.radians(10)))
     assert math.degrees(twice.course_rad) == pytest.approx(20.0)
-    assert math.degrees(drive(track, twice, NONE, False, True).course_rad) == pytest.approx(30.0)
-    slow = drive(track, car._replace(speed_px=2.0), RIGHT, False, True)
+    assert math.degrees(
+        drive(track, twice, ACTION_COMMANDS[NONE], False, True).course_rad
+    ) == pytest.approx(30.0)
+    slow = drive(track, car._replace(speed_px=2.0), ACTION_COMMANDS[RIGHT], False, True)
     assert slow.course_rad == slow.heading_rad
 
 
@@ -204,23 +224,26 @@ def test_the_next_gate_is_the_first_one_ahead() -> None:
             assert abs(car.heading_error_rad) < 0.3
 
 
+COMMANDS = st.sampled_from(ACTION_COMMANDS) | st.builds(Command, st.floats(-1, 1), st.floats(-1, 1))
+
+
 @settings(max_examples=30)
 @given(
-    st.lists(st.tuples(st.floats(100, 900), st.integers(0, 8)), min_size=1, max_size=6),
+    st.lists(st.tuples(st.floats(100, 900), COMMANDS), min_size=1, max_size=6),
     st.booleans(),
     st.booleans(),
 )
 def test_many_cars_drive_as_one_does(
-    starts: list[tuple[float, int]], classic: bool, drift: bool
+    starts: list[tuple[float, Command]], classic: bool, drift: bool
 ) -> None:
     track = corridor()
     before = [car_in(track, x_px, 150.0, 20, 6) for x_px, _ in starts]
-    cars, actions = np.array(before), np.array([action for _, action in starts])
+    cars, commands = np.array(before), [command for _, command in starts]
     rewards, ends = np.zeros(len(cars)), np.zeros(len(cars), dtype=np.int64)
     observations = np.zeros((len(cars), 19), dtype=np.float32)
-    step_cars(track, cars, actions, rewards, ends, observations, classic, drift)
+    step_cars(track, cars, np.array(commands), rewards, ends, observations, classic, drift)
     for i, car in enumerate(before):
-        alone = drive(track, car, actions[i], classic, drift)
+        alone = drive(track, car, commands[i], classic, drift)
         seen = np.zeros(19, dtype=np.float32)
         observe(track, alone, classic, seen)
         assert car_at(cars[i]) == alone
@@ -237,10 +260,11 @@ def test_many_cars_end_as_one_does_anywhere_on_a_track(classic: bool) -> None:
     x_px, y_px = x_px + random.uniform(-45, 45, 300), y_px + random.uniform(-45, 45, 300)
     turns_rad = random.uniform(-math.pi, math.pi, 300)
     before = [placed(track, *pose, 4.0, 0.0) for pose in zip(x_px, y_px, turns_rad, strict=True)]
-    cars, actions = np.array(before), random.integers(9, size=300)
+    cars, commands = np.array(before), random.choice(ACTION_COMMANDS, 300)
     rewards, ends = np.zeros(300), np.zeros(300, dtype=np.int64)
-    step_cars(track, cars, actions, rewards, ends, np.zeros((300, 19), np.float32), classic, False)
-    after = [drive(track, car, actions[i], classic, False) for i, car in enumerate(before)]
+    step_cars(track, cars, commands, rewards, ends, np.zeros((300, 19), np.float32), classic, False)
+    pairs = zip(before, commands, strict=True)
+    after = [drive(track, car, Command(*command), classic, False) for car, command in pairs]
     outcomes = [outcome_of(track, *pair, classic) for pair in zip(before, after, strict=True)]
     assert list(zip(rewards.tolist(), ends.tolist(), strict=True)) == outcomes
     crashes = [walls_hit(track, car) > 0 for car in after]

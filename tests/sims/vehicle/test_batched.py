@@ -18,6 +18,7 @@ from mcaprl.errors import UsageError
 from mcaprl.sims import SIMS, make_sim, make_sims
 from mcaprl.sims.evaluation.pilots import make_pilot
 from tests.sims.test_sims import BATCHED, CASES
+from tests.support.sims import action_of
 
 Envs = VectorEnv[Any, Any, Any]
 COUNT = 3
@@ -54,9 +55,8 @@ def check_same(ours: Any, theirs: Any, where: str) -> None:
         assert ours == theirs, where
 
 
-def actions_of(envs: Envs, chosen: list[int]) -> NDArray[np.int64]:
-    assert isinstance(envs.single_action_space, spaces.Discrete)
-    return np.array([number % int(envs.single_action_space.n) for number in chosen])
+def actions_of(envs: Envs, chosen: list[int]) -> NDArray[Any]:
+    return np.array([action_of(envs.single_action_space, number) for number in chosen])
 
 
 def one_by_one(name: str, count: int, mode: str, steps: int, kwargs: dict[str, Any]) -> Envs:
@@ -134,6 +134,12 @@ def test_gymnasium_makes_batches(name: str) -> None:
     assert env.spec.max_episode_steps == gym.spec(SIMS[name]).max_episode_steps
     assert isinstance(env, type(make_sims(name, 4)))
     assert isinstance(env, type(gym.make_vec(SIMS[name], 4)))
+    continuous = gym.make_vec(SIMS[name].replace("-v0", "Continuous-v0"), num_envs=4)
+    assert isinstance(continuous, type(env))
+    assert (
+        continuous.single_action_space
+        == make_sims(name, 4, actions="continuous").single_action_space
+    )
     again = gym.make_vec(env.spec)
     check_same(again.reset(seed=3), env.reset(seed=3), "made again from its spec")
     env.close()
@@ -272,13 +278,86 @@ def test_a_bad_request_is_refused(name: str, kwargs: dict[str, Any], words: str)
         ([-1, 0], "action -1 does not exist: actions are 0 to 5"),
     ],
 )
-def test_bad_actions_are_refused_and_change_nothing(actions: Any, words: str) -> None:
+def test_bad_discrete_actions_are_refused_and_change_nothing(actions: Any, words: str) -> None:
     env, other = make_sims("lane", 2), make_sims("lane", 2)
     env.reset(seed=0)
     other.reset(seed=0)
     with pytest.raises(UsageError, match=words):
         env.step(actions if isinstance(actions, int) else np.array(actions))
     check_same(env.step(np.array([1, 2])), other.step(np.array([1, 2])), "after the refusal")
+
+
+@pytest.mark.parametrize(
+    ("actions", "words"),
+    [
+        ([[0, 0, 0]] * 2, r"2 x 2 numbers .pedal, steering., not int64 of shape \(2, 3\)"),
+        ([0.0, 0.0], r"2 x 2 numbers .pedal, steering., not float64 of shape \(2,\)"),
+        ([["1", "0"]] * 2, "2 x 2 numbers .pedal, steering., not <U1"),
+        ([[0, 0], [0.5, np.nan]], "action of environment 1: steering is NaN; it must be -1 to 1"),
+        ([[0, 0], [-1.25, 0]], "action of environment 1: pedal is -1.25; it must be -1 to 1"),
+        ([[0, 1.00001], [2, 2]], "action of environment 0: steering is 1.00001"),
+    ],
+)
+def test_bad_continuous_actions_are_refused_and_change_nothing(actions: Any, words: str) -> None:
+    env, other = (make_sims("lane", 2, actions="continuous") for _ in range(2))
+    env.reset(seed=0)
+    other.reset(seed=0)
+    with pytest.raises(UsageError, match=words):
+        env.step(np.array(actions))
+    fine = np.array([[1, 0.25], [-0.5, 0]])
+    check_same(env.step(fine), other.step(fine), "after the refusal")
+
+
+@pytest.mark.parametrize("name", BATCHED)
+def test_continuous_actions_are_float32_and_parts_just_beyond_1_count_as_1(name: str) -> None:
+    """Double precision is rounded as in a log."""
+    results = []
+    for offset in (0.0, 1e-7, 5e-7):
+        single = make_sim(name, actions="continuous")
+        batch = make_sims(name, 2, actions="continuous")
+        action = np.array([1.0 + offset, -0.7, -0.7])[: spaces.flatdim(single.action_space)]
+        single.reset(seed=3)
+        batch.reset(seed=3)
+        for exact in (action, action.astype(np.float32)):
+            one, many = single.step(exact), batch.step(np.stack([exact] * 2))
+            check_same(many[0][0], one[0], "single and batch")
+            results.append(one[0].tobytes())
+    assert results[:2] == results[2:4] == results[4:]
+
+
+# The increments of the drone, not its velocities, have the discrete actions as points.
+SAME = {"lane": "continuous", "racer": "continuous", "powerline": "increments"}
+
+
+@pytest.mark.parametrize("name", BATCHED)
+@pytest.mark.parametrize("observation", [None, "rays", "depth-commands"])
+def test_discrete_actions_are_points_of_the_continuous_ones(
+    name: str, observation: str | None
+) -> None:
+    """Only the brake of the lane's car, which keeps the last steering, has no constant point."""
+    if observation is not None and name != "lane":
+        pytest.skip("only the lane has this observation")
+    kwargs: dict[str, Any] = {} if observation is None else {"observation": observation}
+    kinds = ("discrete", SAME[name])
+    batches: Any = [make_sims(name, 40, actions=kind, **kwargs) for kind in kinds]
+    singles: Any = [make_sim(name, actions=kind, **kwargs) for kind in kinds]
+    commands = batches[0].unwrapped.fleet.controls.commands
+    for env in (*batches, *singles):
+        env.reset(seed=11)
+    random, last, has_ended = np.random.default_rng(1), np.zeros(40), False
+    for step in range(60):
+        actions = random.integers(len(commands), size=40)
+        points = commands[actions]
+        if name == "lane":
+            # An episode starts with steering 0.
+            last[batches[0].unwrapped._started == step] = 0.0
+            points[:, 1] = last = np.where(actions == 0, last, points[:, 1])
+        results = [batches[0].step(actions), batches[1].step(points.astype(np.float32))]
+        check_same(results[1], results[0], f"step {step}")
+        if not has_ended:
+            alone = singles[0].step(actions[0])
+            check_same(singles[1].step(points[0].astype(np.float32)), alone, f"step {step}")
+            has_ended = alone[2] or alone[3]
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,16 @@ import torch
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.sims import SIMS, DeviceSims, make_device_sims
 from mcaprl.sims.lane.block import step_cars as step_lane_cars
+from mcaprl.sims.lane.rules import ACTION_COMMANDS as LANE_COMMANDS
 from mcaprl.sims.lane.rules import Car as LaneCar
 from mcaprl.sims.racer.block import step_cars as step_racer_cars
 from mcaprl.sims.racer.course import Car as RacerCar
 from mcaprl.sims.racer.course import make_track
+from mcaprl.sims.racer.rules import ACTION_COMMANDS as RACER_COMMANDS
 from mcaprl.sims.vehicle.device import draw
 
 CARS = 64
+COMMANDS = {"lane": LANE_COMMANDS, "racer": RACER_COMMANDS}
 OBSERVED_ERROR = 1
 """Index of the heading error among the lane sim's observed numbers; the racer observes none."""
 WAYS: list[tuple[str, dict[str, Any]]] = [
@@ -72,7 +75,8 @@ def test_a_step_is_that_of_the_batched_sim(name: str, options: dict[str, Any]) -
         rewards, ends = np.zeros(CARS), np.zeros(CARS, np.int64)
         observations = np.zeros_like(batch.observations)
         batch.actions[:] = actions_of(sims, step)
-        arrays = (cars, batch.actions, rewards, ends, observations)
+        commands = np.array(COMMANDS[name])[batch.actions]
+        arrays = (cars, commands, rewards, ends, observations)
         if name == "lane":
             step_lane_cars(*arrays)
         else:
@@ -138,6 +142,10 @@ def test_invalid_arguments_are_refused() -> None:
         make_device_sims("lane", 4, device="cpu", start="nowhere")
     with pytest.raises(UsageError, match="has no argument rules"):
         make_device_sims("lane", 4, device="cpu", rules="classic")
+    with pytest.raises(UsageError, match="discrete actions only: sim 'lane' has actions 'contin"):
+        make_device_sims("lane", 4, device="cpu", actions="continuous")
+    with pytest.raises(UsageError, match="device sims have discrete actions only"):
+        make_device_sims("mcaprl/RacerContinuous-v0", 4, device="cpu")
     with pytest.raises(UsageError, match="num_envs"):
         make_device_sims(SIMS["lane"], 0, device="cpu")
 

@@ -1,0 +1,130 @@
+"""Measure updates per second of the learners of Box actions relative to d3rlpy's.
+
+    python -m benchmarks.speed.continuous [--rounds 5] [--turn-s 2.0] [--size 256] [--algo iql]
+
+Both libraries take turns in one process, on the same random transitions (17 numbers, actions of 6)
+and with networks of 256x256; otherwise, settings are the defaults. The measure is CPU time on one
+thread, the best of several turns. The ratios are printed and written to
+benchmarks/speed/continuous.json, and the table to docs/results.md; with --size or --algo, they are
+only printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+import mcaprl
+from benchmarks.page import write_section
+from benchmarks.speed.learning import Turns, Update, best_rates
+from mcaprl.files import write_json
+from mcaprl.offline import BOX_ALGORITHMS, TransitionBuffer
+
+ROWS, EPISODE, WIDTH, ACTION = 20_000, 1_000, 17, 6
+HIDDEN = (256, 256)
+SIZES = (256, 64, 32)
+RIVALS = {
+    "bc": "BCConfig",
+    "td3-bc": "TD3PlusBCConfig",
+    "iql": "IQLConfig",
+    "rebrac": "ReBRACConfig",
+}
+GOALS = {("td3-bc", 256): 2.0, ("iql", 256): 2.0}
+GOAL = 3.0
+RESULTS = Path(__file__).with_name("continuous.json")
+
+
+def transitions(rows: int = ROWS) -> mcaprl.Dataset:
+    """Return random transitions in episodes of 1000."""
+    random = np.random.default_rng(0)
+    frames = random.normal(size=(rows // EPISODE, EPISODE + 1, WIDTH)).astype(np.float32)
+    return mcaprl.Dataset.from_arrays(
+        observations=frames[:, :-1].reshape(-1, WIDTH),
+        next_observations=frames[:, 1:].reshape(-1, WIDTH),
+        actions=random.uniform(-1, 1, (rows, ACTION)).astype(np.float32),
+        rewards=random.normal(size=rows),
+        terminated=np.zeros(rows, bool),
+        truncated=np.arange(1, rows + 1) % EPISODE == 0,
+        action_space=spaces.Box(-1, 1, (ACTION,), np.float32),
+    )
+
+
+def ours(data: mcaprl.Dataset, algo: str, batch_size: int, seeds: int = 1) -> Update:
+    """Return a function that makes one update of mcaprl's learner."""
+    learner_type = BOX_ALGORITHMS[algo]
+    config = learner_type.config_type(batch_size=batch_size, hidden=HIDDEN)
+    buffer = TransitionBuffer.from_dataset(data, config.packing)
+    return learner_type(config, buffer, range(seeds)).update
+
+
+def d3rlpys(data: mcaprl.Dataset, algo: str, batch_size: int) -> Update:
+    """Return a function that draws a batch from d3rlpy's buffer and makes one update."""
+    import d3rlpy
+
+    log = d3rlpy.dataset.MDPDataset(
+        data.observations,
+        data.actions,
+        data.rewards.astype(np.float32),
+        data.terminated.astype(np.float32),
+        data.truncated.astype(np.float32),
+        action_space=d3rlpy.ActionSpace.CONTINUOUS,
+    )
+    encoder = d3rlpy.models.VectorEncoderFactory(list(HIDDEN))
+    names = ["encoder"] if algo == "bc" else ["actor_encoder", "critic_encoder"]
+    settings: dict[str, Any] = {f"{name}_factory": encoder for name in names}
+    config = getattr(d3rlpy.algos, RIVALS[algo])(batch_size=batch_size, **settings)
+    learner = config.create("cpu")
+    learner.build_with_dataset(log)
+    return lambda: learner.update(log.sample_transition_batch(batch_size))
+
+
+def ratios(algo: str, size: int, turns: Turns) -> tuple[float, float]:
+    """Return our updates per CPU second, and their ratio to d3rlpy's."""
+    data = transitions()
+    sides = {"ours": (ours(data, algo, size), 1), "d3rlpy": (d3rlpys(data, algo, size), 1)}
+    rates = best_rates(sides, turns)
+    print(algo, size, {name: round(rate, 1) for name, rate in rates.items()}, flush=True)
+    return rates["ours"], rates["ours"] / rates["d3rlpy"]
+
+
+def main() -> None:
+    """Measure, print ratios, and write them."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--turn-s", type=float, default=2.0)
+    parser.add_argument("--size", type=int, choices=SIZES)
+    parser.add_argument("--algo", choices=RIVALS)
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    turns = Turns(given.rounds, given.turn_s)
+    found = {
+        f"{algo}, batch {size}": ratios(algo, size, turns)
+        for size in ([given.size] if given.size else SIZES)
+        for algo in ([given.algo] if given.algo else RIVALS)
+    }
+    print(table := as_table(found))
+    if not (given.size or given.algo):
+        write_json(RESULTS, json.loads(json.dumps(found)))
+        write_section("continuous-speed", table)
+
+
+def as_table(found: dict[str, tuple[float, float]]) -> str:
+    """Return the table as Markdown, with the goals and the versions."""
+    lines = ["| what | updates per CPU second | d3rlpy's times | goal |", "|---|---|---|---|"]
+    for name, (rate, ratio) in found.items():
+        algo, size = name.split(", batch ")
+        goal = GOALS.get((algo, int(size)), GOAL)
+        lines.append(f"| {name} | {rate:.0f} | {ratio:.2f} | {goal} |")
+    versions = ", ".join(f"{name} {version(name)}" for name in ("torch", "d3rlpy"))
+    return "\n".join([*lines, "", f"Versions: {versions}."])
+
+
+if __name__ == "__main__":
+    main()

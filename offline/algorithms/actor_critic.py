@@ -1,0 +1,61 @@
+"""What the algorithms with an actor and two critics have in common, for the actions of a Box.
+
+The actor maps an observation to the outputs of a head (`heads.BoxHead`). The critics, the twins of
+TD3, are one ensemble of two networks Q(s, a).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import torch
+from torch import Tensor
+
+from mcaprl.offline.algorithms.config import ActorCriticConfig
+from mcaprl.offline.algorithms.heads import BOX_HEADS
+from mcaprl.offline.algorithms.learner import Learner
+from mcaprl.offline.batches.buffer import Batch
+from mcaprl.offline.batches.observations import Observations
+
+
+class ActorCritic(Learner):
+    """Learner with the models `actor` and `q`; a subclass defines the losses of both."""
+
+    acts_by: str = "deterministic"
+    policy_models = ("actor", "q")
+    continuous = True
+    critics = ("q",)
+    config: ActorCriticConfig
+
+    def output_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of the actor's outputs, and of one value per critic."""
+        return {"actor": BOX_HEADS[self.acts_by].output_shape(self.n_actions), "q": (1,)}
+
+    def act(self, observations: Observations) -> Tensor:
+        """Return the actor's actions (R, n), in [-1, 1]."""
+        return BOX_HEADS[self.acts_by].best(self.models["actor"](observations))
+
+    def validate(self, batch: Batch) -> dict[str, Tensor]:
+        """Return metrics of the values in units of the logged rewards, and the actor's error.
+
+        In addition to the values of the logged actions and their TD errors, these are the values of
+        the actor's actions, which show whether it exploits errors of the critics, and the mean
+        absolute difference between both actions, which are scaled to [-1, 1].
+        """
+        q_tm1 = self.models["q"](batch.observations.with_actions(batch.actions)).amin(0)
+        actions = self.act(batch.observations)
+        policy_q = self.models["q"](batch.observations.with_actions(actions)).amin(0)
+        terms = {
+            "q": q_tm1,
+            "td_error": (self.learned_targets(batch) - q_tm1).abs(),
+            "policy_q": policy_q,
+        }
+        error = (actions - batch.actions).abs().mean(1)
+        return {name: self.in_reward_units(x) for name, x in terms.items()} | {
+            "action_error": error
+        }
+
+    @abstractmethod
+    @torch.no_grad()
+    def learned_targets(self, batch: Batch) -> Tensor:
+        """Return the targets (R,) of the critics, computed with the learning networks."""
