@@ -34,8 +34,8 @@ class BasePolicy:
         frame_stack: Number of successive observations that determine an action.
         action_commands: Commands of a robot that the actions stand for; None if unknown.
         mask_from: Source of the action mask; see `mcaprl.actions`.
-        is_deterministic: Whether `act` has no randomness. If not, recordings have no
-            `behavior_prob`.
+        is_deterministic: Whether `act` has no randomness. If not, recordings of finite spaces have
+            no `behavior_prob`; those of floats have a `behavior_log_prob` only then.
     """
 
     name: str = "policy"
@@ -106,6 +106,17 @@ class RandomPolicy(BasePolicy):
         numbering = JointActions.of(space)
         draws = space.np_random.random(mask.shape) * mask
         return numbering.values(draws.argmax(1))
+
+    def log_prob(self, observations: Any, actions: NDArray[Any]) -> NDArray[np.floating[Any]]:
+        """Return the log probabilities (B,) of actions; for a bounded Box, its uniform density."""
+        space = self.action_space
+        if not isinstance(space, spaces.Box):
+            return super().log_prob(observations, actions)
+        if np.dtype(space.dtype).kind != "f" or not space.is_bounded():
+            raise PolicyError(f"random actions of {space} have no density")
+        sizes = space.high.astype(np.float64) - space.low
+        with np.errstate(divide="ignore"):
+            return np.full(len(actions), -np.log(sizes).sum())
 
     def action_probabilities(self, observations: Any) -> NDArray[np.float64]:
         """Return equal probabilities (B, A) of the allowed actions."""

@@ -208,7 +208,7 @@ class WatchedBatch(VectorWrapper):
         return {
             "observation": rows_of(self._observations, WATCHED),
             "action": actions[WATCHED],
-            "behavior_prob": float(probability),
+            "behavior": float(probability),
             "epsilon": exploration(model),
             "policy_version": cast(Any, model)._n_updates,
             "values": values,

@@ -135,7 +135,7 @@ def estimate(
         epsilon,
         evaluator.behavior_return,
         evaluator.behavior_interval,
-        calibration(dataset.behavior_probs, dataset.action_space),
+        calibration(dataset.behavior, dataset.action_space),
         behavior,
         {result.policy: result.coverage for result in results},
         tuple(estimates),

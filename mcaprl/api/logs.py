@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mcaprl.api.bags import BagInfo, bag_info, logs_or_bags
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import LogError, NoEpisodesError, ReportError, UsageError, import_extra
@@ -17,9 +19,10 @@ from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.dataset.statistics import Calibration, calibration
+from mcaprl.recorder.format.behavior import PROBABILITY
 from mcaprl.recorder.source import Definitions, Source, open_data, opened
 from mcaprl.recorder.viewer.surprises import Surprise, moments_of
-from mcaprl.texts import size
+from mcaprl.texts import counted, size
 
 if TYPE_CHECKING:
     from mcaprl.recorder.repair.recover import Recovery
@@ -45,7 +48,11 @@ class LogInfo:
         action_counts: Number of times each action was taken, by its name.
         behavior_prob: Two numbers: the mean of 1 / `behavior_prob`, which estimates the number of
             actions, and the number of actions in the action space. None if unknown.
-        behavior_estimated: Whether `behavior_prob` was estimated, not logged by the policy.
+        action_parts: Parts of a vector action with their bounds and units, if they have names.
+        behavior_field: Name of the log's column about the choice of the actions: `behavior_prob`,
+            or `behavior_log_prob` for actions of floats.
+        behavior_known: Number of steps in which this column has a value.
+        behavior_estimated: Whether this column was estimated, not logged by the policy.
         policies: Names of the policies that acted.
         ends: Number of episodes by the reason of their end.
         size_bytes: Size of all files.
@@ -66,6 +73,9 @@ class LogInfo:
     observations: str
     actions: str
     action_counts: dict[str, int]
+    action_parts: list[str]
+    behavior_field: str
+    behavior_known: int
     behavior_prob: Calibration | None
     behavior_estimated: bool
     policies: list[str]
@@ -97,7 +107,6 @@ class LogInfo:
     def rows(self) -> list[tuple[str, str]]:
         """Return the name and the formatted value of each fact."""
         low, high = self.return_range
-        found, origin = self.behavior_prob, "estimated, " if self.behavior_estimated else ""
         return [
             ("environment", self.env_id or "unknown"),
             ("files", f"{len(self.sources)}, {size(self.size_bytes)}"),
@@ -108,11 +117,20 @@ class LogInfo:
             ("observations", _short(self.observations)),
             ("storage", self.storage),
             ("actions", _short(self.actions)),
+            *([("action parts", ", ".join(self.action_parts))] if self.action_parts else []),
             ("action counts", _counts(self.action_counts) or "-"),
-            ("behavior_prob", "unknown" if found is None else f"{origin}implies {found}"),
+            (self.behavior_field, self._behavior()),
             ("policies", ", ".join(self.policies) or "unknown"),
             ("ends", _counts(self.ends)),
         ]
+
+    def _behavior(self) -> str:
+        origin = "estimated, " if self.behavior_estimated else ""
+        if self.behavior_prob is not None:
+            return f"{origin}implies {self.behavior_prob}"
+        if not self.behavior_known or self.behavior_field == PROBABILITY.name:
+            return "unknown"
+        return f"{origin}known in {self.behavior_known} of {counted(self.steps, 'step')}"
 
 
 def info(
@@ -198,7 +216,10 @@ def _describe(dataset: Dataset, warned: Sequence[str]) -> LogInfo:
             dataset.action_names.get(action, str(action)): count
             for action, count in statistics.action_counts.items()
         },
-        behavior_prob=calibration(dataset.behavior_probs, dataset.action_space),
+        action_parts=list(dataset.action_labels),
+        behavior_field=dataset.behavior_field.name,
+        behavior_known=int((~np.isnan(dataset.behavior)).sum()),
+        behavior_prob=calibration(dataset.behavior, dataset.action_space),
         behavior_estimated=dataset.has_estimated_probs,
         policies=sorted({episode.policy for episode in dataset.episodes if episode.policy}),
         ends=dict(statistics.ends),

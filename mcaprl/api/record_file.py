@@ -14,6 +14,7 @@ import gymnasium as gym
 from mcaprl.api.policies import policies_of, policy_names
 from mcaprl.base_policy import BasePolicy
 from mcaprl.files import work_folder
+from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.sims.evaluation.rollout import (
     EpisodeResult,
@@ -67,8 +68,10 @@ def record_file(
         behavior = _behavior(request, env)
         recorder = _recorder(request, env, behavior)
 
-        def set_probability(probability: float) -> None:
-            recorder.behavior_prob = probability
+        name = behavior_field(env.action_space).name
+
+        def set_behavior(value: float) -> None:
+            setattr(recorder, name, value)
 
         with closing(recorder):
             return rollout(
@@ -79,7 +82,7 @@ def record_file(
                 steps=request.steps,
                 # Appended episodes continue the numbering, which determines the seeds.
                 first_episode=request.first_episode + recorder.episodes,
-                on_action=set_probability,
+                on_action=set_behavior,
                 on_episode=on_episode,
             )
 

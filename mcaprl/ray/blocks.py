@@ -1,8 +1,9 @@
 """Logs as sources and targets of Ray Data, and their transitions as Arrow blocks.
 
 A block has one row for each transition, with the columns of `Dataset.to_arrow`: `episode`, `step`,
-`log_time_ns`, `reward`, `terminated`, `truncated`, `behavior_prob`, `action`, `observation` and
-`next_observation`, or `observation_<key>` for the parts of a Dict. Vectors and images are tensors.
+`log_time_ns`, `reward`, `terminated`, `truncated`, `behavior_prob` (`behavior_log_prob` for actions
+of floats), `action`, `observation` and `next_observation`, or `observation_<key>` for the parts of
+a Dict. Vectors and images are tensors.
 
 Ray divides blocks, and thus episodes, in two cases: a source has fewer tasks than Ray requests, or
 a block is larger than Ray's maximum. Therefore, each task reads one block of at most the maximum
@@ -50,6 +51,8 @@ from mcaprl.recorder.dataset.manifest import (
 from mcaprl.recorder.dataset.open import Episodes, episode_indexes
 from mcaprl.recorder.dataset.tables import described, observation_names, step_columns
 from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.dataset.values import behavior_of
+from mcaprl.recorder.format.behavior import FIELDS, behavior_field
 from mcaprl.recorder.format.metadata import METADATA_NAME, NO_TIMES, LogMetadata, installed_versions
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of, nest
 from mcaprl.storage.remote import check_upload, is_url, upload
@@ -63,9 +66,8 @@ _SCALARS = {
     "reward": np.float64,
     "terminated": np.bool_,
     "truncated": np.bool_,
-    "behavior_prob": np.float32,
 }
-_OPTIONAL = ("log_time_ns", "behavior_prob")
+_OPTIONAL = ("log_time_ns", *(field.name for field in FIELDS))
 _NOT_WHOLE = (
     "{}: episode {} is not whole in its block, or two episodes have this number; bring the rows of"
     ' an episode together with rows.repartition(N, keys=["episode"])'
@@ -75,7 +77,9 @@ _NOT_WHOLE = (
 def empty_columns(description: LogMetadata) -> Columns:
     """Return all columns of a block without rows, to know their dtypes and shapes."""
     action = action_leaf(description.action_space)
-    columns: Columns = {name: np.empty(0, dtype) for name, dtype in _SCALARS.items()}
+    behavior = {behavior_field(description.action_space).name: np.float32}
+    scalars = {**_SCALARS, **behavior}
+    columns: Columns = {name: np.empty(0, dtype) for name, dtype in scalars.items()}
     columns["action"] = np.empty((0, *action.shape), action.dtype)
     for name, leaf in _leaves(description):
         for column in (name, f"next_{name}"):
@@ -105,7 +109,7 @@ def columns_of(data: Dataset, episodes: NDArray[np.int64], names: Sequence[str])
         names: Names of the columns.
     """
     columns = data._transitions
-    found = step_columns(columns) | {"action": columns.actions}
+    found = step_columns(columns, data._description) | {"action": columns.actions}
     found["episode"] = np.repeat(episodes, columns.lengths)
     frames = columns.frame_of_step()
     leaves = leaves_of(data.observation_space)
@@ -144,7 +148,12 @@ def dataset_of(columns: Columns, description: LogMetadata, where: str) -> Datase
             "rewards": columns["reward"],
             "terminated": columns["terminated"],
             "truncated": columns["truncated"],
-            "behavior_probs": columns.get("behavior_prob"),
+            "behavior": behavior_of(
+                behavior_field(description.action_space),
+                *(columns.get(field.name) for field in FIELDS),
+                place=f"{where}: ",
+                is_table=True,
+            ),
         },
     )
     if not np.array_equal(transitions.lengths, lengths):

@@ -106,7 +106,7 @@ class Items:
             "terminated": data.terminated[lasts],
             "truncated": data.truncated[lasts],
             "discount": self._discounts[rows],
-            "behavior_prob": data.behavior_probs[rows],
+            data.behavior_field.name: data.behavior[rows],
         }
 
     def _sequences(self, rows: NDArray[np.int64]) -> Arrays:
@@ -125,7 +125,7 @@ class Items:
             "next_observation": self._observed(frames + 1, firsts),
             "terminated": data.terminated[every],
             "truncated": data.truncated[every],
-            "behavior_prob": data.behavior_probs[every],
+            data.behavior_field.name: data.behavior[every],
             "return_to_go": self._to_go[every],
             "step": self._steps[every],
         }

@@ -37,7 +37,8 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
         terminated          bool, whether next_observation is terminal
         truncated           bool, whether the episode was truncated at next_observation
         discount            float32, gamma to the power of the number of rewards; 0 if terminated
-        behavior_prob       float32, NaN if unknown
+        behavior_prob       float32, NaN if unknown; for actions of floats, behavior_log_prob: the
+                            natural logarithm of their probability density
 
     With `length` L, an item is a sequence of L transitions of one episode, with single rewards.
     Each tensor has a further axis of length L after the batch axis. Rows after the end of the

@@ -38,7 +38,7 @@ from mcaprl.offline.estimate.importance import (
     weighted_per_decision,
 )
 from mcaprl.offline.estimate.values import by_rows
-from mcaprl.recorder.format.probability import is_impossible
+from mcaprl.recorder.format.behavior import PROBABILITY
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -243,7 +243,7 @@ def weighted_value(
     None is returned if the log has no valid action probabilities.
     """
     behavior = dataset.behavior_probs.astype(np.float64)
-    if (np.isnan(behavior) | is_impossible(behavior)).any():
+    if (np.isnan(behavior) | PROBABILITY.is_impossible(behavior)).any():
         return None
     lengths = dataset.episode_lengths
     steps = np.arange(int(lengths.max()) + 1) < lengths[:, None]

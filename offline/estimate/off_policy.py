@@ -23,12 +23,13 @@ from mcaprl.offline.estimate.importance import (
     EpisodeTable,
     Floats,
     RatioEstimate,
+    check_space,
     effective_sample_size,
     mean_weight,
 )
 from mcaprl.offline.estimate.values import by_rows, policy_inputs
 from mcaprl.recorder.dataset.statistics import calibration
-from mcaprl.recorder.format.probability import is_impossible
+from mcaprl.recorder.format.behavior import PROBABILITY
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -118,6 +119,7 @@ class OffPolicyEvaluator:
             TrainingError: There are no transitions, or a number is not finite.
             UsageError: There are too few episodes for cross-fitting.
         """
+        check_space(dataset.action_space)
         self._config = config or FQEConfig()
         self._seed = seed
         self._dataset = dataset
@@ -126,7 +128,7 @@ class OffPolicyEvaluator:
         if len(self._lengths) < FOLDS:
             raise UsageError(f"off-policy evaluation needs {FOLDS} episodes or more in the log")
         self.gamma = self._config.gamma
-        self._calibration = calibration(dataset.behavior_probs, dataset.action_space)
+        self._calibration = calibration(dataset.behavior, dataset.action_space)
         random = np.random.default_rng(seed)
         shape = (RESAMPLES, len(self._lengths))
         self._counts = random.multinomial(shape[1], [1 / shape[1]] * shape[1], shape[0]).astype(
@@ -330,7 +332,7 @@ def ranking(estimates: Sequence[Estimate]) -> dict[str, Any]:
 def _unusable(behavior: Floats) -> str | None:
     """Return a refusal if logged probabilities are missing or impossible, else None."""
     for wrong, what in (
-        (is_impossible(behavior), "not in (0, 1]"),
+        (PROBABILITY.is_impossible(behavior), "not in (0, 1]"),
         (np.isnan(behavior), "unknown; `estimate_behavior=True` estimates it"),
     ):
         if wrong.any():

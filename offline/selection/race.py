@@ -56,7 +56,7 @@ from mcaprl.offline.training.train import train, with_source
 from mcaprl.offline.training.watch import SHORT_HORIZON, horizon_warning
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.lint import lint
-from mcaprl.recorder.format.probability import is_impossible
+from mcaprl.recorder.format.behavior import PROBABILITY
 from mcaprl.runs import (
     METRICS_NAME,
     POLICY_NAME,
@@ -483,7 +483,7 @@ def _traits(dataset: Dataset, clone: BasePolicy) -> LogTraits:
     """Return the properties of a log. The clone imitates its behavior policy."""
     chances = by_rows(clone.action_probabilities, dataset.observations).astype(np.float64)
     behavior = dataset.behavior_probs.astype(np.float64)
-    known = not bool((np.isnan(behavior) | is_impossible(behavior)).any())
+    known = not bool((np.isnan(behavior) | PROBABILITY.is_impossible(behavior)).any())
     logs = np.log(np.where(chances > 0, chances, 1.0))
     nats = -np.log(behavior).mean() if known else -(chances * logs).sum(1).mean()
     returns = dataset.statistics.returns

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.dataset.transitions import Transitions
-from mcaprl.recorder.dataset.values import exactly, flags, numbers, probabilities_of, rewards_of
+from mcaprl.recorder.dataset.values import exactly, flags, numbers, rewards_of
+from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata, installed_versions
 from mcaprl.recorder.format.spaces import (
@@ -30,7 +31,6 @@ _SCALARS: Mapping[str, Callable[[str, Any], NDArray[Any]]] = {
     "rewards": rewards_of,
     "terminated": flags,
     "truncated": flags,
-    "behavior_probs": probabilities_of,
 }
 
 
@@ -57,21 +57,28 @@ def description_of(
 def columns_of_arrays(
     description: LogMetadata, observations: Any, next_observations: Any, given: Mapping[str, Any]
 ) -> Transitions:
-    """Convert arrays to columns without times; `given` maps the `STEP_COLUMNS` to arrays."""
+    """Convert arrays to columns without times.
+
+    `given` maps the `STEP_COLUMNS` to arrays; `behavior` is valid, or None.
+    """
     steps = len(np.atleast_1d(numbers("rewards", given["rewards"])))
     if steps == 0:
         raise SpaceError("no transitions: the arrays are empty")
     leaves = observation_leaves(description.observation_space)
     here = [_leaf_array("observations", observations, leaf, steps) for leaf in leaves]
     there = [_leaf_array("next_observations", next_observations, leaf, steps) for leaf in leaves]
-    if given["behavior_probs"] is None:
-        given = {**given, "behavior_probs": np.full(steps, np.nan, np.float32)}
-    action = action_leaf(description.action_space)
-    columns = {"actions": _leaf_array("actions", given["actions"], action, steps)}
+    action, behavior = action_leaf(description.action_space), given["behavior"]
+    columns: dict[str, Any] = {
+        "actions": _leaf_array("actions", given["actions"], action, steps),
+        "behavior": np.full(steps, np.nan, np.float32) if behavior is None else behavior,
+    }
     for name, convert in _SCALARS.items():
         columns[name] = convert(name, given[name])
+    named = {"behavior": behavior_field(description.action_space).plural}
+    for name in (*_SCALARS, "behavior"):
         if columns[name].shape != (steps,):
-            raise SpaceError(f"{name} has shape {columns[name].shape}, expected {(steps,)}")
+            where = named.get(name, name)
+            raise SpaceError(f"{where} has shape {columns[name].shape}, expected {(steps,)}")
     lasts = last_steps(columns["terminated"] | columns["truncated"], here, there)
     after = lasts + 1
     frames = tuple(

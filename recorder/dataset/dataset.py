@@ -22,6 +22,7 @@ from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.recorder.dataset.statistics import Statistics, describe_columns
 from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, TransitionBatch, Transitions
 from mcaprl.recorder.format.action_commands import ActionCommands
+from mcaprl.recorder.format.behavior import BehaviorField, behavior_field
 from mcaprl.recorder.format.episode_summary import add_up_each
 from mcaprl.recorder.format.metadata import ESTIMATED, LogMetadata
 from mcaprl.recorder.format.spaces import nest, space_to_json
@@ -67,6 +68,7 @@ class Dataset(Conversions):
         truncated: Any,
         next_observations: Any,
         behavior_probs: Any = None,
+        behavior_log_probs: Any = None,
         env_id: str = "",
         observation_space: spaces.Space[Any] | None = None,
         action_space: spaces.Space[Any] | None = None,
@@ -84,7 +86,9 @@ class Dataset(Conversions):
             truncated: (N,) bool; whether the episode was truncated after the transition.
             next_observations: Next observations, in the form of `observations`.
             behavior_probs: (N,) probability of each action under the behavior policy; default: NaN
-                (unknown).
+                (unknown). Not for actions of floats.
+            behavior_log_probs: (N,) natural logarithm of this probability or, for actions of
+                floats, of the probability density; instead of `behavior_probs`.
             env_id: Gymnasium id of the environment.
             observation_space: Space of the observations; default: the environment's space if
                 `env_id` is registered, else unbounded Boxes with the arrays' shapes and dtypes.
@@ -93,14 +97,17 @@ class Dataset(Conversions):
 
         Raises:
             SpaceError: Lengths or shapes do not agree with each other or with the spaces, or an
-                action is not finite.
+                action, probability or density is not possible.
         """
         from mcaprl.recorder.dataset.arrays import columns_of_arrays, description_of
-        from mcaprl.recorder.dataset.values import check_finite, numbers
+        from mcaprl.recorder.dataset.values import behavior_of_arrays, check_finite, numbers
 
         check_finite("actions", numbers("actions", actions))
         description = description_of(env_id, observations, actions, observation_space, action_space)
-        steps = (actions, rewards, terminated, truncated, behavior_probs)
+        behavior = behavior_of_arrays(
+            behavior_field(description.action_space), behavior_probs, behavior_log_probs
+        )
+        steps = (actions, rewards, terminated, truncated, behavior)
         columns = dict(zip(STEP_COLUMNS, steps, strict=True))
         transitions = columns_of_arrays(description, observations, next_observations, columns)
         return cls(transitions, description)
@@ -207,9 +214,34 @@ class Dataset(Conversions):
         return self._transitions.truncated
 
     @property
+    def behavior(self) -> NDArray[np.float32]:
+        """(N,) float32, what the log stores: probabilities, or for actions of floats log densities.
+
+        NaN means unknown. `behavior_field` has the meaning of the values.
+        """
+        return self._transitions.behavior
+
+    @property
+    def behavior_field(self) -> BehaviorField:
+        """Meaning of `behavior`: name of the field in the log, and range of its values."""
+        return behavior_field(self.action_space)
+
+    @property
     def behavior_probs(self) -> NDArray[np.float32]:
-        """(N,) float32 probability of each action under the behavior policy; NaN if unknown."""
-        return self._transitions.behavior_probs
+        """(N,) float32 probability of each action under the behavior policy; NaN if unknown.
+
+        Raises:
+            SpaceError: The actions are floats, which have densities: see `behavior_log_probs`.
+        """
+        return self.behavior_field.probs(self.behavior)
+
+    @property
+    def behavior_log_probs(self) -> NDArray[np.float32]:
+        """(N,) float32 natural logarithm of the probability of each action; NaN if unknown.
+
+        For actions of floats it is that of the probability density, in the action's own units.
+        """
+        return self.behavior_field.log_probs(self.behavior)
 
     @property
     def infos(self) -> dict[str, np.ma.MaskedArray[Any, Any]]:
@@ -222,7 +254,7 @@ class Dataset(Conversions):
 
     @property
     def has_estimated_probs(self) -> bool:
-        """Whether `behavior_probs` were estimated from the actions, not logged by the policy."""
+        """Whether `behavior` was estimated from the actions, not logged by the policy."""
         return bool(self._description.behavior_prob)
 
     @property
@@ -261,6 +293,28 @@ class Dataset(Conversions):
         return self._description.action_meanings
 
     @property
+    def action_part_names(self) -> tuple[str, ...]:
+        """Names of a vector action's elements, such as `steering`; empty if unknown."""
+        return self._description.action_part_names
+
+    @property
+    def action_units(self) -> tuple[str, ...]:
+        """Units of a vector action's elements, such as `m/s`; empty if unknown.
+
+        A unit can also name both directions of an element, as `right | left` does: the negative
+        direction is the first.
+        """
+        return self._description.action_units
+
+    @property
+    def action_labels(self) -> tuple[str, ...]:
+        """Names of a vector action's elements with their bounds and units; empty without names.
+
+        A label is such as `speed (0 to 2 m/s)`, or `steering (-1 right, 1 left)`.
+        """
+        return self._description.action_labels()
+
+    @property
     def action_commands(self) -> ActionCommands | None:
         """Commands that the discrete actions stand for, if the data is from a bag; else None.
 
@@ -293,6 +347,7 @@ class Dataset(Conversions):
                 log_time_ns=columns.log_time_ns[frame : last + 1],
                 summary=summary,
                 infos={name: info[frame : last + 1] for name, info in columns.infos.items()},
+                behavior_field=self.behavior_field,
                 **columns.at(slice(step, step + summary.length)),
             )
             found.append(episode)
@@ -334,13 +389,33 @@ class Dataset(Conversions):
                 dataset, and results that are based on such probabilities mention it.
 
         Raises:
-            SpaceError: The length of `probs` is not the number of transitions.
+            SpaceError: The length of `probs` is not the number of transitions, or the actions are
+                floats.
         """
-        column = np.asarray(probs, np.float32)
+        self.behavior_field.probs(self.behavior)
+        return self._with_behavior("probs", np.asarray(probs, np.float32), estimated)
+
+    def with_behavior_log_probs(
+        self, log_probs: NDArray[Any], *, estimated: bool = False
+    ) -> Dataset:
+        """Return the same transitions with other behavior probabilities or densities.
+
+        Args:
+            log_probs: (N,) values, as `behavior_log_probs` has them; NaN if unknown.
+            estimated: Whether they are estimates; see `with_behavior_probs`.
+
+        Raises:
+            SpaceError: The length of `log_probs` is not the number of transitions.
+        """
+        column = self.behavior_field.column(None, log_probs)
+        assert column is not None
+        return self._with_behavior("log_probs", column, estimated)
+
+    def _with_behavior(self, name: str, column: NDArray[np.float32], estimated: bool) -> Dataset:
         if column.shape != (len(self),):
-            raise SpaceError(f"probs has shape {column.shape}, expected {(len(self),)}")
+            raise SpaceError(f"{name} has shape {column.shape}, expected {(len(self),)}")
         mark = ESTIMATED if estimated else ""
-        columns = dataclasses.replace(self._transitions, behavior_probs=column)
+        columns = dataclasses.replace(self._transitions, behavior=column)
         return self._changed(columns, dataclasses.replace(self._description, behavior_prob=mark))
 
     def with_rewards(self, rewards: Any) -> Dataset:
@@ -423,6 +498,7 @@ class Dataset(Conversions):
         return TransitionBatch(
             observations=nest(self._leaves, [leaf[frames] for leaf in columns.frames]),
             next_observations=nest(self._leaves, [leaf[frames + 1] for leaf in columns.frames]),
+            behavior_field=self.behavior_field,
             **columns.at(steps),
         )
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.recorder.format.behavior import BehaviorField
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.infos import Masked
 
@@ -25,7 +26,9 @@ class Episode:
         terminated: (T,) bool; only the last element can be set.
         truncated: (T,) bool; only the last element can be set.
         next_observations: Next observations, in the form of `observations`.
-        behavior_probs: (T,) float32; NaN where unknown.
+        behavior: (T,) float32 probability of each action under the behavior policy, or natural
+            logarithm of its density if actions are floats; NaN where unknown.
+        behavior_field: Meaning of `behavior`.
         log_time_ns: (T + 1,) log_time of each observation, nanoseconds.
         summary: The log's summary of the episode: seed, end reason, policy, ...
         infos: (T + 1, *shape) masked array of each info by its dotted name; see `Dataset.infos`.
@@ -38,7 +41,8 @@ class Episode:
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
     next_observations: Any
-    behavior_probs: NDArray[np.float32]
+    behavior: NDArray[np.float32]
+    behavior_field: BehaviorField
     log_time_ns: NDArray[np.int64]
     summary: EpisodeSummary
     infos: Mapping[str, Masked] = field(default_factory=dict)
@@ -47,6 +51,16 @@ class Episode:
     def length(self) -> int:
         """Number of transitions."""
         return len(self.rewards)
+
+    @property
+    def behavior_probs(self) -> NDArray[np.float32]:
+        """(T,) float32 probabilities; see `Dataset.behavior_probs`."""
+        return self.behavior_field.probs(self.behavior)
+
+    @property
+    def behavior_log_probs(self) -> NDArray[np.float32]:
+        """(T,) float32 logarithms; see `Dataset.behavior_log_probs`."""
+        return self.behavior_field.log_probs(self.behavior)
 
     @property
     def total_reward(self) -> float:

@@ -7,6 +7,7 @@ name to its `Format` subclass, `module:Class`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
@@ -18,6 +19,7 @@ from mcaprl.entry_points import installed, load
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.files import check_plain, replacing, replacing_folder
 from mcaprl.recorder.dataset.origin import Origin
+from mcaprl.recorder.format.behavior import FIELDS, BehaviorField
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
 from mcaprl.storage.remote import is_url
 
@@ -45,6 +47,10 @@ def _has_final_infos(data: Dataset) -> bool:
     return any(not np.ma.getmaskarray(values[rows]).all() for values in data.infos.values())
 
 
+def _has_behavior(field: BehaviorField, data: Dataset) -> bool:
+    return data.behavior_field is field and not np.isnan(data.behavior).all()
+
+
 FACTS: Mapping[str, Callable[[Dataset], bool]] = {
     "spaces": lambda data: True,
     "times": lambda data: data.metadata.get("times") != NO_TIMES,
@@ -53,7 +59,9 @@ FACTS: Mapping[str, Callable[[Dataset], bool]] = {
     "names and commands of actions": lambda data: (
         bool(data.action_meanings) or data.action_commands is not None
     ),
-    "behavior_prob": lambda data: not np.isnan(data.behavior_probs).all(),
+    "names of parts of actions": lambda data: bool(data.action_part_names),
+    "units of parts of actions": lambda data: any(data.action_units),
+    **{field.name: partial(_has_behavior, field) for field in FIELDS},
     "policy names": _any_summary("policy"),
     "seeds and reset options": _any_summary("seed", "options"),
     "end reasons": lambda data: any(e.summary.reason not in ("", *KINDS) for e in data.episodes),
@@ -81,10 +89,10 @@ class Format:
         suffix: Suffix of the file names, such as `.npz`; empty if the format is a folder.
         keeps: Data beside the transitions that the format has a place for; default: all of
             `spaces`, `times`, `environment`, `names of observations`, `names and commands of
-            actions`, `behavior_prob`, `policy names`, `seeds and reset options`, `end reasons`,
-            `infos`, `infos of final observations`, `final observations after a termination`,
-            `description of the source` and `other metadata`. Writing lists the others that a
-            dataset has.
+            actions`, `names of parts of actions`, `units of parts of actions`, `behavior_prob`,
+            `behavior_log_prob`, `policy names`, `seeds and reset options`, `end reasons`, `infos`,
+            `infos of final observations`, `final observations after a termination`, `description of
+            the source` and `other metadata`. Writing lists the others that a dataset has.
     """
 
     name: ClassVar[str]
@@ -183,7 +191,14 @@ class _BuiltIn(Format):
 class _LeRobot(_BuiltIn):
     name, about = "lerobot", "LeRobot dataset v3 (folder)"
     keeps = frozenset(
-        {"names of observations", "behavior_prob", "infos", "infos of final observations"}
+        {
+            "names of observations",
+            "names of parts of actions",
+            "behavior_prob",
+            "behavior_log_prob",
+            "infos",
+            "infos of final observations",
+        }
     )
 
 
@@ -193,7 +208,10 @@ class _Minari(_BuiltIn):
         "times",
         "names of observations",
         "names and commands of actions",
+        "names of parts of actions",
+        "units of parts of actions",
         "behavior_prob",
+        "behavior_log_prob",
         "policy names",
         "end reasons",
         "other metadata",
@@ -218,6 +236,7 @@ class _Npz(_BuiltIn):
         {
             "times",
             "behavior_prob",
+            "behavior_log_prob",
             "infos",
             "infos of final observations",
             "final observations after a termination",
@@ -232,7 +251,9 @@ class _D3rlpy(_BuiltIn):
 
 class _Hdf5(_BuiltIn):
     name, about, suffix = "hdf5", "D4RL's or robomimic's HDF5 file", ".hdf5"
-    keeps = frozenset({"behavior_prob", "infos", "final observations after a termination"})
+    keeps = frozenset(
+        {"behavior_prob", "behavior_log_prob", "infos", "final observations after a termination"}
+    )
 
 
 # If several formats match a path, the first of them reads it.

@@ -19,8 +19,14 @@ from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.mapped import blocks_of
 from mcaprl.recorder.dataset.statistics import calibration
 from mcaprl.recorder.dataset.values import is_beyond_float32
-from mcaprl.recorder.format.probability import is_impossible
-from mcaprl.recorder.format.spaces import Leaf, bounds_of, observation_leaves, outside
+from mcaprl.recorder.format.behavior import LOG_DENSITY
+from mcaprl.recorder.format.spaces import (
+    Leaf,
+    bounds_of,
+    observation_leaves,
+    outside,
+    part_names,
+)
 
 GAP: Final = 1.5
 """Shortest reported gap between two steps, as a multiple of the median time between steps."""
@@ -78,12 +84,43 @@ def _out_of_range(dataset: Dataset) -> Iterator[Problem]:
 
 
 def _impossible_actions(dataset: Dataset) -> Iterator[Problem]:
+    space, effect = dataset.action_space, "training rejects the dataset"
+    if isinstance(space, spaces.Box):
+        parts = zip(_parts(dataset), space.low.flat, space.high.flat, strict=True)
+        for number, (name, low, high) in enumerate(parts):
+            is_bad = functools.partial(_is_beyond, number, low, high)
+            count = int(is_bad(dataset).sum())
+            if count:
+                what = f"{name} is not in [{low:.4g}, {high:.4g}] in {_steps(dataset, count)}"
+                yield Problem(what, _places(dataset, is_bad), effect)
+        return
     wrong = outside(dataset.action_space, dataset.actions)
     if wrong.any():
         yield Problem(
             f"{_count(int(wrong.sum()), 'action')} outside of {dataset.action_space}",
             _places(dataset, lambda episode: outside(dataset.action_space, episode.actions)),
-            "training rejects the dataset",
+            effect,
+        )
+
+
+def _is_beyond(number: int, low: float, high: float, data: Dataset | Episode) -> NDArray[np.bool_]:
+    """Mark the actions (T,) with a part that is out of its bounds or not finite."""
+    part = data.actions.reshape(len(data.actions), -1)[:, number]
+    found: NDArray[np.bool_] = ~((part >= low) & (part <= high) & np.isfinite(part))
+    return found
+
+
+def _constant_parts(dataset: Dataset) -> Iterator[Problem]:
+    if len(dataset) < 2 or not isinstance(dataset.action_space, spaces.Box):
+        return
+    parts = dataset.actions.reshape(len(dataset), -1)
+    same = np.flatnonzero((parts == parts[0]).all(0))
+    if len(same):
+        names = [f"{_parts(dataset)[index]} is {parts[0, index]:.4g}" for index in same[:_SHOWN]]
+        yield Problem(
+            f"{_count(len(same), 'part')} of the action never change",
+            ", ".join(names) + (", ..." if len(same) > _SHOWN else ""),
+            "training rejects the dataset: nothing can be learned about a command that is constant",
         )
 
 
@@ -220,34 +257,35 @@ def _mixed_policies(dataset: Dataset) -> Iterator[Problem]:
 
 
 def _unknown_probabilities(dataset: Dataset) -> Iterator[Problem]:
-    unknown = int(np.isnan(dataset.behavior_probs).sum())
+    unknown, field = int(np.isnan(dataset.behavior).sum()), dataset.behavior_field
     if unknown:
+        way = "" if field is LOG_DENSITY else " without `estimate_behavior=True`"
         yield _note(
-            f"behavior_prob is unknown in {unknown} of {_count(len(dataset), 'step')}",
-            _places(dataset, lambda episode: np.isnan(episode.behavior_probs)),
-            "off-policy evaluation by importance sampling is not possible without"
-            " `estimate_behavior=True`",
+            f"{field.name} is unknown in {_steps(dataset, unknown)}",
+            _places(dataset, lambda episode: np.isnan(episode.behavior)),
+            f"off-policy evaluation by importance sampling is not possible{way}",
         )
     elif dataset.has_estimated_probs:
         yield _note(
-            "behavior_prob is estimated",
+            f"{field.name} is estimated",
             "all steps",
             "intervals of off-policy estimates do not include the error of estimated probabilities",
         )
 
 
 def _impossible_probabilities(dataset: Dataset) -> Iterator[Problem]:
-    impossible = int(is_impossible(dataset.behavior_probs).sum())
+    field = dataset.behavior_field
+    impossible = int(field.is_impossible(dataset.behavior).sum())
     if impossible:
         yield Problem(
-            f"behavior_prob is not in (0, 1] in {impossible} of {_count(len(dataset), 'step')}",
-            _places(dataset, lambda episode: is_impossible(episode.behavior_probs)),
+            f"{field.name} is not {field.expected} in {_steps(dataset, impossible)}",
+            _places(dataset, lambda episode: field.is_impossible(episode.behavior)),
             "off-policy evaluation by importance sampling is not possible",
         )
 
 
 def _wrong_probabilities(dataset: Dataset) -> Iterator[Problem]:
-    found = calibration(dataset.behavior_probs, dataset.action_space)
+    found = calibration(dataset.behavior, dataset.action_space)
     if found is not None and not found.possible:
         yield Problem(
             f"behavior_prob implies {found}",
@@ -260,6 +298,7 @@ _CHECKS: Final[tuple[Callable[[Dataset], Iterator[Problem]], ...]] = (
     _not_finite,
     _out_of_range,
     _impossible_actions,
+    _constant_parts,
     _masked_actions,
     _duplicates,
     _time_gaps,
@@ -306,6 +345,14 @@ def _places(dataset: Dataset, flags: Callable[[Episode], NDArray[np.bool_]]) -> 
         if len(found) >= _SHOWN:
             break
     return ", ".join(found[:_SHOWN])
+
+
+def _parts(dataset: Dataset) -> tuple[str, ...]:
+    return part_names(dataset.action_space, dataset.action_part_names)
+
+
+def _steps(dataset: Dataset, count: int) -> str:
+    return f"{count} of {_count(len(dataset), 'step')}"
 
 
 def _listed(indexes: list[int]) -> str:

@@ -3,12 +3,12 @@
 Logs of other writers have no metadata, so their spaces are inferred from `/rl/step`.
 
 Such a log needs a topic `/rl/step` of CDR messages. The messages have the fields that `schema.py`
-describes, in any order and with any numeric types. The field `behavior_prob` is optional, and other
-fields are ignored. Vectors are in `observation`, or in `observation_<key>` for each key of a Dict
-space; images are on topics `/rl/observation/<key>`, with the log_times of the step records. The
-inferred spaces are unbounded Boxes; for integer actions, the space is Discrete up to the largest
-action. If there are both `observation` and `observation_<key>` fields, `observation` becomes the
-key `state`.
+describes, in any order and with any numeric types. The fields `behavior_prob` and
+`behavior_log_prob` are optional, and other fields are ignored. Vectors are in `observation`, or in
+`observation_<key>` for each key of a Dict space; images are on topics `/rl/observation/<key>`, with
+the log_times of the step records. The inferred spaces are unbounded Boxes; for integer actions, the
+space is Discrete up to the largest action. If there are both `observation` and `observation_<key>`
+fields, `observation` becomes the key `state`.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ from mcaprl.recorder.dataset.images import read_images
 from mcaprl.recorder.dataset.mapped import Frames
 from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.recorder.dataset.transitions import Transitions, ranges
+from mcaprl.recorder.format.behavior import FIELDS, behavior_field
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.infos import read_infos
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
@@ -247,7 +248,7 @@ class LogReader:
     def _wanted(self) -> list[str]:
         """Return the names of the fields to read from `/rl/step`."""
         fields = self._steps.fields
-        wanted = [*REQUIRED_FIELDS, *(name for name in ("behavior_prob",) if name in fields)]
+        wanted = [*REQUIRED_FIELDS, *(field.name for field in FIELDS if field.name in fields)]
         if self._metadata is None:
             return wanted + observation_fields(fields)
         return wanted + [leaf.name for leaf in self._leaves(self._metadata) if not leaf.encoding]
@@ -297,9 +298,11 @@ class LogReader:
         recorded = self._summaries.summaries(columns[LOG_TIME][finals])
         episodes = summaries(self.path, columns, lengths, recorded)
         action = action_leaf(metadata.action_space)
-        probs = columns.get("behavior_prob")
-        if probs is None:
-            probs = np.full(len(columns["final"]), np.nan, np.float32)
+        behavior = behavior_field(metadata.action_space).column(
+            *(columns.get(field.name) for field in FIELDS)
+        )
+        if behavior is None:
+            behavior = np.full(len(columns["final"]), np.nan, np.float32)
         transitions = Transitions(
             frames=tuple(self._frames(leaf, columns) for leaf in leaves),
             log_time_ns=columns[LOG_TIME],
@@ -308,7 +311,7 @@ class LogReader:
             rewards=_without(columns["reward"].astype(np.float64, copy=False), finals),
             terminated=_without(_flags(columns["terminated"]), finals),
             truncated=_without(_flags(columns["truncated"]), finals),
-            behavior_probs=_without(probs.astype(np.float32, copy=False), finals),
+            behavior=_without(behavior, finals),
             infos=read_infos(self._reader, columns[LOG_TIME]),
         )
         if self._selection.columns is not None:

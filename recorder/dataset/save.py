@@ -91,7 +91,7 @@ def _write_steps(log: LogWriter, columns: Transitions) -> None:
     transitions = {
         "action": columns.actions,
         "reward": columns.rewards,
-        "behavior_prob": columns.behavior_probs,
+        log.behavior.name: columns.behavior,
         "terminated": columns.terminated,
         "truncated": columns.truncated,
     }

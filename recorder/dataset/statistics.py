@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from mcaprl.actions import joint_actions
 from mcaprl.recorder.dataset.mapped import Frames, MappedImages, blocks_of
 from mcaprl.recorder.dataset.transitions import Transitions
-from mcaprl.recorder.format.probability import is_impossible
+from mcaprl.recorder.format.behavior import PROBABILITY
 from mcaprl.recorder.format.spaces import Leaf
 
 
@@ -216,20 +216,20 @@ class Calibration:
 
 
 def calibration(
-    behavior_probs: NDArray[np.floating], action_space: spaces.Space[Any]
+    behavior: NDArray[np.floating], action_space: spaces.Space[Any]
 ) -> Calibration | None:
-    """Compare the logged action probabilities (N,) with the size of the action space.
+    """Compare the behavior column (N,) of a dataset with the size of the action space.
 
     Returns:
         The result of the comparison. It is None if the space is not finite, if a probability is
         unknown or not in (0, 1], or if there are fewer than two steps.
     """
     joint = joint_actions(action_space)
-    if joint is None or joint.count > _MOST_ACTIONS or len(behavior_probs) < 2:
+    if joint is None or joint.count > _MOST_ACTIONS or len(behavior) < 2:
         return None
-    if np.isnan(behavior_probs).any() or is_impossible(behavior_probs).any():
+    if np.isnan(behavior).any() or PROBABILITY.is_impossible(behavior).any():
         return None
-    probs = behavior_probs.astype(np.float64)
+    probs = behavior.astype(np.float64)
     inverse = 1 / probs
     place = np.searchsorted(EDGES, probs)
     ranges = [

@@ -1,11 +1,11 @@
 """Conversion of datasets to PyArrow tables. Requires the extra `tables`.
 
 A tensor is a column whose rows are vectors or arrays. With `tensors="columns"`, a tensor becomes
-one column per element, `observation.<name>` or `observation.<index>`; a row of more than
-MAX_COLUMNS elements, such as an image, becomes a flat list. With `tensors="lists"`, each tensor
-becomes one column of flat fixed-size lists in C order, and the metadata of the column's field has
-the shape of a row, as a JSON list in `shape`. The metadata of the table's schema has the spaces:
-see `described`.
+one column per element, such as `observation.<name>`, or `action.<index>` without names; a row of
+more than MAX_COLUMNS elements, such as an image, becomes a flat list. With `tensors="lists"`, each
+tensor becomes one column of flat fixed-size lists in C order, and the metadata of the column's
+field has the shape of a row, as a JSON list in `shape`. The metadata of the table's schema has the
+spaces: see `described`.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError, import_extra
 from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.format.infos import Masked
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf
@@ -49,7 +50,9 @@ def transition_table(
     """
     arrow = import_extra("pyarrow", "tables")
     import_extra("pyarrow.compute", "tables")
-    found = [(name, arrow.array(array)) for name, array in step_columns(columns).items()]
+    found = [
+        (name, arrow.array(array)) for name, array in step_columns(columns, description).items()
+    ]
     if tensors == "lists":
         found += _tensor_lists(arrow, columns, leaves)
     else:
@@ -166,7 +169,7 @@ def _shapes(columns: Transitions, leaves: Sequence[Leaf]) -> dict[str, tuple[int
     return shapes
 
 
-def step_columns(columns: Transitions) -> dict[str, NDArray[Any]]:
+def step_columns(columns: Transitions, description: LogMetadata) -> dict[str, NDArray[Any]]:
     """Return the numeric and boolean columns (N,) of a table of transitions, by name."""
     lengths = columns.lengths
     return {
@@ -176,7 +179,7 @@ def step_columns(columns: Transitions) -> dict[str, NDArray[Any]]:
         "reward": columns.rewards,
         "terminated": columns.terminated,
         "truncated": columns.truncated,
-        "behavior_prob": columns.behavior_probs,
+        behavior_field(description.action_space).name: columns.behavior,
     }
 
 
@@ -204,7 +207,7 @@ def _tensor_lists(
 def _tensor_columns(
     arrow: Any, columns: Transitions, leaves: Sequence[Leaf], description: LogMetadata
 ) -> Iterator[tuple[str, Any]]:
-    yield from _columns(arrow, "action", columns.actions, ())
+    yield from _columns(arrow, "action", columns.actions, description.action_part_names)
     step_frames = columns.frame_of_step()
     for name, leaf, frames in zip(observation_names(leaves), leaves, columns.frames, strict=True):
         named = description.observation_names if leaf.path == () else ()

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.dataset.mapped import Frames, joined, rows_of
+from mcaprl.recorder.format.behavior import BehaviorField
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.infos import Masked, is_exact, kind_of
 
-STEP_COLUMNS = ("actions", "rewards", "terminated", "truncated", "behavior_probs")
+STEP_COLUMNS = ("actions", "rewards", "terminated", "truncated", "behavior")
 """The columns with one row per transition."""
 
 
@@ -34,7 +35,8 @@ class Transitions:
         rewards: (N,) float64.
         terminated: (N,) bool.
         truncated: (N,) bool.
-        behavior_probs: (N,) float32; NaN where unknown.
+        behavior: (N,) float32, in the meaning of the `BehaviorField` of the action space; NaN where
+            unknown.
         episodes: Summaries of the episodes, in order. Their lengths divide the rows into episodes.
         infos: (F, *shape) masked array of each info by its dotted name. Row k is the info that the
             environment returned with frame k; it is masked if the environment returned none.
@@ -46,7 +48,7 @@ class Transitions:
     rewards: NDArray[np.float64]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
-    behavior_probs: NDArray[np.float32]
+    behavior: NDArray[np.float32]
     episodes: tuple[EpisodeSummary, ...]
     infos: Mapping[str, Masked] = field(default_factory=dict)
 
@@ -121,7 +123,9 @@ class TransitionBatch:
         terminated: (B,) bool.
         truncated: (B,) bool.
         next_observations: Next observations, in the form of `observations`.
-        behavior_probs: (B,) float32; NaN where unknown.
+        behavior: (B,) float32 probability of each action under the behavior policy, or natural
+            logarithm of its density if actions are floats; NaN where unknown.
+        behavior_field: Meaning of `behavior`.
     """
 
     observations: Any
@@ -130,7 +134,18 @@ class TransitionBatch:
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
     next_observations: Any
-    behavior_probs: NDArray[np.float32]
+    behavior: NDArray[np.float32]
+    behavior_field: BehaviorField
+
+    @property
+    def behavior_probs(self) -> NDArray[np.float32]:
+        """(B,) float32 probabilities; see `Dataset.behavior_probs`."""
+        return self.behavior_field.probs(self.behavior)
+
+    @property
+    def behavior_log_probs(self) -> NDArray[np.float32]:
+        """(B,) float32 logarithms; see `Dataset.behavior_log_probs`."""
+        return self.behavior_field.log_probs(self.behavior)
 
 
 def joined_infos(parts: Sequence[tuple[Mapping[str, Masked], int]]) -> dict[str, Masked]:

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError
-from mcaprl.recorder.format.probability import is_impossible
+from mcaprl.recorder.format.behavior import LOG_DENSITY, PROBABILITY, BehaviorField
 from mcaprl.recorder.format.spaces import outside
 from mcaprl.texts import shortened
 
@@ -55,13 +55,49 @@ def rewards_of(name: str, values: Any) -> NDArray[np.float64]:
     return exactly(name, numbers(name, values), np.dtype(np.float64))
 
 
-def probabilities_of(name: str, values: Any, *, first_row: int = 0) -> NDArray[np.float32]:
-    """Return action probabilities as float32; NaN means unknown."""
-    array = numbers(name, values)
-    wrong = is_impossible(array)
-    if wrong.any():
-        raise SpaceError(f"{name}: {_row(array, wrong, first_row)}, expected a number in (0, 1]")
-    return array.astype(np.float32)
+def behavior_of(
+    field: BehaviorField,
+    probs: Any,
+    log_probs: Any,
+    *,
+    place: str = "",
+    is_table: bool = False,
+    first_row: int = 0,
+) -> NDArray[np.float32] | None:
+    """Return probabilities or log densities of actions in the meaning of `field`; NaN is unknown.
+
+    Args:
+        field: Meaning of the result.
+        probs: Probabilities; None if there are none. Earlier versions stored those of all actions.
+        log_probs: Logarithms of probabilities or densities; None if there are none.
+        place: Text before the names of the arrays, for errors.
+        is_table: Whether errors name the columns of a table, instead of arrays.
+        first_row: Row of the first value, for errors.
+    """
+    for given, values in ((PROBABILITY, probs), (LOG_DENSITY, log_probs)):
+        if values is None:
+            continue
+        name = f"{place}{given.name if is_table else given.plural}"
+        array = numbers(name, values)
+        wrong, expected = given.is_impossible(array), given.expected
+        if given is LOG_DENSITY and field is PROBABILITY:
+            wrong |= field.is_impossible(np.exp(array.astype(np.float64)))
+            expected = f"the logarithm of {field.expected}"
+        if wrong.any():
+            raise SpaceError(f"{name}: {_row(array, wrong, first_row)}, expected {expected}")
+    return field.column(probs, log_probs)
+
+
+def behavior_of_arrays(
+    field: BehaviorField, probs: Any, log_probs: Any
+) -> NDArray[np.float32] | None:
+    """Return the behavior column of a caller's arrays; None if there are none."""
+    if probs is not None:
+        field.probs(np.empty(0, np.float32))
+        if log_probs is not None:
+            raise SpaceError("pass behavior_probs or behavior_log_probs, not both")
+    found = behavior_of(field, probs, log_probs)
+    return None if found is None else found.copy()
 
 
 def check_finite(name: str, values: NDArray[Any], *, first_row: int = 0) -> None:

@@ -19,6 +19,7 @@ from mcaprl.files import replacing
 from mcaprl.recorder.dataset.log_reader import described
 from mcaprl.recorder.dataset.open import find_logs
 from mcaprl.recorder.edit.source import Edited, FinishedLog
+from mcaprl.recorder.format.behavior import FIELDS
 from mcaprl.recorder.format.messages import EPISODE_TYPE
 from mcaprl.recorder.format.metadata import (
     DEFAULT_STEP_DURATION_NS,
@@ -27,7 +28,13 @@ from mcaprl.recorder.format.metadata import (
     LogMetadata,
     same_env,
 )
-from mcaprl.recorder.format.reading import ROS_TO_NUMPY, McapReader, definitions_of, full_name
+from mcaprl.recorder.format.reading import (
+    ROS_TO_NUMPY,
+    McapReader,
+    Topic,
+    definitions_of,
+    full_name,
+)
 from mcaprl.recorder.format.selected_copy import (
     NewTopics,
     Source,
@@ -274,6 +281,7 @@ def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
     for log, other in others:
         _check_same(first.path, metadata, log.path, other)
     _check_types(logs, are_described=True)
+    _check_behavior([log for log, _ in described_ones])
     common = LogMetadata.common([one for _, one in described_ones])
     # Older logs store the id of the environment without its module. If a log stores the id with
     # the module, this id is the longest.
@@ -290,15 +298,29 @@ def _strings(logs: Sequence[FinishedLog], metadata: LogMetadata) -> dict[str, st
 
 
 def _check_same(first: Path, one: LogMetadata, second: Path, other: LogMetadata) -> None:
-    here, there = one.to_strings(), other.to_strings()
+    found = one.to_strings(), other.to_strings()
     for name in SAME_WHEN_APPENDED:
-        same = here[name] == there[name]
-        if not (same_env(here[name], there[name]) if name == "env_id" else same):
+        here, there = (strings.get(name, "not known") for strings in found)
+        if not (same_env(here, there) if name == "env_id" else here == there):
             kind = SpaceError if name.endswith("_space") else LogError
             raise kind(
-                f"{first} and {second} differ in {name}: {here[name]:.200} and"
-                f" {there[name]:.200}; they cannot be one log"
+                f"{first} and {second} differ in {name}: {here:.200} and {there:.200}; they"
+                " cannot be one log"
             )
+
+
+def _check_behavior(logs: Sequence[FinishedLog]) -> None:
+    """Raise LogError if an earlier version recorded some of the logs with another column."""
+    known: dict[str, Path] = {}
+    for log in logs:
+        fields = Topic(log.reader, STEP_TOPIC).fields
+        known |= {field.name: log.path for field in FIELDS if field.name in fields}
+    if len(known) > 1:
+        (first, one), (second, other) = known.items()
+        raise LogError(
+            f"{one} has {first}, as earlier versions recorded it, but {other} has {second}; they"
+            f" cannot be one log: save the older one again with mcaprl.open({str(one)!r}).save(OUT)"
+        )
 
 
 def _check_types(logs: Sequence[FinishedLog], *, are_described: bool) -> None:

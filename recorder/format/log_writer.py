@@ -52,7 +52,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
 
 from numpy.typing import NDArray
 
@@ -60,6 +60,7 @@ from mcaprl.errors import LogError
 from mcaprl.recorder.columns.signals import HoldSignals
 from mcaprl.recorder.columns.writer import McapWriter
 from mcaprl.recorder.format import messages
+from mcaprl.recorder.format.behavior import PROBABILITY, behavior_field
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, begin_line
 from mcaprl.recorder.format.metadata import (
     METADATA_NAME,
@@ -68,7 +69,13 @@ from mcaprl.recorder.format.metadata import (
     same_env,
 )
 from mcaprl.recorder.format.rows import ImageRows, StepRows, TopicRows
-from mcaprl.recorder.format.schema import LEARNER_TEXT, LEARNER_TYPE, step_schema, values_schema
+from mcaprl.recorder.format.schema import (
+    LEARNER_TEXT,
+    LEARNER_TYPE,
+    earlier_step_schemas,
+    step_schema,
+    values_schema,
+)
 from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
 from mcaprl.recorder.format.topics import (
     EPISODE_TOPIC,
@@ -110,6 +117,7 @@ class LogTopics:
         sink: Receiver of the messages.
         metadata: Metadata of the log.
         action: Shape and dtype of an action.
+        behavior: Meaning of the behavior column of `/rl/step`.
         image_leaves: Leaves of the observation that are images.
     """
 
@@ -120,11 +128,13 @@ class LogTopics:
         leaves = observation_leaves(metadata.observation_space)
         self.metadata, self.sink = metadata, sink
         self.action = action_leaf(metadata.action_space)
+        self.behavior = behavior_field(metadata.action_space)
         self.image_leaves = tuple(leaf for leaf in leaves if leaf.encoding is not None)
         strings = metadata.to_strings()
         self._action_names = metadata.action_names() if names_actions else {}
+        labels = metadata.action_labels() if names_actions else ()
         spaces = (metadata.observation_space, metadata.action_space)
-        name, self._step_text = step_schema(*spaces, self._action_names)
+        name, self._step_text = step_schema(*spaces, self._action_names, labels)
         sink.add_metadata(METADATA_NAME, strings)
         self._step_channel = sink.add_channel(STEP_TOPIC, name, self._step_text, strings)
         self._episode_channel = self.add_channel(EPISODE_TOPIC, messages.EPISODE_TYPE)
@@ -221,7 +231,8 @@ class LogWriter(LogTopics):
         """Create the file, or open it to append, and announce its topics."""
         strings = metadata.to_strings()
         # Raise SpaceError before a file is created.
-        plain_name, _ = step_schema(metadata.observation_space, metadata.action_space)
+        both = metadata.observation_space, metadata.action_space
+        plain_name, other_name = (name for name, _ in earlier_step_schemas(*both))
         with ExitStack() as at_error:
             # An interruption must not leave a file without topics, which readers refuse. With
             # `source`, signals are not delayed, because copying it may take long.
@@ -238,7 +249,10 @@ class LogWriter(LogTopics):
                     self._check_same(strings)
                 # The schemas of older logs do not contain the action names. Such logs are continued
                 # without these names.
-                is_plain = plain_name in {schema.name for schema in self.mcap.schemas.values()}
+                names = {schema.name for schema in self.mcap.schemas.values()}
+                is_plain = plain_name in names
+                if other_name in names and not is_plain:
+                    self._refuse(f"an earlier version recorded its {PROBABILITY.name} of floats")
                 super().__init__(metadata, self.mcap, names_actions=not is_plain)
             at_error.pop_all()
 
@@ -246,14 +260,14 @@ class LogWriter(LogTopics):
         """Raise LogError if the existing log was recorded from another environment."""
         found = self.mcap.metadata(METADATA_NAME) or {}
         for name in SAME_WHEN_APPENDED:
-            here, there = strings[name], found.get(name, "not known")
+            here, there = (one.get(name, "not known") for one in (strings, found))
             same = same_env(here, there) if name == "env_id" else here == there
             if not same:
-                self.mcap.abandon()
-                raise LogError(
-                    f"{self.mcap.path} cannot be appended to: its {name} is {there:.200}, but"
-                    f" the recording has {here:.200}; record to another file"
-                )
+                self._refuse(f"its {name} is {there:.200}, but the recording has {here:.200}")
+
+    def _refuse(self, reason: str) -> NoReturn:
+        self.mcap.abandon()
+        raise LogError(f"{self.mcap.path} cannot be appended to: {reason}; record to another file")
 
     def close(self) -> None:
         """Write the summary section and close the file. Closing twice is harmless."""

@@ -15,6 +15,9 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
                         derived from the space by `spaces.observation_leaves`
     observation_names   JSON list: names of the elements of a vector observation; may be empty
     action_meanings     JSON list: names of the discrete actions; may be empty
+    action_part_names   JSON list: names of the elements of a vector action; absent if unknown
+    action_units        JSON list: unit of each of these elements, which may be empty; absent if
+                        unknown
     action_commands     JSON object: "fields", the paths of the fields of a command in another
                         program's messages, and "commands", a list with the values of the fields for
                         each discrete action, or null; absent if unknown
@@ -76,6 +79,8 @@ SAME_WHEN_APPENDED = (
     "action_space",
     "observation_names",
     "action_meanings",
+    "action_part_names",
+    "action_units",
     "step_duration_ns",
 )
 DEFAULT_STEP_DURATION_NS = 100_000_000
@@ -104,6 +109,8 @@ class LogMetadata:
             cannot be stored because they are not JSON.
         observation_names: Names of a vector observation's elements; empty if unknown.
         action_meanings: Names of the discrete actions; empty if unknown.
+        action_part_names: Names of a vector action's elements; empty if unknown.
+        action_units: Units of these elements; see `Dataset.action_units`.
         action_commands: Commands that the discrete actions stand for; None if unknown.
         success_reasons: End reasons of successful episodes; empty if unknown.
         view: Numbers for viewers, empty if unknown. `distance_m` and `tilt_deg` place the follow
@@ -141,6 +148,8 @@ class LogMetadata:
     times: str = ""
     action_commands: ActionCommands | None = None
     unstored_kwargs: tuple[str, ...] = ()
+    action_part_names: tuple[str, ...] = ()
+    action_units: tuple[str, ...] = ()
 
     @cached_property
     def leaves(self) -> tuple[Leaf, ...]:
@@ -162,6 +171,19 @@ class LogMetadata:
             shown = values if space.n <= MAX_NUMBERED_ACTIONS else ()
             return {value: str(value) for value in shown}
         return dict(zip(values, meanings, strict=True))
+
+    def action_labels(self) -> tuple[str, ...]:
+        """Return the named parts of an action with bounds and units; empty if they have no names.
+
+        A label is such as `speed (0 to 2 m/s)`, or `steering (-1 right, 1 left)` if the unit names
+        both directions, as `right | left` does.
+        """
+        names, space = self.action_part_names, self.action_space
+        if not isinstance(space, spaces.Box) or len(names) != math.prod(space.shape):
+            return ()
+        units = self.action_units if len(self.action_units) == len(names) else ("",) * len(names)
+        bounds = zip(space.low.flat, space.high.flat, strict=True)
+        return tuple(map(_label, names, units, bounds))
 
     def is_failure(self, reason: str) -> bool:
         """Return whether `reason` is the end reason of a failure.
@@ -196,11 +218,11 @@ class LogMetadata:
             "epsilon": self.epsilon,
             "seed": self.seed,
             "versions": json.dumps(dict(self.versions)),
-            **(
-                {"unstored_kwargs": json.dumps(self.unstored_kwargs)}
-                if self.unstored_kwargs
-                else {}
-            ),
+            **{
+                name: json.dumps(found)
+                for name in ("unstored_kwargs", "action_part_names", "action_units")
+                if (found := getattr(self, name))
+            },
             **({"behavior_prob": self.behavior_prob} if self.behavior_prob else {}),
             **({"about": json.dumps(dict(self.about))} if self.about else {}),
             **({"times": self.times} if self.times else {}),
@@ -244,6 +266,8 @@ class LogMetadata:
                 times=strings.get("times", ""),
                 action_commands=_commands(strings, action_space),
                 unstored_kwargs=_texts(strings, "unstored_kwargs"),
+                action_part_names=_texts(strings, "action_part_names"),
+                action_units=_texts(strings, "action_units"),
             )
         except (KeyError, ValueError, TypeError, MemoryError) as error:
             raise LogError(
@@ -320,6 +344,8 @@ class LogMetadata:
             unstored_kwargs=unstored,
             observation_names=_names(inner, "observation_names"),
             action_meanings=_names(inner, "action_meanings"),
+            action_part_names=_names(inner, "action_part_names"),
+            action_units=_names(inner, "action_units"),
             success_reasons=_names(inner, "success_reasons"),
             view=_numbers(getattr(inner, "view_settings", {})),
             step_duration_ns=round(step_duration_s * 1e9),
@@ -328,6 +354,17 @@ class LogMetadata:
             seed=seed,
             versions=installed_versions(),
         )
+
+
+def _label(name: str, unit: str, bounds: tuple[float, float]) -> str:
+    """Return the name of a part of an action with its bounds and unit."""
+    low, high = bounds
+    ends = unit.split(" | ")
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return f"{name} ({unit})" if unit else name
+    if len(ends) == 2:
+        return f"{name} ({low:g} {ends[0]}, {high:g} {ends[1]})"
+    return f"{name} ({low:g} to {high:g}{unit and ' '}{unit})"
 
 
 def _split_kwargs(spec: Any) -> tuple[dict[str, Any], tuple[str, ...]]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mcaprl.recorder.columns.cdr import ENCAPSULATION, ENCAPSULATION_BYTES
 from mcaprl.recorder.columns.message_rows import message_rows
+from mcaprl.recorder.format.behavior import FIELDS
 from mcaprl.recorder.format.schema import fill_image_constants, image_dtype, message_dtype
 from mcaprl.recorder.format.topics import BYTES_PER_CHUNK, IMAGE_FRAME, MIN_ROWS
 
@@ -22,7 +23,7 @@ Write = Callable[[NDArray[Any]], None]
 _FINAL = {
     "action": 0,
     "reward": 0.0,
-    "behavior_prob": math.nan,
+    **{field.name: math.nan for field in FIELDS},
     "terminated": False,
     "truncated": False,
     "final": True,
@@ -146,7 +147,8 @@ class StepRows(TopicRows):
     def finish(self, where: Any) -> None:
         """Turn rows into final records; their observation, episode and step stay unchanged."""
         for name, value in _FINAL.items():
-            self.fields[name][where] = value
+            if name in self.fields:
+                self.fields[name][where] = value
 
 
 class ImageRows(TopicRows):

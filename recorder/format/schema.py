@@ -7,9 +7,11 @@ is a NumPy structured dtype, so a chunk of messages is one array.
 The fields of `/rl/step` are sorted by decreasing size, so there is no padding:
 
     float64 reward              reward of this record's action; 0 in a final record
-    int64 | float32[M] action   0 in a final record; constants name the discrete actions
+    int64 | float32[M] action   0 in a final record; constants name the discrete actions, and
+                                comments the parts of a vector, with their bounds and units
     float32[N] observation      one field per leaf of a Dict space, `observation_<key>`
     float32 behavior_prob       probability of the action under the policy that took it, or NaN
+      | behavior_log_prob       for actions of floats: log of the probability density, or NaN
     uint32 episode, step        counted from 0
     bool terminated, truncated  flags of the transition that starts in this record
     bool final                  whether the record contains only an episode's last observation
@@ -28,7 +30,7 @@ from __future__ import annotations
 import hashlib
 import re
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,6 +39,7 @@ from gymnasium import spaces
 from mcaprl.errors import SpaceError
 from mcaprl.limits import MAX_CHUNK_BYTES
 from mcaprl.recorder.columns.cdr import ENCAPSULATION, ENCAPSULATION_BYTES, ROS_TO_NUMPY
+from mcaprl.recorder.format.behavior import PROBABILITY, BehaviorField, behavior_field
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
 
 LEARNER_TYPE = "mcaprl_msgs/msg/Learner"
@@ -58,6 +61,8 @@ def step_schema(
     observation_space: spaces.Space[Any],
     action_space: spaces.Space[Any],
     action_names: Mapping[int, str] | None = None,
+    action_labels: Sequence[str] = (),
+    behavior: BehaviorField | None = None,
 ) -> tuple[str, str]:
     """Return the type name and definition of `/rl/step` for a pair of spaces.
 
@@ -69,6 +74,8 @@ def step_schema(
         action_space: Action space of the environment.
         action_names: Names of the discrete actions by value, for the constants of `action`; see
             `action_constants`.
+        action_labels: Descriptions of the parts of an action, for comments before `action`.
+        behavior: Behavior column; default: that of the action space.
 
     Raises:
         SpaceError: A log cannot store these spaces.
@@ -78,7 +85,7 @@ def step_schema(
         ("float64", 0, "reward"),
         _leaf_field(action_leaf(action_space)),
         *map(_leaf_field, vectors),
-        ("float32", 0, "behavior_prob"),
+        ("float32", 0, (behavior or behavior_field(action_space)).name),
         ("uint32", 0, "episode"),
         ("uint32", 0, "step"),
         ("bool", 0, "terminated"),
@@ -86,7 +93,19 @@ def step_schema(
         ("bool", 0, "final"),
     ]
     fields.sort(key=lambda field: -np.dtype(ROS_TO_NUMPY[field[0]]).itemsize)
-    return _named("Step", fields, {"action": action_constants(action_names or {})})
+    constants = {"action": action_constants(action_names or {})}
+    return _named("Step", fields, constants, {"action": list(map(_one_line, action_labels))})
+
+
+def earlier_step_schemas(
+    observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> list[tuple[str, str]]:
+    """Return the type names and definitions of `/rl/step` that earlier versions wrote.
+
+    The first does not name the actions. The second has the probabilities of all actions.
+    """
+    both = observation_space, action_space
+    return [step_schema(*both), step_schema(*both, behavior=PROBABILITY)]
 
 
 def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
@@ -267,15 +286,26 @@ def _named(
     prefix: str,
     fields: list[tuple[str, int, str]],
     constants: Mapping[str, Mapping[str, int]] | None = None,
+    comments: Mapping[str, Sequence[str]] | None = None,
 ) -> tuple[str, str]:
-    """Return type name and definition of a message; constants precede the field they belong to."""
+    """Return type name and definition of a message.
+
+    The constants and comments of a field precede it.
+    """
     lines = []
     for kind, count, name in fields:
+        lines += [f"# {comment}" for comment in (comments or {}).get(name, ())]
         named = (constants or {}).get(name, {})
         lines += [f"{kind} {word}={value}" for word, value in named.items()]
         lines.append(f"{kind}{f'[{count}]' if count else ''} {name}")
     text = "".join(f"{line}\n" for line in lines)
     return f"mcaprl_msgs/msg/{prefix}{_digest(text.encode())}", text
+
+
+def _one_line(text: str) -> str:
+    """Return a text as a comment: printable ASCII on one line."""
+    plain = " ".join(text.split()).encode("ascii", "replace").decode()
+    return "".join(one if one.isprintable() else "?" for one in plain)
 
 
 def _constant(name: str) -> str:

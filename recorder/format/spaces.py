@@ -166,6 +166,17 @@ def action_leaf(space: spaces.Space[Any]) -> Leaf:
     return Leaf("action", (), shape, dtype)
 
 
+def part_names(space: spaces.Space[Any], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the name of each number of an action, in C order.
+
+    These are `names` if there is one for each number, otherwise `action[0]` and so on.
+    """
+    shape = tuple(space.shape or ())
+    if len(names) == math.prod(shape):
+        return tuple(names)
+    return tuple(f"action[{index}]" for index in range(math.prod(shape))) if shape else ("action",)
+
+
 def check_actions(space: spaces.Space[Any]) -> None:
     """Check that a space does not have too many discrete actions for a log or a policy."""
     if isinstance(space, spaces.Discrete) and int(space.n) > MAX_ACTIONS:

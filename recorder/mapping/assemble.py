@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import itertools
-from typing import Any, NamedTuple
+import warnings
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -17,11 +18,12 @@ from mcaprl.recorder.dataset.mapped import Frames
 from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.action_commands import ActionCommands, Command
+from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import MAX_NUMBERED_ACTIONS, LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of
 from mcaprl.recorder.mapping.align import NS_PER_S
-from mcaprl.recorder.mapping.config import Action, Quantity
+from mcaprl.recorder.mapping.config import Action, Limits, Quantity
 from mcaprl.recorder.mapping.paths import as_numbers
 from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.runs import Segment
@@ -171,6 +173,8 @@ def assembled(
         return None
     actions = np.concatenate([run.actions.values for run in runs])[steps]
     space, meanings = _common_space([run.actions.space for run in runs]), runs[0].actions.meanings
+    if (box := plan.mapping.action.box) is not None:
+        space = _limited(box, cast(spaces.Box, space), actions, runs[0].actions.names)
     with plan.place.named("action", "representatives"):
         logged = np.concatenate([run.actions.commands for run in runs])[steps]
         fields = runs[0].actions.fields
@@ -182,6 +186,8 @@ def assembled(
         observation_names=observed.names,
         action_meanings=meanings,
         action_commands=commands,
+        action_part_names=runs[0].actions.names,
+        action_units=runs[0].actions.units if any(runs[0].actions.units) else (),
         step_duration_ns=_step_ns(plan, times),
         policy=plan.mapping.meta.policy,
     )
@@ -192,7 +198,7 @@ def assembled(
         rewards=np.concatenate([run.rewards for run in runs])[steps],
         terminated=_at_ends(lengths, [each.terminated for each in summaries]),
         truncated=_at_ends(lengths, [each.truncated for each in summaries]),
-        behavior_probs=np.concatenate([run.probs for run in runs])[steps],
+        behavior=np.concatenate([run.behavior for run in runs])[steps],
         episodes=tuple(summaries),
     )
     return Dataset(transitions, metadata, origin=Origin(plan.bag.paths))
@@ -217,18 +223,19 @@ def _summary(
             f" {run.times_ns[segment.first + wrong[0]]} ns; it is not finite in {len(wrong)} of"
             f" {len(rewards)} steps of this episode: set `missing` for the quantities in `reward`"
         )
-    probs = run.probs[segment.first : segment.last]
-    # Unknown probabilities are NaN.
-    wrong = np.flatnonzero((probs <= 0) | (probs > 1))
+    values, kind = run.behavior[segment.first : segment.last], behavior_field(run.actions.space)
+    wrong = np.flatnonzero(kind.is_impossible(values))
     if len(wrong):
+        assert plan.behavior is not None
+        (key,) = plan.behavior.keys
         raise UsageError(
-            f"{plan.place.of('behavior_prob')}: the probability is {probs[wrong[0]]:g} at"
-            f" {run.times_ns[segment.first + wrong[0]]} ns; it is not above 0 and at most 1 in"
-            f" {len(wrong)} of {len(probs)} steps of this episode: use another field, `scale` or"
-            " `clip`, or remove behavior_prob"
+            f"{plan.place.of(key)}: the {kind.what} is {values[wrong[0]]:g} at"
+            f" {run.times_ns[segment.first + wrong[0]]} ns; it is not {kind.expected} in"
+            f" {len(wrong)} of {len(values)} steps of this episode: use another field, `scale` or"
+            f" `clip`, or remove {key}"
         )
     named = (name for name, holds in run.reasons.items() if holds[segment.last])
-    kind = "terminated" if segment.terminated else "truncated"
+    end = "terminated" if segment.terminated else "truncated"
     return EpisodeSummary(
         episode=number,
         length=segment.length,
@@ -237,7 +244,7 @@ def _summary(
         truncated=segment.truncated,
         start_time_ns=int(times_ns[0]),
         end_time_ns=int(times_ns[-1]),
-        reason=next(named, segment.reason or kind),
+        reason=next(named, segment.reason or end),
         policy=plan.mapping.meta.policy,
     )
 
@@ -378,6 +385,23 @@ def _repeated(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
     assert isinstance(space, spaces.Box), "all parts are Boxes"
     low, high = (np.concatenate([limit] * count, axis=-1) for limit in (space.low, space.high))
     return spaces.Box(low, high, dtype=space.dtype.type)
+
+
+def _limited(box: Limits, space: spaces.Box, actions: Array, names: tuple[str, ...]) -> spaces.Box:
+    """Return a space with the limits of the actions (N, K) where the mapping has none."""
+    low = actions.min(axis=0) if box.low is None else space.low
+    high = actions.max(axis=0) if box.high is None else space.high
+    if box.low is None or box.high is None:
+        found = ", ".join(
+            f"{name} from {least:g} to {most:g}"
+            for name, least, most in zip(names, low, high, strict=True)
+        )
+        warnings.warn(
+            f"the limits of the action are those of this data: {found}; give `box` a low and a"
+            " high, because other data may have others",
+            stacklevel=5,
+        )
+    return spaces.Box(low, high)
 
 
 def _common_space(found: list[spaces.Space[Any]]) -> spaces.Space[Any]:

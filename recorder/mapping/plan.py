@@ -58,7 +58,7 @@ class Plan:
         place: Positions of the mapping's keys in its file, for error messages.
         quantities: Observed and other quantities, by name.
         images: Readers of the observed images, by name.
-        behavior_prob: Probability of the action; None if unknown.
+        behavior: Probability or log density of the action; None if unknown.
         commands: Fields of the action; empty if it consists of expressions.
         expressions: Expressions of the action.
         conditions: Conditions of the episodes: `begin`, `end`, `terminated`, `truncated`.
@@ -106,13 +106,14 @@ class Plan:
             self._expression(("action", "expressions", number), text)
             for number, text in enumerate(action.expressions)
         ]
-        self.behavior_prob = None
-        if (prob := mapping.behavior_prob) is not None:
-            has_align = "align" in prob.model_fields_set
+        self.behavior = None
+        if (behavior := mapping.behavior) is not None:
+            key, quantity = behavior
+            has_align = "align" in quantity.model_fields_set
             same = {} if has_align else {"align": align}
-            self.behavior_prob = self._wanted(
-                ("behavior_prob",),
-                prob.model_copy(update={**same, "time": prob.time or action.time}),
+            self.behavior = self._wanted(
+                (key,),
+                quantity.model_copy(update={**same, "time": quantity.time or action.time}),
                 is_during=is_during and not has_align,
             )
         episodes = mapping.episodes
@@ -173,8 +174,8 @@ class Plan:
         return {name: np.array(min(each)) for name, each in found.items() if len(each) == 1}
 
     def _open_streams(self) -> None:
-        prob = [] if self.behavior_prob is None else [self.behavior_prob]
-        every = [*self.quantities.values(), *self.commands, *prob]
+        behavior = [] if self.behavior is None else [self.behavior]
+        every = [*self.quantities.values(), *self.commands, *behavior]
         fields: dict[str, set[str]] = {}
         for wanted in every:
             fields.setdefault(wanted.stream, set()).update(wanted.source.fields)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
+from mcaprl.recorder.format.behavior import PROBABILITY, BehaviorField, behavior_field
 from mcaprl.recorder.mapping.actions import Actions, CommandPart, actions_of
 from mcaprl.recorder.mapping.align import NS_PER_S, time_order
 from mcaprl.recorder.mapping.config import Stamp, TimeSource
@@ -33,6 +34,7 @@ from mcaprl.recorder.mapping.runs import (
     runs_of,
     segments,
 )
+from mcaprl.recorder.mapping.units import unit_of
 
 _Times = NDArray[np.int64]
 
@@ -199,7 +201,7 @@ class Steps(NamedTuple):
         times_ns: (N,) times.
         quantities: Values of each quantity by name.
         actions: Action of each step.
-        probs: (N,) probability of the action; NaN if unknown.
+        behavior: (N,) probability or log density of the action; NaN if unknown.
         rewards: (N,) reward of each step's action; may depend on the next step.
         episodes: Episodes that the steps form.
         reasons: (N,) flags by end reason: whether the condition of this reason is true.
@@ -208,7 +210,7 @@ class Steps(NamedTuple):
     times_ns: NDArray[np.int64]
     quantities: dict[str, Values]
     actions: Actions
-    probs: NDArray[np.float32]
+    behavior: NDArray[np.float32]
     rewards: NDArray[np.float64]
     episodes: list[Segment]
     reasons: dict[str, NDArray[np.bool_]]
@@ -255,10 +257,6 @@ class StepReader:
         quantities = {
             name: self._values(wanted, run, ticks) for name, wanted in plan.quantities.items()
         }
-        probs = np.full(len(times_ns), np.nan, np.float32)
-        if plan.behavior_prob is not None:
-            found = self._values(plan.behavior_prob, run, ticks)
-            probs = self._scalars(plan.behavior_prob, found).astype(np.float32)
         columns = {
             **plan.constants,
             **{
@@ -269,6 +267,7 @@ class StepReader:
         }
         following = np.minimum(np.arange(len(times_ns)) + 1, max(len(times_ns) - 1, 0))
         actions = self._actions(run, ticks, columns, following)
+        behavior = self._behavior(run, ticks, behavior_field(actions.space))
         if actions.values.ndim == 1:
             columns["action"] = actions.values
         conditions = self._conditions(("episodes",), plan.conditions, columns, following)
@@ -290,7 +289,18 @@ class StepReader:
         with plan.place.named("reward"):
             rewards = plan.reward(columns, following)
         episodes = segments(marks, self._mapping.episodes.max_steps)
-        return Steps(times_ns, quantities, actions, probs, rewards, episodes, reasons)
+        return Steps(times_ns, quantities, actions, behavior, rewards, episodes, reasons)
+
+    def _behavior(self, run: Run, ticks: Ticks, field: BehaviorField) -> NDArray[np.float32]:
+        """Return the probabilities or log densities of the actions; NaN if unknown."""
+        wanted = self._plan.behavior
+        if wanted is None:
+            return np.full(len(ticks.times_ns), np.nan, np.float32)
+        values = self._scalars(wanted, self._values(wanted, run, ticks))
+        is_prob = wanted.keys == (PROBABILITY.name,)
+        found = field.column(values, None) if is_prob else field.column(None, values)
+        assert found is not None
+        return found
 
     def _transform_time(self, topic: str) -> TimeSource:
         """Return the time of the transforms of a topic."""
@@ -384,12 +394,18 @@ class StepReader:
                 found = found._replace(values=numbers)
             elif found.values.dtype.kind != "O":
                 found = found._replace(values=self._scalars(wanted, found))
-            commands.append(_command(wanted, found))
+            commands.append(_command(wanted, found, plan.bag.topics[wanted.source.topic].type_name))
         for place, expression in enumerate(plan.expressions):
             with plan.place.named("action", "expressions", place):
                 values = expression.evaluate(columns, following).astype(np.float64)
             commands.append(
-                CommandPart(expression.text, values, np.isnan(values), path=expression.text)
+                CommandPart(
+                    expression.text,
+                    values,
+                    np.isnan(values),
+                    path=expression.text,
+                    label=expression.text,
+                )
             )
         with plan.place.named("action"):
             return actions_of(action, commands)
@@ -420,10 +436,19 @@ class StepReader:
         return usable
 
 
-def _command(wanted: Wanted, found: Values) -> CommandPart:
+def _command(wanted: Wanted, found: Values, type_name: str) -> CommandPart:
     """Return a field of the command, named by the last part of its path."""
     path, names = wanted.source.path, wanted.quantity.names
     assert path is not None, "commands are fields"
     whole = path._replace(elements=None) if isinstance(path.elements, slice) else path
     word = str(whole).rpartition(".")[2]
-    return CommandPart(word, found.values, found.missing, tuple(names or ()), str(path))
+    label = str(path).removeprefix(wanted.source.topic).lstrip(".")
+    return CommandPart(
+        word,
+        found.values,
+        found.missing,
+        tuple(names or ()),
+        str(path),
+        label,
+        unit_of(type_name, label),
+    )

@@ -126,7 +126,8 @@ class StepColumns:
         """Preallocate a chunk of rows."""
         self._rows = log.step_rows()
         self._fields = self._rows.fields
-        self._rewards, self._probs = array("d"), array("d")
+        self._rewards, self._behavior = array("d"), array("d")
+        self._behavior_name = log.behavior.name
         self._waiting: dict[str, Arrays | Integers] = {}
         self.store_action = self.take_action = self.store(log.action)
         actions = self._waiting[log.action.name]
@@ -134,15 +135,15 @@ class StepColumns:
             self.take_action = actions.append
         self.store_reward: Store = self._rewards.append
 
-    def store_behavior_prob(self, prob: float) -> None:
-        """Store the probability of the latest action.
+    def store_behavior(self, value: float) -> None:
+        """Store the probability or log density of the latest action.
 
-        Earlier actions without a probability get NaN.
+        Earlier actions without a value get NaN.
         """
-        unknown = len(self._rewards) - len(self._probs)
+        unknown = len(self._rewards) - len(self._behavior)
         if unknown:
-            self._probs.extend([math.nan] * unknown)
-        self._probs.append(prob)
+            self._behavior.extend([math.nan] * unknown)
+        self._behavior.append(value)
 
     def store(self, leaf: Leaf) -> Store:
         """Return a function that stores values of a leaf."""
@@ -192,10 +193,10 @@ class StepColumns:
 
     def _fill(self, actions: int, observations: int) -> None:
         """Copy the stored values into the rows."""
-        probs = self._probs[:actions]
+        known = self._behavior[:actions]
         self._fields["reward"][:actions] = self._rewards[:actions]
-        self._fields["behavior_prob"][: len(probs)] = probs
-        self._fields["behavior_prob"][len(probs) : actions] = math.nan
+        self._fields[self._behavior_name][: len(known)] = known
+        self._fields[self._behavior_name][len(known) : actions] = math.nan
         for name, waiting in self._waiting.items():
             count = actions if name == "action" else observations
             waiting.put(self._fields[name][:count])
@@ -212,7 +213,7 @@ class StepColumns:
         return np.arange(self._first_step, self._first_step + count)
 
     def _drop(self, count: int | None) -> None:
-        del self._rewards[:count], self._probs[:count]
+        del self._rewards[:count], self._behavior[:count]
         for waiting in self._waiting.values():
             waiting.drop(count)
 

@@ -21,10 +21,10 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError
+from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.format.episode_summary import INTERRUPTED, EpisodeSummary
 from mcaprl.recorder.format.info_topics import InfoTopics
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.probability import check_probability, is_impossible
 from mcaprl.recorder.format.rows import TopicRows
 from mcaprl.recorder.format.spaces import action_leaf
 from mcaprl.recorder.format.writing import HoldSignals
@@ -80,8 +80,6 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
     exits.
 
     Attributes:
-        behavior_probs: (N,) probabilities of the next actions under the behavior policy. Set them
-            before each `step`, which resets them to NaN (unknown).
         policy: Name of the policy, for `/rl/episode`; may be changed at any time. Each episode
             records the name that is set when the episode begins.
         epsilon: Exploration rate of the policy; NaN if unknown. May be changed at any time.
@@ -130,7 +128,8 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         super().__init__(env)
         self._autoreset = autoreset_mode(env)
         self.policy, self.epsilon, self.policy_version = policy, epsilon, policy_version
-        self.behavior_probs: Any = math.nan
+        self._behavior: Any = math.nan
+        self._field = behavior_field(env.single_action_space)
         description = LogMetadata.of_env(
             env,
             step_duration_s=step_duration_s,
@@ -151,7 +150,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         self._display = Display(log, None, scene=False, camera=False)
         fields = [leaf.name for leaf in recorded.leaves if not leaf.encoding]
         self._columns = OpenSteps(
-            log.step_rows(), count, ["action", "reward", "behavior_prob", *fields]
+            log.step_rows(), count, ["action", "reward", self._field.name, *fields]
         )
         self._images = {
             leaf: OpenRows(log.image_rows(leaf.topic, leaf.shape, leaf.encoding), count, ["data"])
@@ -188,6 +187,32 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
     def episodes(self) -> int:
         """Number of finished episodes in the log, including episodes of earlier recordings."""
         return self._recording.episodes
+
+    @property
+    def behavior_probs(self) -> Any:
+        """(N,) probabilities of the next actions under the behavior policy.
+
+        Set them before each `step`, which resets them to NaN (unknown). Actions of floats have
+        densities instead: set `behavior_log_probs`.
+        """
+        return self._field.probs(self._behavior)
+
+    @behavior_probs.setter
+    def behavior_probs(self, probs: Any) -> None:
+        self._behavior = self._field.probs(probs)
+
+    @property
+    def behavior_log_probs(self) -> Any:
+        """(N,) natural logarithms of the probabilities of the next actions, or of their densities.
+
+        For actions of floats they are densities in the action's own units. Set them as
+        `behavior_probs`.
+        """
+        return self._field.log_probs(as_array(self._behavior))
+
+    @behavior_log_probs.setter
+    def behavior_log_probs(self, log_probs: Any) -> None:
+        self._behavior = self._field.from_log_probs(as_array(log_probs))
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
         """Reset environments and begin their episodes.
@@ -230,7 +255,8 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
 
         Raises:
             ResetNeeded: An environment has no open episode.
-            UsageError: One of `behavior_probs` is not in (0, 1]; the environments are not stepped.
+            UsageError: One of `behavior_probs` is not in (0, 1], or one of `behavior_log_probs` is
+                not finite; the environments are not stepped.
             SpaceError: The actions do not fit their space (the environments are not stepped), or an
                 observation does not fit its space.
         """
@@ -289,32 +315,32 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         """Store the actions before the environments can change them."""
         row = self._now.row
         # The checks take longer than storing the values, and most recordings have no probabilities.
-        probs = self._checked_probs() if self.behavior_probs is not math.nan else math.nan
+        behavior = self._checked_behavior() if self._behavior is not math.nan else math.nan
         self._columns.put("action", row, self._action_of(actions))
-        self._columns.put("behavior_prob", row, probs)
-        self.behavior_probs = math.nan
+        self._columns.put(self._field.name, row, behavior)
+        self._behavior = math.nan
         if self._learner is not None:
             version = -1 if self.policy_version is None else self.policy_version
             self._learner.put("epsilon", row, self.epsilon)
             self._learner.put("policy_version", row, version)
 
-    def _checked_probs(self) -> NDArray[np.float32]:
-        """Return `behavior_probs` as an array, () or (N,).
+    def _checked_behavior(self) -> NDArray[np.float32]:
+        """Return the probabilities or log densities as an array, () or (N,).
 
         Raises:
             SpaceError: The shape is wrong.
-            UsageError: A probability is not in (0, 1].
+            UsageError: A value is not possible.
         """
-        given, shape = as_array(self.behavior_probs), (self.num_envs,)
-        probs = given.astype(np.float32)
-        if probs.shape not in ((), shape):
-            raise SpaceError(f"behavior_probs has shape {probs.shape}, expected {shape}")
-        # An environment that is reset in this step ignores its action, so its probability is not
-        # checked.
-        for number in np.flatnonzero(is_impossible(probs) & self._running):
-            prob = float(np.broadcast_to(given, shape)[number])
-            check_probability(prob, f"behavior_probs[{number}]")
-        return probs
+        given, shape, field = as_array(self._behavior), (self.num_envs,), self._field
+        with np.errstate(over="ignore"):
+            values = given.astype(np.float32)
+        if values.shape not in ((), shape):
+            raise SpaceError(f"{field.plural} has shape {values.shape}, expected {shape}")
+        # An environment that is reset in this step ignores its action, so the value is not checked.
+        for number in np.flatnonzero(field.is_impossible(values) & self._running):
+            value = float(np.broadcast_to(given, shape)[number])
+            field.check(value, f"{field.plural}[{number}]")
+        return values
 
     def _tables(self) -> list[OpenRows[Any]]:
         learner = [self._learner] if self._learner is not None else []

@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
+import numpy as np
 
 from mcaprl.errors import SpaceError
+from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.info_topics import InfoTopics
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.probability import SMALLEST, check_probability
 from mcaprl.recorder.format.spaces import action_leaf
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
@@ -46,8 +47,6 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
     Without a call of `close`, the log is finished when the wrapper is deleted or Python exits.
 
     Attributes:
-        behavior_prob: Probability of the next action under the behavior policy. Set it before each
-            `step`, which resets it to NaN (unknown).
         policy: Name of the policy, for `/rl/episode`; may be changed between episodes.
         epsilon: Exploration rate of the policy; NaN if unknown. May be changed between episodes.
     """
@@ -112,7 +111,8 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
         recorded = recorded_space(env.observation_space, keys)
         action_leaf(env.action_space)
         super().__init__(env)
-        self.policy, self.epsilon, self.behavior_prob = policy, epsilon, math.nan
+        self.policy, self.epsilon, self._behavior = policy, epsilon, _UNKNOWN
+        self._field = behavior_field(env.action_space)
         description = LogMetadata.of_env(
             env,
             step_duration_s=step_duration_s,
@@ -150,6 +150,32 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
         """Number of finished episodes in the log, including episodes of earlier recordings."""
         return self._recording.episodes
 
+    @property
+    def behavior_prob(self) -> float:
+        """Probability of the next action under the behavior policy.
+
+        Set it before each `step`, which resets it to NaN (unknown). Actions of floats have
+        densities instead: set `behavior_log_prob`.
+        """
+        return self._field.probs(self._behavior, "behavior_log_prob")
+
+    @behavior_prob.setter
+    def behavior_prob(self, prob: float) -> None:
+        self._behavior = self._field.probs(prob, "behavior_log_prob")
+
+    @property
+    def behavior_log_prob(self) -> float:
+        """Natural logarithm of the probability of the next action, or of its density.
+
+        For actions of floats it is the density in the action's own units. Set it as
+        `behavior_prob`.
+        """
+        return float(self._field.log_probs(np.array(self._behavior, np.float32)))
+
+    @behavior_log_prob.setter
+    def behavior_log_prob(self, log_prob: float) -> None:
+        self._behavior = self._field.from_log_probs(log_prob)
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -173,7 +199,8 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
 
         Raises:
             ResetNeeded: No episode is open.
-            UsageError: `behavior_prob` is not in (0, 1]; the environment is not stepped.
+            UsageError: `behavior_prob` is not in (0, 1], or `behavior_log_prob` is not finite; the
+                environment is not stepped.
             SpaceError: The action does not fit its space (the environment is not stepped), or the
                 observation does not fit its space. An error in the environment or in its results
                 ends the episode, which is recorded up to the previous transition.
@@ -182,25 +209,24 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
         if episode is None:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is open")
         step = episode.steps + 1
-        probability = self.behavior_prob
-        # Call `check_probability` only for invalid values, because a comparison is faster than a
-        # call.
-        if probability is not _UNKNOWN:
+        behavior, field = self._behavior, self._field
+        # Call `check` only for invalid values, because a comparison is faster than a call.
+        if behavior is not _UNKNOWN:
             try:
-                is_possible = SMALLEST <= probability <= 1.0
+                is_possible = field.low <= behavior <= field.high
             except (TypeError, ValueError):
                 is_possible = False
             if not is_possible:
-                check_probability(probability, "behavior_prob")
+                field.check(behavior, field.name)
         try:
             # Copy the action before the environment can change it.
             try:
                 self._take_action(action)
             except (TypeError, OverflowError):
                 self._columns.store_action(action)
-            if probability is not _UNKNOWN:
-                self._columns.store_behavior_prob(probability)
-                self.behavior_prob = _UNKNOWN
+            if behavior is not _UNKNOWN:
+                self._columns.store_behavior(behavior)
+                self._behavior = _UNKNOWN
         except SpaceError:
             raise
         except BaseException:

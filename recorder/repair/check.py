@@ -13,15 +13,17 @@ from __future__ import annotations
 import math
 import warnings
 from collections import defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
@@ -45,8 +47,9 @@ from mcaprl.recorder.dataset.episodes import (
     summaries_of_records,
 )
 from mcaprl.recorder.dataset.log_reader import LogReader, described
+from mcaprl.recorder.format.behavior import FIELDS
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
-from mcaprl.recorder.format.metadata import METADATA_NAME
+from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.reading import (
     LOG_TIME,
     Columns,
@@ -60,8 +63,8 @@ from mcaprl.recorder.format.reading import (
     check_statistics,
     place,
 )
-from mcaprl.recorder.format.schema import step_schema
-from mcaprl.recorder.format.spaces import Leaf, observation_leaves, outside
+from mcaprl.recorder.format.schema import earlier_step_schemas, step_schema
+from mcaprl.recorder.format.spaces import Leaf, observation_leaves, outside, part_names
 from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 from mcaprl.storage.remote import RemotePath, as_path
 from mcaprl.texts import counted
@@ -96,6 +99,8 @@ class EpisodeCheck:
         ]
         # If other software wrote the log in another form, `LogReader` validates it.
         self._has_our_form = self._metadata is not None and self._schema_fits()
+        # A schema of our form has one of these fields.
+        self._behavior = next((f for f in FIELDS if f.name in self._steps.fields), FIELDS[0])
         self._columns: Columns = {}
         self._problems = Shortlist[Problem]()
         self._places: dict[int, list[_Place]] = defaultdict(list)
@@ -106,7 +111,8 @@ class EpisodeCheck:
         """Check the messages of one chunk."""
         for decoder, messages, where in self._places.get(chunk.chunk_start_offset, ()):
             if isinstance(where, slice):
-                self._take_steps(decoder.alike(records, messages.index, _FIELDS), where)
+                fields = (*_FIELDS, self._behavior.name)
+                self._take_steps(decoder.alike(records, messages.index, fields), where)
             else:
                 self._take_images(decoder.alike(records, messages.index, _IMAGE_FIELDS), where)
 
@@ -149,8 +155,9 @@ class EpisodeCheck:
         assert self._metadata is not None
         spaces = (self._metadata.observation_space, self._metadata.action_space)
         schema = self._reader.schema_of(channels[0])
-        # Schemas of older logs do not name the actions.
-        possible = [step_schema(*spaces, names) for names in (self._metadata.action_names(), None)]
+        labels = self._metadata.action_labels()
+        current = step_schema(*spaces, self._metadata.action_names(), labels)
+        possible = [current, *earlier_step_schemas(*spaces)]
         fits = (schema.name, schema.data.decode(errors="replace")) in possible
         if schema.name.startswith("mcaprl_msgs/msg/Step") and not fits:
             raise CorruptLogError(f"schema {schema.name} does not match the metadata's spaces")
@@ -181,18 +188,26 @@ class EpisodeCheck:
             raise CorruptLogError(f"messages of {STEP_TOPIC} do not match their schema")
         for name in _FIELDS[1:]:
             self._columns[name][rows] = found[name]
-        assert self._metadata is not None
-        space = self._metadata.action_space
+        metadata = self._metadata
+        assert metadata is not None
+        space = metadata.action_space
         actions = found["action"].reshape(-1, *(space.shape or ()))
-        wrong = outside(space, actions) & ~found["final"].astype(bool)
-        for row in np.flatnonzero(wrong)[:LISTED].tolist():
-            self._problems.append(
-                Problem(
-                    f"action {found['action'][row]} is outside of {space}",
-                    f"episode {found['episode'][row]} step {found['step'][row]}",
-                    next=IMPOSSIBLE_ACTION,
-                )
-            )
+        behavior, values = self._behavior, found[self._behavior.name]
+        is_final = found["final"].astype(bool)
+        self._report(found, outside(space, actions) & ~is_final, partial(_outside, metadata))
+        self._report(
+            found,
+            behavior.is_impossible(values) & ~is_final,
+            lambda row: f"{behavior.name} is {row[behavior.name]:g}, expected {behavior.expected}",
+        )
+
+    def _report(
+        self, found: NDArray[Any], wrong: NDArray[np.bool_], what: Callable[[Any], str]
+    ) -> None:
+        """Add a problem for each of the first wrong records."""
+        for record in found[np.flatnonzero(wrong)[:LISTED]]:
+            where = f"episode {record['episode']} step {record['step']}"
+            self._problems.append(Problem(what(record), where, next=IMPOSSIBLE_ACTION))
 
     def _take_images(self, found: NDArray[Any] | None, leaf: Leaf) -> None:
         if found is None or not _is_image(found, leaf):
@@ -211,6 +226,17 @@ class EpisodeCheck:
         actual = summaries_of_records(columns, finals, lengths)
         for number, summary_and_actual in enumerate(zip(whole, actual, strict=True)):
             yield from _check_summary(number, *summary_and_actual)
+
+
+def _outside(metadata: LogMetadata, record: Any) -> str:
+    """Return what is wrong with an action; of a vector, name the first part that is wrong."""
+    space = metadata.action_space
+    if not isinstance(space, spaces.Box):
+        return f"action {record['action']} is outside of {space}"
+    parts, low, high = np.ravel(record["action"]), space.low.ravel(), space.high.ravel()
+    first = int(np.argmin((parts >= low) & (parts <= high)))
+    name = part_names(space, metadata.action_part_names)[first]
+    return f"{name} {parts[first]:.6g} is outside of {low[first]:.4g} to {high[first]:.4g}"
 
 
 def _check_summary(

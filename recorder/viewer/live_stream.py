@@ -172,7 +172,8 @@ class LiveStep:
         reward: Reward of the action.
         terminated: Whether the transition reached a terminal state.
         truncated: Whether the episode was truncated.
-        behavior_prob: Probability of the action under the behavior policy; NaN if unknown.
+        behavior: Probability of the action under the behavior policy, or natural logarithm of its
+            density if actions are floats; NaN if unknown.
         epsilon: Probability of a random action; NaN if unknown.
         policy_version: Number of updates of the policy so far.
         values: Fields of `schema.values_schema`; empty if unknown.
@@ -185,7 +186,7 @@ class LiveStep:
     reward: float
     terminated: bool
     truncated: bool
-    behavior_prob: float = math.nan
+    behavior: float = math.nan
     epsilon: float = math.nan
     policy_version: int = -1
     values: Mapping[str, Any] = field(default_factory=dict)
@@ -443,8 +444,11 @@ class LiveStream(ViewerServer):
 
     def _send_step(self, step: LiveStep) -> None:
         """Send the transition as messages on the same topics as in a log."""
-        columns = {name: getattr(step, name) for name in ("reward", "behavior_prob")}
-        columns["action"] = as_declared(step.action, self._log.action)
+        columns: dict[str, Any] = {
+            "reward": step.reward,
+            self._log.behavior.name: step.behavior,
+            "action": as_declared(step.action, self._log.action),
+        }
         for leaf in observation_leaves(self._log.metadata.observation_space):
             value = np.asarray(leaf.of(step.observation))
             if leaf in self._images:

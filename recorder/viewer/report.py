@@ -74,7 +74,7 @@ def _findings_section(findings: Sequence[Problem]) -> Section:
 
 def _calibration_section(dataset: Dataset) -> list[Section]:
     """Return the section about behavior probabilities. If they are unknown, the list is empty."""
-    found = calibration(dataset.behavior_probs, dataset.action_space)
+    found = calibration(dataset.behavior, dataset.action_space)
     if found is None:
         return []
     rows = [

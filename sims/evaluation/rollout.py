@@ -171,6 +171,7 @@ class EpsilonGreedy:
         self.name = self.policy.name if self.policy else "random"
         self._space = action_space
         self._joint = joint_actions(action_space)
+        self._random_policy = RandomPolicy(action_space)
         self.mask_from = self.policy.mask_from if self.policy else mask_from
         self.begin(0)
 
@@ -184,24 +185,25 @@ class EpsilonGreedy:
     def choose(
         self, observation: Any, info: Mapping[str, Any] = MappingProxyType({})
     ) -> tuple[Any, float]:
-        """Return the action for one observation and its info, and the probability of that action.
+        """Return the action for one observation and its info, and what a log stores about it.
 
-        Each of the A allowed actions has the probability epsilon / A; the policy's greedy action
-        has an additional 1 - epsilon. Without an action mask, all actions are allowed. Each
-        combination of the elements of a MultiDiscrete or MultiBinary space is one action; with more
-        than `MOST_NUMBERED` actions, and for other spaces, the returned probability is NaN.
+        That is the probability of the action, or the log density of an action of floats. Each of
+        the A allowed actions has the probability epsilon / A; the policy's greedy action has an
+        additional 1 - epsilon. Without an action mask, all actions are allowed. Each combination of
+        the elements of a MultiDiscrete or MultiBinary space is one action; with more than
+        `MOST_NUMBERED` actions, and for Boxes of integers, the probability is NaN. The log density
+        is NaN if the policy is deterministic or has no densities, or if random actions are not
+        uniform because a bound is infinite.
         """
         if self.mask_from:
             observation = masked(observation, info, self.mask_from)
-        greedy = (
-            None
-            if self.policy is None
-            else self.policy.act(mapped(lambda part: np.asarray(part)[None], observation))[0]
-        )
+        batch = mapped(lambda part: np.asarray(part)[None], observation)
+        greedy: Any = None if self.policy is None else self.policy.act(batch)[0]
         explores = self.epsilon > 0 and self._random.random() < self.epsilon
         joint = self._joint
         if joint is None or joint.count > MOST_NUMBERED:
-            return (self._space.sample() if explores else greedy), math.nan
+            action = self._space.sample() if explores else greedy
+            return action, self._log_density(batch, np.asarray(action)[None])
         mask = allowed_actions(observation)
         # For MultiDiscrete spaces, there are also masks with one flag for each value of an element.
         if joint.shape and mask is not None and mask.shape != (joint.count,):
@@ -218,6 +220,23 @@ class EpsilonGreedy:
         if self.policy is not None and not self.policy.is_deterministic:
             chance = math.nan
         return (action if joint.shape else int(action)), chance
+
+    def _log_density(self, batch: Any, actions: NDArray[Any]) -> float:
+        """Return the log density of an action (1, *shape); NaN if unknown."""
+        is_box = isinstance(self._space, spaces.Box)
+        if not is_box or (self.policy is not None and self.policy.is_deterministic):
+            return math.nan
+        parts = [(self.epsilon, self._random_policy), (1 - self.epsilon, self.policy)]
+        try:
+            found = [
+                math.log(share) + float(policy.log_prob(batch, actions)[0])
+                for share, policy in parts
+                if share > 0 and policy is not None
+            ]
+        except PolicyError:
+            return math.nan
+        log_density = float(np.logaddexp.reduce(found))
+        return log_density if math.isfinite(log_density) else math.nan
 
 
 def episode_seed(seed: int, episode: int) -> int:
@@ -277,7 +296,8 @@ def rollout(
         episodes: Number of episodes, or None to count steps.
         steps: Total number of steps; the last episode may be interrupted.
         first_episode: Index k of the first episode.
-        on_action: Function called with each action's probability before the step.
+        on_action: Function called before each step with what `EpsilonGreedy.choose` returns beside
+            the action.
         on_episode: Function called after each episode.
 
     Raises:

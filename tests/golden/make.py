@@ -21,9 +21,10 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
 import mcaprl
+from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.repair.recover import recover_log
 from tests.support.damage.faults import KnownEpisodes, play
-from tests.support.recordings import MIXED_SPACE, ScriptedEnv, leaves_of, record
+from tests.support.recordings import MIXED_SPACE, KnownCommands, ScriptedEnv, leaves_of, record
 
 FOLDER = Path(__file__).parent
 CONTENTS = FOLDER / "contents.json"
@@ -118,6 +119,17 @@ def short_episodes(path: Path) -> None:
                 env.step(step % 2)
 
 
+def densities(path: Path) -> None:
+    """Record actions of floats whose parts have names, with the densities of some of them."""
+    with closing(mcaprl.RecordMcap(KnownCommands(), path, start_time_ns=START_NS)) as recorder:
+        for episode in range(2):
+            recorder.reset(seed=episode)
+            for step in range(3):
+                if (step, episode) != (1, 0):
+                    recorder.behavior_log_prob = (-100.0, 0.0, 3.5)[step]
+                recorder.step(np.array([step / 2 - 0.5, step], np.float32))
+
+
 FILES: dict[str, Callable[[Path], None]] = {
     **{
         f"every-space-{name}": partial(every_space, compression=name)
@@ -141,6 +153,7 @@ FILES: dict[str, Callable[[Path], None]] = {
     "lane-with-scene": with_scene,
     "reported": reported,
     "short-episodes": short_episodes,
+    "densities": densities,
 }
 
 
@@ -150,7 +163,7 @@ def contents_of(path: Path) -> dict[str, Any]:
         warnings.simplefilter("error")
         data = mcaprl.open(path)
     columns = {"actions": data.actions, "rewards": data.rewards, "terminated": data.terminated}
-    columns |= {"truncated": data.truncated, "behavior_probs": data.behavior_probs}
+    columns |= {"truncated": data.truncated, **_behavior(path, data)}
     columns |= {f"observation {k}": leaf for k, leaf in enumerate(leaves_of(data.observations))}
     columns |= {f"next {k}": leaf for k, leaf in enumerate(leaves_of(data.next_observations))}
     columns["log_time_ns"] = np.concatenate([e.log_time_ns for e in data.episodes])
@@ -161,6 +174,21 @@ def contents_of(path: Path) -> dict[str, Any]:
         "episodes": [[e.length, e.total_reward, e.reason, e.seed, e.policy] for e in data.episodes],
         "columns": {name: _digest(column) for name, column in columns.items()},
     }
+
+
+def _behavior(path: Path, data: mcaprl.Dataset) -> dict[str, np.ndarray[Any, Any]]:
+    """Return the behavior column of a log by the name of the array.
+
+    Before version 0.2, logs had probabilities of all actions; readers convert them to logarithms.
+    """
+    topic = Topic(McapReader(path), "/rl/step")
+    if data.behavior_field.name in topic.fields:
+        return {data.behavior_field.plural: data.behavior}
+    rows = topic.read(("behavior_prob", "final"))
+    probs = rows["behavior_prob"][~rows["final"].astype(bool)]
+    expected = [np.float32(np.log(float(prob))) for prob in probs]
+    assert data.behavior_log_probs.tolist() == expected
+    return {"behavior_probs": probs}
 
 
 def _digest(column: np.ndarray[Any, Any]) -> str:

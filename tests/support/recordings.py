@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from mcaprl.recorder.format.behavior import LOG_DENSITY, behavior_field
 from mcaprl.recorder.record.wrapper import RecordMcap
 
 MIXED_SPACE = spaces.Dict(
@@ -58,6 +59,18 @@ class ScriptedEnv(gym.Env[Any, Any]):
         return observation, reward, terminated, truncated, self._infos
 
 
+class KnownCommands(ScriptedEnv):
+    """Two episodes of three steps, whose actions are a steering angle and a speed."""
+
+    action_part_names = ("steering", "speed")
+    action_units = ("right | left", "m/s")
+
+    def __init__(self) -> None:
+        row = [(np.full(2, k / 4, np.float32), float(k), k == 3, False) for k in range(4)]
+        commands = spaces.Box(np.array([-1, 0], np.float32), np.array([1, 2.5], np.float32))
+        super().__init__(spaces.Box(-1, 1, (2,), np.float32), commands, [row, row])
+
+
 @dataclass
 class Truth:
     """Recorded values of each transition."""
@@ -68,7 +81,7 @@ class Truth:
     rewards: list[float] = field(default_factory=list)
     terminated: list[bool] = field(default_factory=list)
     truncated: list[bool] = field(default_factory=list)
-    behavior_probs: list[float] = field(default_factory=list)
+    behavior: list[float] = field(default_factory=list)
 
 
 def record(
@@ -96,6 +109,7 @@ def record(
             rows.append((observation_space.sample(), reward, *ends))
         episodes.append(rows)
     env = ScriptedEnv(observation_space, action_space, episodes)
+    kind = behavior_field(action_space)
     recorder = RecordMcap(
         env, path, **{"step_duration_s": 0.05, "start_time_ns": 10**18, **options}
     )
@@ -103,8 +117,10 @@ def record(
         for number, rows in enumerate(episodes):
             observation, _ = recorder.reset(seed=100 + number)
             for _ in rows[1:]:
-                action, probability = action_space.sample(), float(np.float32(random.random()))
-                recorder.behavior_prob = probability
+                action, behavior = action_space.sample(), float(np.float32(random.random()))
+                if kind is LOG_DENSITY:
+                    behavior = float(np.float32(200 * behavior - 100))
+                setattr(recorder, kind.name, behavior)
                 truth.observations.append(observation)
                 observation, earned, terminated, truncated, _ = recorder.step(action)
                 truth.next_observations.append(observation)
@@ -112,7 +128,7 @@ def record(
                 truth.rewards.append(float(earned))
                 truth.terminated.append(terminated)
                 truth.truncated.append(truncated)
-                truth.behavior_probs.append(probability)
+                truth.behavior.append(behavior)
     return truth
 
 
@@ -135,7 +151,7 @@ def assert_holds(dataset: Any, truth: Truth) -> None:
     """Check that every column of the dataset has the recorded bits."""
     for name in ("rewards", "terminated", "truncated"):
         assert_same_bits(getattr(dataset, name), np.array(getattr(truth, name)))
-    assert_same_bits(dataset.behavior_probs, np.array(truth.behavior_probs, np.float32))
+    assert_same_bits(dataset.behavior, np.array(truth.behavior, np.float32))
     assert_same_bits(dataset.actions, np.stack([np.asarray(action) for action in truth.actions]))
     for name in ("observations", "next_observations"):
         rows = [leaves_of(observation) for observation in getattr(truth, name)]

@@ -9,6 +9,8 @@ import hypothesis.strategies as st
 import numpy as np
 from gymnasium import spaces
 
+from mcaprl.recorder.format.behavior import LOG_DENSITY, behavior_field
+
 DTYPES = ("float32", "float64", "float16", "int64", "int32", "int16", "int8", "uint8", "uint64")
 
 
@@ -70,6 +72,11 @@ def transitions(draw: st.DrawFn) -> dict[str, Any]:
     observation_space, action_space = draw(observation_spaces()), draw(simple_spaces())
     rows = draw(st.integers(1, 12))
     ends = numpy_strategies.arrays(np.bool_, rows)
+    kind = behavior_field(action_space)
+    limit = 2.0**100 if kind is LOG_DENSITY else 1.0
+    least = -limit if kind is LOG_DENSITY else 2.0**-100
+    values = st.one_of(st.just(np.nan), st.floats(least, limit, width=32))
+    behavior = numpy_strategies.arrays(np.float32, rows, elements=values)
     rewards = numpy_strategies.arrays(np.uint64, rows).map(lambda bits: bits.view(np.float64))
     return {
         "observation_space": observation_space,
@@ -80,4 +87,5 @@ def transitions(draw: st.DrawFn) -> dict[str, Any]:
         "rewards": draw(rewards),
         "terminated": draw(ends),
         "truncated": draw(ends),
+        kind.plural: draw(behavior),
     }

@@ -27,13 +27,13 @@ def same_transitions(found: Dataset, data: Dataset, *, probs: bool = True) -> No
     Args:
         found: Dataset that was read.
         data: Dataset that was written.
-        probs: Whether to compare action probabilities.
+        probs: Whether to compare probabilities or densities of actions.
     """
     assert found.episode_lengths.tolist() == data.episode_lengths.tolist()
     is_index = data.actions.ndim == 1 and data.actions.dtype.kind in "iu"
     assert_same_bits(found.actions, data.actions.astype(np.int64) if is_index else data.actions)
     names = ["rewards", "terminated", "truncated"]
-    for name in [*names, "behavior_probs"] if probs else names:
+    for name in [*names, "behavior"] if probs else names:
         assert_same_bits(getattr(found, name), getattr(data, name))
     mine, theirs = leaves_of(found.observation_space), leaves_of(data.observation_space)
     for leaf, other in zip(mine, theirs, strict=True):

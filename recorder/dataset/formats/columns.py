@@ -15,13 +15,14 @@ from mcaprl.recorder.dataset.arrays import with_fresh_times
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.transitions import Transitions, joined_infos
 from mcaprl.recorder.dataset.values import (
+    behavior_of,
     check_finite,
     check_inside,
     exactly,
     numbers,
-    probabilities_of,
     rewards_of,
 )
+from mcaprl.recorder.format.behavior import BehaviorField, behavior_field
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up, summary_of
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
@@ -40,6 +41,7 @@ class EpisodeArrays:
         terminated: Whether the last transition led to a terminal state.
         truncated: Whether the episode was truncated after the last transition.
         behavior_probs: (T,) probability of each action; None if unknown.
+        behavior_log_probs: (T,) logarithms of probabilities or densities; None if unknown.
         times_ns: (T + 1,) time of each observation, nanoseconds since the Unix epoch; None if
             unknown.
         infos: Masked array of T + 1 rows for each info, by its dotted name.
@@ -54,6 +56,7 @@ class EpisodeArrays:
     terminated: bool
     truncated: bool
     behavior_probs: NDArray[Any] | None = None
+    behavior_log_probs: NDArray[Any] | None = None
     times_ns: NDArray[np.int64] | None = None
     infos: Mapping[str, Any] = field(default_factory=dict)
     summary: Mapping[str, Any] = field(default_factory=dict)
@@ -82,7 +85,7 @@ def dataset_of(
     check_duration(metadata, sum(len(episode.rewards) + 1 for _, episode in kept), where)
     for index, episode in kept:
         place = _place(where, index, episode)
-        _check_times_and_probabilities(episode, place)
+        _check_times_and_shapes(episode, place)
         _check_values(episode, metadata, place, has_rewards=has_rewards)
     return _joined([episode for _, episode in kept], metadata, where)
 
@@ -111,19 +114,18 @@ def _place(where: object, index: int, episode: EpisodeArrays) -> str:
     return f"{where}" if episode.first_row is not None else f"{where}: episode {index}"
 
 
-def _check_times_and_probabilities(episode: EpisodeArrays, place: str) -> None:
-    first, count = episode.first_row or 0, len(episode.rewards)
+def _check_times_and_shapes(episode: EpisodeArrays, place: str) -> None:
+    count = len(episode.rewards)
     for name, column, rows in (
         ("rewards", episode.rewards, count),
         ("log_time_ns", episode.times_ns, count + 1),
         ("behavior_probs", episode.behavior_probs, count),
+        ("behavior_log_probs", episode.behavior_log_probs, count),
     ):
         if column is not None and np.shape(column) != (rows,):
             raise SpaceError(f"{place}: {name} has shape {np.shape(column)}, expected {(rows,)}")
     if episode.times_ns is not None:
         check_times(f"{place}: log_time_ns", episode.times_ns)
-    if episode.behavior_probs is not None:
-        probabilities_of(f"{place}: behavior_probs", episode.behavior_probs, first_row=first)
 
 
 def _check_values(
@@ -137,6 +139,7 @@ def _check_values(
     rewards = numbers(f"{place}: rewards", episode.rewards)
     if has_rewards:
         check_finite(f"{place}: rewards", rewards, first_row=first)
+    _behavior(episode, behavior_field(metadata.action_space), f"{place}: ", first)
     for leaf in metadata.leaves:
         name = f"{place}: {leaf.name}"
         space = leaf.of(metadata.observation_space)
@@ -146,7 +149,7 @@ def _check_values(
 def _joined(kept: Sequence[EpisodeArrays], metadata: LogMetadata, where: object) -> Dataset:
     """Return a dataset of episodes with valid values; see `dataset_of`."""
     leaves = observation_leaves(metadata.observation_space)
-    action = action_leaf(metadata.action_space)
+    action, kind = action_leaf(metadata.action_space), behavior_field(metadata.action_space)
     lengths = np.array([len(episode.rewards) for episode in kept])
     try:
         columns = Transitions(
@@ -161,7 +164,7 @@ def _joined(kept: Sequence[EpisodeArrays], metadata: LogMetadata, where: object)
             rewards=np.concatenate([rewards_of("rewards", e.rewards) for e in kept]),
             terminated=_last_rows(lengths, [e.terminated for e in kept]),
             truncated=_last_rows(lengths, [e.truncated for e in kept]),
-            behavior_probs=np.concatenate([_probabilities(e) for e in kept]),
+            behavior=np.concatenate([_behavior(e, kind) for e in kept]),
             episodes=tuple(_summary(k, e) for k, e in enumerate(kept)),
             infos=joined_infos([(e.infos, len(e.rewards) + 1) for e in kept]),
         )
@@ -208,10 +211,12 @@ def _last_rows(lengths: NDArray[np.int64], flags: Sequence[bool]) -> NDArray[np.
     return column
 
 
-def _probabilities(episode: EpisodeArrays) -> NDArray[np.float32]:
-    if episode.behavior_probs is None:
-        return np.full(len(episode.rewards), np.nan, np.float32)
-    return np.asarray(episode.behavior_probs, np.float32)
+def _behavior(
+    episode: EpisodeArrays, kind: BehaviorField, place: str = "", first_row: int = 0
+) -> NDArray[np.float32]:
+    arrays = episode.behavior_probs, episode.behavior_log_probs
+    found = behavior_of(kind, *arrays, place=place, first_row=first_row)
+    return np.full(len(episode.rewards), np.nan, np.float32) if found is None else found
 
 
 def _summary(index: int, episode: EpisodeArrays) -> EpisodeSummary:

@@ -18,10 +18,12 @@ from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.dataset.formats.ends import MEANINGS, Ends, Kind, ends_of
 from mcaprl.recorder.dataset.formats.infos import masked
 from mcaprl.recorder.dataset.values import exactly, numbers
+from mcaprl.recorder.format.behavior import FIELDS
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.texts import counted, printable
 
-COLUMNS = ("observations", "actions", "rewards", "next_observations", "behavior_probs")
+_SCALARS = ("rewards", *(field.plural for field in FIELDS))
+COLUMNS = ("observations", "actions", "next_observations", *_SCALARS)
 FINALS, TIMES, INFOS = "final_observations", "log_time_ns", "infos"
 NAMES = frozenset((*COLUMNS, *MEANINGS, FINALS, TIMES))
 """Names of the arrays that are read."""
@@ -64,7 +66,7 @@ def flat_dataset(
         has = ", ".join(sorted([*found, *unread])[:MAX_MEMBERS_SHOWN])
         raise LogError(f"{where} has no {', '.join(missing)}; it has {printable(has) or 'none'}")
     columns = {name: _one_column(name, values, where) for name, values in found.items()}
-    for name in ("actions", "rewards", "behavior_probs"):
+    for name in ("actions", *_SCALARS):
         if isinstance(columns.get(name), Mapping):
             raise LogError(f"{where}: {name} is a group; a log can store one array of {name}")
     if columns["rewards"].ndim != 1:
@@ -162,7 +164,8 @@ class _Steps:
     def episodes(self, infos: Mapping[str, NDArray[Any]]) -> Iterator[EpisodeArrays]:
         """Yield the episodes; see `flat_dataset`."""
         actions, rewards = self._columns["actions"], self._columns["rewards"]
-        observations, probs = self._columns["observations"], self._columns.get("behavior_probs")
+        observations = self._columns["observations"]
+        behavior = {f.plural: self._columns[f.plural] for f in FIELDS if f.plural in self._columns}
         for index, (start, stop) in enumerate(self._spans):
             last = stop - self._is_left_out(stop - 1)
             steps, frames = slice(start, last), np.arange(start, last + 1)
@@ -178,8 +181,8 @@ class _Steps:
                 rewards=rewards[steps],
                 terminated=bool(self._ends.terminated[stop - 1]),
                 truncated=bool(self._ends.truncated[stop - 1]),
-                behavior_probs=None if probs is None else probs[steps],
                 times_ns=None if self._times is None else self._times[frames],
+                **{name: values[steps] for name, values in behavior.items()},
                 infos={
                     name: _info(
                         values[frames]
@@ -295,7 +298,7 @@ def _one_column(name: str, values: Any, where: object) -> Any:
         )
     except SpaceError as error:
         raise SpaceError(f"{where}: {error}") from error
-    is_flat = name in MEANINGS or name in ("rewards", "behavior_probs")
+    is_flat = name in MEANINGS or name in _SCALARS
     return array[:, 0] if is_flat and array.ndim == 2 and array.shape[1] == 1 else array
 
 

@@ -1,7 +1,8 @@
 """HDF5 files: D4RL's form is read and written, robomimic's form is only read.
 
 D4RL's form is flat arrays of all transitions. The files written here also have `next_observations`
-and, if they are known, `behavior_probs`, which D4RL's own files often lack.
+and, if they are known, `behavior_probs`, which D4RL's own files often lack; for actions of floats,
+`behavior_log_probs`.
 
 robomimic's form has a group `data/demo_<i>` for each episode.
 """
@@ -78,8 +79,8 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
         file["rewards"] = dataset.rewards
         file["terminals"] = dataset.terminated
         file["timeouts"] = timeouts
-        if not np.isnan(dataset.behavior_probs).all():
-            file["behavior_probs"] = dataset.behavior_probs
+        if not np.isnan(dataset.behavior).all():
+            file[dataset.behavior_field.plural] = dataset.behavior
         for name, parts in info_names.items():
             values = infos[name][dataset.frame_of_step]
             is_text = values.dtype.kind == "U"

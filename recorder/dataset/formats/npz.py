@@ -4,7 +4,8 @@
 
     observations              (N, *shape); or arrays `observations/KEY` for the keys of a Dict
     final_observations        (E, *shape), named in the same way
-    actions, rewards, terminations, truncations, behavior_probs    (N,) or (N, *shape)
+    actions, rewards, terminations, truncations    (N,) or (N, *shape)
+    behavior_probs            (N,); for actions of floats, behavior_log_probs
     episode_lengths           (E,)
     log_time_ns               (N + E,), if the data has times
     infos/NAME                (N + E, *shape)
@@ -169,7 +170,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
             "rewards": dataset.rewards,
             "terminations": dataset.terminated,
             "truncations": dataset.truncated,
-            "behavior_probs": dataset.behavior_probs,
+            dataset.behavior_field.plural: dataset.behavior,
             "episode_lengths": dataset.episode_lengths,
         }
         if dataset.metadata.get("times") != NO_TIMES:

@@ -1,10 +1,11 @@
 """Parquet files: a folder with a table of transitions and a table of episodes.
 
 `transitions.parquet` has a row for each transition: `episode`, `step`, `log_time_ns`, `reward`,
-`terminated`, `truncated`, `behavior_prob`, `action`, `observation` and `next_observation`. The
-parts of a Dict observation are `observation_<key>` and `next_observation_<key>`. A tensor is a
-fixed-size list in C order; the field's metadata has its shape. The metadata of the schema has the
-spaces, as `tables.described` writes them.
+`terminated`, `truncated`, `behavior_prob`, `action`, `observation` and `next_observation`. For
+actions of floats, `behavior_log_prob` replaces `behavior_prob`. The parts of a Dict observation are
+`observation_<key>` and `next_observation_<key>`. A tensor is a fixed-size list in C order; the
+field's metadata has its shape. The metadata of the schema has the spaces, as `tables.described`
+writes them.
 
 `episodes.parquet` has a row for each episode: the fields of `EpisodeSummary`, `final_log_time_ns`
 and the last observation, `final_observation`. The columns of next observations are for
@@ -42,7 +43,8 @@ from mcaprl.recorder.dataset.tables import (
     transition_table,
 )
 from mcaprl.recorder.dataset.transitions import Transitions
-from mcaprl.recorder.dataset.values import exactly, probabilities_of
+from mcaprl.recorder.dataset.values import behavior_of, exactly
+from mcaprl.recorder.format.behavior import FIELDS, PROBABILITY, behavior_field
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, summary_of
 from mcaprl.recorder.format.infos import Masked
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
@@ -129,10 +131,7 @@ def read(path: Path) -> Dataset:
         rewards=steps.values("reward", (), np.dtype(np.float64)),
         terminated=steps.values("terminated", (), _FLAG),
         truncated=steps.values("truncated", (), _FLAG),
-        behavior_probs=probabilities_of(
-            f"{path / TRANSITIONS}: behavior_prob",
-            steps.values("behavior_prob", (), np.dtype(np.float32)),
-        ),
+        behavior=_behavior(steps, metadata, path),
         episodes=episodes.summaries(),
         infos={
             name: _info(steps.info("info", name), episodes.info("reset_info", name), lengths)
@@ -141,6 +140,17 @@ def read(path: Path) -> Dataset:
     )
     _check_ends(columns, path)
     return Dataset(columns, metadata)
+
+
+def _behavior(steps: _Table, metadata: LogMetadata, path: Path) -> NDArray[np.float32]:
+    field = behavior_field(metadata.action_space)
+    # Earlier versions wrote the probabilities of all actions.
+    stored = field if steps.has(field.name) else PROBABILITY
+    values = steps.values(stored.name, (), np.dtype(np.float32))
+    arrays = [values if one is stored else None for one in FIELDS]
+    found = behavior_of(field, *arrays, place=f"{path / TRANSITIONS}: ", is_table=True)
+    assert found is not None
+    return found
 
 
 class _Table:
@@ -170,6 +180,10 @@ class _Table:
             return LogMetadata.from_strings(parse_json(found))
         except (AttributeError, ValueError) as error:
             raise LogError(f"{self._path}: metadata '{METADATA_NAME}': {error}") from error
+
+    def has(self, name: str) -> bool:
+        """Return whether there is a column with this name."""
+        return name in self._table.column_names
 
     def values(self, name: str, shape: Sequence[int], dtype: np.dtype[Any]) -> NDArray[Any]:
         """Return a column (N, *shape) in this dtype."""

@@ -303,8 +303,9 @@ class LogPage:
         }
         if infos:
             yield _plot("info", list(infos), np.column_stack(list(infos.values())))
-        if not np.isnan(episode.behavior_probs).all():
-            yield _plot("probability of the action", ["behavior_prob"], episode.behavior_probs)
+        if not np.isnan(episode.behavior).all():
+            field = episode.behavior_field
+            yield _plot(f"{field.what} of the action", [field.name], episode.behavior)
 
     def _policies(self, episode: Episode) -> Iterator[dict[str, Any]]:
         """Yield the values of each policy that annotated the log."""

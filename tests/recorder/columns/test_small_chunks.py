@@ -41,7 +41,7 @@ def test_merged_or_not(
     assert merged.fingerprint == apart.fingerprint
     # The summaries are compared as text, because NaN equals NaN in text.
     assert [str(e.summary) for e in merged.episodes] == [str(e.summary) for e in apart.episodes]
-    for name in ("rewards", "behavior_probs"):
+    for name in ("rewards", "behavior"):
         assert getattr(merged, name).tobytes() == getattr(apart, name).tobytes()
 
 

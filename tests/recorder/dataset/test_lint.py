@@ -110,7 +110,7 @@ def test_the_reward_of_a_terminal_step_may_be_special() -> None:
             (
                 changed("behavior_probs", 4, prob),
                 "problem",
-                "behavior_prob is not in (0, 1] in 1 of 6 steps (episode 1 step 1)",
+                "behavior_prob is not a number in (0, 1] in 1 of 6 steps (episode 1 step 1)",
             )
             for prob in (-0.5, 0.0, 2.0, math.inf)
         ),

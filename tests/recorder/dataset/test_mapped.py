@@ -72,7 +72,7 @@ def test_batches(log: Path) -> None:
         for found, column in zip(leaves_of(getattr(batch, name)), every, strict=True):
             assert isinstance(found, np.ndarray)
             assert_same_bits(found, column[steps])
-    for name in ("actions", "rewards", "terminated", "truncated", "behavior_probs"):
+    for name in ("actions", "rewards", "terminated", "truncated", "behavior"):
         assert_same_bits(getattr(batch, name), getattr(memory, name)[steps])
 
 

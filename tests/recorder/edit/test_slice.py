@@ -38,7 +38,7 @@ def log(tmp_path: Path) -> Path:
 
 
 def assert_same_rows(part: mcaprl.Dataset, whole: mcaprl.Dataset, start: int, stop: int) -> None:
-    for name in ("actions", "rewards", "terminated", "behavior_probs"):
+    for name in ("actions", "rewards", "terminated", "behavior"):
         assert_same_bits(getattr(part, name), getattr(whole, name)[start:stop])
     for name in ("observations", "next_observations"):
         pairs = zip(leaves_of(getattr(part, name)), leaves_of(getattr(whole, name)), strict=True)

@@ -29,19 +29,27 @@ from mcaprl.recorder.viewer.scene_reader import moments_of_episode
 from mcaprl.sims import make_sim
 from tests.conftest import need
 from tests.support.paths import NODE
-from tests.support.recordings import MIXED_SPACE, leaves_of, record
+from tests.support.recordings import MIXED_SPACE, KnownCommands, leaves_of, record
 
 Messages = dict[str, list[tuple[int, Any]]]
 
 
-@pytest.fixture(scope="module", params=["zstd", "lz4", "none"])
+_COMMANDS = spaces.Box(-1, 1, (2, 2), np.float64)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[*((name, spaces.Discrete(5)) for name in ("zstd", "lz4", "none")), ("zstd", _COMMANDS)],
+    ids=["zstd", "lz4", "none", "densities"],
+)
 def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record two image topics, and vectors of all dtypes with NaN and infinity.
 
     Each topic has several chunks.
     """
     path = tmp_path_factory.mktemp("foreign") / "log.mcap"
-    record(path, MIXED_SPACE, spaces.Discrete(5), [120, 1, 33], compression=request.param)
+    compression, actions = request.param
+    record(path, MIXED_SPACE, actions, [120, 1, 33], compression=compression)
     return path
 
 
@@ -61,8 +69,9 @@ def ours(path: Path) -> dict[str, dict[str, np.ndarray[Any, Any]]]:
             for leaf, array in zip(leaves, leaves_of(source), strict=True):
                 (images if leaf.encoding else step)[leaf.name].append(array[index])
             step["reward"].append(0.0 if final else episode.rewards[row])
-            step["action"].append(0 if final else episode.actions[row])
-            step["behavior_prob"].append(np.nan if final else episode.behavior_probs[row])
+            action = episode.actions[index]
+            step["action"].append(np.zeros_like(action) if final else action)
+            step[dataset.behavior_field.name].append(np.nan if final else episode.behavior[row])
             step["terminated"].append(not final and episode.terminated[row])
             step["truncated"].append(not final and episode.truncated[row])
             step["final"].append(final)
@@ -142,6 +151,27 @@ def test_every_reader_returns_the_recorded_values(
         assert (np.diff(times[topic]) > 0).all(), f"log_time of {topic} does not rise"
         if topic != "/rl/episode":
             assert times[topic] == times["/rl/step"]
+
+
+@pytest.mark.parametrize("read", READERS)
+def test_names_of_the_parts_of_an_action_are_comments(
+    read: Callable[[Path], Messages], tmp_path: Path
+) -> None:
+    env = KnownCommands()
+    env.action_part_names, env.action_units = ("Lenkung \u00e4\n", "speed"), ("right | left", "m/s")
+    path = tmp_path / "commands.mcap"
+    with closing(mcaprl.RecordMcap(env, path)) as recorder:
+        recorder.reset()
+        recorder.behavior_log_prob = 7.25
+        recorder.step(np.array([0.5, 2], np.float32))
+        recorder.step(np.array([-1, 0], np.float32))
+    reader = McapReader(path)
+    text = reader.schema_of(reader.channels_of("/rl/step")[0]).data.decode()
+    assert "# Lenkung ? (-1 right, 1 left)\n# speed (0 to 2.5 m/s)\nfloat32[2] action\n" in text
+    steps = [message for _, message in read(path)["/rl/step"]]
+    assert [list(_field(step, "action")) for step in steps] == [[0.5, 2], [-1, 0], [0, 0]]
+    densities = [float(_field(step, "behavior_log_prob")) for step in steps]
+    np.testing.assert_array_equal(densities, [7.25, np.nan, np.nan])
 
 
 @pytest.fixture(scope="module")

@@ -97,12 +97,60 @@ def test_the_probability_in_a_very_large_space_is_unknown() -> None:
     assert math.isnan(probability)
 
 
-def test_box_actions_have_no_known_probability() -> None:
-    env = gym.make("Pendulum-v1")
-    behavior = EpsilonGreedy(None, 0.0, env.action_space)
-    action, probability = behavior.choose(np.zeros(3))
-    assert env.action_space.contains(action)
-    assert math.isnan(probability)
+class Uniform(BasePolicy):
+    """A stochastic policy that is uniform from 0 to 1."""
+
+    is_deterministic = False
+
+    def act(self, observations: Any) -> NDArray[Any]:
+        return np.full((len(observations), 1), 0.5, np.float32)
+
+    def log_prob(self, observations: Any, actions: NDArray[Any]) -> NDArray[Any]:
+        with np.errstate(divide="ignore"):
+            found: NDArray[Any] = np.log(((actions >= 0) & (actions <= 1)).astype(float))[:, 0]
+        return found
+
+
+def test_the_density_of_a_random_command_is_uniform() -> None:
+    env = gym.make("Pendulum-v1")  # torques from -2 to 2
+    for behavior in (
+        EpsilonGreedy(None, 0.0, env.action_space),
+        EpsilonGreedy(Uniform(), 1.0, env.action_space),
+    ):
+        action, log_density = behavior.choose(np.zeros(3))
+        assert env.action_space.contains(action)
+        assert log_density == pytest.approx(-math.log(4))
+    box = spaces.Box(np.array([0, -1], np.float32), np.array([0.5, 7], np.float32))
+    assert EpsilonGreedy(None, 1.0, box).choose(np.zeros(3))[1] == pytest.approx(-math.log(4))
+
+
+def test_the_density_of_an_exploring_policy_is_that_of_the_mixture() -> None:
+    space = spaces.Box(-2, 2, (1,), np.float32)
+    behavior = EpsilonGreedy(Uniform(), 0.2, space)
+    drawn = [behavior.choose(np.zeros(3)) for _ in range(100)]
+    assert {action.item() for action, _ in drawn} > {0.5}
+    for action, log_density in drawn:
+        inside = 0.8 if 0 <= action.item() <= 1 else 0.0
+        assert log_density == pytest.approx(math.log(0.2 / 4 + inside))
+
+
+def test_the_density_is_unknown_without_one() -> None:
+    class Certain(Uniform):
+        is_deterministic = True
+
+    class Undecided(Uniform):
+        def log_prob(self, observations: Any, actions: NDArray[Any]) -> NDArray[Any]:
+            raise PolicyError("no density")
+
+    box = spaces.Box(-2, 2, (1,), np.float32)
+    for policy, space in (
+        (Certain(), box),
+        (Undecided(), box),
+        (None, spaces.Box(-np.inf, 2, (1,), np.float32)),
+        (None, spaces.Box(-3, 3, (1,), np.int64)),
+        (None, spaces.Box(1, 1, (1,), np.float32)),
+    ):
+        assert math.isnan(EpsilonGreedy(policy, 0.5, space).choose(np.zeros(3))[1])
 
 
 def test_episodes_do_not_depend_on_who_runs_them(env: gym.Env[Any, Any]) -> None:

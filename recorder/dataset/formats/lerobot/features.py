@@ -21,14 +21,15 @@ from mcaprl.errors import LogError, import_extra
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.image_files import decoded_file
 from mcaprl.recorder.dataset.values import exactly
+from mcaprl.recorder.format.behavior import FIELDS
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, check_elements
 
 STATE, IMAGE, IMAGES = "observation.state", "observation.image", "observation.images."
 ACTION, REWARD, DONE, TRUNCATED = "action", "next.reward", "next.done", "next.truncated"
 INFO = "complementary_info."
-PROBABILITY = f"{INFO}behavior_prob"
-STEPS = (ACTION, REWARD, DONE, TRUNCATED, PROBABILITY)
-"""Features of each step: its action, reward, end flags and action probability."""
+BEHAVIORS = tuple(f"{INFO}{field.name}" for field in FIELDS)
+STEPS = (ACTION, REWARD, DONE, TRUNCATED, *BEHAVIORS)
+"""Features of each step: action, reward, end flags, and probability or density of the action."""
 INDEXES = ("frame_index", "episode_index", "index", "task_index")
 DEFAULTS = ("timestamp", *INDEXES)
 """Features of every dataset."""
@@ -176,7 +177,7 @@ def info_features(infos: Mapping[str, Any], frames: NDArray[np.int64]) -> dict[s
         frames: Indexes (N,) of the rows with the infos that the steps returned.
     """
     found: dict[str, Feature] = {}
-    taken = {PROBABILITY}
+    taken = {*BEHAVIORS}
     for name, values in infos.items():
         shape = values.shape[1:] or (1,)
         is_number = values.dtype.kind in "biuf" and values.dtype != np.uint64

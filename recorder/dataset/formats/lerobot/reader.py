@@ -33,7 +33,9 @@ from mcaprl.recorder.dataset.formats.lerobot.features import (
 )
 from mcaprl.recorder.dataset.formats.lerobot.video import read_frames
 from mcaprl.recorder.dataset.values import flags
+from mcaprl.recorder.format.behavior import FIELDS
 from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.spaces import MAX_ACTIONS
 from mcaprl.texts import counted
 
 _VERSIONS = "v3."
@@ -248,10 +250,17 @@ def _dataset_of(files: Files) -> Dataset:
         next(iter(parts.values())) if is_single else spaces.Dict(list(parts.items())),
         action_space,
         observation_names=labels if is_single else (),
+        action_part_names=_labels(files.features[features.ACTION])
+        if isinstance(action_space, spaces.Box)
+        else (),
         step_duration_ns=_step_ns(files),
     )
     rewards = steps.get(features.REWARD, np.full((len(actions), 1), np.nan))
-    probabilities = steps.get(features.PROBABILITY)
+    behavior: dict[str, Any] = {
+        field.plural: steps[name][:, 0]
+        for field, name in zip(FIELDS, features.BEHAVIORS, strict=True)
+        if name in steps
+    }
     times, infos = _times_ns(files), _infos(files)
     episodes = []
     for part in _parts(files, steps):
@@ -262,7 +271,7 @@ def _dataset_of(files: Files) -> Dataset:
             rewards=rewards[part.steps, 0],
             terminated=part.terminated,
             truncated=part.truncated,
-            behavior_probs=None if probabilities is None else probabilities[part.steps, 0],
+            **{name: values[part.steps] for name, values in behavior.items()},
             times_ns=_frame_times(times, part, metadata.step_duration_ns),
             infos={name: _info_rows(array[part.steps]) for name, array in infos.items()},
             summary={"options": _options(files, part.source)},
@@ -434,8 +443,8 @@ def _values_and_space(
     """Convert values (N, *shape) to a dtype that a space can have; return values and space."""
     if values.dtype.kind == "b":
         return values.astype(np.int8), spaces.MultiBinary(list(values.shape[1:]))
-    is_index = values.shape[1:] == (1,) and values.dtype.kind in "iu" and (values >= 0).all()
-    if is_action and is_index:
+    is_scalar = values.shape[1:] == (1,) and values.dtype.kind in "iu"
+    if is_action and is_scalar and ((values >= 0) & (values < MAX_ACTIONS)).all():
         scalars = values[:, 0].astype(np.int64)
         return scalars, action_space_of(scalars)
     return values, box_of(values)

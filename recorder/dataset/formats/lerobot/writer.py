@@ -410,7 +410,7 @@ class _Writer:
             features.REWARD: self._dataset.rewards[steps],
             features.DONE: self._dataset.terminated[steps],
             features.TRUNCATED: self._dataset.truncated[steps],
-            features.PROBABILITY: self._dataset.behavior_probs[steps],
+            _behavior_feature(self._dataset): self._dataset.behavior[steps],
             "timestamp": times,
             "frame_index": np.arange(count),
             "episode_index": np.full(count, index),
@@ -474,14 +474,18 @@ def _step_features(dataset: Dataset) -> list[Feature]:
     with np.errstate(over="ignore"):
         fits = np.array_equal(rewards.astype(np.float32), rewards, equal_nan=True)
     found = [
-        features.feature_of(features.ACTION, leaf),
+        features.feature_of(features.ACTION, leaf, dataset.action_part_names),
         Feature(features.REWARD, "float32" if fits else "float64", (1,)),
         Feature(features.DONE, "bool", (1,)),
         Feature(features.TRUNCATED, "bool", (1,)),
     ]
-    if not np.isnan(dataset.behavior_probs).all():
-        found.append(Feature(features.PROBABILITY, "float32", (1,)))
+    if not np.isnan(dataset.behavior).all():
+        found.append(Feature(_behavior_feature(dataset), "float32", (1,)))
     return found
+
+
+def _behavior_feature(dataset: Dataset) -> str:
+    return f"{features.INFO}{dataset.behavior_field.name}"
 
 
 def _plain(stats: Stats) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import assume, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 
 import mcaprl
 from mcaprl import Dataset
@@ -103,7 +103,7 @@ def test_a_dataset_that_is_cut_off_is_refused_in_one_line(tmp_path: Path, form: 
 
 
 @pytest.mark.parametrize("form", ["npz", "hdf5"])
-@settings(max_examples=40)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.filter_too_much])
 @given(arguments=transitions())
 def test_any_transitions_come_back(form: str, arguments: dict[str, Any]) -> None:
     data = Dataset.from_arrays(**arguments)

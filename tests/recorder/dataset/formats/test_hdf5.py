@@ -29,7 +29,7 @@ def _two_episodes() -> Dataset:
         rewards=np.array([0.1, 2]),
         terminated=True,
         truncated=False,
-        behavior_probs=np.array([0.5, np.nan], np.float32),
+        behavior_log_probs=np.array([2.5, np.nan], np.float32),
         times_ns=np.array([10, 20, 35]),
         summary={"reason": "goal", "seed": 3, "policy": "pid", "options": '{"x": 1}'},
     )
@@ -63,7 +63,7 @@ def test_what_d4rl_has_no_place_for_is_said(tmp_path: Path) -> None:
     assert found.frames.tolist() == data.frames.tolist()
     assert found.terminated.tolist() == [False, True, False]
     assert found.truncated.tolist() == [False, False, True]
-    np.testing.assert_array_equal(found.behavior_probs, [0.5, np.nan, np.nan])
+    np.testing.assert_array_equal(found.behavior_log_probs, [2.5, np.nan, np.nan])
     assert found.actions.tolist() == [[0.5], [-1], [0]]
 
 
@@ -78,7 +78,7 @@ def test_the_arrays_are_those_of_d4rl(tmp_path: Path) -> None:
         assert file["timeouts"][()].tolist() == [False, False, True]
         assert set(file) == {
             *("observations", "next_observations", "actions", "rewards", "terminals", "timeouts"),
-            "behavior_probs",
+            "behavior_log_probs",
         }
 
 

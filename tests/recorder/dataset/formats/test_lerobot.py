@@ -108,7 +108,7 @@ def _same_steps(first: Dataset, second: Dataset) -> None:
     shape, dtype = second.actions.shape[1:], np.int64 if is_index else first.actions.dtype
     actions = first.actions[is_kept].reshape(-1, *shape)
     assert_same_bits(second.actions, actions.astype(dtype))
-    for name in ("rewards", "behavior_probs"):
+    for name in ("rewards", "behavior"):
         assert_same_bits(getattr(second, name), getattr(first, name)[is_kept])
     assert second.terminated.tolist() == first.terminated[is_kept].tolist()
     assert (
@@ -457,7 +457,7 @@ def test_a_dataset_of_lerobots_writer_with_rewards_and_images() -> None:
     assert dataset.rewards.tolist() == [0, 1, 2, 3, 0.5, 1.5]
     assert dataset.terminated.tolist() == [False, False, False, True, False, False]
     assert dataset.truncated.tolist() == [False, False, False, False, False, True]
-    assert np.isnan(dataset.behavior_probs).all()
+    assert np.isnan(dataset.behavior_log_probs).all()
     assert [e.summary.options for e in dataset.episodes] == [
         '{"task": "lift the cube"}',
         '{"task": "drop the cube"}',

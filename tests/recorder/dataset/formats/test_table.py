@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -196,8 +196,16 @@ _INFOS = [
 ]
 
 
-def _described(*names: str) -> tuple[Dataset, Callable[[Dataset, Dataset], bool]]:
+_Aspect = tuple[Dataset, Callable[[Dataset, Dataset], bool]]
+_COMMANDS = LogMetadata(
+    _VECTOR, _VECTOR, action_part_names=("turn", "speed"), action_units=("rad/s", "m/s")
+)
+
+
+def _described(*names: str, metadata: LogMetadata | None = None) -> _Aspect:
     """Return a dataset with metadata, and whether these fields of the metadata are kept."""
+    if metadata is not None:
+        return Dataset(_made(action=_VECTOR)._transitions, metadata), _same_fields(names)
     metadata = LogMetadata(
         _VECTOR,
         spaces.Discrete(3),
@@ -210,13 +218,19 @@ def _described(*names: str) -> tuple[Dataset, Callable[[Dataset, Dataset], bool]
         seed="4",
         about={"author": "A. Author"},
     )
-    data = Dataset(_made()._transitions, metadata)
+    return Dataset(_made()._transitions, metadata), _same_fields(names)
 
+
+def _same_fields(names: Sequence[str]) -> Callable[[Dataset, Dataset], bool]:
     def same(before: Dataset, after: Dataset) -> bool:
         found = [LogMetadata.from_strings(one.metadata) for one in (before, after)]
         return all(getattr(found[0], name) == getattr(found[1], name) for name in names)
 
-    return data, same
+    return same
+
+
+def _same_behavior(before: Dataset, after: Dataset) -> bool:
+    return _same_arrays(_tree(before.behavior, _KEPT), _tree(after.behavior, _KEPT))
 
 
 _ASPECTS: dict[str, tuple[Dataset, Callable[[Dataset, Dataset], bool]]] = {
@@ -249,13 +263,17 @@ _ASPECTS: dict[str, tuple[Dataset, Callable[[Dataset, Dataset], bool]]] = {
     "env id": (_made(), lambda before, after: before.env_id == after.env_id),
     "names of observations": _described("observation_names"),
     "names and commands of actions": _described("action_meanings", "action_commands"),
+    "names of parts of actions": _described("action_part_names", metadata=_COMMANDS),
+    "units of parts of actions": _described("action_units", metadata=_COMMANDS),
     "description of the source": _described("about"),
     "other metadata": _described("success_reasons", "view", "epsilon", "seed"),
     "behavior_prob": (
         _made(behavior_probs=[np.full(length, 0.25) for length in _LENGTHS]),
-        lambda before, after: _same_arrays(
-            _tree(before.behavior_probs, _KEPT), _tree(after.behavior_probs, _KEPT)
-        ),
+        _same_behavior,
+    ),
+    "behavior_log_prob": (
+        _made(action=_VECTOR, behavior_log_probs=[np.full(length, 2.25) for length in _LENGTHS]),
+        _same_behavior,
     ),
     "policy names": (_made(summary=_SUMMARIES), _summaries("policy")),
     "seeds": (_made(summary=_SUMMARIES), _summaries("seed")),
