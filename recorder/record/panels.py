@@ -98,7 +98,7 @@ def bounded_actions(metadata: LogMetadata) -> list[Bounded]:
     units = itertools.chain(metadata.action_units, itertools.repeat(""))
     parts = zip(action_parts(metadata), ends, units, strict=False)
     return [
-        Bounded(name, index, *pair, unit.endswith("| left"))
+        Bounded(name, index, *pair, " | " in unit and unit.endswith("left"))
         for index, (name, pair, unit) in enumerate(parts)
         if all(map(math.isfinite, pair))
     ]
