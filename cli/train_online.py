@@ -87,7 +87,7 @@ def _tuned() -> dict[str, dict[str, Any]]:
     "--device",
     help="Train all seeds at once, with sims, replay buffers and networks on this device: cuda or"
     " cpu. For double-dqn in lane and racer, with other default settings; the last policy is saved."
-    " Without it, Stable-Baselines3 trains one seed after the other.",
+    " Without it, one seed is trained after the other.",
 )
 @click.option(
     "--max-steps",

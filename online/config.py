@@ -22,7 +22,6 @@ has the command and the scores of four seeds. Important settings are:
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final
@@ -134,9 +133,6 @@ class DQNConfig(OnlineConfig):
         return {
             **super().arguments(),
             **{name: getattr(self, name) for name in same},
-            # `sys.maxsize` disables SB3's own updates of the target network. A callback updates it
-            # instead.
-            **({"target_update_interval": sys.maxsize} if self.target_update_episodes else {}),
             "buffer_size": min(self.buffer_size, self.steps + self.envs),
             # SB3 counts calls of `step`; each call steps every environment.
             "train_freq": max(1, self.steps_per_update // self.envs),

@@ -12,8 +12,7 @@ killed between the two writes.
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
@@ -29,19 +28,16 @@ from mcaprl.offline.algorithms.heads import build_head
 from mcaprl.offline.algorithms.learner import NotFiniteError
 from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.policy import Policy, read_policy, save_policy
-from mcaprl.online.agent import BROKEN, Agent, center_images, is_due, read_checkpoint
+from mcaprl.online.agent import Agent, center_images, is_due
 from mcaprl.online.collector import Choice, VectorEnvironments
 from mcaprl.online.config import DoubleDQNConfig
 from mcaprl.online.engine import Agents
-from mcaprl.online.live import WATCHED, LiveTraining
+from mcaprl.online.live import WATCHED
 from mcaprl.online.replay import Outcome
-from mcaprl.online.task import Task
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.runs import CHECKPOINT_NAME, POLICY_NAME, broken_checkpoint
-from mcaprl.sims.evaluation.evaluate import Scale
+from mcaprl.runs import POLICY_NAME
 from mcaprl.sims.evaluation.rollout import episode_seed
-from mcaprl.storage.tensor_files import write_tensors
 
 _CHECKED = 64
 """Number of observations on which a copied network must produce the same values."""
@@ -55,73 +51,33 @@ class LearningAgent(Agent):
     """
 
     best_files = ("policy.safetensors", POLICY_NAME)
+    repeats_steps = True
 
-    def __init__(
-        self,
-        task: Task,
-        env_id: str,
-        folder: Path,
-        seed: int,
-        scale: Scale,
-        *,
-        record: Path | None = None,
-        resume: bool = False,
-        live: LiveTraining | None = None,
-    ) -> None:
-        """Create an agent, its environments, and its log; the arguments are those of `Agent`.
-
-        With `resume`, it continues from the folder's checkpoint, if there is one.
-
-        Raises:
-            TrainingError: The checkpoint belongs to another task, or is broken.
-        """
-        path = folder / CHECKPOINT_NAME
-        found = read_checkpoint(path, task) if resume and path.exists() else None
-        episodes = None
-        if resume:
-            episodes = 0 if found is None else found[1]["episodes_in_log"]
-        super().__init__(
-            task, env_id, folder, seed, scale, record=record, episodes=episodes, live=live
-        )
-        try:
-            self._encoder = self._make_encoder(None if found is None else found[0])
-            self.agents = self._make_agents()
-            if found is not None:
-                try:
-                    self._load(*found)
-                except BROKEN as error:
-                    raise broken_checkpoint(path, error) from error
-        except BaseException:
-            self.close()
-            raise
-
-    def _make_encoder(self, tensors: dict[str, Tensor] | None) -> ObservationEncoder:
-        """Return the encoder of a checkpoint, or a new one with the images of random steps."""
+    def _prepare(self, tensors: dict[str, Tensor] | None) -> None:
+        """Create the encoder, and an agent with new weights."""
         space: Any = self.env.single_observation_space
         encoder = ObservationEncoder(space, int(self.env.single_action_space.n))
         if tensors is not None:
             _load_normalization(encoder, tensors)
         elif self._task.config.center_images and encoder.image_inputs:
             center_images(encoder, self._task, self._seed)
-        return encoder
+        self._create(encoder)
 
-    def _make_agents(self) -> Agents:
-        config = cast(DoubleDQNConfig, self._task.config)
-        if config.image_shift and not self._encoder.image_inputs:
+    def _create(self, encoder: ObservationEncoder) -> None:
+        """Create an agent with new weights that observes through an encoder."""
+        config, actions = cast(DoubleDQNConfig, self._task.config), self.env.single_action_space
+        if config.image_shift and not encoder.image_inputs:
             raise UsageError("image_shift is for images, but the observations have none")
-        agents = Agents(
-            config,
-            self._encoder,
-            self.env.single_action_space,
-            [self._seed],
-            torch.device("cpu"),
-        )
-        self._environments = VectorEnvironments(self.env, self._encoder)
-        agents.connect(self._environments)
-        agents.collector.before_step = self._before_step
+        self._encoder = encoder
+        self.agents = Agents(config, encoder, actions, [self._seed], torch.device("cpu"))
+        self._environments = VectorEnvironments(self.env, encoder)
+        self.agents.connect(self._environments)
+        self.agents.collector.before_step = self._before_step
         self._choice: Choice | None = None
-        self._show(self)
-        return agents
+        self.__dict__.pop("policy", None)
+
+    def _shown(self) -> LearningAgent:
+        return self
 
     @property
     def steps(self) -> int:
@@ -167,9 +123,7 @@ class LearningAgent(Agent):
         """Copy the network and the normalization of a policy."""
         _check_fits(policy, self._encoder.space, self._task.config.frame_stack)
         if type(policy.encoder) is ObservationEncoder:
-            self._encoder = policy.encoder
-            self.agents = self._make_agents()
-            self.__dict__.pop("policy", None)
+            self._create(policy.encoder)
         theirs, learner = policy.head.networks["q"], self.agents.learner
         ours = learner.network("q", self._seed)
         if _weights_of(theirs) != _weights_of(ours):
@@ -233,36 +187,26 @@ class LearningAgent(Agent):
             self._recorder.policy_version = self.agents.learner.step
             self._recorder.behavior_probs = choice.probabilities().numpy()
 
-    def _save_policy(self) -> None:
-        """Write the current policy."""
+    def save_policy(self, folder: Path) -> None:
+        """Write the current policy into a folder."""
         learner = self.agents.learner
-        save_policy(self._folder, learner, self._seed, self._env_id, self._task.sim_options)
+        save_policy(folder, learner, self._seed, self._env_id, self._task.sim_options)
 
-    def _save(self) -> None:
-        """Replace the checkpoint."""
+    def _state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Return the state for a checkpoint, as tensors and as JSON values."""
         episodes = self._environments.episodes
-        description = {
-            **self._task.identity.parts,
-            "counters": self.agents.counters(),
-            "episodes_in_log": self._recorder.episodes if self._recorder is not None else 0,
-            "episodes": [episodes.count, list(episodes.returns), list(episodes.lengths)],
-            "points": [asdict(point) for point in self.points],
-        }
-        tensors = {
-            **self.agents.state(),
-            **_normalization_of(self._encoder),
-            **self._best_content(),
-        }
-        write_tensors(self._checkpoint, tensors, description)
+        tensors = {**self.agents.state(), **_normalization_of(self._encoder)}
+        finished = [episodes.count, list(episodes.returns), list(episodes.lengths)]
+        return tensors, {"counters": self.agents.counters(), "episodes": finished}
 
     def _load(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
-        """Restore a checkpoint."""
+        """Restore what `_state` returned."""
         self.agents.load_state(tensors, description["counters"])
         count, returns, lengths = description["episodes"]
         episodes = self._environments.episodes
         episodes.count = int(count)
-        episodes.returns, episodes.lengths = deque(returns, 100), deque(lengths, 100)
-        self._restore_best(tensors, description["points"])
+        episodes.returns.extend(returns)
+        episodes.lengths.extend(lengths)
 
     # What the live view shows.
 
