@@ -13,7 +13,7 @@ rm -rf "$out/runs"
 export OMP_NUM_THREADS=1
 
 case ${2:-commands} in
-  commands) actions=continuous exploration="--noise 0.1" mapping=robot.yaml algo=iql ;;
+  commands) actions=continuous exploration="--noise 0.1 --noise-per-episode" mapping=robot.yaml algo=iql ;;
   buttons) actions=discrete exploration="--epsilon 0.1" mapping=buttons.yaml algo=cql ;;
   *) echo "the second argument is 'buttons' or nothing" >&2 && exit 2 ;;
 esac
