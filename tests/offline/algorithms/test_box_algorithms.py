@@ -319,7 +319,7 @@ def test_an_algorithm_that_does_not_fit_names_those_that_do(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", ["bc", "iql"])
-def test_a_name_stands_for_the_algorithm_of_the_space(name: str) -> None:
+def test_a_name_selects_the_algorithm_of_the_space(name: str) -> None:
     assert choose_algorithm(name, space=BOX_LQ).learner_type is BOX_ALGORITHMS[name]
     assert choose_algorithm(name, space=spaces.Discrete(2)).learner_type is ALGORITHMS[name]
 
