@@ -216,7 +216,7 @@ def _describe(dataset: Dataset, warned: Sequence[str]) -> LogInfo:
             dataset.action_names.get(action, str(action)): count
             for action, count in statistics.action_counts.items()
         },
-        action_parts=list(dataset._description.action_labels()),
+        action_parts=list(dataset.action_labels),
         behavior_field=dataset.behavior_field.name,
         behavior_known=int((~np.isnan(dataset.behavior)).sum()),
         behavior_prob=calibration(dataset.behavior, dataset.action_space),

@@ -307,6 +307,14 @@ class Dataset(Conversions):
         return self._description.action_units
 
     @property
+    def action_labels(self) -> tuple[str, ...]:
+        """Names of a vector action's elements with their bounds and units; empty without names.
+
+        A label is such as `speed (0 to 2 m/s)`, or `steering (-1 right, 1 left)`.
+        """
+        return self._description.action_labels()
+
+    @property
     def action_commands(self) -> ActionCommands | None:
         """Commands that the discrete actions stand for, if the data is from a bag; else None.
 

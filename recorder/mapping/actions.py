@@ -26,6 +26,8 @@ class Actions(NamedTuple):
         meanings: Names of the discrete actions; empty if they have none.
         commands: (N, K) elements of the command: float64, 0 where missing, or texts of a `field`.
         fields: Path or expression of each element of the command.
+        names: Name of each element, such as `linear.x`.
+        units: Unit of each element; empty texts if they are not known.
     """
 
     space: spaces.Space[Any]
@@ -35,6 +37,8 @@ class Actions(NamedTuple):
     meanings: tuple[str, ...]
     commands: NDArray[Any]
     fields: tuple[str, ...]
+    names: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
 
 
 class CommandPart(NamedTuple):
@@ -46,6 +50,8 @@ class CommandPart(NamedTuple):
         missing: (N,) bool: whether there is no value.
         names: Names of the K elements; empty if they have none.
         path: Path of the field, or the expression.
+        label: Path in the message, or the expression.
+        unit: Unit of the values; empty if unknown.
     """
 
     name: str
@@ -53,6 +59,15 @@ class CommandPart(NamedTuple):
     missing: NDArray[np.bool_]
     names: tuple[str, ...] = ()
     path: str = ""
+    label: str = ""
+    unit: str = ""
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the elements in the message, or of the single value."""
+        if self.values.ndim == 1:
+            return (self.label,)
+        return self.names or tuple(f"{self.label}[{k}]" for k in range(self.values.shape[1]))
 
     @property
     def elements(self) -> tuple[str, ...]:
@@ -86,7 +101,7 @@ def actions_of(action: Action, commands: Sequence[CommandPart]) -> Actions:
     if action.box is not None:
         low, high = (
             np.broadcast_to(np.array(each, np.float32), numbers.shape[1])
-            for each in (action.box.low, action.box.high)
+            for each in action.box.ends
         )
         # The limits are float32, so a command that equals its limit may be beyond it in float64.
         with np.errstate(over="ignore"):
@@ -94,7 +109,20 @@ def actions_of(action: Action, commands: Sequence[CommandPart]) -> Actions:
         far = ((rounded < low) | (rounded > high)).any(axis=1) & ~missing
         kept = np.clip(rounded, low, high)
         box = spaces.Box(low.copy(), high.copy())
-        return Actions(box, kept, missing, far, (), numbers, fields)
+        names = tuple(label for part in commands for label in part.labels)
+        units = tuple(part.unit for part in commands for _ in part.labels)
+        return Actions(
+            box,
+            kept,
+            missing,
+            far,
+            (),
+            numbers,
+            fields,
+            # The same fields of several topics need the names of the topics.
+            names if len(set(names)) == len(names) else fields,
+            tuple(action.units) or units,
+        )
     if action.actions:
         values, distance = _nearest(numbers, np.array(list(action.actions.values()), np.float64))
         far = (distance > action.far) & ~missing

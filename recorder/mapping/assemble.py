@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import itertools
-from typing import Any, NamedTuple
+import warnings
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -22,7 +23,7 @@ from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import MAX_NUMBERED_ACTIONS, LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of
 from mcaprl.recorder.mapping.align import NS_PER_S
-from mcaprl.recorder.mapping.config import Action, Quantity
+from mcaprl.recorder.mapping.config import Action, Limits, Quantity
 from mcaprl.recorder.mapping.paths import as_numbers
 from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.runs import Segment
@@ -172,6 +173,8 @@ def assembled(
         return None
     actions = np.concatenate([run.actions.values for run in runs])[steps]
     space, meanings = _common_space([run.actions.space for run in runs]), runs[0].actions.meanings
+    if (box := plan.mapping.action.box) is not None:
+        space = _limited(box, cast(spaces.Box, space), actions, runs[0].actions.names)
     with plan.place.named("action", "representatives"):
         logged = np.concatenate([run.actions.commands for run in runs])[steps]
         fields = runs[0].actions.fields
@@ -183,6 +186,8 @@ def assembled(
         observation_names=observed.names,
         action_meanings=meanings,
         action_commands=commands,
+        action_part_names=runs[0].actions.names,
+        action_units=runs[0].actions.units if any(runs[0].actions.units) else (),
         step_duration_ns=_step_ns(plan, times),
         policy=plan.mapping.meta.policy,
     )
@@ -380,6 +385,23 @@ def _repeated(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
     assert isinstance(space, spaces.Box), "all parts are Boxes"
     low, high = (np.concatenate([limit] * count, axis=-1) for limit in (space.low, space.high))
     return spaces.Box(low, high, dtype=space.dtype.type)
+
+
+def _limited(box: Limits, space: spaces.Box, actions: Array, names: tuple[str, ...]) -> spaces.Box:
+    """Return a space with the limits of the actions (N, K) where the mapping has none."""
+    low = actions.min(axis=0) if box.low is None else space.low
+    high = actions.max(axis=0) if box.high is None else space.high
+    if box.low is None or box.high is None:
+        found = ", ".join(
+            f"{name} from {least:g} to {most:g}"
+            for name, least, most in zip(names, low, high, strict=True)
+        )
+        warnings.warn(
+            f"the limits of the action are those of this data: {found}; give `box` a low and a"
+            " high, because other data may have others",
+            stacklevel=5,
+        )
+    return spaces.Box(low, high)
 
 
 def _common_space(found: list[spaces.Space[Any]]) -> spaces.Space[Any]:

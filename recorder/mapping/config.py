@@ -249,16 +249,20 @@ def _check_names(names: str | list[str] | None, names_from: str | None) -> None:
 class Limits(_Part):
     """Limits of continuous actions."""
 
-    low: float | list[float] = Field(
-        description="Lowest value of each element of the command, or of all of them."
+    low: float | list[float] | None = Field(
+        default=None,
+        description="Lowest value of each element of the command, or of all of them; without it,"
+        " the lowest of the transitions, with a warning.",
     )
-    high: float | list[float] = Field(
-        description="Highest value of each element of the command, or of all of them."
+    high: float | list[float] | None = Field(
+        default=None,
+        description="Highest value of each element of the command, or of all of them; without it,"
+        " the highest of the transitions, with a warning.",
     )
 
     @model_validator(mode="after")
     def _are_in_order(self) -> Limits:
-        low, high = (each if isinstance(each, list) else [each] for each in (self.low, self.high))
+        low, high = (each if isinstance(each, list) else [each] for each in self.ends)
         if min(len(low), len(high)) != 1 and len(low) != len(high):
             raise ValueError(f"low has {len(low)} entries, but high has {len(high)}")
         count = max(len(low), len(high))
@@ -271,6 +275,12 @@ class Limits(_Part):
                     f"low must not be above high: entry {number} is {least:g}, {most:g}"
                 )
         return self
+
+    @property
+    def ends(self) -> tuple[float | list[float], float | list[float]]:
+        """Lowest and highest values; infinite where the mapping has none."""
+        low = -math.inf if self.low is None else self.low
+        return low, math.inf if self.high is None else self.high
 
 
 class Action(_Part):
@@ -307,7 +317,14 @@ class Action(_Part):
         " combination of bins, one for each element.",
     )
     box: Limits | None = Field(
-        default=None, description="Limits of a Box action; commands are clipped to them."
+        default=None,
+        description="Limits of a Box action; commands are clipped to them. `{}` takes the limits"
+        " from the data.",
+    )
+    units: list[str] = Field(
+        default=[],
+        description="With `box`: unit of each element of the command, such as `m/s`. Default: those"
+        " of common types of messages, such as Twist and AckermannDrive.",
     )
     representatives: (
         dict[str, CommandValue | list[CommandValue]] | list[CommandValue | list[CommandValue]]
@@ -350,6 +367,8 @@ class Action(_Part):
         if self.selected is not None and given != ["fields"]:
             raise ValueError("a list of names is for `fields`")
         _check_names(self.selected, self.names_from)
+        if self.units and self.box is None:
+            raise ValueError("units are for a command with box")
         if self.representatives and self.box is not None:
             raise ValueError("representatives are for discrete actions, not for box")
         least = len(self.fields or self.expressions)
@@ -379,6 +398,8 @@ class Action(_Part):
         found = [(f"the command '{name}'", len(each)) for name, each in self.actions.items()]
         if self.edges:
             found.append(("edges", len(self.edges)))
+        if self.units:
+            found.append(("units", len(self.units)))
         for name in ("low", "high"):
             limit = getattr(self.box, name, None)
             if isinstance(limit, list):

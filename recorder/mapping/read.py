@@ -113,8 +113,22 @@ def _read(plan: Plan, images: Storage) -> MappedBag | None:
     tree = mapping.model_dump(mode="json", by_alias=True)
     if commands is not None and None not in commands.commands:
         tree["action"]["representatives"] = commands.to_json()["commands"]
-    dataset.origin = replace(dataset.origin, mapping=tree, report=report)
+    if isinstance(space := dataset.action_space, spaces.Box):
+        found = {"low": space.low.tolist(), "high": space.high.tolist()}
+        given = {name: each for name, each in tree["action"]["box"].items() if each is not None}
+        tree["action"]["box"] = {**found, **given}
+        report = replace(report, action_parts=list(dataset.action_labels))
+    dataset.origin = replace(dataset.origin, mapping=_json_of(tree), report=report)
     return MappedBag(dataset, report)
+
+
+def _json_of(tree: Any) -> Any:
+    """Return keys and values with infinite numbers as texts, because JSON lacks them."""
+    if isinstance(tree, dict):
+        return {key: _json_of(each) for key, each in tree.items()}
+    if isinstance(tree, list):
+        return [_json_of(each) for each in tree]
+    return str(tree) if isinstance(tree, float) and math.isinf(tree) else tree
 
 
 def _longest(kept: list[list[Segment]], recordings: list[int]) -> list[list[Segment]]:

@@ -34,6 +34,7 @@ from mcaprl.recorder.mapping.runs import (
     runs_of,
     segments,
 )
+from mcaprl.recorder.mapping.units import unit_of
 
 _Times = NDArray[np.int64]
 
@@ -393,12 +394,18 @@ class StepReader:
                 found = found._replace(values=numbers)
             elif found.values.dtype.kind != "O":
                 found = found._replace(values=self._scalars(wanted, found))
-            commands.append(_command(wanted, found))
+            commands.append(_command(wanted, found, plan.bag.topics[wanted.source.topic].type_name))
         for place, expression in enumerate(plan.expressions):
             with plan.place.named("action", "expressions", place):
                 values = expression.evaluate(columns, following).astype(np.float64)
             commands.append(
-                CommandPart(expression.text, values, np.isnan(values), path=expression.text)
+                CommandPart(
+                    expression.text,
+                    values,
+                    np.isnan(values),
+                    path=expression.text,
+                    label=expression.text,
+                )
             )
         with plan.place.named("action"):
             return actions_of(action, commands)
@@ -429,10 +436,19 @@ class StepReader:
         return usable
 
 
-def _command(wanted: Wanted, found: Values) -> CommandPart:
+def _command(wanted: Wanted, found: Values, type_name: str) -> CommandPart:
     """Return a field of the command, named by the last part of its path."""
     path, names = wanted.source.path, wanted.quantity.names
     assert path is not None, "commands are fields"
     whole = path._replace(elements=None) if isinstance(path.elements, slice) else path
     word = str(whole).rpartition(".")[2]
-    return CommandPart(word, found.values, found.missing, tuple(names or ()), str(path))
+    label = str(path).removeprefix(wanted.source.topic).lstrip(".")
+    return CommandPart(
+        word,
+        found.values,
+        found.missing,
+        tuple(names or ()),
+        str(path),
+        label,
+        unit_of(type_name, label),
+    )

@@ -302,6 +302,7 @@ class MappingReport:
         far_actions: Share of the transitions whose command is far from every named action, or
             beyond the limits of the Box.
         action_counts: Number of transitions of each discrete action, by name or number.
+        action_parts: Elements of a Box action, with their limits and units.
         images: Problems of the images: messages that were left out, and guesses of their meaning.
         rounded: Digits that observed quantities and the action lose as float32, by name.
         commands: Command of each discrete action, by name or number of the action.
@@ -322,6 +323,7 @@ class MappingReport:
     missing_actions: float
     far_actions: float
     action_counts: dict[str, int]
+    action_parts: list[str] = dataclass_field(default_factory=list)
     images: list[Problem] = dataclass_field(default_factory=list)
     rounded: dict[str, Rounding] = dataclass_field(default_factory=dict)
     commands: dict[str, Command | None] = dataclass_field(default_factory=dict)
@@ -372,8 +374,13 @@ class MappingReport:
             what = f"{self.missing_actions:.0%} of the steps have no action"
             found.append(Problem(what, "action", next="check the topic and `align`"))
         if self.far_actions > _MUCH:
-            what = f"{self.far_actions:.0%} of the commands are far from every named action"
-            found.append(Problem(what, "action", next="name more commands, or use `edges`"))
+            what = f"{self.far_actions:.0%} of the commands are"
+            if self.action_parts:
+                what = f"{what} beyond the limits of {', '.join(self.action_parts)}"
+                found.append(Problem(what, "action", next="set wider limits in `box`"))
+            else:
+                what = f"{what} far from every named action"
+                found.append(Problem(what, "action", next="name more commands, or use `edges`"))
         if sum(self.dropped) > _MUCH * (self.steps + sum(self.dropped)):
             episodes = counted(len(self.dropped), "short episode")
             what = f"{episodes} with {counted(sum(self.dropped), 'step')} left out"
@@ -396,9 +403,12 @@ class MappingReport:
         if self.action_counts:
             actions = ", ".join(f"{count} {name}" for name, count in self.action_counts.items())
             rows.append(("actions", actions))
+        if self.action_parts:
+            rows.append(("action", ", ".join(self.action_parts)))
         if self.commands:
             rows.append(("commands", _listed(self.commands)))
-        return [*rows, ("far commands", f"{self.far_actions:.1%}")]
+        far = "commands beyond the limits" if self.action_parts else "far commands"
+        return [*rows, (far, f"{self.far_actions:.1%}")]
 
     def why_empty(self) -> str:
         """Return why there are no episodes, in one line."""
