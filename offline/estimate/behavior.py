@@ -23,8 +23,7 @@ from mcaprl.errors import UsageError
 from mcaprl.offline.algorithms.bc import BC
 from mcaprl.offline.algorithms.config import BCConfig
 from mcaprl.offline.algorithms.models import outputs_of_buffer
-from mcaprl.offline.batches.buffer import TransitionBuffer
-from mcaprl.offline.estimate.importance import check_space
+from mcaprl.offline.batches.buffer import TransitionBuffer, discrete_actions
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.statistics import EDGES
 
@@ -142,7 +141,7 @@ def estimate_behavior(
         TrainingError: There are no transitions, or a number is not finite.
         UsageError: There are fewer than two folds, or too few episodes for them.
     """
-    check_space(dataset.action_space)
+    discrete_actions(dataset.action_space, "estimating behavior_prob")
     count = len(dataset.episode_lengths)
     if folds < 2 or updates < 1:
         raise UsageError(

@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 
 from mcaprl.base_policy import BasePolicy, RandomPolicy
 from mcaprl.errors import SpaceError, UsageError
-from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline.batches.buffer import TransitionBuffer, discrete_actions
 from mcaprl.offline.estimate.fqe import FQE, FQEConfig
 from mcaprl.offline.estimate.importance import (
     ESTIMATORS,
     EpisodeTable,
     Floats,
     RatioEstimate,
-    check_space,
     effective_sample_size,
     mean_weight,
 )
@@ -119,7 +118,7 @@ class OffPolicyEvaluator:
             TrainingError: There are no transitions, or a number is not finite.
             UsageError: There are too few episodes for cross-fitting.
         """
-        check_space(dataset.action_space)
+        discrete_actions(dataset.action_space, "evaluation from the log alone")
         self._config = config or FQEConfig()
         self._seed = seed
         self._dataset = dataset

@@ -77,7 +77,7 @@ class Bounded(NamedTuple):
     """An element of a Box action with finite bounds."""
 
     name: str
-    index: int
+    element: int
     low: float
     high: float
     is_leftward: bool
