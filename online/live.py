@@ -118,7 +118,7 @@ class LiveTraining:
         with closing(self._shown):
             self.stream.close()
 
-    def _source_of(self, batch: Any) -> Callable[[int | None], object]:
+    def _source_of(self, batch: Any) -> Callable[[object], object]:
         """Return a function that maps the last action to the object whose scene is shown.
 
         The action is that of the watched environment, or None after a reset. The function returns
@@ -127,7 +127,7 @@ class LiveTraining:
         single = self._shown.unwrapped
         if isinstance(batch, BatchedEnv) and isinstance(single, VehicleEnv):
 
-            def imitate(action: int | None) -> object:
+            def imitate(action: object) -> object:
                 single.imitate(batch.fleet, WATCHED, action)
                 return single
 
@@ -150,7 +150,7 @@ class WatchedBatch(VectorWrapper):
         env: VectorEnv[Any, Any, Any],
         stream: LiveStream,
         algo: str,
-        source: Callable[[int | None], object],
+        source: Callable[[object], object],
     ) -> None:
         """Wrap `env`, and store the source of the scene.
 
@@ -162,7 +162,7 @@ class WatchedBatch(VectorWrapper):
         self.score = math.nan
         self._stream, self._algo, self._source = stream, algo, source
         self._observations: Any = None
-        self._last_action: int | None = None
+        self._last_action: NDArray[Any] | None = None
         self._episode = -1
         self._begin_episode()
 
@@ -194,7 +194,7 @@ class WatchedBatch(VectorWrapper):
                 **before,
             )
             self._is_shown = stream.show(step)
-        self._observations, self._last_action = observations, int(actions[WATCHED])
+        self._observations, self._last_action = observations, np.copy(actions[WATCHED])
         self._step += 1
         self._return_so_far += float(rewards[WATCHED])
         if any(ends):
