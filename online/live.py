@@ -11,8 +11,10 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from gymnasium.vector import SyncVectorEnv, VectorEnv
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.frames import rows_of
