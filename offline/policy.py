@@ -349,16 +349,9 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
     check_actions(action_space)
     joint = joint_actions(action_space)
     box = _box(action_space, description.action_range)
-    encoder = ObservationEncoder(observation_space, joint.count if joint else 0)
-    encoder.shift = weights.pop("observation.shift").numpy()
-    encoder.scale = weights.pop("observation.scale").numpy()
-    if not (encoder.scale > 0).all():
-        raise ValueError("observation.scale is not positive")
     stack = description.frame_stack
     check_elements(stack * sum(leaf.size for leaf in observation_leaves(observation_space)))
-    encoder.image_inputs = [
-        _image_input(image, number, weights) for number, image in enumerate(encoder.image_inputs)
-    ]
+    encoder = _encoder(observation_space, joint.count if joint else 0, weights)
     images = [image.stacked(stack) for image in encoder.image_inputs]
     log_std = weights.pop(LOG_STD, None)
     if log_std is not None and (box is None or log_std.shape != (box.size,)):
@@ -393,6 +386,21 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
         else ActionCommands.from_json(commands, joint.count),
         mask_from=mask_from,
     )
+
+
+def _encoder(
+    space: spaces.Space[Any], actions: int, weights: dict[str, Tensor]
+) -> ObservationEncoder:
+    """Return an encoder with the normalization that is in `weights`, which is removed there."""
+    encoder = ObservationEncoder(space, actions)
+    encoder.shift = weights.pop("observation.shift").numpy()
+    encoder.scale = weights.pop("observation.scale").numpy()
+    if not (encoder.scale > 0).all():
+        raise ValueError("observation.scale is not positive")
+    encoder.image_inputs = [
+        _image_input(image, number, weights) for number, image in enumerate(encoder.image_inputs)
+    ]
+    return encoder
 
 
 def _box(action_space: spaces.Space[Any], action_range: Any) -> BoxActions | None:

@@ -110,15 +110,7 @@ def train(
     cluster.check()
     out = Path(out)
     if resume:
-        earlier = run_to_resume(out)
-        check_kind(out, earlier, "offline")
-        was = earlier.get("algo", algo)
-        if getattr(algo, "name", algo) not in (None, was):
-            raise UsageError(
-                f"{out} is a run of {was}: resume it without algo, or choose another folder"
-            )
-        algo = algo or was
-        settings = {**settings_from_json(earlier.get("config")), **settings}
+        algo, settings = _resumed(out, algo, settings)
     numbers = choose_seeds(out, seeds, seed, resume)
     if algo == AUTO:
         check_settings(algo, AutoConfig, settings)
@@ -154,6 +146,20 @@ def train(
 def _refuse_arguments_of_open(settings: Mapping[str, Any]) -> None:
     for name in _OF_OPEN & settings.keys():
         raise UsageError(f"`{name}=` is an argument of mcaprl.open: pass what it returns as data")
+
+
+def _resumed(
+    out: Path, algo: str | type[Learner] | None, settings: Mapping[str, Any]
+) -> tuple[str | type[Learner], dict[str, Any]]:
+    """Return the algorithm and the settings of the run in `out`, with those that are given."""
+    earlier = run_to_resume(out)
+    check_kind(out, earlier, "offline")
+    was = earlier.get("algo", algo)
+    if getattr(algo, "name", algo) not in (None, was):
+        raise UsageError(
+            f"{out} is a run of {was}: resume it without algo, or choose another folder"
+        )
+    return algo or was, {**settings_from_json(earlier.get("config")), **settings}
 
 
 def train_online(
