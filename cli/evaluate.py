@@ -156,53 +156,14 @@ def _refuse_unused(given: dict[str, Any], names: Sequence[str], needed: str) -> 
 
 
 def _print_scores(found: Evaluation) -> None:
-    from mcaprl.sims.evaluation.statistics import interquartile_mean
-
-    rows = []
-    if (logged := found.behavior) is not None:
-        rows.append(
-            [
-                "behavior, as logged",
-                f"{logged.mean_return:.2f}",
-                _interval(logged.interval),
-                "",
-                _score(logged.normalized_score),
-                "",
-                counted(logged.episodes, "episode"),
-            ]
-        )
-    rows += [
-        [
-            score.policy,
-            f"{score.mean_return:.2f}",
-            _interval(score.interval),
-            f"{float(interquartile_mean(score.returns)):.2f}",
-            _score(score.normalized_score),
-            "" if score.success_rate is None else f"{score.success_rate:.0%}",
-            ", ".join(f"{count} {reason}" for reason, count in score.ends.items()),
-        ]
-        for score in found.policies
-    ]
-    columns = [
-        "policy",
-        "mean return",
-        "95 % interval",
-        "IQM",
-        "random 0, pilot 1",
-        "success",
-        "ends",
-    ]
-    changes = [score.command_change for score in found.policies]
-    if any(change is not None for change in changes):
-        columns.append("change a step")
-        texts = ["" if change is None else f"{change:.3g}" for change in changes]
-        first = len(rows) - len(texts)
-        rows = [row + ([texts[k - first]] if k >= first else [""]) for k, row in enumerate(rows)]
+    rows = _score_rows(found)
+    # Discrete actions have no change of the command.
+    columns = [name for name in rows[-1] if any(row.get(name) is not None for row in rows)]
     episodes = found.policies[0].returns.shape[1]
     print_table(
         f"{found.sim}: {counted(episodes, 'episode')} for each policy and training seed",
         columns,
-        rows,
+        [[row.get(name) or "" for name in columns] for row in rows],
     )
     if not found.improvements:
         return
@@ -214,6 +175,38 @@ def _print_scores(found: Evaluation) -> None:
             for one in found.improvements
         ],
     )
+
+
+def _score_rows(found: Evaluation) -> list[dict[str, str | None]]:
+    """Return the cells of the table by column, for the behavior in a log and for each policy."""
+    from mcaprl.sims.evaluation.statistics import interquartile_mean
+
+    rows: list[dict[str, str | None]] = []
+    if (logged := found.behavior) is not None:
+        rows.append(
+            {
+                "policy": "behavior, as logged",
+                "mean return": f"{logged.mean_return:.2f}",
+                "95 % interval": _interval(logged.interval),
+                "random 0, pilot 1": _score(logged.normalized_score),
+                "ends": counted(logged.episodes, "episode"),
+            }
+        )
+    for score in found.policies:
+        rate, change = score.success_rate, score.command_change
+        rows.append(
+            {
+                "policy": score.policy,
+                "mean return": f"{score.mean_return:.2f}",
+                "95 % interval": _interval(score.interval),
+                "IQM": f"{float(interquartile_mean(score.returns)):.2f}",
+                "random 0, pilot 1": _score(score.normalized_score),
+                "success": "" if rate is None else f"{rate:.0%}",
+                "ends": ", ".join(f"{count} {reason}" for reason, count in score.ends.items()),
+                "change a step": None if change is None else f"{change:.3g}",
+            }
+        )
+    return rows
 
 
 def _print_estimates(found: LogEstimates) -> None:
