@@ -154,7 +154,7 @@ def _resumed(
     """Return the algorithm and the settings of the run in `out`, with those that are given."""
     earlier = run_to_resume(out)
     check_kind(out, earlier, "offline")
-    was = earlier.get("algo", algo)
+    was: Any = earlier.get("algo", algo)
     if getattr(algo, "name", algo) not in (None, was):
         raise UsageError(
             f"{out} is a run of {was}: resume it without algo, or choose another folder"
