@@ -13,6 +13,7 @@ from mcaprl.cli.completion import Name, sims
 from mcaprl.cli.help import WITH_LOSSES, Command
 from mcaprl.cli.options import (
     PATH,
+    actions_option,
     bag_options,
     bag_reader,
     env_arg_option,
@@ -133,6 +134,7 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
     type=click.Path(path_type=Path),
     help="JSON file to write; - for the standard output.",
 )
+@actions_option
 @env_arg_option
 @keys_option
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")

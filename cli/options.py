@@ -94,7 +94,20 @@ def sim_options(command: F) -> F:
     """Add the options that select the variant of a sim."""
     text = "Observation that the sim returns: state, depth, ..."
     rules = click.option("--rules", help="Rules of the sim: default, classic, ...")
-    return click.option("--observation", help=text)(rules(env_arg_option(command)))
+    found = rules(actions_option(env_arg_option(command)))
+    return click.option("--observation", help=text)(found)
+
+
+def _kind(_: click.Context, __: click.Parameter, text: str | None) -> str | int | None:
+    return int(text) if text is not None and text.isdecimal() else text
+
+
+actions_option = click.option(
+    "--actions",
+    metavar="KIND",
+    callback=_kind,
+    help="Actions of the sim: discrete, continuous, ...",
+)
 
 
 def env_arguments(texts: Iterable[str]) -> dict[str, Any] | None:

@@ -47,6 +47,20 @@ def _compressions() -> Iterable[str]:
     type=click.FloatRange(0, 1),
     help="Probability of a random action instead of the policy's.",
 )
+@click.option(
+    "--noise",
+    default=0.0,
+    show_default=True,
+    metavar="S",
+    type=click.FloatRange(0, 1),
+    help="Standard deviation of Gaussian noise on continuous actions, as a fraction of half their"
+    " range.",
+)
+@click.option(
+    "--noise-per-episode",
+    is_flag=True,
+    help="Draw the deviation of each episode uniformly between 0 and --noise.",
+)
 @click.option("--episodes", type=click.IntRange(1), help="Number of episodes to record.")
 @click.option(
     "--steps",

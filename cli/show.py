@@ -71,7 +71,7 @@ def _option(name: str, value: str) -> str:
 
 
 def _env_option(name: str, value: object) -> str:
-    if name in ("observation", "rules") and isinstance(value, str):
+    if name in ("observation", "rules", "actions") and isinstance(value, str):
         return f"--{name} {shlex.quote(value)}"
     return f"--env-arg {shlex.quote(f'{name}={json.dumps(value)}')}"
 

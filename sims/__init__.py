@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from mcaprl.sims.drawing.camera import lens
     from mcaprl.sims.drawing.depth import DepthCamera, encode_depth
     from mcaprl.sims.evaluation.evaluate import PolicyScore, Scale, evaluate, normalize
+    from mcaprl.sims.evaluation.noise import NoisyPolicy
     from mcaprl.sims.evaluation.pilots import make_pilot
     from mcaprl.sims.evaluation.rollout import EpsilonGreedy, episode_seed, rollout
     from mcaprl.sims.lane.camera import CarCamera
@@ -194,6 +195,7 @@ __all__ = [
     "DeviceSims",
     "EpsilonGreedy",
     "LaneKeepingEnv",
+    "NoisyPolicy",
     "Policy",
     "PolicyScore",
     "Scale",
@@ -218,6 +220,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.sims.drawing.depth": ("DepthCamera", "encode_depth"),
         "mcaprl.base_policy": ("BasePolicy as Policy",),
         "mcaprl.sims.evaluation.evaluate": ("PolicyScore", "Scale", "evaluate", "normalize"),
+        "mcaprl.sims.evaluation.noise": ("NoisyPolicy",),
         "mcaprl.sims.evaluation.pilots": ("make_pilot",),
         "mcaprl.sims.evaluation.rollout": ("EpsilonGreedy", "episode_seed", "rollout"),
         "mcaprl.sims.lane.camera": ("CarCamera",),

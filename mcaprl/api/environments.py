@@ -21,17 +21,20 @@ _MAX_SHOWN = 200
 
 
 def all_options(
-    observation: str | None, rules: str | None, others: Mapping[str, Any] | None
+    observation: str | None,
+    rules: str | None,
+    actions: str | int | None,
+    others: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """Return the arguments of a sim, except arguments that are None.
 
     Raises:
         UsageError: An argument is given twice.
 
-    >>> all_options("depth", None, {"road": "racetrack-v0"})
+    >>> all_options("depth", None, None, {"road": "racetrack-v0"})
     {'observation': 'depth', 'road': 'racetrack-v0'}
     """
-    named = {"observation": observation, "rules": rules}
+    named = {"observation": observation, "rules": rules, "actions": actions}
     given = {name: value for name, value in named.items() if value is not None}
     for name in given.keys() & (others or {}).keys():
         raise UsageError(f"the argument {name} is given twice: pass it once")

@@ -198,6 +198,7 @@ def evaluate(
     seed: int = 1_000_000,
     observation: str | None = None,
     rules: str | None = None,
+    actions: str | int | None = None,
     sim_options: Mapping[str, Any] | None = None,
     trust_env: bool = False,
     behavior: Data | None = None,
@@ -226,6 +227,7 @@ def evaluate(
         seed: Seed of the episodes.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
+        actions: Actions of the sim, such as `continuous`.
         sim_options: Other arguments of the environment. Without any argument, the environment has
             the arguments with which `policies` were trained in it.
         trust_env: Whether the arguments of the training may be passed to environments other than
@@ -263,7 +265,7 @@ def evaluate(
         raise UsageError("`record=` needs one process: omit `ray=True`")
     if keys is not None and record is None:
         raise UsageError("`keys=` selects what `record=` writes: omit it, or pass `record=`")
-    given, options = by_name(policies), all_options(observation, rules, sim_options)
+    given, options = by_name(policies), all_options(observation, rules, actions, sim_options)
     paths = [policy for policy in given.values() if isinstance(policy, str)]
     options = trained_options(paths, sim, options, trust_env=trust_env)
     if ray:

@@ -7,6 +7,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from mcaprl.api.environments import all_options
 from mcaprl.errors import OutputExistsError, ReportError, UsageError
 from mcaprl.files import temporary_folder, write_json
 from mcaprl.recorder.format.reading import McapReader
@@ -21,6 +22,7 @@ def layout(
     source: str | Path,
     out: str | Path | None = None,
     *,
+    actions: str | int | None = None,
     sim_options: Mapping[str, Any] | None = None,
     keys: Sequence[str] | None = None,
     overwrite: bool = False,
@@ -30,7 +32,8 @@ def layout(
     Args:
         source: Path or URL of a log, short name of a sim, or Gymnasium id.
         out: JSON file to write; None to write nothing.
-        sim_options: Arguments of the environment.
+        actions: Actions of the sim, such as `continuous`.
+        sim_options: Other arguments of the environment.
         keys: Keys of the parts of a Dict or Tuple observation that the logs contain; default: all.
         overwrite: Whether an existing file is replaced.
 
@@ -49,10 +52,10 @@ def layout(
     name = str(source)
     is_file = is_url(name) or Path(name).is_file() or name.endswith(".mcap")
     is_log = name not in SIMS and is_file
-    options = dict(sim_options or {})
+    options = all_options(None, None, actions, sim_options)
     if is_log and (options or keys is not None):
         raise UsageError(
-            f"{name} is a log, but `sim_options=` and `keys=` are for a sim: omit them"
+            f"{name} is a log, but `actions=`, `sim_options=` and `keys=` are for a sim: omit them"
         )
     found = attached_layout(McapReader(name)) if is_log else _layout_of_sim(name, options, keys)
     if path is not None:

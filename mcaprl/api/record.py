@@ -59,6 +59,8 @@ def record(
     *,
     policy: str | PathLike[str] | Actor = "pilot",
     epsilon: float = 0.0,
+    noise: float = 0.0,
+    noise_per_episode: bool = False,
     episodes: int | None = None,
     steps: int | None = None,
     max_steps: int | None = None,
@@ -66,6 +68,7 @@ def record(
     envs: int = 1,
     observation: str | None = None,
     rules: str | None = None,
+    actions: str | int | None = None,
     sim_options: Mapping[str, Any] | None = None,
     trust_env: bool = False,
     scene: bool = True,
@@ -92,6 +95,11 @@ def record(
             method `act(observations)` for batches of observations. Only policies of this package,
             and those with a true attribute `is_deterministic`, get a `behavior_prob`.
         epsilon: Probability of a random action instead of the policy's.
+        noise: Standard deviation of Gaussian noise that is added to each part of continuous
+            actions, as a fraction of half the range of the part. The noisy action is within the
+            bounds, by truncation of the distribution, and the log has its exact density.
+        noise_per_episode: Whether the standard deviation of each episode is drawn uniformly between
+            0 and `noise`.
         episodes: Number of episodes; exclusive with `steps`.
         steps: Number of steps; exclusive with `episodes`.
         max_steps: Steps after which an episode is truncated, with the reason `step_limit`. None
@@ -101,6 +109,7 @@ def record(
             `if __name__ == "__main__"`, because each process imports the script.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
+        actions: Actions of the sim, such as `continuous`.
         sim_options: Other arguments of the environment. Without any argument, a trained policy acts
             with the arguments of its training if that was in the same environment.
         trust_env: Whether the arguments of the training may be passed to environments other than
@@ -133,13 +142,15 @@ def record(
         ClusterError: The Ray cluster cannot be used.
         MissingExtraError: Ray is not installed.
     """
-    options = all_options(observation, rules, sim_options)
+    options = all_options(observation, rules, actions, sim_options)
     sim_name, ((shown, chosen),) = name_of(sim), by_name([policy]).items()
     request = FileRequest(
         sim=sim,
         out=Path(out),
         policy=chosen,
         epsilon=epsilon,
+        noise=noise,
+        noise_per_episode=noise_per_episode,
         episodes=episodes,
         steps=steps,
         seed=seed,
@@ -198,7 +209,9 @@ def record(
 def _check_request(request: FileRequest, envs: int) -> None:
     if (request.episodes is None) == (request.steps is None):
         raise UsageError("record needs either `episodes=N` or `steps=N`")
-    check_fraction(epsilon=request.epsilon)
+    check_fraction(epsilon=request.epsilon, noise=request.noise)
+    if request.noise_per_episode and not request.noise:
+        raise UsageError("`noise_per_episode=True` needs a largest deviation: pass `noise=S`")
     if request.rotate_mb is not None:
         check_positive(rotate_mb=request.rotate_mb)
     check_least(

@@ -16,6 +16,7 @@ from mcaprl.base_policy import BasePolicy
 from mcaprl.files import work_folder
 from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.record.wrapper import RecordMcap
+from mcaprl.sims.evaluation.noise import NoisyPolicy, noisy_name
 from mcaprl.sims.evaluation.rollout import (
     EpisodeResult,
     EpsilonGreedy,
@@ -37,6 +38,8 @@ class FileRequest:
     out: Path
     policy: str | BasePolicy
     epsilon: float
+    noise: float
+    noise_per_episode: bool
     episodes: int | None
     steps: int | None
     seed: int
@@ -55,9 +58,9 @@ class FileRequest:
     @property
     def policy_name(self) -> str:
         """Name of the policy in the log."""
-        if isinstance(self.policy, BasePolicy):
-            return self.policy.name
-        return policy_names([self.policy])[self.policy]
+        given = self.policy
+        name = given.name if isinstance(given, BasePolicy) else policy_names([given])[given]
+        return noisy_name(name, self.noise, per_episode=self.noise_per_episode)
 
 
 def record_file(
@@ -109,7 +112,10 @@ def _env(request: FileRequest) -> gym.Env[Any, Any]:
 
 
 def _behavior(request: FileRequest, env: gym.Env[Any, Any]) -> EpsilonGreedy:
-    return EpsilonGreedy(policies_of(request.policy, env)[0], request.epsilon, env.action_space)
+    policy, space = policies_of(request.policy, env)[0], env.action_space
+    if request.noise:
+        policy = NoisyPolicy(policy, request.noise, space, per_episode=request.noise_per_episode)
+    return EpsilonGreedy(policy, request.epsilon, space)
 
 
 def _recorder(request: FileRequest, env: gym.Env[Any, Any], behavior: EpsilonGreedy) -> RecordMcap:

@@ -177,6 +177,7 @@ def train_online(
     max_steps: int | None = None,
     observation: str | None = None,
     rules: str | None = None,
+    actions: str | int | None = None,
     sim_options: Mapping[str, Any] | None = None,
     on_live: Callable[[LiveAddress], None] = lambda address: None,
     progress: ProgressCallback = lambda now: None,
@@ -216,6 +217,7 @@ def train_online(
             environments without a time limit.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
+        actions: Actions of the sim, such as `continuous`.
         sim_options: Other arguments of the environment.
         on_live: Function called with the address once viewers can connect.
         progress: Function called repeatedly during training.
@@ -248,7 +250,7 @@ def train_online(
         if record is None:
             raise UsageError("upload needs record: there is no log to copy")
     out = Path(out)
-    options = all_options(observation, rules, sim_options)
+    options = all_options(observation, rules, actions, sim_options)
     if device is not None:
         if algo not in (None, "double-dqn"):
             raise UsageError(f"`device=` trains double-dqn only: omit `algo={algo!r}`")

@@ -22,6 +22,7 @@ from mcaprl.errors import PolicyError
 from mcaprl.frames import mapped
 from mcaprl.limits import STEP_LIMIT
 from mcaprl.sims import make_sim, make_sims
+from mcaprl.sims.evaluation.noise import NoisyPolicy
 
 DEFAULT_MAX_STEPS: Final = 27_000
 """Limit in environments without a time limit: half an hour of an Atari game, as in ALE's papers."""
@@ -177,6 +178,8 @@ class EpsilonGreedy:
 
     def begin(self, seed: int) -> None:
         """Start an episode: reset the policy's memory and seed the exploration."""
+        if isinstance(self.policy, NoisyPolicy):
+            self.policy.seed(seed)
         if self.policy is not None:
             self.policy.begin()
         self._random = np.random.default_rng([seed, 1])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -11,7 +10,8 @@ from mcaprl.sims.highway.course import Course
 from mcaprl.sims.highway.env import STEERING_RAD, HighwayLaneEnv
 from mcaprl.sims.vehicle.env import ScriptedPilot
 
-PURSUIT_M = 10.0
+PURSUIT_M, CONTINUOUS_PURSUIT_M = 10.0, 4.0
+"""Lookahead distance along the lane for discrete and continuous actions."""
 ROOM_M = 30.0
 """Free distance ahead below which the pilot changes to the lane with the most free distance."""
 BESIDE_M = 9.0
@@ -21,7 +21,7 @@ BESIDE_M = 9.0
 class HighwayPilot(ScriptedPilot[HighwayLaneEnv]):
     """Scripted driver of the highway-lane sim's car."""
 
-    def choose(self) -> Any:
+    def choose(self) -> int | list[float]:
         """Choose the action for the current state of the car.
 
         Let a point ahead be at distance d from the car, and l meters to the left of its heading.
@@ -30,12 +30,14 @@ class HighwayPilot(ScriptedPilot[HighwayLaneEnv]):
         1992.
         """
         car, course = self.sim.car, self._free_course()
+        is_continuous = self.sim.controls.commands is None
+        pursuit_m = CONTINUOUS_PURSUIT_M if is_continuous else PURSUIT_M
         along_m = course.nearest(car.x_m, car.y_m).along_m
-        forward_m, left_m = car.to_body_frame(course.point(along_m + PURSUIT_M))
+        forward_m, left_m = car.to_body_frame(course.point(along_m + pursuit_m))
         # In highway-env, the wheelbase equals the car's length.
         slip_sine = car.length_m * left_m / (forward_m**2 + left_m**2)
         wanted_rad = math.atan(2.0 * math.tan(math.asin(min(max(slip_sine, -1.0), 1.0))))
-        if self.sim.controls.commands is None:
+        if is_continuous:
             return [min(max(wanted_rad / self.sim.steering_range_rad, -1.0), 1.0)]
         return int(np.argmin(np.abs(STEERING_RAD - wanted_rad)))
 

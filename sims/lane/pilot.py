@@ -1,11 +1,12 @@
-"""Pilot of the lane sim: pure pursuit that brakes before corners.
+"""Pilots of the lane sim: pure pursuit that brakes before corners.
 
-If pure pursuit would end the episode, the pilot searches for a better action.
+If pure pursuit would end the episode, the pilot with discrete actions searches for a better action.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.bicycle import steering_of
@@ -15,50 +16,87 @@ from mcaprl.sims.lane.env import LaneKeepingEnv
 from mcaprl.sims.lane.rules import (
     ACTION_COMMANDS,
     BRAKE,
+    BRAKE_M_S2,
+    DECISION_S,
     DRIVING,
+    MAX_STEERING_RAD,
     SUBSTEP_S,
     SUBSTEPS,
     WHEELBASE_M,
     Car,
+    Command,
+    acceleration,
     drive,
     end_of,
     reward_of,
+    steering_share,
     wheel_angle,
 )
 from mcaprl.sims.vehicle.env import ScriptedPilot
 
-PURSUIT_M = 8.0
-PURSUIT_S = 0.4
-"""Lookahead distance along the path: 8 m plus 0.4 s times the speed."""
-CORNER_SPEED_M_S = 7.0
-CORNER_BRAKE_M_S2 = 1.5
-CORNER_EARLY_M = 2.0
-"""The pilot brakes with 1.5 m/s^2, so that the car reaches the corner speed 2 m before the
-corner."""
+
+class Gains(NamedTuple):
+    """Constants of a pilot."""
+
+    pursuit_m: float
+    pursuit_s: float
+    """The lookahead distance along the path is `pursuit_m` plus `pursuit_s` times the speed."""
+    corner_speed_m_s: float
+    corner_brake_m_s2: float
+    corner_early_m: float
+    """The pilot brakes so that the car reaches the corner speed this far before the corner."""
+
+
+GAINS = Gains(8.0, 0.4, 7.0, 1.5, 2.0)
+CONTINUOUS_GAINS = Gains(8.8, 0.5, 10.2, 7.6, 8.6)
 HORIZON = 12
 """Number of decisions in a plan (3 s by default). The episode must not end during a plan."""
 
 
 @compiled
-def pursue(car: Car) -> int:
-    """Choose an action by pure pursuit; brake for the next corner if necessary.
+def wanted_speed(car: Car, gains: Gains) -> float:
+    """Return the speed, m/s, from which the car can still brake for the next corner."""
+    leg = leg_at(COURSE, car.along_m)
+    corner_m = COURSE.along_m[leg + 1] - car.along_m % COURSE.length_m
+    slowing_m = max(0.0, corner_m - gains.corner_early_m)
+    return math.sqrt(gains.corner_speed_m_s**2 + 2.0 * gains.corner_brake_m_s2 * slowing_m)
+
+
+@compiled
+def pursuit_angle(car: Car, gains: Gains) -> float:
+    """Return the wheel angle, radians, of pure pursuit.
 
     Let a point ahead be at distance d from the car, and l meters to the left of its heading. The
     circle through this point that is tangent to the heading has the radius d^2 / (2 l). Coulter,
     "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01, 1992.
     """
-    leg = leg_at(COURSE, car.along_m)
-    corner_m = COURSE.along_m[leg + 1] - car.along_m % COURSE.length_m
-    slowing_m = max(0.0, corner_m - CORNER_EARLY_M)
-    if car.speed_m_s > math.sqrt(CORNER_SPEED_M_S**2 + 2.0 * CORNER_BRAKE_M_S2 * slowing_m):
-        return BRAKE
-    ahead_m = PURSUIT_M + PURSUIT_S * car.speed_m_s
+    ahead_m = gains.pursuit_m + gains.pursuit_s * car.speed_m_s
     x_m, y_m = point_at(COURSE, car.along_m + ahead_m)
     forward_m, left_m = in_body_frame(
         x_m - car.x_m, y_m - car.y_m, math.cos(car.yaw_rad), math.sin(car.yaw_rad)
     )
     slip_sine = WHEELBASE_M * left_m / (forward_m**2 + left_m**2)
-    wanted_rad = steering_of(min(max(slip_sine, -1.0), 1.0))
+    return steering_of(min(max(slip_sine, -1.0), 1.0))
+
+
+@compiled
+def steer(car: Car, gains: Gains = CONTINUOUS_GAINS) -> Command:
+    """Return the command of pure pursuit that reaches the wanted speed in one decision."""
+    lacking_m_s2 = (wanted_speed(car, gains) - car.speed_m_s) / DECISION_S
+    is_braking = lacking_m_s2 < 0.0
+    full_m_s2 = BRAKE_M_S2 if is_braking else acceleration(car.speed_m_s, 1.0)
+    pedal = lacking_m_s2 / max(full_m_s2, 1e-9)
+    full_rad = MAX_STEERING_RAD * steering_share(car.speed_m_s)
+    steering = pursuit_angle(car, gains) / full_rad
+    return Command(min(max(pedal, -1.0), 1.0), min(max(steering, -1.0), 1.0))
+
+
+@compiled
+def pursue(car: Car) -> int:
+    """Choose an action by pure pursuit; brake for the next corner if necessary."""
+    if car.speed_m_s > wanted_speed(car, GAINS):
+        return BRAKE
+    wanted_rad = pursuit_angle(car, GAINS)
     best, smallest_rad = BRAKE, math.inf
     for action in range(BRAKE + 1, len(ACTION_COMMANDS)):
         error_rad = abs(wheel_angle(ACTION_COMMANDS[action].steering, car.speed_m_s) - wanted_rad)
@@ -105,6 +143,8 @@ def choose(car: Car, substeps: int = SUBSTEPS) -> int:
 class LanePilot(ScriptedPilot[LaneKeepingEnv]):
     """Scripted driver of the lane sim's car."""
 
-    def choose(self) -> int:
+    def choose(self) -> int | Command:
         """Choose the action for the current state of the car."""
+        if self.sim.controls.commands is None:
+            return steer(self.sim.car)
         return choose(self.sim.car, round(self.sim.step_duration_s / SUBSTEP_S))

@@ -127,22 +127,29 @@ def store_car(car: Car, row: NDArray[np.float64]) -> None:
 
 
 @inlined
-def slip(steering: float, speed_m_s: float) -> float:
-    """Return the sine of the car's slip angle for a steering command at a speed.
+def steering_share(speed_m_s: float) -> float:
+    """Return the maximum steering angle at a speed, as a fraction of 40 degrees.
 
-    The maximum steering angle falls from 40 degrees at rest to 36 degrees at 20 km/h, 32 degrees
-    at 60 km/h and 28 degrees at 120 km/h. The slip angle is limited so that the lateral
-    acceleration is at most 9 m/s^2.
+    It falls from 40 degrees at rest to 36 degrees at 20 km/h, 32 degrees at 60 km/h and 28 degrees
+    at 120 km/h.
     """
     # The curve is convex and consists of straight lines, so it is the maximum of these lines.
-    share = max(
+    return max(
         max(
             1.0 - _FALL_1 * speed_m_s,
             STEERING_CURVE[0] - _FALL_2 * (speed_m_s - STEERING_CURVE_M_S[0]),
         ),
         STEERING_CURVE[1] - _FALL_3 * (speed_m_s - STEERING_CURVE_M_S[1]),
     )
-    steering_rad = steering * MAX_STEERING_RAD * share
+
+
+@inlined
+def slip(steering: float, speed_m_s: float) -> float:
+    """Return the sine of the car's slip angle for a steering command at a speed.
+
+    The slip angle is limited so that the lateral acceleration is at most 9 m/s^2.
+    """
+    steering_rad = steering * MAX_STEERING_RAD * steering_share(speed_m_s)
     return slip_of(steering_rad, speed_m_s, MAX_LATERAL_M_S2, WHEELBASE_M)
 
 

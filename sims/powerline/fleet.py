@@ -100,7 +100,7 @@ class PowerlineFleet(Fleet):
             noise_size=3 if gust_m_s else 0,
         )
         self._plant = PLANTS.index(plant or ("point" if classic else "quad"))
-        self._are_changes = actions != "continuous"
+        self.are_changes = actions != "continuous"
         self._on_line = start == "line"
         self._wind_m_s, self._gust_m_s = wind_m_s, float(gust_m_s)
         self._shows_state = observation == "state"
@@ -162,7 +162,7 @@ class PowerlineFleet(Fleet):
         after = (self.rewards, self.ends, self._seen)
         if self.classic:
             return step_classic, *before, *after
-        return step_flights, *before, self._are_changes, self._gust_m_s, self.noise, *after
+        return step_flights, *before, self.are_changes, self._gust_m_s, self.noise, *after
 
     def observation(self, i: int) -> Any:
         """Return the observation of drone i."""

@@ -8,7 +8,7 @@ from mcaprl.compiled import compiled
 from mcaprl.sims.geometry.vectors import Vector, minus, norm, times
 from mcaprl.sims.powerline.course import ALONG_M, LEGS, TANGENTS, nearest_on_line, point_on_line
 from mcaprl.sims.powerline.env import PowerlineEnv
-from mcaprl.sims.powerline.rules import ACTION_MEANINGS, DIRECTIONS, Flight
+from mcaprl.sims.powerline.rules import ACTION_MEANINGS, DIRECTIONS, MAX_COMMAND_M_S, Flight
 from mcaprl.sims.vehicle.env import ScriptedPilot
 
 AIM_M = 6.0
@@ -49,6 +49,20 @@ def wanted_velocity(position_m: Vector) -> Vector:
 
 
 @compiled
+def steer(flight: Flight, is_change: bool) -> Vector:
+    """Return the command for the wanted velocity; see `commanded`."""
+    wanted = wanted_velocity(flight.drone.position_m)
+    if not is_change:
+        return times(1.0 / MAX_COMMAND_M_S, wanted)
+    missing = minus(wanted, flight.command_m_s)
+    return Vector(
+        min(max(missing.x, -1.0), 1.0),
+        min(max(missing.y, -1.0), 1.0),
+        min(max(missing.z, -1.0), 1.0),
+    )
+
+
+@compiled
 def choose(flight: Flight, step_m_s: float, from_measured: bool) -> int:
     """Choose the action that most reduces the command's error, or none if the error is small."""
     base = flight.drone.velocity_m_s if from_measured else flight.command_m_s
@@ -66,7 +80,9 @@ def choose(flight: Flight, step_m_s: float, from_measured: bool) -> int:
 class PowerlinePilot(ScriptedPilot[PowerlineEnv]):
     """Scripted pilot of the powerline sim's drone."""
 
-    def choose(self) -> int:
+    def choose(self) -> int | Vector:
         """Choose the action for the current state of the drone."""
         fleet = self.sim.fleet
+        if fleet.controls.commands is None:
+            return steer(self.sim.flight, fleet.are_changes)
         return choose(self.sim.flight, fleet.velocity_step_m_s, fleet.classic)

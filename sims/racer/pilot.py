@@ -11,11 +11,17 @@ from mcaprl.compiled import compiled
 from mcaprl.sims.racer.course import Car, Track
 from mcaprl.sims.racer.env import RacerEnv
 from mcaprl.sims.racer.rays import BLOCK_SIZE, CENTER_RAYS, CENTER_RAYS_RAD, LENGTH, measure
-from mcaprl.sims.racer.rules import ACTION_COMMANDS, MAX_SPEED_PX, SPEED_CHANGE_PX
+from mcaprl.sims.racer.rules import (
+    ACTION_COMMANDS,
+    MAX_SPEED_PX,
+    SPEED_CHANGE_PX,
+    TURN_RAD,
+    Command,
+)
 from mcaprl.sims.vehicle.env import ScriptedPilot
 
-ROOM_EXPONENT = 1.17
-"""Exponent of a ray's length in the weight of the ray."""
+ROOM_EXPONENT, CONTINUOUS_ROOM_EXPONENT = 1.17, 1.3
+"""Exponents of a ray's length in the weight of the ray, for discrete and continuous actions."""
 TURN_BEYOND_RAD = math.radians(7.5)
 """Minimum aim angle for a turn: half of the turn of one action."""
 STOP_PX, SPEED_PER_PX, SLOWEST_PX = 38.5, 0.296, 2.0
@@ -23,11 +29,11 @@ STOP_PX, SPEED_PER_PX, SLOWEST_PX = 38.5, 0.296, 2.0
 
 
 @compiled
-def choose(track: Track, car: Car, allowed: NDArray[np.int64], classic: bool) -> int:
-    """Choose one of the allowed actions, based on the rays up to 90 degrees to each side.
+def aim(track: Track, car: Car, room_exponent: float) -> tuple[float, float]:
+    """Return the wanted turn, radians, right positive, and the wanted change of speed, pixels.
 
-    The mean direction of the rays, weighted by length, determines the turn. The ray straight ahead
-    determines the speed. If no allowed action fits both, the turn has priority.
+    The mean direction of the rays up to 90 degrees to each side, weighted by length, determines the
+    turn. The ray straight ahead determines the speed.
     """
     block = np.empty(BLOCK_SIZE)
     measure(track.walls_px, car, False, block)
@@ -35,13 +41,29 @@ def choose(track: Track, car: Car, allowed: NDArray[np.int64], classic: bool) ->
     weights, moments = 0.0, 0.0
     for i in range(CENTER_RAYS):
         if abs(CENTER_RAYS_RAD[i]) <= 0.5 * math.pi:
-            weight = lengths_px[i] ** ROOM_EXPONENT
+            weight = lengths_px[i] ** room_exponent
             weights += weight
             moments += weight * CENTER_RAYS_RAD[i]
-    aim_rad = moments / weights
-    turn = 0.0 if abs(aim_rad) <= TURN_BEYOND_RAD else math.copysign(1.0, -aim_rad)
     wanted_px = min(max((lengths_px[0] - STOP_PX) * SPEED_PER_PX, SLOWEST_PX), MAX_SPEED_PX)
-    lacking_px = wanted_px - car.speed_px
+    return moments / weights, wanted_px - car.speed_px
+
+
+@compiled
+def steer(track: Track, car: Car) -> Command:
+    """Return the command that turns to the wanted direction and reaches the wanted speed."""
+    aim_rad, lacking_px = aim(track, car, CONTINUOUS_ROOM_EXPONENT)
+    acceleration, turn = lacking_px / SPEED_CHANGE_PX, -aim_rad / TURN_RAD
+    return Command(min(max(acceleration, -1.0), 1.0), min(max(turn, -1.0), 1.0))
+
+
+@compiled
+def choose(track: Track, car: Car, allowed: NDArray[np.int64], classic: bool) -> int:
+    """Choose the allowed action that fits the wanted turn and change of speed.
+
+    If no allowed action fits both, the turn has priority.
+    """
+    aim_rad, lacking_px = aim(track, car, ROOM_EXPONENT)
+    turn = 0.0 if abs(aim_rad) <= TURN_BEYOND_RAD else math.copysign(1.0, -aim_rad)
     acceleration = 0.0
     if abs(lacking_px) > 0.5 * SPEED_CHANGE_PX:
         acceleration = math.copysign(1.0, -lacking_px if classic else lacking_px)
@@ -57,8 +79,10 @@ def choose(track: Track, car: Car, allowed: NDArray[np.int64], classic: bool) ->
 class RacerPilot(ScriptedPilot[RacerEnv]):
     """Scripted driver of the racer sim's car."""
 
-    def choose(self) -> int:
+    def choose(self) -> int | Command:
         """Choose the action for the current state of the car."""
         fleet = self.sim.fleet
+        if fleet.controls.commands is None:
+            return steer(fleet.track, self.sim.car)
         chosen = choose(fleet.track, self.sim.car, fleet.action_set, fleet.classic)
         return int(np.flatnonzero(fleet.action_set == chosen)[0])

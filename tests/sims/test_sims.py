@@ -19,7 +19,7 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaprl.errors import UnknownNameError, UsageError
+from mcaprl.errors import PolicyError, UnknownNameError, UsageError
 from mcaprl.sims import SIMS, make_sim
 from mcaprl.sims.drawing.depth import encode_depth
 from mcaprl.sims.evaluation.pilots import make_pilot
@@ -355,7 +355,7 @@ def test_starts_on_the_line_are_near_it_and_not_all_the_same(
         ("powerline", {}),
         ("powerline", {"observation": "depth"}),
         ("highway-lane", {}),
-        ("highway-lane", {"actions": "continuous"}),
+        *((name, {"actions": "continuous"}) for name in SIMS),
     ],
 )
 def test_actions_of_the_pilot_have_a_leading_dimension_of_one(
@@ -371,6 +371,11 @@ def test_actions_of_the_pilot_have_a_leading_dimension_of_one(
     assert env.action_space.contains(actions[0])
     with pytest.raises(ValueError, match="not 2"):
         pilot.act(batched(observation, 2))
+    if isinstance(env.action_space, spaces.Discrete):
+        assert pilot.log_prob(batched(observation), actions).tolist() == [0.0]
+    else:
+        with pytest.raises(PolicyError, match="pilot has no action probabilities"):
+            pilot.log_prob(batched(observation), actions)
 
 
 @every_sim

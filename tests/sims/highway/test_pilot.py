@@ -13,16 +13,18 @@ from mcaprl.sims.highway.env import STEERING_RAD
 from tests.support.sims import piloted
 
 
-def test_it_finishes_from_anywhere() -> None:
-    drives = [piloted("highway-lane", seed) for seed in range(25)]
+@pytest.mark.parametrize("actions", ["discrete", "continuous"])
+def test_it_finishes_from_anywhere(actions: str) -> None:
+    drives = [piloted("highway-lane", seed, actions=actions) for seed in range(25)]
     assert sum(reason == "finished" for _, reason, _ in drives) >= 24
     offsets = [np.mean([abs(info["lateral_offset_m"]) for info in infos]) for *_, infos in drives]
     assert np.mean(offsets) < 0.6
 
 
+@pytest.mark.parametrize("actions", ["discrete", "continuous"])
 @pytest.mark.parametrize("road", ["racetrack-v0", "racetrack-oval-v0"])
-def test_it_laps_the_racetracks_around_other_cars(road: str) -> None:
-    kwargs: dict[str, Any] = {"road": road, "max_episode_steps": 200}
+def test_it_laps_the_racetracks_around_other_cars(road: str, actions: str) -> None:
+    kwargs: dict[str, Any] = {"road": road, "actions": actions, "max_episode_steps": 200}
     reasons = [piloted("highway-lane", seed, **kwargs)[1] for seed in range(4)]
     assert reasons == ["time_limit"] * 4
 

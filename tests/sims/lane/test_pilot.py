@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,8 @@ from mcaprl.errors import UnknownNameError
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.pilots import make_pilot
 from mcaprl.sims.geometry.bicycle import moving
-from mcaprl.sims.lane.pilot import HORIZON, choose, pursue, pursuit_value
-from mcaprl.sims.lane.rules import ACTION_COMMANDS, DRIVING, drive, end_of, located
+from mcaprl.sims.lane.pilot import HORIZON, choose, pursue, pursuit_value, steer
+from mcaprl.sims.lane.rules import ACTION_COMMANDS, DRIVING, drive, end_of, located, wheel_angle
 from tests.support.sims import piloted
 
 
@@ -18,6 +20,30 @@ def test_it_drives_on_from_anywhere() -> None:
     ends = [piloted("lane", seed, start="anywhere") for seed in range(100)]
     assert sum(reason == "time_limit" for _, reason, _ in ends) >= 98
     assert 145.0 < np.mean([total for total, _, _ in ends]) < 157.0
+
+
+def test_with_pedal_and_steering_it_drives_faster_and_smoothly() -> None:
+    ends = [piloted("lane", seed, actions="continuous") for seed in range(100)]
+    assert sum(reason == "time_limit" for _, reason, _ in ends) >= 99
+    assert 206.0 < np.mean([total for total, _, _ in ends]) < 212.0
+
+
+def test_it_commands_what_pursuit_wants() -> None:
+    """On the path before a corner, the car brakes for it; after the corner, it accelerates."""
+    straight = located(moving(60.0, 1.0, 0.0, 10.0), 0.0, 60.0, 0.0)
+    assert steer(straight) == (1.0, 0.0)
+    # The corner is 10 m ahead, hence 1.4 m of braking with 7.6 m/s^2 to 10.2 m/s are left.
+    before = located(moving(122.0, 1.0, 0.0, 14.0), 0.0, 122.0, 0.0)
+    assert steer(before).pedal == -1.0
+    corner_m = 130.0 - 119.0
+    slower = located(moving(119.0, 1.0, 0.0, 12.0), 0.0, 119.0, 0.0)
+    wanted_m_s = math.sqrt(10.2**2 + 2 * 7.6 * (corner_m - 8.6))
+    assert steer(slower).pedal == pytest.approx((wanted_m_s - 12.0) / 0.25 / 8.0)
+    right = located(moving(60.0, 0.0, 0.0, 10.0), 0.0, 60.0, 0.0)
+    angle_rad = wheel_angle(steer(right).steering, 10.0)
+    # The point to reach is 13.8 m ahead and 1 m to the left.
+    ahead_m = math.sqrt(13.8**2 + 1.0)
+    assert math.tan(angle_rad) == pytest.approx(2 * math.tan(math.asin(2.7 / ahead_m**2)))
 
 
 def test_it_laps_the_course_from_the_start_line() -> None:

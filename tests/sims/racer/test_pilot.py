@@ -16,9 +16,22 @@ def test_it_drives_on_from_anywhere() -> None:
     assert 150.0 < np.mean([total for total, _, _ in ends]) < 162.0
 
 
+def test_continuous_actions_are_better() -> None:
+    ends = [piloted("racer", seed, actions="continuous") for seed in range(100)]
+    assert sum(reason == "time_limit" for _, reason, _ in ends) >= 99
+    assert 161.0 < np.mean([total for total, _, _ in ends]) < 165.0
+
+
 @pytest.mark.parametrize(
     "kwargs",
-    [{"actions": 5}, {"actions": 8}, {"drift": True}, {"track_seed": 0}, {"track_seed": 1}],
+    [
+        {"actions": 5},
+        {"actions": 8},
+        {"drift": True},
+        {"track_seed": 0},
+        {"track_seed": 1},
+        {"actions": "continuous", "track_seed": 1},
+    ],
 )
 def test_it_drives_by_other_actions_and_on_other_tracks(kwargs: dict[str, Any]) -> None:
     ends = [piloted("racer", seed, **kwargs) for seed in range(20)]
