@@ -55,10 +55,13 @@ class Shown(Protocol):
         """Number of updates of the network."""
 
     def probability(self) -> float:
-        """Return the probability of the action of the watched environment."""
+        """Return the probability, or log density, of the action of the watched environment."""
 
-    def values(self) -> tuple[Tensor, Tensor, float]:
-        """Return the watched environment's Q-values (A,), preferences (A,), and state value."""
+    def values(self) -> tuple[Tensor, Tensor, float] | None:
+        """Return the watched environment's Q-values (A,), preferences (A,), and state value.
+
+        None without a finite number of actions.
+        """
 
     def metrics(self) -> dict[str, float]:
         """Return the metrics of `TRAINING_LABELS` without the score."""
@@ -118,7 +121,7 @@ class LiveTraining:
         with closing(self._shown):
             self.stream.close()
 
-    def _source_of(self, batch: Any) -> Callable[[int | None], object]:
+    def _source_of(self, batch: Any) -> Callable[[Any], object]:
         """Return a function that maps the last action to the object whose scene is shown.
 
         The action is that of the watched environment, or None after a reset. The function returns
@@ -127,7 +130,7 @@ class LiveTraining:
         single = self._shown.unwrapped
         if isinstance(batch, BatchedEnv) and isinstance(single, VehicleEnv):
 
-            def imitate(action: int | None) -> object:
+            def imitate(action: Any) -> object:
                 single.imitate(batch.fleet, WATCHED, action)
                 return single
 
@@ -150,7 +153,7 @@ class WatchedBatch(VectorWrapper):
         env: VectorEnv[Any, Any, Any],
         stream: LiveStream,
         algo: str,
-        source: Callable[[int | None], object],
+        source: Callable[[Any], object],
     ) -> None:
         """Wrap `env`, and store the source of the scene.
 
@@ -162,7 +165,7 @@ class WatchedBatch(VectorWrapper):
         self.score = math.nan
         self._stream, self._algo, self._source = stream, algo, source
         self._observations: Any = None
-        self._last_action: int | None = None
+        self._last_action: Any = None
         self._episode = -1
         self._begin_episode()
 
@@ -194,7 +197,7 @@ class WatchedBatch(VectorWrapper):
                 **before,
             )
             self._is_shown = stream.show(step)
-        self._observations, self._last_action = observations, int(actions[WATCHED])
+        self._observations, self._last_action = observations, actions[WATCHED]
         self._step += 1
         self._return_so_far += float(rewards[WATCHED])
         if any(ends):
@@ -213,7 +216,7 @@ class WatchedBatch(VectorWrapper):
         shown = self.shown
         assert shown is not None
         is_shown = self._stream.look(self._source(self._last_action), self._return_so_far)
-        values = _values(shown, int(actions[WATCHED])) if is_shown else {}
+        values = _values(shown, actions[WATCHED]) if is_shown else {}
         probability = shown.probability()
         self._stream.pause()
         return {
@@ -243,9 +246,15 @@ class WatchedBatch(VectorWrapper):
         self._stream.end_episode(summary)
 
 
-def _values(shown: Shown, taken: int) -> dict[str, Any]:
-    """Return the learner's values for the watched environment, as fields of `values_schema`."""
-    q, preference, value = shown.values()
+def _values(shown: Shown, action: Any) -> dict[str, Any]:
+    """Return the learner's values for the watched environment, as fields of `values_schema`.
+
+    The dict is empty without a finite number of actions.
+    """
+    values = shown.values()
+    if values is None:
+        return {}
+    (q, preference, value), taken = values, int(action)
     best = int(preference.argmax())
     entropy = torch.special.entr(preference).sum() / math.log(max(len(preference), 2))
     return {

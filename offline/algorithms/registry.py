@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 
 from gymnasium import spaces
 
+from mcaprl.actions import short_name
 from mcaprl.entry_points import installed, load
 from mcaprl.errors import SpaceError, UnknownNameError, UsageError
 from mcaprl.offline.algorithms.bc import BC, BoxBC
@@ -116,7 +117,8 @@ def choose_algorithm(
             return each
     needed = "discrete actions" if is_box else "the actions of a Box"
     raise SpaceError(
-        f"{found[0].learner_type.name} needs {needed}; for {_short(space)} use {_SUGGESTED[is_box]}"
+        f"{found[0].learner_type.name} needs {needed}; for {short_name(space)} use"
+        f" {_SUGGESTED[is_box]}"
     )
 
 
@@ -172,10 +174,3 @@ def _checked(learner: type[Learner]) -> type[Learner]:
             f"the algorithm {learner.__name__} has the name {learner.name!r} of a built-in one"
         )
     return learner
-
-
-def _short(space: spaces.Space[Any]) -> str:
-    """Return a space in messages: that of a Box without its bounds."""
-    if not isinstance(space, spaces.Box):
-        return f"{space}"
-    return f"Box{space.shape}" if len(space.shape) != 1 else f"Box({space.shape[0]},)"
