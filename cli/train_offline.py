@@ -39,14 +39,19 @@ def _configs() -> dict[str, Settings]:
     return {**default_configs(), AUTO: AutoConfig()}
 
 
+def _names() -> list[str]:
+    """Return the names of the algorithms, without the kind of actions of some settings."""
+    return list(dict.fromkeys(name.partition(" (")[0] for name in _configs()))
+
+
 @click.command(cls=SettingsCommand, configs=_configs)
 @click.argument("data", nargs=-1, required=True, metavar="DATA...", type=PATH)
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Run folder to create.")
 @click.option(
     "--algo",
-    type=Name(_configs),
-    help="dqn, double-dqn, cql, bc, bcq, iql, one from another package, or auto, which chooses by"
-    " the log.  [default: cql]",
+    type=Name(_names),
+    help="dqn, double-dqn, cql, bc, bcq, iql; for the actions of a Box bc, td3-bc, rebrac, iql; one"
+    " from another package; or auto, which chooses by the log.  [default: cql; for a Box iql]",
 )
 @seed_options("network")
 @integer_option(

@@ -3,9 +3,9 @@
 RUN/config.json                         algorithm, settings, seeds, the data or sim, and versions
 RUN/seed-K/checkpoint.safetensors       state to resume from
 RUN/seed-K/metrics.csv                  loss terms of an offline run
-RUN/seed-K/policy.json, .safetensors    policy of an offline run
+RUN/seed-K/policy.json, .safetensors    policy of an offline run, best policy of an online run
 RUN/seed-K/curve.csv                    evaluations of an online run
-RUN/seed-K/best_model.zip               policy of an online run, as Stable-Baselines3 writes it
+RUN/seed-K/best_model.zip               best policy of an online run of Stable-Baselines3
 """
 
 from __future__ import annotations

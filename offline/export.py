@@ -3,8 +3,9 @@
 The inputs are the parts of an observation as the environment returns them, with a leading batch
 axis. They have the same names as in `/rl/step` (`observation`, `camera`, ...). A policy with frame
 stacks of k expects inputs (B, k, *shape), oldest frame first. The outputs are `action` (B, *shape),
-a value of the action space, and `scores` (B, A); the action has the largest score. The file
-includes the normalization.
+a value of the action space, and `scores` (B, A); the action has the largest score. A policy for the
+actions of a Box has no scores; its action is in the units of the space. The file includes the
+normalization.
 
 A Discrete action is an int64. An action of a MultiDiscrete or MultiBinary space has the dtype of
 the space; score k is that of the k-th combination of its elements, where the last element changes
@@ -27,7 +28,7 @@ from torch import Tensor, nn
 
 from mcaprl.errors import PolicyError, import_extra
 from mcaprl.files import replacing
-from mcaprl.offline.algorithms.heads import DiscreteHead
+from mcaprl.offline.algorithms.heads import BoxHead, DiscreteHead, Head
 from mcaprl.offline.batches.observations import Observations, codes_of, has_channels_first
 from mcaprl.offline.policy import Policy
 from mcaprl.recorder.format.spaces import space_to_json
@@ -39,8 +40,7 @@ class ExportedPolicy(nn.Module):
     def __init__(self, policy: Policy) -> None:
         """Wrap a policy's networks and normalization."""
         super().__init__()
-        assert isinstance(policy.head, DiscreteHead)
-        self.head: DiscreteHead = policy.head
+        self.head: Head = policy.head
         self.encoder = policy.encoder
         self.frame_stack = policy.frame_stack
         self.shift = torch.from_numpy(policy.encoder.shift)
@@ -67,11 +67,18 @@ class ExportedPolicy(nn.Module):
             for column, shape in zip(columns, shapes, strict=True)
         )
 
-    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Map observations to `action` and `scores`."""
+    @property
+    def output_names(self) -> list[str]:
+        """Names of the results of `forward`."""
+        return ["action", "scores"] if isinstance(self.head, DiscreteHead) else ["action"]
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Map observations to `action`, and to `scores` if the actions are finite in number."""
         if self.frame_stack > 1:
             inputs = tuple(part.flatten(0, 1) for part in inputs)
         observations = self._encode(inputs).stacked(self.frame_stack)
+        if not isinstance(self.head, DiscreteHead):
+            return (self.head.actions(observations),)
         scores = self.head.scores(observations)
         return self.head.best(scores), scores
 
@@ -99,7 +106,7 @@ def _channels_last(images: Tensor) -> Tensor:
 
 def export_onnx(policy: object, path: Path, *, overwrite: bool = True) -> None:
     """Write the policy of an offline run as an ONNX file, for a batch of any size."""
-    if not isinstance(policy, Policy) or not isinstance(policy.head, DiscreteHead):
+    if not isinstance(policy, Policy) or not isinstance(policy.head, DiscreteHead | BoxHead):
         raise PolicyError(f"{getattr(policy, 'name', policy)} has no scores of actions to export")
     for package in ("onnx", "onnxscript"):
         import_extra(package, "export")
@@ -109,7 +116,7 @@ def export_onnx(policy: object, path: Path, *, overwrite: bool = True) -> None:
             module,
             module.examples(2),
             input_names=module.input_names,
-            output_names=["action", "scores"],
+            output_names=module.output_names,
             dynamic_shapes=(tuple({0: torch.export.Dim("batch")} for _ in module.input_names),),
             dynamo=True,
             verbose=False,
@@ -122,7 +129,9 @@ def export_onnx(policy: object, path: Path, *, overwrite: bool = True) -> None:
 
 def _metadata(policy: Policy) -> dict[str, str]:
     """Return the properties of the ONNX file that describe its outputs."""
-    assert isinstance(policy.head, DiscreteHead)
+    space = {"action_space": space_to_json(policy.action_space)}
+    if not isinstance(policy.head, DiscreteHead):
+        return space
     joint = policy.head.joint
     if not joint.shape:
         order = f"scores[:, k] is the score of action k + {joint.first}"
@@ -131,7 +140,7 @@ def _metadata(policy: Policy) -> dict[str, str]:
         if joint.starts.any():
             elements += f" + {joint.starts.tolist()}"
         order = f"scores[:, k] is the score of the action {elements}, in C order"
-    return {"action_space": space_to_json(policy.action_space), "scores": order}
+    return {**space, "scores": order}
 
 
 @contextmanager

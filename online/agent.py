@@ -10,6 +10,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from contextlib import ExitStack, closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -33,14 +34,14 @@ from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import CHECKPOINT_NAME, CURVE_NAME, broken_checkpoint, writing
 from mcaprl.sims.evaluation.evaluate import Scale
-from mcaprl.storage.tensor_files import read_tensors
+from mcaprl.storage.tensor_files import read_tensors, write_tensors
 
 LOG_INTERVAL = 1_000
 """Number of environment steps between two rows of scalars, and between two progress reports."""
 EVALUATIONS_NAME = "evaluations"
 CENTERING_STEPS = 2_000
 """Number of random steps before training; their images determine the image normalization."""
-BROKEN = (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError, IndexError)
+_BROKEN = (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError, IndexError)
 """Errors of a checkpoint that cannot be read."""
 
 
@@ -49,11 +50,14 @@ class Agent(ABC):
 
     Attributes:
         best_files: Names of the files of the best policy.
+        repeats_steps: Whether a resumed run repeats the steps after its checkpoint to the same
+            bits, so that they are removed from the log.
         resumed_at: Number of steps done by earlier sessions.
         points: All evaluations, including those of earlier sessions.
     """
 
     best_files: ClassVar[tuple[str, ...]]
+    repeats_steps: ClassVar[bool]
 
     def __init__(
         self,
@@ -64,10 +68,10 @@ class Agent(ABC):
         scale: Scale,
         *,
         record: Path | None = None,
-        episodes: int | None = None,
+        resume: bool = False,
         live: LiveTraining | None = None,
     ) -> None:
-        """Create the environments, and the log.
+        """Create an agent with new weights, its environments, and its log.
 
         Args:
             task: Algorithm, settings and environment.
@@ -76,25 +80,28 @@ class Agent(ABC):
             seed: Seed of the agent.
             scale: Mean returns that define the scores 0 and 1.
             record: Log to write; None records neither training nor evaluations.
-            episodes: Number of episodes that the log had at the checkpoint from which this session
-                continues, to which it appends; -1 for all of the log. None for a new log.
+            resume: Whether to continue from the folder's checkpoint and log, if they exist.
             live: Live view of the training.
 
         Raises:
             SpaceError, OutputExistsError, LogError: The log cannot be written.
+            TrainingError: The checkpoint belongs to another task, or is broken.
         """
         self.points: list[CurvePoint] = []
-        self.resumed_at = 0
+        self.resumed_at, self._reported_at, self._began_s = 0, -1, 0.0
         self._task, self._env_id, self._folder, self._seed = task, env_id, folder, seed
-        self._score, self._reported_at = math.nan, -1
-        self._began_s = 0.0
         self._scalars: ScalarsWriter | None = None
+        self._checkpoint = folder / CHECKPOINT_NAME
+        found = self._read_checkpoint() if resume and self._checkpoint.exists() else None
+        kept = None
+        if resume:
+            kept = found[1]["episodes_in_log"] if found else 0 if self.repeats_steps else -1
         with ExitStack() as stack:
             self.env: Any = stack.enter_context(closing(task.batch(task.config.envs)))
             self._recorder = None
             if record is not None:
                 self.env = self._recorder = recorded(
-                    self.env, record, algo=task.algo, seed=seed, episodes=episodes
+                    self.env, record, algo=task.algo, seed=seed, episodes=kept
                 )
                 stack.callback(self._recorder.close)
             self._watched = None
@@ -102,7 +109,21 @@ class Agent(ABC):
                 self.env = self._watched = live.watch(self.env)
             evaluated = FirstEpisodes(task.evaluation_batch(task.config.eval_episodes), env_id)
             self._evaluation = Evaluation(stack.enter_context(closing(evaluated)), scale)
+            if found is None:
+                self._prepare(None)
+            else:
+                self._restore(*found)
+            if self._watched is not None:
+                self._watched.shown = self._shown()
             self._envs = stack.pop_all()
+
+    @abstractmethod
+    def _prepare(self, tensors: dict[str, Tensor] | None) -> None:
+        """Create what is trained; `tensors` are those of the checkpoint, if there is one."""
+
+    @abstractmethod
+    def _shown(self) -> Shown:
+        """Return what the live view shows."""
 
     @property
     @abstractmethod
@@ -144,8 +165,16 @@ class Agent(ABC):
         """Train until all steps are done."""
 
     @abstractmethod
-    def _save_policy(self) -> None:
-        """Write the current policy to `best_files`."""
+    def save_policy(self, folder: Path) -> None:
+        """Write the current policy to the `best_files` in a folder."""
+
+    @abstractmethod
+    def _state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Return the state for a checkpoint, as tensors and as JSON values."""
+
+    @abstractmethod
+    def _load(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
+        """Restore what `_state` returned."""
 
     def close(self) -> None:
         """Close the environments and the log."""
@@ -182,9 +211,8 @@ class Agent(ABC):
         best = max((point.mean_return for point in self.points), default=-math.inf)
         point = self._evaluation.point(self.policy, self.steps, best)
         if point.best:
-            self._save_policy()
+            self.save_policy(self._folder)
         self.points.append(point)
-        self._score = point.score
         if self._watched is not None:
             self._watched.score = point.score
         write_curve(self._folder / CURVE_NAME, self.points)
@@ -216,55 +244,54 @@ class Agent(ABC):
             terms = {"score": last.score, "mean_return": last.mean_return}
         report(TrainingProgress(self._seed, self.steps, self._task.config.steps, terms))
 
-    def _show(self, shown: Shown) -> None:
-        """Show this agent in the live view, if there is one."""
-        if self._watched is not None:
-            self._watched.shown = shown
-
-    @property
-    def _checkpoint(self) -> Path:
-        return self._folder / CHECKPOINT_NAME
-
-    def _best_content(self) -> dict[str, Tensor]:
-        """Return the contents of `best_files`; empty before the first evaluation."""
-        if not self.points:
-            return {}
-        return {
-            f"best.{name}": torch.from_numpy(
-                np.frombuffer((self._folder / name).read_bytes(), np.uint8).copy()
-            )
-            for name in self.best_files
-        }
-
-    def _restore_best(self, tensors: dict[str, Tensor], points: list[dict[str, Any]]) -> None:
-        """Restore the curve and the best policy of a checkpoint.
-
-        The files may be newer than the checkpoint; the evaluations after it are repeated.
-        """
-        self.points = [CurvePoint(**point) for point in points]
+    def _save(self) -> None:
+        """Replace the checkpoint."""
+        tensors, description = self._state()
         for name in self.best_files if self.points else ():
-            content = tensors[f"best.{name}"].numpy().tobytes()
-            write_atomically(self._folder / name, content, TrainingError)
+            content = np.frombuffer((self._folder / name).read_bytes(), np.uint8)
+            tensors[f"best.{name}"] = torch.from_numpy(content.copy())
+        recorder = self._recorder if self.repeats_steps else None
+        description |= {
+            **self._task.identity.parts,
+            "episodes_in_log": -1 if recorder is None else recorder.episodes,
+            "points": [asdict(point) for point in self.points],
+        }
+        write_tensors(self._checkpoint, tensors, description)
 
+    def _restore(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
+        """Restore a checkpoint.
 
-def is_due(before: int, now: int, interval: int) -> bool:
-    """Return whether a multiple of the interval was reached."""
-    return now // interval > before // interval
+        The best policy's files may be newer; the evaluations after the checkpoint are repeated.
+        """
+        try:
+            self._prepare(tensors)
+            self._load(tensors, description)
+            self.points = [CurvePoint(**point) for point in description["points"]]
+            best = {name: tensors[f"best.{name}"] for name in self.best_files if self.points}
+        except _BROKEN as error:
+            raise broken_checkpoint(self._checkpoint, error) from error
+        for name, content in best.items():
+            write_atomically(self._folder / name, content.numpy().tobytes(), TrainingError)
 
-
-def read_checkpoint(path: Path, task: Task) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read the checkpoint of a task: tensors, and a description."""
-    try:
-        tensors, description = read_tensors(path)
-        task.identity.check_same(description, path)
+    def _read_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Read the tensors and the description of the checkpoint."""
+        path = self._checkpoint
+        try:
+            tensors, description = read_tensors(path)
+        except _BROKEN as error:
+            raise broken_checkpoint(path, error) from error
+        self._task.identity.check_same(description, path)
         if "episodes_in_log" not in description:
             raise TrainingError(
                 f"cannot resume: {path} was written by an earlier version of mcaprl; resume it with"
                 " that version, or train into another folder"
             )
         return tensors, description
-    except BROKEN as error:
-        raise broken_checkpoint(path, error) from error
+
+
+def is_due(before: int, now: int, interval: int) -> bool:
+    """Return whether a multiple of the interval was reached."""
+    return now // interval > before // interval
 
 
 def center_images(encoder: ObservationEncoder, task: Task, seed: int) -> None:

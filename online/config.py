@@ -23,7 +23,6 @@ has the command and the scores of four seeds. Important settings are:
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -180,9 +179,6 @@ class DQNConfig(ReplayConfig):
         return {
             **super().arguments(),
             **{name: getattr(self, name) for name in same},
-            # `sys.maxsize` disables SB3's own updates of the target network. A callback updates it
-            # instead.
-            **({"target_update_interval": sys.maxsize} if self.target_update_episodes else {}),
         }
 
 

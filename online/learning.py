@@ -12,9 +12,8 @@ killed between the two writes.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, cast
@@ -33,19 +32,17 @@ from mcaprl.offline.algorithms.learner import NotFiniteError
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.policy import TWIN, Policy, read_policy, save_policy
-from mcaprl.online.agent import BROKEN, Agent, center_images, is_due, read_checkpoint
+from mcaprl.online.agent import Agent, center_images, is_due
 from mcaprl.online.collector import Choice, EpsilonGreedy, VectorEnvironments
 from mcaprl.online.config import ReplayConfig
 from mcaprl.online.engine import Agents
-from mcaprl.online.live import WATCHED, LiveTraining
+from mcaprl.online.live import WATCHED
 from mcaprl.online.replay import Outcome, ReplayBuffer, packed_log, restored_log
-from mcaprl.online.task import Task
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.runs import CHECKPOINT_NAME, POLICY_NAME, broken_checkpoint
-from mcaprl.sims.evaluation.evaluate import Scale
+from mcaprl.runs import POLICY_NAME
 from mcaprl.sims.evaluation.rollout import episode_seed
-from mcaprl.storage.tensor_files import below, write_tensors
+from mcaprl.storage.tensor_files import below
 
 _CHECKED = 64
 """Number of observations on which a copied network must produce the same values."""
@@ -59,49 +56,10 @@ class LearningAgent(Agent):
     """
 
     best_files = ("policy.safetensors", POLICY_NAME)
+    repeats_steps = True
 
-    def __init__(
-        self,
-        task: Task,
-        env_id: str,
-        folder: Path,
-        seed: int,
-        scale: Scale,
-        *,
-        record: Path | None = None,
-        resume: bool = False,
-        live: LiveTraining | None = None,
-    ) -> None:
-        """Create an agent, its environments, and its log; the arguments are those of `Agent`.
-
-        With `resume`, it continues from the folder's checkpoint, if there is one.
-
-        Raises:
-            TrainingError: The checkpoint belongs to another task, or is broken.
-        """
-        path = folder / CHECKPOINT_NAME
-        found = read_checkpoint(path, task) if resume and path.exists() else None
-        episodes = None
-        if resume:
-            episodes = 0 if found is None else found[1]["episodes_in_log"]
-        super().__init__(
-            task, env_id, folder, seed, scale, record=record, episodes=episodes, live=live
-        )
-        try:
-            self._encoder = self._make_encoder(None if found is None else found[0])
-            logged = {} if found is None else below(below(found[0], "buffer"), "log")
-            self.agents = self._make_agents(partial(restored_log, logged) if logged else None)
-            if found is not None:
-                try:
-                    self._load(*found)
-                except BROKEN as error:
-                    raise broken_checkpoint(path, error) from error
-        except BaseException:
-            self.close()
-            raise
-
-    def _make_encoder(self, tensors: dict[str, Tensor] | None) -> ObservationEncoder:
-        """Return the encoder of a checkpoint, or a new one with the images of random steps."""
+    def _prepare(self, tensors: dict[str, Tensor] | None) -> None:
+        """Create the encoder, and an agent with new weights."""
         joint = joint_actions(self.env.single_action_space)
         count = 0 if joint is None else joint.count
         encoder = ObservationEncoder(self.env.single_observation_space, count)
@@ -109,31 +67,31 @@ class LearningAgent(Agent):
             _load_normalization(encoder, tensors)
         elif self._task.config.center_images and encoder.image_inputs:
             center_images(encoder, self._task, self._seed)
-        return encoder
+        logged = {} if tensors is None else below(below(tensors, "buffer"), "log")
+        self._create(encoder, partial(restored_log, logged) if logged else None)
 
-    def _make_agents(self, log: Callable[[ReplayBuffer], TransitionBuffer] | None = None) -> Agents:
-        """Create agents, the networks of the policy, and the connection to the environments.
+    def _create(
+        self,
+        encoder: ObservationEncoder,
+        log: Callable[[ReplayBuffer], TransitionBuffer] | None = None,
+    ) -> None:
+        """Create an agent with new weights that observes through an encoder.
 
         `log` returns the logged transitions that are a part of each batch, if there are any.
         """
-        config = cast(ReplayConfig, self._task.config)
-        if config.image_shift and not self._encoder.image_inputs:
+        config, actions = cast(ReplayConfig, self._task.config), self.env.single_action_space
+        if config.image_shift and not encoder.image_inputs:
             raise UsageError("image_shift is for images, but the observations have none")
-        agents = Agents(
-            config,
-            self._encoder,
-            self.env.single_action_space,
-            [self._seed],
-            torch.device("cpu"),
-            log,
-        )
-        self.__dict__.pop("policy", None)
-        self._environments = VectorEnvironments(self.env, self._encoder)
-        agents.connect(self._environments)
-        agents.collector.before_step = self._before_step
+        self._encoder = encoder
+        self.agents = Agents(config, encoder, actions, [self._seed], torch.device("cpu"), log)
+        self._environments = VectorEnvironments(self.env, encoder)
+        self.agents.connect(self._environments)
+        self.agents.collector.before_step = self._before_step
         self._choice: Choice | None = None
-        self._show(self)
-        return agents
+        self.__dict__.pop("policy", None)
+
+    def _shown(self) -> LearningAgent:
+        return self
 
     @property
     def steps(self) -> int:
@@ -171,16 +129,16 @@ class LearningAgent(Agent):
         if self.agents.steps:
             # The checkpoint has what the first session started from.
             return
-        box = self.agents.buffer.box
+        box, encoder = self.agents.buffer.box, self._encoder
         if policy is not None:
             _check_fits(policy, self.env.single_action_space, self._task.config.frame_stack)
             if type(policy.encoder) is ObservationEncoder:
-                self._encoder = policy.encoder
+                encoder = policy.encoder
         if data is not None:
             _check_spaces(data, self._encoder.space, self.env.single_action_space)
-        if policy is not None or (box is not None and data is not None):
-            is_mixed = box is not None and data is not None
-            self.agents = self._make_agents(partial(packed_log, data) if is_mixed else None)
+        log = None if box is None or data is None else partial(packed_log, data)
+        if log is not None or encoder is not self._encoder:
+            self._create(encoder, log)
         if policy is not None:
             (self._take_values if box is None else self._take_actor_and_critics)(policy)
             self.agents.learner.load_targets()
@@ -271,36 +229,26 @@ class LearningAgent(Agent):
             name = "behavior_probs" if self.agents.buffer.box is None else "behavior_log_probs"
             setattr(self._recorder, name, choice.behavior().numpy())
 
-    def _save_policy(self) -> None:
-        """Write the current policy."""
+    def save_policy(self, folder: Path) -> None:
+        """Write the current policy into a folder."""
         learner = self.agents.learner
-        save_policy(self._folder, learner, self._seed, self._env_id, self._task.sim_options)
+        save_policy(folder, learner, self._seed, self._env_id, self._task.sim_options)
 
-    def _save(self) -> None:
-        """Replace the checkpoint."""
+    def _state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Return the state for a checkpoint, as tensors and as JSON values."""
         episodes = self._environments.episodes
-        description = {
-            **self._task.identity.parts,
-            "counters": self.agents.counters(),
-            "episodes_in_log": self._recorder.episodes if self._recorder is not None else 0,
-            "episodes": [episodes.count, list(episodes.returns), list(episodes.lengths)],
-            "points": [asdict(point) for point in self.points],
-        }
-        tensors = {
-            **self.agents.state(),
-            **_normalization_of(self._encoder),
-            **self._best_content(),
-        }
-        write_tensors(self._checkpoint, tensors, description)
+        tensors = {**self.agents.state(), **_normalization_of(self._encoder)}
+        finished = [episodes.count, list(episodes.returns), list(episodes.lengths)]
+        return tensors, {"counters": self.agents.counters(), "episodes": finished}
 
     def _load(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
-        """Restore a checkpoint."""
+        """Restore what `_state` returned."""
         self.agents.load_state(tensors, description["counters"])
         count, returns, lengths = description["episodes"]
         episodes = self._environments.episodes
         episodes.count = int(count)
-        episodes.returns, episodes.lengths = deque(returns, 100), deque(lengths, 100)
-        self._restore_best(tensors, description["points"])
+        episodes.returns.extend(returns)
+        episodes.lengths.extend(lengths)
 
     # What the live view shows.
 

@@ -12,7 +12,6 @@ import random
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, cast
@@ -50,7 +49,7 @@ from mcaprl.frames import (
     stacked_space,
     whole_of,
 )
-from mcaprl.online.agent import BROKEN, Agent, center_images, is_due, read_checkpoint
+from mcaprl.online.agent import Agent, center_images
 from mcaprl.online.config import (
     ActorCriticConfig,
     DQNConfig,
@@ -66,8 +65,7 @@ from mcaprl.online.features import (
     normalize_images,
     policy_arguments,
 )
-from mcaprl.online.live import WATCHED, LiveTraining
-from mcaprl.online.task import Task
+from mcaprl.online.live import WATCHED
 from mcaprl.online.zip_file import (
     ClampedGaussian,
     ModelEncoder,
@@ -78,10 +76,9 @@ from mcaprl.online.zip_file import (
 )
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.runs import BEST_NAME, CHECKPOINT_NAME, broken_checkpoint
-from mcaprl.sims.evaluation.evaluate import Scale
+from mcaprl.runs import BEST_NAME
 from mcaprl.sims.evaluation.rollout import episode_seed
-from mcaprl.storage.tensor_files import below, write_tensors
+from mcaprl.storage.tensor_files import below
 
 MODELS: Final[dict[str, type[BaseAlgorithm]]] = {
     "dqn": DQN,
@@ -110,57 +107,22 @@ class ModelAgent(Agent):
     """
 
     best_files = (BEST_NAME,)
+    repeats_steps = False
 
-    def __init__(
-        self,
-        task: Task,
-        env_id: str,
-        folder: Path,
-        seed: int,
-        scale: Scale,
-        *,
-        record: Path | None = None,
-        resume: bool = False,
-        live: LiveTraining | None = None,
-    ) -> None:
-        """Create an agent, its environments, and its log; the arguments are those of `Agent`.
-
-        With `resume`, it continues from the folder's checkpoint, if there is one.
-
-        Raises:
-            TrainingError: The checkpoint belongs to another task, or is broken.
-        """
-        path = folder / CHECKPOINT_NAME
-        found = read_checkpoint(path, task) if resume and path.exists() else None
-        episodes = -1 if resume else None
-        super().__init__(
-            task, env_id, folder, seed, scale, record=record, episodes=episodes, live=live
-        )
-        try:
-            self.model = self._make_model()
-            self._show(self)
-            if found is not None:
-                try:
-                    self._load(*found)
-                except BROKEN as error:
-                    raise broken_checkpoint(path, error) from error
-        except BaseException:
-            self.close()
-            raise
-
-    def _make_model(self) -> BaseAlgorithm:
+    def _prepare(self, tensors: dict[str, Tensor] | None) -> None:
+        """Create a model with new weights."""
         task, config = self._task, self._task.config
         batched = BatchedVecEnv(self.env)
         batched.before_step = self._before_step
         stack = config.frame_stack
         env: VecEnv = batched if stack == 1 else StackedVecEnv(batched, stack)
-        model = make_model(task.algo, config, env, self._seed)
+        self.model = make_model(task.algo, config, env, self._seed)
         architecture = own_architecture(config, env.observation_space)
         space = self.env.single_observation_space
         if architecture is not None and config.center_images:
             encoder = ModelEncoder(space)
             center_images(encoder, task, self._seed)
-            normalize_images(model.policy, encoder.image_inputs, config.frame_stack)
+            normalize_images(self.model.policy, encoder.image_inputs, config.frame_stack)
         self._description = describe_run(
             task.algo,
             config.hidden,
@@ -173,8 +135,10 @@ class ModelAgent(Agent):
         )
         self._row: dict[str, float] = {}
         self._actions: NDArray[Any] = np.zeros(0)
-        model.set_logger(Logger(folder=None, output_formats=[_Rows(self._row)]))
-        return model
+        self.model.set_logger(Logger(folder=None, output_formats=[_Rows(self._row)]))
+
+    def _shown(self) -> ModelAgent:
+        return self
 
     @property
     def steps(self) -> int:
@@ -228,13 +192,13 @@ class ModelAgent(Agent):
             else:
                 self._recorder.behavior_probs = found
 
-    def _save_policy(self) -> None:
-        """Write the current model in the format of SB3."""
-        save_policy(self._folder / BEST_NAME, self.model, self._description)
+    def save_policy(self, folder: Path) -> None:
+        """Write the current model into a folder, in the format of SB3."""
+        save_policy(folder / BEST_NAME, self.model, self._description)
 
-    def _save(self) -> None:
-        """Replace the checkpoint."""
-        model = self.model
+    def _state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Return the state for a checkpoint, as tensors and as JSON values."""
+        model, buffer = self.model, _buffer_of(self.model)
         generators, states = _generators(model)
         tensors = {
             **{f"policy.{name}": value for name, value in model.policy.state_dict().items()},
@@ -242,21 +206,13 @@ class ModelAgent(Agent):
             **_temperature(model),
             **{f"generator.{name}": value for name, value in generators.items()},
             **{f"buffer.{name}": torch.from_numpy(v) for name, v in _columns(model).items()},
-            **self._best_content(),
         }
-        buffer = _buffer_of(model)
-        description = {
-            **self._task.identity.parts,
-            "counters": {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)},
-            "place": [buffer.pos, buffer.full] if buffer is not None else [],
-            "generators": states,
-            "points": [asdict(point) for point in self.points],
-            "episodes_in_log": -1,
-        }
-        write_tensors(self._checkpoint, tensors, description)
+        counters = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
+        place = [] if buffer is None else [buffer.pos, buffer.full]
+        return tensors, {"counters": counters, "place": place, "generators": states}
 
     def _load(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
-        """Restore a checkpoint. The environments start new episodes, with a new seed."""
+        """Restore what `_state` returned. The environments start new episodes, with a new seed."""
         model, buffer = self.model, _buffer_of(self.model)
         model.policy.load_state_dict(below(tensors, "policy"))
         for name, optimizer in _optimizers(model).items():
@@ -271,7 +227,6 @@ class ModelAgent(Agent):
         for name, value in description["counters"].items():
             setattr(model, name, value)
         _load_generators(model, below(tensors, "generator"), description["generators"])
-        self._restore_best(tensors, description["points"])
         assert model.env is not None
         model.env.seed(episode_seed(self._seed, self.steps))
 
@@ -337,21 +292,15 @@ class _Rows(KVWriter):
 
 
 class _Callbacks(BaseCallback):
-    """Evaluations, reports and checkpoints of an agent, and target updates by episodes."""
+    """Evaluations, reports and checkpoints of an agent."""
 
     def __init__(self, agent: ModelAgent, report: ProgressCallback) -> None:
         super().__init__()
-        self._agent, self._report = agent, report
-        self._saved_at, self._finished = agent.steps, 0
+        self._agent, self._report, self._saved_at = agent, report, agent.steps
 
     def _on_step(self) -> bool:
-        config, before = self._agent._task.config, self._finished
-        self._agent._after_step(self.num_timesteps - config.envs, self._report)
-        self._finished += int(np.sum(self.locals["dones"]))
-        episodes = config.target_update_episodes if isinstance(config, DQNConfig) else 0
-        if episodes and is_due(before, self._finished, episodes):
-            model = cast(DQN, self.model)
-            model.q_net_target.load_state_dict(model.q_net.state_dict())
+        before = self.num_timesteps - self._agent._task.config.envs
+        self._agent._after_step(before, self._report)
         return True
 
     def _on_rollout_start(self) -> None:
@@ -399,40 +348,24 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
     if encoder == "nature" and _has_images(env.observation_space):
         # Convolutions take 25 % less time in channels-last format; results do not change.
         cast(Any, model.policy).to(memory_format=torch.channels_last)
-    if isinstance(config, DQNConfig) and config.exploration_decay:
-        cast(DQN, model).exploration_schedule = _Decay(config)
     return model
-
-
-@dataclass(frozen=True)
-class _Decay:
-    """Exploration that decays by a factor at each step, as a schedule of SB3."""
-
-    config: DQNConfig
-
-    def __call__(self, remaining: float) -> float:
-        """Return epsilon for a remaining fraction of the steps, from 1 (start) to 0 (end)."""
-        return self.config.epsilon_at(round((1 - remaining) * self.config.steps))
 
 
 def _check(algo: str, config: OnlineConfig, space: spaces.Space[Any]) -> None:
     """Refuse settings that SB3's algorithms with a replay buffer do not have."""
     if not isinstance(config, ReplayConfig):
         return
-    own = "use `algo='double-dqn'`" if isinstance(config, DQNConfig) else "omit `engine='sb3'`"
-    if config.image_shift:
-        raise UsageError(f"{algo} of Stable-Baselines3 has no image_shift: {own}")
+    lacks = ("image_shift", "exploration_decay", "target_update_episodes", "critic_layer_norm")
+    given = [name for name in lacks if getattr(config, name, False)]
     if config.n_steps > 1 and isinstance(space, spaces.Dict):
-        raise UsageError(
-            f"{algo} of Stable-Baselines3 has no n-step returns for Dict observations: pass"
-            f" `n_steps=1`, or {own}"
-        )
-    if isinstance(config, ActorCriticConfig) and (
-        config.critic_layer_norm or own_architecture(config, space) is not None
-    ):
+        given.append("n_steps for Dict observations")
+    own = "use `algo='double-dqn'`" if isinstance(config, DQNConfig) else "omit `engine='sb3'`"
+    if given:
+        raise UsageError(f"{algo} of Stable-Baselines3 has no {given[0]}: omit it, or {own}")
+    if isinstance(config, ActorCriticConfig) and own_architecture(config, space) is not None:
         raise UsageError(
             f"{algo} of Stable-Baselines3 has its own networks only: pass `encoder='nature'`,"
-            f" `center_images=False` and no layer normalization, or {own}"
+            f" `center_images=False` and `layer_norm=False`, or {own}"
         )
 
 

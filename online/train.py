@@ -3,7 +3,7 @@
 `mcaprl.runs` lists the files of a run folder; an online run also writes
 
     RUN/seed-K/evaluations/step-N.mcap      episodes of each evaluation, if training is recorded
-    RUN/seed-K/progress.csv                 SB3's scalars, which TensorBoard files also contain
+    RUN/seed-K/progress.csv                 scalars, which TensorBoard files also contain
     RUN/scores.json                         score of each seed's best checkpoint on new episodes
     RUN/curve.png                           curves of all seeds
     RUN/foxglove-layout.json                layout for live viewers

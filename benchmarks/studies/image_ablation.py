@@ -24,7 +24,6 @@ import numpy as np
 import torch
 
 from mcaprl.files import write_json
-from mcaprl.offline.batches.buffer import Batch
 from mcaprl.online import FRESH_SEED, SELECTION_SEED, LearningAgent, Task, measure_scale
 from mcaprl.sims import Scale, evaluate, make_sim
 
@@ -61,7 +60,7 @@ class MirroredBuffer:
         """Return an attribute of the buffer."""
         return getattr(self._buffer, name)
 
-    def batch(self, rows: torch.Tensor) -> Batch:
+    def batch(self, rows: torch.Tensor) -> Any:
         """Return transitions; rows 0, 2, 4, ... are mirrored."""
         batch = self._buffer.batch(rows)
         actions = batch.actions.clone()

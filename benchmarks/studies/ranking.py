@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 import mcaprl
 from mcaprl.files import write_json
 from mcaprl.offline import FQEConfig, OffPolicyEvaluator
-from mcaprl.offline.policy import Policy, read_policy, save_policy
 from mcaprl.online import LearningAgent, Task
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import Scale, episode_seed, make_sims
@@ -61,14 +60,14 @@ def train(sim: str, folder: Path, seed: int, steps: int) -> tuple[Path, list[Pat
         if progress.done % every == 0:
             path = folder / f"step-{progress.done}"
             path.mkdir()
-            save_policy(path, agent.agents.learner, seed, task.sim, task.sim_options)
+            agent.save_policy(path)
 
     with closing(agent):
         agent.learn(keep)
     return log, kept
 
 
-def true_values(sim: str, policy: Policy) -> tuple[float, float]:
+def true_values(sim: str, policy: Any) -> tuple[float, float]:
     """Return the greedy policy's mean discounted and undiscounted return over fresh episodes."""
     with closing(make_sims(sim, EPISODES)) as envs:
         each: Any = [episode_seed(FIRST_SEED, k) for k in range(EPISODES)]
@@ -91,7 +90,7 @@ def ask(sim: str, log: Path, kept: list[Path], config: FQEConfig) -> list[dict[s
     evaluator = OffPolicyEvaluator(dataset, config)
     found = []
     for number, path in enumerate(kept):
-        policy = read_policy(path)
+        policy = mcaprl.load_policy(path)
         discounted, plain = true_values(sim, policy)
         estimates = evaluator.evaluate(policy, path.stem).estimates
         values = {estimate.estimator: estimate.value for estimate in estimates}

@@ -1,6 +1,7 @@
-"""Make a robot's bag from the drives in a log of the lane sim.
+r"""Make a robot's bag from the drives in a log of the lane sim.
 
-    mcaprl record lane --policy pilot --epsilon 0.1 --episodes 40 --out native.mcap
+    mcaprl record lane --actions continuous --policy pilot --noise 0.1 --noise-per-episode \
+      --episodes 40 --out native.mcap
     python examples/05_robot_bag/make_bag.py native.mcap bag                  # ROS 2, by rosbags
     python examples/05_robot_bag/make_bag.py native.mcap drive.mcap --format protobuf
 
@@ -36,10 +37,11 @@ def make_bag(log: str | Path, out: str | Path, form: str = "ros2") -> int:
 
 
 def _recorded(log: str | Path) -> Iterator[tuple[int, Message]]:
-    env, camera, start_ns = mcaprl.make_sim("lane"), CarCamera(), START_NS
-    for episode in mcaprl.open(log).episodes:
+    data, camera, start_ns = mcaprl.open(log), CarCamera(), START_NS
+    env = mcaprl.make_sim("lane", **data.env_kwargs)
+    for episode in data.episodes:
         assert episode.seed is not None, f"{log} has no seeds"
-        drive = Drive(env, episode.seed, episode.actions.tolist())
+        drive = Drive(env, episode.seed, episode.actions)
         for message in drive.messages(camera, start_ns):
             yield start_ns + round(message.time_s * 1e9), message
         start_ns += round((drive.duration_s + PAUSE_S) * 1e9)

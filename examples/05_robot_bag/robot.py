@@ -4,11 +4,15 @@
 /joint_states   sensor_msgs/JointState at 20 Hz: commanded position of the steering joint
 /lane           std_msgs/Float32MultiArray at 4 Hz, a lane detector: offset and heading error from
                 the middle of the lane, distance along the route, and four points of the lane ahead
-/cmd_vel        geometry_msgs/Twist at 20 Hz: speed and steering that the controller wants, chosen
-                after each message of the lane detector
+/cmd_vel        geometry_msgs/Twist at 20 Hz: what the controller wants, chosen after each message
+                of the lane detector; linear.x is the pedal, from full brake (-1) to full throttle
+                (1), and angular.z the steering, from full right (-1) to full left (1)
 /e_stop         std_msgs/Bool: true when a safety monitor stops the car
 /camera/depth   sensor_msgs/Image at 10 Hz: depth in millimeters
 /diagnostics    diagnostic_msgs/DiagnosticArray at 1 Hz
+
+A car with six buttons, instead of a pedal and a steering wheel, publishes the speed in m/s and the
+steering of its button; see `BUTTONS`.
 
 A message is a dict with the fields of its type; fields that are left out are zero.
 """
@@ -36,7 +40,7 @@ TYPES = {
 }
 PAUSE_S = 5.0
 """Time between two drives, in seconds."""
-COMMANDS = (
+BUTTONS = (
     ("brake", 0.0, 0.0),
     ("straight", 30.0, 0.0),
     ("right", 30.0, -0.5),
@@ -44,7 +48,7 @@ COMMANDS = (
     ("slightly right", 30.0, -0.25),
     ("slightly left", 30.0, 0.25),
 )
-"""Name, speed in m/s and steering (fraction of the maximum angle, left positive) of each action."""
+"""Name, speed in m/s and steering (fraction of the maximum angle, left positive) of each button."""
 _STEP_S, _SUBSTEP_S = 0.25, 0.05
 _LOOKAHEADS_M = np.repeat([5.0, 10.0, 20.0, 40.0], 2)
 _FULL_STEERING_RAD = math.radians(40.0)
@@ -73,30 +77,31 @@ class Message(NamedTuple):
 class Drive:
     """One drive of the car in the lane sim."""
 
-    def __init__(self, env: gym.Env[Any, Any], seed: int, actions: list[int]) -> None:
+    def __init__(self, env: gym.Env[Any, Any], seed: int, actions: NDArray[Any]) -> None:
         """Drive the car.
 
         Args:
-            env: Lane sim with its default rules.
+            env: Lane sim with its default rules, and the kind of actions.
             seed: Seed of the start.
-            actions: Actions of the controller; each lasts 0.25 s.
+            actions: Buttons (T,), or pedal and steering (T, 2), of the controller; each lasts
+                0.25 s.
         """
         self._random = np.random.default_rng(seed)
-        self._actions = actions
+        self._wanted = [_wanted(action) for action in actions.tolist()]
         sim: Any = env.unwrapped
         seen, _ = env.reset(seed=seed)
         self._lanes = [_lane(sim.car, seen)]
         self._cars = [sim.car]
         self._stopped = False
         for action in actions:
-            self._cars += sim.fleet.substeps(sim.car, action)
+            self._cars += sim.fleet.substeps(sim.car, sim.fleet.controls.read(action))
             seen, _, self._stopped, _, _ = env.step(action)
             self._lanes.append(_lane(sim.car, seen))
 
     @property
     def duration_s(self) -> float:
         """Length of the drive, seconds."""
-        return len(self._actions) * _STEP_S
+        return len(self._wanted) * _STEP_S
 
     def messages(self, camera: CarCamera, start_ns: int) -> list[Message]:
         """Return all messages in the order of recording.
@@ -148,9 +153,8 @@ class Drive:
             yield Message(step * _STEP_S + _LANE_DELAY_S, "/lane", {"data": data})
 
     def _commands(self) -> Iterator[Message]:
-        for step, action in enumerate(self._actions):
-            _, speed, steering = COMMANDS[action]
-            content = {"linear": {"x": speed}, "angular": {"z": steering}}
+        for step, (forward, turn) in enumerate(self._wanted):
+            content = {"linear": {"x": forward}, "angular": {"z": turn}}
             for repeat in range(round(_STEP_S / _COMMAND_S)):
                 time_s = step * _STEP_S + repeat * _COMMAND_S + _COMMAND_DELAY_S
                 yield Message(time_s, "/cmd_vel", content)
@@ -203,6 +207,11 @@ class Drive:
             yaw_rad=low.yaw_rad + share * turn,
             speed_m_s=low.speed_m_s + share * (high.speed_m_s - low.speed_m_s),
         )
+
+
+def _wanted(action: Any) -> tuple[float, float]:
+    """Return linear.x and angular.z of the command of an action."""
+    return BUTTONS[action][1:] if isinstance(action, int) else (action[0], action[1])
 
 
 def _lane(car: Any, seen: NDArray[np.float32]) -> list[float]:

@@ -93,7 +93,9 @@ def record(
         out: File to write; with several processes, a folder with one file per process.
         policy: `pilot`, `random`, the path of a trained policy, a policy or another object with a
             method `act(observations)` for batches of observations. Only policies of this package,
-            and those with a true attribute `is_deterministic`, get a `behavior_prob`.
+            and those with a true attribute `is_deterministic`, get a `behavior_prob`. Actions of
+            floats get a `behavior_log_prob` from the method `log_prob(observations, actions)` of
+            policies that are not deterministic.
         epsilon: Probability of a random action instead of the policy's.
         noise: Standard deviation of Gaussian noise that is added to each part of continuous
             actions, as a fraction of half the range of the part. The noisy action is within the

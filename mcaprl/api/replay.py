@@ -304,7 +304,7 @@ def _of_scene(
                 moment.follow,
                 _caption(dataset, episode, moment.step, moment.time_ns),
                 [
-                    Dial(one.name, float(actions[moment.step, one.index]), *one.ends)
+                    Dial(one.name, float(actions[moment.step, one.element]), *one.ends)
                     for one in bounded
                     if moment.step < episode.length
                 ],

@@ -214,7 +214,8 @@ def train_online(
         device: `cuda` or `cpu`, on which sims, replay buffers and networks of all seeds stay, and
             all seeds are trained at once; only for `double-dqn` in the sims `lane` and `racer`,
             without a recording. The settings have other defaults (`mcaprl.device.training`), and
-            the last policy is saved instead of the best checkpoint.
+            the last policy is saved instead of the best checkpoint. None trains one seed after the
+            other.
         max_steps: Steps after which an episode is truncated, in training and evaluation. None
             selects that of the resumed run, else no limit in training, and 27,000 in evaluations of
             environments without a time limit.

@@ -32,10 +32,11 @@ def read(
     """Read logs as a dataset of Ray Data with one row per transition.
 
     The columns are those of `Dataset.to_arrow`: `episode`, `step`, `log_time_ns`, `reward`,
-    `terminated`, `truncated`, `behavior_prob`, `action`, `observation` and `next_observation`, or
-    `observation_<key>` and `next_observation_<key>` for the parts of a Dict. Vectors and images
-    are tensors. Each block has whole episodes of one log. An episode above Ray's maximum block size
-    is divided. Infos are not read.
+    `terminated`, `truncated`, `behavior_prob` (for actions of floats, `behavior_log_prob`),
+    `action`, `observation` and `next_observation`, or `observation_<key>` and
+    `next_observation_<key>` for the parts of a Dict. Vectors and images are tensors. Each block has
+    whole episodes of one log. An episode above Ray's maximum block size is divided. Infos are not
+    read.
 
     This function reads only the summaries of the logs. When rows are needed, the workers read the
     columns that later steps use, and check all CRCs.
@@ -88,9 +89,10 @@ def write(
 ) -> Path | str:
     """Write a dataset of Ray Data as logs, one for each block, and write a manifest of the logs.
 
-    The rows have the columns of `read`; `log_time_ns` and `behavior_prob` may be missing. All rows
-    of an episode must be in one block. The logs are numbered in the order of the blocks. The
-    times in the logs are new. The seeds and policies of the logs that were read are dropped.
+    The rows have the columns of `read`; `log_time_ns`, `behavior_prob` and `behavior_log_prob` may
+    be missing. All rows of an episode must be in one block. The logs are numbered in the order of
+    the blocks. The times in the logs are new. The seeds and policies of the logs that were read are
+    dropped.
 
     Args:
         rows: Dataset to write; this function runs its steps.

@@ -188,7 +188,7 @@ class BoxHead(Head):
 
     log_std: Tensor | None
     _low: Tensor
-    _half: Tensor
+    _high: Tensor
 
     def __init__(
         self, networks: Mapping[str, nn.Module], box: BoxActions, log_std: Tensor | None = None
@@ -199,8 +199,7 @@ class BoxHead(Head):
         self.register_buffer("log_std", log_std)
         # In float64, so that the bounds are the same numbers as in the space.
         self.register_buffer("_low", torch.from_numpy(box.low), persistent=False)
-        half = torch.from_numpy((box.high - box.low) / 2)
-        self.register_buffer("_half", half, persistent=False)
+        self.register_buffer("_high", torch.from_numpy(box.high), persistent=False)
 
     @staticmethod
     @abstractmethod
@@ -220,9 +219,9 @@ class BoxHead(Head):
     def actions(self, observations: Observations) -> Tensor:
         """Return the best actions (B, *shape), in the units and dtype of the space."""
         numbers = self.best(self.networks["actor"](observations)).double()
-        values = torch.addcmul(self._low, numbers + 1, self._half)
+        values = self._low + (numbers + 1) / 2 * (self._high - self._low)
         dtype = getattr(torch, str(self.box.space.dtype))
-        return values.to(dtype).view(-1, *self.box.shape)
+        return values.clamp(self._low, self._high).to(dtype).view(-1, *self.box.shape)
 
     def log_prob(self, observations: Observations, actions: NDArray[Any]) -> Tensor:
         """Return the log densities (B,) of actions (B, *shape), in their own units."""
@@ -334,7 +333,8 @@ class Mixture(BoxHead):
     @staticmethod
     def _components(outputs: Tensor) -> Tensor:
         """Return the means and deviations (B, C, 2, n) before they are bounded."""
-        return outputs[:, COMPONENTS:].view(len(outputs), COMPONENTS, 2, -1)
+        size = (outputs.shape[1] // COMPONENTS - 1) // 2
+        return outputs[:, COMPONENTS:].reshape(-1, COMPONENTS, 2, size)
 
 
 COMPONENTS: Final = 5

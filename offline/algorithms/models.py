@@ -17,6 +17,7 @@ from typing import ClassVar, cast
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
+from torch.nn import functional
 
 from mcaprl.networks import Network
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
@@ -118,21 +119,26 @@ class StackedMLP(Model):
 
     bulk_gain = 2.0
 
+    def __init__(self, networks: Sequence[Network], members: int = 1) -> None:
+        """Move the weights of networks of one shape into one matrix."""
+        super().__init__(networks, members)
+        self._is_normed = any(isinstance(m, nn.LayerNorm) for m in networks[0].modules())
+
     @staticmethod
     def fits(network: Network) -> bool:
-        """Return whether a network consists of linear layers and ReLU only.
+        """Return whether a network consists of linear layers, layer normalization and ReLU only.
 
-        Layers with a single input or output are excluded on the CPU, because matrix-vector products
-        round differently for one seed than for several.
+        Layers with a single input are excluded on the CPU, because matrix-vector products round
+        differently for one seed than for several. So are hidden layers with a single output.
         """
-        kinds = (Network, nn.ModuleList, nn.Sequential, nn.Linear, nn.ReLU)
+        kinds = (Network, nn.ModuleList, nn.Sequential, nn.Linear, nn.LayerNorm, nn.ReLU)
         plain = len(network.stems) == 1 and all(isinstance(m, kinds) for m in network.modules())
         matrices = [weights for weights in network.parameters() if weights.ndim == 2]
-        return plain and all(one.is_cuda or min(one.shape) > 1 for one in matrices)
+        return plain and all(one.is_cuda or one.shape[1] > 1 for one in matrices)
 
     def _outputs(self, observations: Observations, weights: Tensor, members: int) -> Tensor:
-        # Store observations as columns (K, width, B). Autograd's weight gradients, dy x^T, then
-        # have the layout of the weights and need no transposition.
+        # Store observations as columns (C, width, B) of C networks. Autograd's weight gradients,
+        # dy x^T, then have the layout of the weights and need no transposition.
         count, seeds = len(weights), len(weights) // members
         columns = observations.vector.view(seeds, -1, observations.vector.shape[1]).mT
         if members > 1:
@@ -142,13 +148,24 @@ class StackedMLP(Model):
             # Add a second column, because matrix-vector products round differently for one seed
             # than for several.
             columns = columns.expand(-1, -1, 2)
-        parts = weights.split_with_sizes(self._sizes, 1)[:-1]
-        last = len(parts) // 2 - 1
-        for layer, (matrix, bias) in enumerate(zip(parts[::2], parts[1::2], strict=True)):
-            matrices = matrix.view(count, *self._shapes[2 * layer])
-            columns = torch.baddbmm(bias.unsqueeze(2), matrices, columns)
-            columns = columns if layer == last else columns.relu_()
-        return columns[:, :, :rows].mT.reshape(-1, *self.networks[0].output_shape)
+        sizes_and_shapes = zip(weights.split_with_sizes(self._sizes, 1), self._shapes, strict=False)
+        parts = [part.view(count, *shape) for part, shape in sizes_and_shapes]
+        step = 4 if self._is_normed else 2
+        for matrix, bias, *norm in (parts[k : k + step] for k in range(0, len(parts) - 2, step)):
+            columns = torch.baddbmm(bias.unsqueeze(2), matrix, columns)
+            if norm:
+                normal = functional.layer_norm(columns.mT, columns.shape[1:2]).mT
+                gain, shift = (part.unsqueeze(2) for part in norm)
+                columns = torch.addcmul(shift, gain, normal)
+            columns = columns.relu_()
+        matrix, bias = parts[-2:]
+        outputs = matrix.shape[1]
+        if outputs == 1:
+            # Matrix-vector products round differently for one network than for several.
+            matrix = matrix.expand(-1, 2, -1)
+        columns = torch.baddbmm(bias.unsqueeze(2), matrix, columns)
+        shape = self.networks[0].output_shape
+        return columns[:, :outputs, :rows].mT.reshape(-1, *shape)
 
 
 def build_model(networks: Sequence[Network], members: int = 1) -> Model:

@@ -41,34 +41,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 from scipy.stats import norm, t
 
-from mcaprl.actions import joint_actions
-from mcaprl.errors import SpaceError
 from mcaprl.sims.evaluation.statistics import LEAST_RESAMPLED
 
 Floats = NDArray[np.float64]
 
 CONFIDENCE: Final = 0.95
 _RESAMPLES_AT_ONCE = 64
-
-
-def check_space(space: spaces.Space[Any]) -> None:
-    """Check that the probabilities of actions can be compared.
-
-    Raises:
-        SpaceError: The actions are not finite in number.
-    """
-    if joint_actions(space) is None:
-        raise SpaceError(
-            f"importance sampling needs discrete actions, got {space}: evaluate policies in the"
-            " environment instead"
-        )
 
 
 @dataclass(frozen=True, eq=False)

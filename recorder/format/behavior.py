@@ -110,8 +110,11 @@ class BehaviorField:
         """Return logarithms of probabilities or densities as values, which `check` checks."""
         if self is LOG_DENSITY:
             return values
-        with np.errstate(all="ignore"):
-            return np.exp(values)
+        try:
+            with np.errstate(all="ignore"):
+                return np.exp(values)
+        except TypeError:
+            return values
 
 
 PROBABILITY: Final = BehaviorField(

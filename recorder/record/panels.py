@@ -77,7 +77,7 @@ class Bounded(NamedTuple):
     """An element of a Box action with finite bounds."""
 
     name: str
-    index: int
+    element: int
     low: float
     high: float
     is_leftward: bool
@@ -98,7 +98,7 @@ def bounded_actions(metadata: LogMetadata) -> list[Bounded]:
     units = itertools.chain(metadata.action_units, itertools.repeat(""))
     parts = zip(action_parts(metadata), ends, units, strict=False)
     return [
-        Bounded(name, index, *pair, unit.endswith("| left"))
+        Bounded(name, index, *pair, " | " in unit and unit.endswith("left"))
         for index, (name, pair, unit) in enumerate(parts)
         if all(map(math.isfinite, pair))
     ]

@@ -207,7 +207,7 @@ def _actions_taken(dataset: Dataset) -> dict[str, int]:
 def _command_panels(dataset: Dataset) -> list[Panel]:
     """Return a histogram of each of the first elements of a Box action, over its range."""
     metadata = LogMetadata.from_strings(dataset.metadata)
-    bounded = {one.index: (one.low, one.high) for one in bounded_actions(metadata)}
+    bounded = {one.element: (one.low, one.high) for one in bounded_actions(metadata)}
     columns = dataset.actions.reshape(len(dataset), -1).T
     return [
         Panel(f"Action {name}", partial(_commands_taken, values=column, ends=bounded.get(index)))

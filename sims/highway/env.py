@@ -39,7 +39,7 @@ ROADS: Final[dict[str, type]] = {
 ACTION_MEANINGS = ("straight", "right", "left", "slightly right", "slightly left")
 STEERING_RAD = np.radians([0.0, -24.0, 24.0, -6.0, 6.0])
 """Angle of the front wheels for each action; left is positive."""
-_PARTS = ("steering",), ("full angle, left positive",)
+_PARTS = ("steering",), ("full right | full left",)
 CONTROLS: Final = {
     "discrete": Controls(*_PARTS, ACTION_MEANINGS, STEERING_RAD[:, np.newaxis]),
     "continuous": Controls(*_PARTS),

@@ -15,7 +15,7 @@ from mcaprl.sims.drawing.top_view import Body, FollowView
 from mcaprl.sims.lane import scene as lane_scene
 from mcaprl.sims.lane.camera import IMAGE_SHAPE, LENS
 from mcaprl.sims.lane.fleet import LaneFleet
-from mcaprl.sims.lane.rules import DECISION_S, Car, Command, wheel_angle
+from mcaprl.sims.lane.rules import DECISION_S, Car, wheel_angle
 from mcaprl.sims.vehicle.batched import BatchedEnv
 from mcaprl.sims.vehicle.env import RENDER_MODES, RenderMode, VehicleEnv
 
@@ -246,7 +246,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
         return self.car
 
     def _moments(self, before: Any, command: Sequence[float]) -> list[Sequence[Frame]]:
-        return [_frames_of(car) for car in self.fleet.substeps(before, Command(*command))]
+        return [_frames_of(car) for car in self.fleet.substeps(before, command)]
 
     def _open_view(self, render_mode: RenderMode) -> FollowView:
         frames_per_s = self.metadata["render_fps"]

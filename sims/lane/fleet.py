@@ -114,13 +114,14 @@ class LaneFleet(Fleet):
         """Return the state of a car."""
         return Car._make(self._cars[i, :STARTED_AT].tolist())
 
-    def substeps(self, before: Car, command: Command) -> list[Car]:
+    def substeps(self, before: Car, command: Sequence[float]) -> list[Car]:
         """Return the states of a car after each 0.05 s of a decision; the last is at the end."""
+        wanted = Command(*command)
         if not self._classic:
-            return [drive(before, command, 1 + k) for k in range(SUBSTEPS)]
+            return [drive(before, wanted, 1 + k) for k in range(SUBSTEPS)]
         cars = [before]
         for _ in range(CLASSIC_SUBSTEPS):
-            cars.append(drive(cars[-1], command, 1))
+            cars.append(drive(cars[-1], wanted, 1))
         return cars[1:]
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:

@@ -46,7 +46,7 @@ ACTION_COMMANDS = (
     Command(1.0, -0.25),
     Command(1.0, 0.25),
 )
-COMMAND_UNITS = ("full throttle or brake", "full angle, left positive")
+COMMAND_UNITS = ("full brake | full throttle", "full right | full left")
 DECISION_S = 0.25
 SUBSTEPS = 5
 SUBSTEP_S = DECISION_S / SUBSTEPS

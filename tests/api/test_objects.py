@@ -79,6 +79,31 @@ def test_policies_of_other_packages_are_evaluated_and_recorded(tmp_path: Path) -
     assert set(mcaprl.open(tmp_path / "b.mcap").behavior_probs.tolist()) == {0.25, 0.75}
 
 
+class Swing:
+    """A stochastic policy of Pendulum: torques from a normal distribution of width 0.1."""
+
+    is_deterministic = False
+
+    def act(self, observations: Any) -> Any:
+        drawn = np.random.default_rng(len(observations)).normal(0, 0.1, (len(observations), 1))
+        return drawn.astype(np.float32)
+
+    def log_prob(self, observations: Any, actions: Any) -> Any:
+        return -((actions[:, 0] / 0.1) ** 2) / 2 - math.log(0.1 * math.sqrt(2 * math.pi))
+
+
+def test_densities_of_policies_of_other_packages_are_recorded(tmp_path: Path) -> None:
+    swing: Any = Swing()
+    mcaprl.record("Pendulum-v1", tmp_path / "log.mcap", policy=swing, steps=30, seed=3)
+    log = mcaprl.open(tmp_path / "log.mcap")
+    expected = swing.log_prob(log.observations, log.actions.astype(np.float64))
+    np.testing.assert_allclose(log.behavior_log_probs, expected, rtol=1e-6)
+    assert expected.max() > 0, "a density may be above 1"
+    swing.is_deterministic = True
+    mcaprl.record("Pendulum-v1", tmp_path / "b.mcap", policy=swing, steps=30, seed=3)
+    assert np.isnan(mcaprl.open(tmp_path / "b.mcap").behavior_log_probs).all()
+
+
 def test_a_pilot_records_the_same_steps_as_its_name(tmp_path: Path) -> None:
     env = mcaprl.make_sim("lane")
     pilot = make_pilot(env)

@@ -46,7 +46,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ("online", "double-dqn", "online/seed-0"),
         ("online/seed-1", "double-dqn", "online/seed-1"),
-        ("online/seed-1/best_model.zip", "double-dqn", "online/seed-1"),
+        ("online/seed-1/policy.json", "double-dqn", "online/seed-1"),
         ("offline", "cql", "offline/seed-0"),
         ("offline/seed-1", "cql", "offline/seed-1"),
         ("sb3.zip", "dqn", "sb3"),

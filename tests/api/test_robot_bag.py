@@ -16,10 +16,19 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "05_robot_bag"
 
 
 @pytest.fixture(scope="module")
-def native(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record drives; in one of them, the car stalls."""
-    path = tmp_path_factory.mktemp("robot") / "native.mcap"
+def buttons(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record drives of the car with buttons; in one of them, the car stalls."""
+    path = tmp_path_factory.mktemp("buttons") / "native.mcap"
     mcaprl.record("lane", path, epsilon=0.1, episodes=3, seed=5)
+    return path
+
+
+@pytest.fixture(scope="module")
+def native(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record drives with a pedal and a steering wheel; noise ends some of them."""
+    path = tmp_path_factory.mktemp("robot") / "native.mcap"
+    options = {"actions": "continuous"}
+    mcaprl.record("lane", path, sim_options=options, noise=0.1, episodes=3, seed=5)
     return path
 
 
@@ -34,10 +43,8 @@ def make(native: Path, form: str) -> Path:
     return out
 
 
-@pytest.mark.parametrize("form", ["ros2", "protobuf", "json"])
-def test_the_bag_gives_the_transitions_of_the_native_log(native: Path, form: str) -> None:
-    bag = make(native, form)
-    recorded, read = mcaprl.open(native), mcaprl.open(bag, mapping=EXAMPLE / "robot.yaml")
+def assert_same_drives(recorded: mcaprl.Dataset, read: mcaprl.Dataset) -> None:
+    """Check that a bag has the transitions of the native log."""
     assert read.episode_lengths.tolist() == recorded.episode_lengths.tolist()
     differences = np.abs(read.frames - recorded.frames).max(axis=0)
     # The last odometry before a step is at most 20 ms old. In 20 ms, braking changes the speed by
@@ -45,12 +52,29 @@ def test_the_bag_gives_the_transitions_of_the_native_log(native: Path, form: str
     speed = recorded.observation_names.index("speed")
     assert differences[speed] < 0.16 / 30
     assert np.delete(differences, speed).max() < 1e-6
-    assert (read.actions == recorded.actions).all()
-    assert read.action_meanings == recorded.action_meanings
+    np.testing.assert_array_equal(read.actions, recorded.actions)
+    assert read.action_space == recorded.action_space
     # The lane detector's distance along the route, up to 1,000 m, is rounded to float32.
     assert np.abs(read.rewards - recorded.rewards).max() < 1e-4
     assert (read.terminated == recorded.terminated).all()
     assert (read.truncated == recorded.truncated).all()
+
+
+@pytest.mark.parametrize("form", ["ros2", "protobuf", "json"])
+def test_the_bag_gives_the_transitions_of_the_native_log(native: Path, form: str) -> None:
+    read = mcaprl.open(make(native, form), mapping=EXAMPLE / "robot.yaml")
+    assert_same_drives(mcaprl.open(native), read)
+    assert read.action_labels == (
+        "linear.x (-1 full brake, 1 full throttle)",
+        "angular.z (-1 full right, 1 full left)",
+    )
+
+
+def test_the_bag_of_a_car_with_buttons(buttons: Path) -> None:
+    recorded = mcaprl.open(buttons)
+    read = mcaprl.open(make(buttons, "ros2"), mapping=EXAMPLE / "buttons.yaml")
+    assert_same_drives(recorded, read)
+    assert read.action_meanings == recorded.action_meanings
     assert [episode.reason for episode in read.episodes] == ["gap", "gap", "stall"]
 
 
@@ -62,7 +86,8 @@ def test_a_policy_that_learned_from_the_bag_drives_in_the_sim(
     mapping = ["--mapping", str(EXAMPLE / "robot.yaml")]
     train = ["train-offline", str(bag), *mapping, "--algo", "bc", "--updates", "20"]
     assert run([*train, "--out", str(runs)]) == 0
-    assert run(["evaluate", str(runs), "--sim", "lane", "--episodes", "2"]) == 0
+    sim = ["--sim", "lane", "--actions", "continuous"]
+    assert run(["evaluate", str(runs), *sim, "--episodes", "2"]) == 0
     assert "runs" in capsys.readouterr().out
 
 
@@ -77,6 +102,8 @@ def test_the_suggested_mapping_uses_frequent_topics(native: Path, tmp_path: Path
     assert "joint_states_position_steering" in observed
     assert "lane_data_10" in observed
     assert not any(name.startswith(("e_stop", "joint_states_velocity")) for name in observed)
+    assert found.dataset.action_part_names == ("linear.x", "angular.z")
+    assert found.dataset.action_units == ("m/s", "rad/s")
     # The clock of the suggested mapping is not aligned with the messages of the lane detector.
     # Therefore, some steps are in the pauses between the drives.
     assert len(found.dataset) > 0.9 * len(mcaprl.open(native))

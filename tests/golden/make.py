@@ -179,7 +179,7 @@ def contents_of(path: Path) -> dict[str, Any]:
 def _behavior(path: Path, data: mcaprl.Dataset) -> dict[str, np.ndarray[Any, Any]]:
     """Return the behavior column of a log by the name of the array.
 
-    Before version 0.2, logs had probabilities of all actions; readers convert them to logarithms.
+    Logs of version 0.1.0 have probabilities of all actions; readers convert them to logarithms.
     """
     topic = Topic(McapReader(path), "/rl/step")
     if data.behavior_field.name in topic.fields:

@@ -11,8 +11,16 @@ from gymnasium import spaces
 
 from mcaprl.api.policies import load_policy
 from mcaprl.cli import run
-from mcaprl.offline.algorithms.config import BCConfig, BCQConfig, DQNConfig, TrainingConfig
-from mcaprl.offline.algorithms.registry import ALGORITHMS
+from mcaprl.offline.algorithms.config import (
+    BCConfig,
+    BCQConfig,
+    BoxBCConfig,
+    BoxIQLConfig,
+    DQNConfig,
+    TD3BCConfig,
+    TrainingConfig,
+)
+from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.export import ExportedPolicy, export_onnx
 from mcaprl.offline.policy import Policy, read_policy, save_policy
@@ -50,7 +58,12 @@ CASES = [
 ]
 
 
-def policy_of(config: TrainingConfig, space: spaces.Space[Any], folder: Path) -> Policy:
+def policy_of(
+    config: TrainingConfig,
+    space: spaces.Space[Any],
+    folder: Path,
+    actions: spaces.Box | None = None,
+) -> Policy:
     space.seed(0)
     samples = [space.sample() for _ in range(20)]
     column: Any
@@ -62,15 +75,15 @@ def policy_of(config: TrainingConfig, space: spaces.Space[Any], folder: Path) ->
         column = np.stack(samples)
     data = Dataset.from_arrays(
         observations=column,
-        actions=np.full(20, 7),
+        actions=np.full(20, 7) if actions is None else [actions.sample() for _ in range(20)],
         rewards=np.ones(20),
         terminated=np.ones(20, bool),
         truncated=np.zeros(20, bool),
         next_observations=column,
         observation_space=space,
-        action_space=spaces.Discrete(4, start=7),
+        action_space=actions or spaces.Discrete(4, start=7),
     )
-    learner_type = next(each for each in ALGORITHMS.values() if type(config) is each.config_type)
+    learner_type = choose_algorithm(config).learner_type
     learner = learner_type(config, TransitionBuffer.from_dataset(data, config.packing), [0])
     save_policy(folder, learner, 0, "", {})
     return read_policy(folder)
@@ -95,6 +108,35 @@ def test_the_exported_policy_returns_the_same_scores_and_actions(
         np.testing.assert_array_equal(action, policy.act(observations))
         expected: Any = policy.scores(observations)
         np.testing.assert_allclose(scores, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        BoxBCConfig(**TINY, head="mixture"),
+        BoxBCConfig(**TINY, head="gaussian", frame_stack=3),
+        TD3BCConfig(**TINY),
+        BoxIQLConfig(**TINY),
+    ],
+)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_exported_policy_returns_actions_in_the_units_of_their_box(
+    tmp_path: Path, config: TrainingConfig, dtype: Any
+) -> None:
+    need(onnxruntime is not None, "onnxruntime is not installed")
+    low, high = np.array([[[-3.0, 0.1]], [[5.0, 0.7]]], dtype)
+    space = spaces.Box(low, high, dtype=dtype)
+    policy = policy_of(config, VECTOR, tmp_path, space)
+    export_onnx(policy, tmp_path / "policy.onnx")
+    session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
+    module = ExportedPolicy(policy)
+    for batch_size in (1, 5):
+        arrays = [tensor.numpy() for tensor in module.examples(batch_size, seed=batch_size)]
+        (action,) = session.run(None, dict(zip(module.input_names, arrays, strict=True)))
+        expected = policy.act(arrays[0])
+        assert action.dtype == expected.dtype == dtype
+        np.testing.assert_allclose(action, expected, rtol=1e-5, atol=1e-6)
+        assert all(space.contains(one) for one in expected)
 
 
 @pytest.mark.parametrize("name", ["online-dqn.zip", "online-camera.zip", "sb3-a2c.zip"])

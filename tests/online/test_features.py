@@ -208,7 +208,7 @@ def test_sb3s_network_is_used_if_it_is_asked_for(tmp_path: Path) -> None:
 def test_settings_that_sb3_lacks_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="dqn of Stable-Baselines3 has no image_shift"):
         agent(tmp_path, "depth", "dqn", image_shift=1)
-    with pytest.raises(UsageError, match="no n-step returns for Dict observations"):
+    with pytest.raises(UsageError, match="has no n_steps for Dict observations: omit it"):
         agent(tmp_path, "dashboard", "dqn", n_steps=3)
     with pytest.raises(UsageError, match="image_shift is for images"):
         agent(tmp_path, "state", image_shift=1)

@@ -95,7 +95,7 @@ def test_a_checkpoint_restores_everything(
         assert second.resumed_at == 2_000
         assert second.points == first.points
         path.unlink()
-        second._save()  # type: ignore[attr-defined]
+        second._save()
     assert path.read_bytes() == before
 
 

@@ -22,6 +22,7 @@ from mcaprl.errors import (
 from mcaprl.recorder.dataset.log_reader import Selection
 from mcaprl.recorder.repair.check import check_log
 from tests.support.damage.faults import KnownEpisodes, write_log
+from tests.support.paths import GOLDEN
 
 pytestmark = pytest.mark.usefixtures("ray_cluster")
 
@@ -177,6 +178,16 @@ def test_written_logs_have_the_same_transitions(cartpole: Path, tmp_path: Path) 
         assert check_log(path) == []
     files = {path.name for path in again.sources} | {"manifest.json"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == files
+
+
+def test_logs_of_commands_keep_their_densities(tmp_path: Path) -> None:
+    data = mcaprl.open(GOLDEN / "densities.mcap")
+    rows = mcaprl.ray.read(GOLDEN / "densities.mcap")
+    assert_same(columns_of(rows)["behavior_log_prob"], data.behavior_log_probs)
+    mcaprl.ray.write(rows, tmp_path / "out")
+    again = mcaprl.open(tmp_path / "out")
+    assert again.fingerprint == data.fingerprint
+    assert again.action_labels == data.action_labels
 
 
 def test_changed_and_filtered_rows_are_written(folder: Path, tmp_path: Path) -> None:

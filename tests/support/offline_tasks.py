@@ -81,3 +81,38 @@ def crossing(lengths: tuple[int, ...] = (40, 30, 50), n_actions: int = 1) -> Dat
         env_id="Crossing-v0",
         action_space=spaces.Discrete(n_actions),
     )
+
+
+A_LQ, B_LQ, COST_LQ = 0.9, 0.25, 0.05
+"""The regulator x' = A x + B u with the reward -(x^2 + COST u^2)."""
+BOX_LQ = spaces.Box(-4, 4, (1,), np.float32)
+
+
+def riccati() -> tuple[float, float]:
+    """Return P and K of the regulator: the optimal value is -P x^2, the optimal action -K x."""
+    p = 1.0
+    for _ in range(1_000):
+        p = 1 + A_LQ * GAMMA * p * A_LQ * COST_LQ / (COST_LQ + GAMMA * B_LQ**2 * p)
+    return p, GAMMA * A_LQ * B_LQ * p / (COST_LQ + GAMMA * B_LQ**2 * p)
+
+
+def regulator(count: int = 4_000, noise: float | None = None, seed: int = 0) -> Dataset:
+    """Create transitions of the regulator from random states; each one is a separate episode.
+
+    The actions are random in the Box. With `noise`, they are the optimal ones with normal noise.
+    """
+    random = np.random.default_rng(seed)
+    x = random.uniform(-1, 1, (count, 1)).astype(np.float32)
+    u = random.uniform(-4, 4, (count, 1))
+    if noise is not None:
+        u = (-riccati()[1] * x + noise * random.standard_normal((count, 1))).clip(-4, 4)
+    return Dataset.from_arrays(
+        observations=x,
+        actions=u.astype(np.float32),
+        rewards=-(x**2 + COST_LQ * u**2).ravel(),
+        terminated=np.zeros(count, bool),
+        truncated=np.ones(count, bool),
+        next_observations=(A_LQ * x + B_LQ * u).astype(np.float32),
+        observation_space=spaces.Box(-4, 4, (1,), np.float32),
+        action_space=BOX_LQ,
+    )

@@ -119,9 +119,14 @@ def test_layer_norm_keeps_outputs_invariant_to_the_first_layers_scale() -> None:
     torch.testing.assert_close(network(seen), before, rtol=1e-3, atol=1e-3)
 
 
-def networks(count: int, hidden: tuple[int, ...] = (32, 16)) -> list[Network]:
+def networks(
+    count: int, hidden: tuple[int, ...] = (32, 16), *, outputs: int = 4, layer_norm: bool = False
+) -> list[Network]:
     torch.manual_seed(3)
-    return [Network(5, [], (4,), Architecture(hidden)) for _ in range(count)]
+    found = [Network(5, [], (outputs,), Architecture(hidden, (), layer_norm)) for _ in range(count)]
+    for parameter in (each for network in found for each in network.parameters()):
+        parameter.data += 0.1 * torch.randn(parameter.shape)
+    return found
 
 
 def gradients(model: Model, observations: Observations, d_output: Tensor) -> tuple[Tensor, Tensor]:
@@ -131,23 +136,57 @@ def gradients(model: Model, observations: Observations, d_output: Tensor) -> tup
     return outputs.detach(), model.weights.grad
 
 
+@pytest.mark.parametrize("layer_norm", [False, True])
+@pytest.mark.parametrize("outputs", [1, 4])
 @pytest.mark.parametrize("hidden", [(), (32,), (32, 16, 24)])
 @pytest.mark.parametrize("seeds", [1, 3])
 def test_stacked_networks_have_the_gradients_of_separate_ones(
-    seeds: int, hidden: tuple[int, ...]
+    seeds: int, hidden: tuple[int, ...], outputs: int, layer_norm: bool
 ) -> None:
-    seen, d_output = vectors(seeds * 7, 5), torch.randn(seeds * 7, 4)
-    stacked = gradients(StackedMLP(networks(seeds, hidden)), seen, d_output)
-    separate = gradients(AnyModel(networks(seeds, hidden)), seen, d_output)
-    for mine, reference in zip(stacked, separate, strict=True):
-        torch.testing.assert_close(mine, reference, rtol=1e-5, atol=1e-6)
+    seen, d_output = vectors(seeds * 7, 5), torch.randn(seeds * 7, outputs)
+    both = []
+    for kind in (StackedMLP, AnyModel):
+        mine = Observations(seen.vector.clone().requires_grad_())
+        model = kind(networks(seeds, hidden, outputs=outputs, layer_norm=layer_norm))
+        both.append([*gradients(model, mine, d_output), mine.vector.grad])
+    for stacked, separate in zip(*both, strict=True):
+        torch.testing.assert_close(stacked, separate, rtol=1e-4, atol=1e-5)
 
 
-def alone_and_together(model_type: type[Model], rows: int) -> Sequence[tuple[Tensor, Tensor]]:
-    seen, d_output = vectors(4 * rows, 5), torch.randn(4 * rows, 4)
-    together = gradients(model_type(networks(4)), seen, d_output)
+@pytest.mark.parametrize("kind", [StackedMLP, AnyModel])
+def test_the_networks_of_an_ensemble_see_the_same_rows(kind: type[Model]) -> None:
+    each, seen = networks(4, outputs=1), vectors(2 * 7, 5)
+    # Networks 0 and 1 belong to the first seed, which has the first seven rows.
+    parts = seen.split(7)
+    expected = torch.stack(
+        [
+            torch.cat([each[0](parts[0]), each[2](parts[1])]).flatten(),
+            torch.cat([each[1](parts[0]), each[3](parts[1])]).flatten(),
+        ]
+    )
+    model = kind(networks(4, outputs=1), 2)
+    assert model.weights.shape[0] == 2
+    torch.testing.assert_close(model(seen), expected)
+    torch.testing.assert_close(model(seen, members=1), expected[:1])
+
+
+@pytest.mark.parametrize("kind", [StackedMLP, AnyModel])
+def test_frozen_weights_have_no_gradient(kind: type[Model]) -> None:
+    model = kind(networks(4, outputs=1), 2)
+    seen = Observations(vectors(2 * 7, 5).vector.requires_grad_())
+    torch.autograd.backward(model(seen, frozen=True, members=1).sum())
+    assert model.weights.grad is None
+    assert seen.vector.grad is not None
+    assert seen.vector.grad.abs().min() > 0
+
+
+def alone_and_together(
+    model_type: type[Model], rows: int, outputs: int
+) -> Sequence[tuple[Tensor, Tensor]]:
+    seen, d_output = vectors(4 * rows, 5), torch.randn(4 * rows, outputs)
+    together = gradients(model_type(networks(4, outputs=outputs)), seen, d_output)
     pairs = []
-    for k, network in enumerate(networks(4)):
+    for k, network in enumerate(networks(4, outputs=outputs)):
         mine = slice(k * rows, (k + 1) * rows)
         alone = gradients(model_type([network]), Observations(seen.vector[mine]), d_output[mine])
         pairs += [(alone[0], together[0][mine]), (alone[1][0], together[1][k])]
@@ -155,9 +194,13 @@ def alone_and_together(model_type: type[Model], rows: int) -> Sequence[tuple[Ten
 
 
 @pytest.mark.parametrize("model_type", [StackedMLP, AnyModel])
+@pytest.mark.parametrize("outputs", [1, 4])
 @pytest.mark.parametrize("rows", [1, 32, 256])
-def test_a_seed_gets_the_same_bits_alone_and_in_a_batch(model_type: type[Model], rows: int) -> None:
-    assert all(torch.equal(alone, beside) for alone, beside in alone_and_together(model_type, rows))
+def test_a_seed_gets_the_same_bits_alone_and_in_a_batch(
+    model_type: type[Model], rows: int, outputs: int
+) -> None:
+    pairs = alone_and_together(model_type, rows, outputs)
+    assert all(torch.equal(alone, beside) for alone, beside in pairs)
 
 
 def test_a_network_has_the_weights_of_its_model() -> None:
@@ -186,9 +229,10 @@ def test_a_copy_has_separate_weights() -> None:
     [
         (Network(5, [], (4,), Architecture((8,))), StackedMLP),
         (Network(5, [], (4, 3), Architecture((8,))), StackedMLP),
-        (Network(5, [], (4,), Architecture((8,), layer_norm=True)), AnyModel),
+        (Network(5, [], (4,), Architecture((8,), layer_norm=True)), StackedMLP),
         (Network(5, [], (4,), Architecture((8,), dueling=True)), AnyModel),
-        (Network(5, [], (1,), Architecture((8,))), AnyModel),
+        (Network(5, [], (1,), Architecture((8,))), StackedMLP),
+        (Network(1, [], (4,), Architecture((8,))), AnyModel),
         (Network(0, [ImageInput((36, 36, 1))], (4,), Architecture((8,))), AnyModel),
     ],
 )

@@ -64,6 +64,15 @@ def test_an_item_is_a_transition() -> None:
     }
 
 
+def test_items_of_commands_have_log_densities() -> None:
+    data = mcaprl.open(GOLDEN / "densities.mcap")
+    item = TransitionDataset(data)[2]
+    assert item["behavior_log_prob"].item() == 3.5
+    assert "behavior_prob" not in item
+    batch = TransitionDataset(data, length=4)[:]
+    assert batch["behavior_log_prob"][3].tolist() == [-100, 0, 3.5, 0]
+
+
 def test_returns_of_several_steps_stop_at_ends() -> None:
     # The first episode has the rewards 0, 1 and 2, and terminates. The second episode has the
     # rewards 3 and 4, and is truncated.

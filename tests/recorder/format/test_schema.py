@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
+import struct
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,9 +14,12 @@ import pytest
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+import mcaprl
 from mcaprl.errors import SpaceError
+from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
@@ -25,7 +32,7 @@ from mcaprl.recorder.format.schema import (
     telemetry_schema,
 )
 from mcaprl.recorder.format.spaces import observation_leaves
-from tests.support.recordings import MIXED_SPACE
+from tests.support.recordings import MIXED_SPACE, KnownCommands
 
 
 def test_step_definition_by_hand() -> None:
@@ -48,6 +55,75 @@ def test_step_definition_by_hand() -> None:
     assert is_intact(name, text.encode())
     assert not is_intact(name, text.replace("[3]", "[2]").encode())
     assert is_intact("other_msgs/msg/Step", b"anything")
+
+
+def test_a_row_of_commands_by_hand(log_path: Path) -> None:
+    """The bytes of two records: all fields in order, without padding."""
+    with closing(mcaprl.RecordMcap(KnownCommands(), log_path, compression="none")) as env:
+        env.reset()
+        env.behavior_log_prob = -2.5
+        env.step(np.array([0.5, 2], np.float32))
+    reader = McapReader(log_path)
+    (channel,) = reader.channels_of("/rl/step")
+    assert reader.schema_of(channel).data.decode().splitlines() == [
+        "float64 reward",
+        "# steering (-1 right, 1 left)",
+        "# speed (0 to 2.5 m/s)",
+        "float32[2] action",
+        "float32[2] observation",
+        "float32 behavior_log_prob",
+        "uint32 episode",
+        "uint32 step",
+        "bool terminated",
+        "bool truncated",
+        "bool final",
+    ]
+    with log_path.open("rb") as file:
+        found = [m.data for _, _, m in make_reader(file).iter_messages(topics=["/rl/step"])]
+    head, ends = bytes([0, 1, 0, 0]), [bytes([0, 1, 0]), bytes([0, 0, 1])]
+    assert found == [
+        head + struct.pack("<d2f2ff2I", 1, 0.5, 2, 0, 0, -2.5, 0, 0) + ends[0],
+        head + struct.pack("<d2f2ff2I", 0, 0, 0, 0.25, 0.25, math.nan, 0, 1) + ends[1],
+    ]
+
+
+def test_the_column_depends_on_the_action_space() -> None:
+    box = spaces.Box(-1, 1, (3,), np.float32)
+    for action, name in (
+        (spaces.Box(-1, 1, (2,), np.float64), "behavior_log_prob"),
+        (spaces.Box(-1, 1, (), np.float16), "behavior_log_prob"),
+        (spaces.Box(-1, 1, (2,), np.int64), "behavior_prob"),
+        (spaces.MultiDiscrete([2, 3]), "behavior_prob"),
+        (spaces.MultiBinary(3), "behavior_prob"),
+    ):
+        assert f"float32 {name}\n" in step_schema(box, action)[1]
+
+
+@pytest.mark.parametrize(
+    ("names", "units", "labels"),
+    [
+        (("a", "b"), (), ["a (-1 to 1)", "b (0 to 2.5)"]),
+        (("a", "b"), ("m/s", ""), ["a (-1 to 1 m/s)", "b (0 to 2.5)"]),
+        (("a", "b"), ("right | left", "x"), ["a (-1 right, 1 left)", "b (0 to 2.5 x)"]),
+        (("a", "b"), ("m/s",), ["a (-1 to 1)", "b (0 to 2.5)"]),
+        (("a", "b", "c"), (), []),
+        ((), ("m/s", "m/s"), []),
+    ],
+)
+def test_labels_have_bounds_and_units(
+    names: tuple[str, ...], units: tuple[str, ...], labels: list[str]
+) -> None:
+    space = KnownCommands().action_space
+    metadata = LogMetadata(space, space, action_part_names=names, action_units=units)
+    assert list(metadata.action_labels()) == labels
+    again = LogMetadata.from_strings(metadata.to_strings())
+    assert (again.action_part_names, again.action_units) == (names, units)
+
+
+def test_labels_without_finite_bounds_have_the_unit_alone() -> None:
+    space = spaces.Box(np.array([-np.inf, -1]), np.array([1, np.inf]), dtype=np.float64)
+    metadata = LogMetadata(space, space, action_part_names=("a", "b"), action_units=("m", ""))
+    assert metadata.action_labels() == ("a (m)", "b")
 
 
 def test_different_spaces_have_different_type_names() -> None:

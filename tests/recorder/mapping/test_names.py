@@ -96,6 +96,9 @@ def test_commands_are_selected_by_name(bag: Path) -> None:
     data = read_bag(bag, mapping({"field": "/low.command"}, action=action)).dataset
     assert data.actions.tolist() == [0, 2, 3]
     assert data.action_names[2] == "b from 10 and g below 30.5"
+    action = {"fields": ["/low.position"], "names": ["b", "g"], "box": {"low": 0, "high": 99}}
+    data = read_bag(bag, mapping({"field": "/low.command"}, action=action)).dataset
+    assert data.action_labels == ("b (0 to 99)", "g (0 to 99)")
 
 
 def test_unknown_names_list_the_nearest(bag: Path) -> None:

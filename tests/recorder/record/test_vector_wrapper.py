@@ -26,7 +26,7 @@ from mcaprl.recorder.record.vector_rows import OpenSteps
 from mcaprl.recorder.record.vector_wrapper import VectorWrapper
 from mcaprl.recorder.repair.check import check_log
 from tests.support.learner_topic import read_learner
-from tests.support.recordings import MIXED_SPACE, assert_same_bits, leaves_of
+from tests.support.recordings import MIXED_SPACE, KnownCommands, assert_same_bits, leaves_of
 
 MODES = list(AutoresetMode)
 
@@ -335,6 +335,25 @@ def test_an_ended_environment_has_to_be_reset(log_path: Path) -> None:
         with pytest.raises(gym.error.ResetNeeded):  # noqa: PT012
             while True:
                 env.step(np.ones(2, np.int64))
+
+
+def test_densities_of_several_environments(log_path: Path) -> None:
+    envs = SyncVectorEnv([KnownCommands, KnownCommands])
+    with closing(mcaprl.RecordVecMcap(envs, log_path)) as recorder:
+        recorder.reset()
+        with pytest.raises(SpaceError, match="use behavior_log_probs"):
+            recorder.behavior_probs = (0.5, 0.5)
+        for wrong in ((0.0, math.inf), (1e39, 0.0), (-math.inf, 0.0)):
+            recorder.behavior_log_probs = wrong
+            with pytest.raises(UsageError, match=r"behavior_log_probs\[[01]\] .* log density"):
+                recorder.step(np.zeros((2, 2), np.float32))
+        for step in range(3):
+            if step != 1:
+                recorder.behavior_log_probs = np.array([step - 7.5, 40.0])
+            recorder.step(np.full((2, 2), step / 2, np.float32))
+    data = mcaprl.open(log_path)
+    assert data.action_labels == ("steering (-1 right, 1 left)", "speed (0 to 2.5 m/s)")
+    np.testing.assert_array_equal(data.behavior_log_probs, [-7.5, np.nan, -5.5, 40, np.nan, 40])
 
 
 def test_invalid_arguments_are_refused(log_path: Path) -> None:

@@ -35,7 +35,7 @@ from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.signals import HoldSignals
 from mcaprl.recorder.repair.check import check_log
 from tests.support.paths import ROOT
-from tests.support.recordings import ScriptedEnv
+from tests.support.recordings import KnownCommands, ScriptedEnv
 
 BOX = spaces.Box(-np.inf, np.inf, (2,), np.float32)
 
@@ -82,6 +82,56 @@ def test_impossible_probabilities_are_refused_before_the_step(prob: float, log_p
     (episode,) = mcaprl.open(log_path).episodes
     assert episode.actions.tolist() == [1, 0]
     assert episode.behavior_probs[0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("wrong", [math.inf, -math.inf, 1e39, None, "0.5", [0.5, 0.5]])
+def test_impossible_densities_are_refused_before_the_step(wrong: Any, log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(KnownCommands(), log_path)) as env:
+        env.reset()
+        env.behavior_log_prob = wrong
+        with pytest.raises(UsageError, match=r"^behavior_log_prob .* is not the log density"):
+            env.step(two(0, 0))
+        env.behavior_log_prob = 300.5
+        env.step(two(0, 0))
+        assert math.isnan(env.behavior_log_prob)
+        env.behavior_log_prob = math.nan
+        env.step(two(0, 1))
+    data = mcaprl.open(log_path)
+    np.testing.assert_array_equal(data.behavior_log_probs, [300.5, math.nan])
+    assert data.action_part_names == ("steering", "speed")
+    assert data.action_units == ("right | left", "m/s")
+
+
+def test_commands_have_no_probability(log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(KnownCommands(), log_path)) as env:
+        env.reset()
+        with pytest.raises(SpaceError, match=r"densities, not prob.*: use behavior_log_prob$"):
+            env.behavior_prob = 0.5
+        env.step(two(0, 0))
+    data = mcaprl.open(log_path)
+    for one in (data, data.episodes[0], data.batch(np.array([0]))):
+        with pytest.raises(SpaceError, match=r"use behavior_log_probs$"):
+            _ = one.behavior_probs
+
+
+def test_buttons_have_probabilities_and_their_logarithms(log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(scripted(ONE), log_path)) as env:
+        env.reset()
+        env.behavior_log_prob = math.log(0.25)
+        assert env.behavior_prob == pytest.approx(0.25)
+        env.step(0)
+        env.behavior_log_prob = 0.5
+        with pytest.raises(UsageError, match=r"behavior_prob 1.6.* is not the probability"):
+            env.step(0)
+        env.behavior_log_prob = None  # type: ignore[assignment]
+        with pytest.raises(UsageError, match="behavior_prob None is not the probability"):
+            env.step(0)
+        env.behavior_prob = 0.5
+        assert env.behavior_log_prob == pytest.approx(math.log(0.5))
+        env.step(0)
+    data = mcaprl.open(log_path)
+    np.testing.assert_allclose(data.behavior_probs, [0.25, 0.5])
+    np.testing.assert_allclose(data.behavior_log_probs, np.log([0.25, 0.5]), rtol=1e-6)
 
 
 def test_columns_by_hand(log_path: Path) -> None:

@@ -318,7 +318,7 @@ def commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log of commands (gas from 0 to 4, turn from -1 to 1) with a policy's commands."""
     folder = tmp_path_factory.mktemp("commands")
     actions = np.stack([np.arange(5), [1, 0, -1, 0.5, 0]], 1).astype(np.float32)
-    env = Driver()
+    env: Any = Driver()
     env.action_space = spaces.Box(np.array([0, -1], np.float32), np.array([4, 1], np.float32))
     env.action_part_names, env.action_units = ("gas", "turn"), ("", "right | left")
     del env.action_meanings
