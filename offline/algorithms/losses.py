@@ -211,8 +211,8 @@ def squashed_normal_log_density(pre: Tensor, mean: Tensor, log_std: Tensor) -> T
     """
     scaled = (pre - mean) * (-log_std).exp()
     # log(1 - tanh(x)^2), without the difference of two almost equal numbers.
-    log_slope = 2 * (math.log(2) - pre - functional.softplus(-2 * pre))
-    return -0.5 * scaled.square() - log_std - _LOG_SQRT_TAU - log_slope
+    log_gradient = 2 * (math.log(2) - pre - functional.softplus(-2 * pre))
+    return -0.5 * scaled.square() - log_std - _LOG_SQRT_TAU - log_gradient
 
 
 def temperature_loss(log_alpha: Tensor, log_pi: Tensor, target_entropy: float) -> Tensor:

@@ -36,6 +36,8 @@ BOX_ALGORITHMS: dict[str, type[Learner]] = {
 """The built-in algorithms for the actions of a Box."""
 _BUILT_IN: Final = [*ALGORITHMS.values(), *BOX_ALGORITHMS.values()]
 _DEFAULTS: Final = (CQL, BoxIQL)
+_ONLINE: Final = ("sac", "td3")
+"""Names of learners of online training alone, which overestimate actions that no log has."""
 _SUGGESTED: Final = {False: "cql or iql", True: "iql or rebrac"}
 
 
@@ -77,6 +79,8 @@ def algorithms_named(
     if found := [learner for learner in _BUILT_IN if learner.name == algo]:
         return found
     entries = installed(ENTRY_POINT_GROUP)
+    if algo in _ONLINE and algo not in entries:
+        raise UsageError(f"{algo} learns online only, not from logs: use {_SUGGESTED[True]}")
     if algo not in entries:
         known = dict.fromkeys(learner.name for learner in _BUILT_IN)
         raise UnknownNameError("algorithm", algo, [*known, *entries, *others])
