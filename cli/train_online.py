@@ -31,17 +31,33 @@ def _presets() -> Iterable[str]:
     return PRESETS
 
 
-def _tuned() -> dict[str, dict[str, Any]]:
-    from mcaprl.online.config import SIM_SETTINGS
+def _engines() -> Iterable[str]:
+    from mcaprl.online.config import ENGINES
 
-    return SIM_SETTINGS
+    return ENGINES
+
+
+def _tuned() -> dict[str, dict[str, Any]]:
+    from mcaprl.online.config import BOX_SETTINGS, SIM_SETTINGS
+
+    continuous = {f"{sim} (continuous)": settings for sim, settings in BOX_SETTINGS.items()}
+    return {**SIM_SETTINGS, **continuous}
 
 
 @click.command(cls=SettingsCommand, configs=_configs, tuned=_tuned)
 @click.argument("sim", required=False, type=Name(sims))
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Run folder to create.")
 @click.option(
-    "--algo", type=Name(_configs), help="dqn, double-dqn, ppo or a2c.  [default: double-dqn]"
+    "--algo",
+    type=Name(_configs),
+    help="double-dqn or dqn for discrete actions, sac or td3 for those of a Box, ppo or a2c for"
+    " both.  [default: double-dqn or sac]",
+)
+@click.option(
+    "--engine",
+    type=Name(_engines),
+    help="mcaprl, with the learners of train-offline, or sb3 for Stable-Baselines3.  [default:"
+    " mcaprl if it has the algorithm]",
 )
 @click.option(
     "--preset",
@@ -62,8 +78,8 @@ def _tuned() -> dict[str, dict[str, Any]]:
     "sources",
     multiple=True,
     metavar="DATA|POLICY",
-    help="Logs to put into the replay buffer, or a policy that initializes the agents (each agent"
-    " from one seed of the run); may be given twice.",
+    help="Logs to learn from, or a policy that initializes the agents (each agent from one seed of"
+    " the run); may be given twice.",
 )
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--live", is_flag=True, help="Show the training in Foxglove.")
@@ -101,8 +117,8 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
 
     An omitted setting has the value of the preset, else the value tuned for SIM, else the default
     of Stable-Baselines3. With --resume, it has the value of the run. Settings are tuned only for
-    dqn and double-dqn with default rules. The best checkpoint is kept. It is
-    selected on one set of episodes and scored on another set.
+    dqn, double-dqn, sac and td3 with default rules. The best checkpoint is kept. It is selected on
+    one set of episodes and scored on another set.
     """
     given = {name: value for name, value in request.items() if value is not None}
     on_device = request["device"] is not None

@@ -223,6 +223,15 @@ def part_name(part: int, names: Sequence[str] = ()) -> str:
     return f"action[{part}]" + (f" ({names[part]})" if part < len(names) else "")
 
 
+def short_name(space: spaces.Space[Any]) -> str:
+    """Return a space in messages: that of a Box without its bounds.
+
+    >>> short_name(spaces.Box(-1, 1, (2,))), short_name(spaces.Discrete(5))
+    ('Box(2,)', 'Discrete(5)')
+    """
+    return f"Box{space.shape}" if isinstance(space, spaces.Box) else f"{space}"
+
+
 def joint_actions(space: spaces.Space[Any] | None) -> JointActions | None:
     """Return the numbering of a finite space; None for other spaces."""
     if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):

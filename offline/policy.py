@@ -45,6 +45,8 @@ from mcaprl.runs import POLICY_NAME
 from mcaprl.storage.tensor_files import check_finite, read_tensors, write_tensors
 
 FORMAT_VERSION = 2
+TWIN = "q_twin"
+"""Name of the second critic of a policy for a Box, which is not used to act."""
 _WEIGHTS_NAME = "policy.safetensors"
 _IMAGE_SHIFT = "observation.image_{}.shift"
 _IMAGE_SCALE = "observation.image_{}.scale"
@@ -239,9 +241,12 @@ def save_policy(
     """Write the current policy of a seed into a folder."""
     buffer = learner.buffer
     networks = {name: copy.deepcopy(learner.network(name, seed)) for name in learner.policy_models}
-    if "q" in networks:
+    if "q" in learner.critics:
+        # Training online may continue with both critics.
+        networks[TWIN] = copy.deepcopy(learner.network("q", seed, member=1))
+    for name in {"q", TWIN} & networks.keys():
         # Saved values are in units of the logged rewards.
-        networks["q"].scale_outputs(buffer.reward_scale)
+        networks[name].scale_outputs(buffer.reward_scale)
     weights = {
         f"{name}.{key}": value
         for name, network in networks.items()
@@ -283,10 +288,10 @@ def _box_description(learner: Learner) -> dict[str, Any]:
     box = learner.buffer.box
     if box is None:
         return {}
-    critics = {name: learner.architecture_of(name) for name in learner.critics}
+    twins = ("q", TWIN) if "q" in learner.critics else ()
     return {
         "action_range": [box.low.tolist(), box.high.tolist()],
-        "critics": {name: asdict(each) for name, each in critics.items()},
+        "critics": {name: asdict(learner.architecture_of("q")) for name in twins},
     }
 
 

@@ -6,6 +6,7 @@ sims whose state stays on a GPU.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
@@ -19,12 +20,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.frames import mapped
+from mcaprl.offline.algorithms.heads import SquashedGaussian
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.algorithms.losses import mean_values
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
-from mcaprl.online.config import DQNConfig
 from mcaprl.online.replay import Outcome, ReplayBuffer
 from mcaprl.sims import DeviceSims
+from mcaprl.sims.evaluation.noise import log_density, quantile
 from mcaprl.sims.evaluation.rollout import episode_seed
 from mcaprl.sims.vehicle.device import Batch
 
@@ -131,15 +133,15 @@ class Choice:
     """Actions of one step, and what is known about them.
 
     Attributes:
-        actions: (W, *shape) actions.
-        probabilities: Function that returns the probabilities (W,) of the actions under the
-            behavior policy, or the densities of continuous actions.
+        actions: (W, *shape) actions of the action space.
+        behavior: Function that returns the probabilities (W,) of the actions under the behavior
+            policy; for the actions of a Box, the natural logarithms of their densities.
         values: Values (W, A) of all actions from the forward pass that chose them; None if there
             was none, or if the actions are not finite in number.
     """
 
     actions: Tensor
-    probabilities: Callable[[], Tensor]
+    behavior: Callable[[], Tensor]
     values: Tensor | None = None
 
 
@@ -201,6 +203,84 @@ class EpsilonGreedy(Behavior):
         return by_chance + (1 - epsilon) * (actions == values.argmax(1))
 
 
+class BoxBehavior(Behavior):
+    """Random actions of a Box: uniform ones at epsilon 1, else those of a stochastic policy."""
+
+    def __init__(self, learner: Learner, generator: torch.Generator) -> None:
+        """Select by the actor of `learner`; `generator` is on the CPU."""
+        assert learner.buffer.box is not None
+        self._learner, self._box, self._generator = learner, learner.buffer.box, generator
+
+    @torch.no_grad()
+    def choose(self, observations: Observations, epsilon: float) -> Choice:
+        """Select an action for each of W observations."""
+        if epsilon == 1:
+            shape = (len(observations), self._box.size)
+            numbers = 2 * torch.rand(shape, generator=self._generator) - 1
+            return self._choice(numbers, lambda taken: torch.full((len(taken),), self._uniform))
+        outputs = self._learner.models["actor"](observations)
+        numbers = self._drawn(outputs)
+        return self._choice(numbers, lambda taken: self._log_density(outputs, taken))
+
+    @abstractmethod
+    def _drawn(self, outputs: Tensor) -> Tensor:
+        """Draw actions (W, n) in [-1, 1], for outputs of the actor."""
+
+    @abstractmethod
+    def _log_density(self, outputs: Tensor, numbers: Tensor) -> Tensor:
+        """Return the log densities (W,) of actions (W, n) in [-1, 1]."""
+
+    def _choice(self, numbers: Tensor, log_density: Callable[[Tensor], Tensor]) -> Choice:
+        """Return actions in the units of the space, with densities of what the log stores."""
+        actions = self._box.unscaled(numbers.numpy())
+
+        def behavior() -> Tensor:
+            taken = torch.from_numpy(self._box.scaled(actions).clip(-1, 1))
+            return log_density(taken) + self._box.log_scale
+
+        return Choice(torch.from_numpy(actions), behavior)
+
+    @property
+    def _uniform(self) -> float:
+        """Log density of uniform actions in [-1, 1]."""
+        return -self._box.size * math.log(2)
+
+
+class SquashedSamples(BoxBehavior):
+    """Samples of a squashed Gaussian: the exploration of SAC."""
+
+    def _drawn(self, outputs: Tensor) -> Tensor:
+        noise = torch.randn((len(outputs), self._box.size), generator=self._generator)
+        return SquashedGaussian.sample(outputs, noise)[0]
+
+    def _log_density(self, outputs: Tensor, numbers: Tensor) -> Tensor:
+        return SquashedGaussian.log_density(outputs, numbers)
+
+
+class NoisyActions(BoxBehavior):
+    """Actions of a deterministic actor with Gaussian noise, truncated to the Box: that of TD3."""
+
+    def __init__(self, learner: Learner, generator: torch.Generator, noise: float) -> None:
+        """Add noise with this standard deviation to numbers in [-1, 1]."""
+        super().__init__(learner, generator)
+        self._noise = noise
+
+    def _drawn(self, outputs: Tensor) -> Tensor:
+        share = torch.rand(outputs.shape, generator=self._generator, dtype=torch.float64)
+        drawn = quantile(share.numpy(), self._means(outputs), self._noise, -1.0, 1.0)
+        return torch.from_numpy(drawn)
+
+    def _log_density(self, outputs: Tensor, numbers: Tensor) -> Tensor:
+        taken = numbers.double().numpy()
+        found = log_density(taken, self._means(outputs), self._noise, -1.0, 1.0)
+        return torch.from_numpy(found.sum(1))
+
+    @staticmethod
+    def _means(outputs: Tensor) -> NDArray[np.float64]:
+        means: NDArray[np.float64] = outputs.tanh().double().numpy()
+        return means
+
+
 class Collector:
     """Steps environments and stores their transitions in a replay buffer.
 
@@ -228,12 +308,3 @@ class Collector:
         outcome = self.environments.step(choice.actions)
         self.buffer.add(choice.actions, outcome)
         return outcome
-
-
-def epsilon_at(config: DQNConfig, steps: int) -> float:
-    """Return the probability of a random action after a number of steps of one agent."""
-    first, last = config.exploration_initial_eps, config.exploration_final_eps
-    if config.exploration_decay:
-        return max(last, first * float(config.exploration_decay**steps))
-    done = steps / max(config.exploration_fraction * config.steps, 1)
-    return last if done >= 1 else first + (last - first) * done

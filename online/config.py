@@ -22,8 +22,9 @@ has the command and the scores of four seeds. Important settings are:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from mcaprl.architecture import Architecture, NetworkSettings
@@ -46,8 +47,6 @@ class OnlineConfig(NetworkSettings):
     gamma: float = 0.99
     """discount per step"""
     hidden: tuple[int, ...] = (64, 64)
-    max_grad_norm: float = 10.0
-    """maximum norm of the gradient"""
     eval_interval: int = 5_000
     """environment steps between two evaluations"""
     eval_episodes: int = 30
@@ -60,32 +59,76 @@ class OnlineConfig(NetworkSettings):
         """Validate the settings."""
         super().__post_init__()
         self._require_positive("steps", "envs", "eval_interval", "eval_episodes")
-        self._require("max_grad_norm", self.max_grad_norm > 0, "above 0")
         self._require_fraction("gamma")
 
     def arguments(self) -> dict[str, Any]:
         """Return arguments of SB3's constructor, except learning rate and networks."""
-        return {"gamma": self.gamma, "max_grad_norm": self.max_grad_norm}
+        return {"gamma": self.gamma}
 
 
 @dataclass(frozen=True)
-class DQNConfig(OnlineConfig):
-    """Settings of DQN."""
+class ReplayConfig(OnlineConfig):
+    """Settings of algorithms that learn from a replay buffer."""
 
-    batch_size: int = 32
+    batch_size: int = 256
     """transitions in one gradient step"""
     buffer_size: int = 1_000_000
     """capacity of the replay buffer in transitions, capped at the number of steps"""
     learning_starts: int = 100
     """random steps before the first gradient step"""
+    steps_per_update: int = 1
+    """environment steps for each gradient step"""
+    n_steps: int = 1
+    """number of rewards in a target before the bootstrap value"""
+    image_shift: int = 0
+    """largest random shift of the images in a batch, in pixels of the network's input"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require_positive("batch_size", "steps_per_update", "n_steps")
+        self._require("buffer_size", self.buffer_size >= self.envs, f"at least envs ({self.envs})")
+        self._require("learning_starts", self.learning_starts >= 0, "at least 0")
+        self._require("image_shift", self.image_shift >= 0, "at least 0")
+        even = max(self.steps_per_update, self.envs) % min(self.steps_per_update, self.envs) == 0
+        self._require("steps_per_update", even, f"a multiple or a divisor of envs ({self.envs})")
+
+    @property
+    def final_epsilon(self) -> float:
+        """Probability of a random action at the end of the training."""
+        return 0.0
+
+    def epsilon_at(self, steps: int) -> float:
+        """Return the probability of a random action after a number of steps of one agent."""
+        return self.final_epsilon
+
+    def arguments(self) -> dict[str, Any]:
+        """Return arguments of SB3's constructor, except learning rate and networks."""
+        same = ("batch_size", "learning_starts", "n_steps")
+        return {
+            **super().arguments(),
+            **{name: getattr(self, name) for name in same},
+            "buffer_size": min(self.buffer_size, self.steps + self.envs),
+            # SB3 counts calls of `step`; each call steps every environment.
+            "train_freq": max(1, self.steps_per_update // self.envs),
+            "gradient_steps": max(1, self.envs // self.steps_per_update),
+        }
+
+
+@dataclass(frozen=True)
+class DQNConfig(ReplayConfig):
+    """Settings of DQN."""
+
+    max_grad_norm: float = 10.0
+    """maximum norm of the gradient"""
+    batch_size: int = 32
+    """transitions in one gradient step"""
     steps_per_update: int = 4
     """environment steps for each gradient step"""
     target_update_interval: int = 10_000
     """environment steps between two updates of the target network"""
     target_update_episodes: int = 0
     """episodes between two updates of the target network; 0 selects an interval in steps"""
-    n_steps: int = 1
-    """number of rewards in a target before the bootstrap value"""
     exploration_fraction: float = 0.1
     """fraction of the training during which epsilon falls linearly to its final value"""
     exploration_initial_eps: float = 1.0
@@ -96,24 +139,29 @@ class DQNConfig(OnlineConfig):
     """factor on epsilon at each step; 0 selects the linear decay"""
     dueling: bool = False
     """learn the value of a state separately from the advantages of its actions"""
-    image_shift: int = 0
-    """largest random shift of the images in a batch, in pixels of the network's input"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
         super().__post_init__()
-        self._require_positive(
-            "batch_size", "steps_per_update", "target_update_interval", "n_steps"
-        )
-        self._require("buffer_size", self.buffer_size >= self.envs, f"at least envs ({self.envs})")
-        self._require("learning_starts", self.learning_starts >= 0, "at least 0")
-        self._require("image_shift", self.image_shift >= 0, "at least 0")
+        self._require("max_grad_norm", self.max_grad_norm > 0, "above 0")
+        self._require_positive("target_update_interval")
         self._require("target_update_episodes", self.target_update_episodes >= 0, "at least 0")
         self._require_fraction("exploration_fraction", "exploration_initial_eps")
         self._require_fraction("exploration_final_eps", "exploration_decay")
         self._require("hidden", bool(self.hidden) or not self.dueling, "not empty if dueling")
-        even = max(self.steps_per_update, self.envs) % min(self.steps_per_update, self.envs) == 0
-        self._require("steps_per_update", even, f"a multiple or a divisor of envs ({self.envs})")
+
+    @property
+    def final_epsilon(self) -> float:
+        """Probability of a random action at the end of the training."""
+        return self.exploration_final_eps
+
+    def epsilon_at(self, steps: int) -> float:
+        """Return the probability of a random action after a number of steps of one agent."""
+        first, last = self.exploration_initial_eps, self.exploration_final_eps
+        if self.exploration_decay:
+            return max(last, first * float(self.exploration_decay**steps))
+        done = steps / max(self.exploration_fraction * self.steps, 1)
+        return last if done >= 1 else first + (last - first) * done
 
     def architecture_for(self, channels: Iterable[int]) -> Architecture:
         """Return the network's architecture, given the channels of each image before stacking."""
@@ -122,10 +170,8 @@ class DQNConfig(OnlineConfig):
     def arguments(self) -> dict[str, Any]:
         """Return arguments of SB3's constructor, except learning rate and networks."""
         same = (
-            "batch_size",
-            "learning_starts",
+            "max_grad_norm",
             "target_update_interval",
-            "n_steps",
             "exploration_fraction",
             "exploration_initial_eps",
             "exploration_final_eps",
@@ -133,10 +179,6 @@ class DQNConfig(OnlineConfig):
         return {
             **super().arguments(),
             **{name: getattr(self, name) for name in same},
-            "buffer_size": min(self.buffer_size, self.steps + self.envs),
-            # SB3 counts calls of `step`; each call steps every environment.
-            "train_freq": max(1, self.steps_per_update // self.envs),
-            "gradient_steps": max(1, self.envs // self.steps_per_update),
         }
 
 
@@ -154,10 +196,88 @@ class DoubleDQNConfig(DQNConfig):
 
 
 @dataclass(frozen=True)
+class ActorCriticConfig(ReplayConfig):
+    """Settings of the algorithms with an actor and two critics, for the actions of a Box."""
+
+    learning_rate: float = 3e-4
+    hidden: tuple[int, ...] = (256, 256)
+    polyak: float = 0.005
+    """weight of the learning networks in an update of the target networks; 1 copies them"""
+    critic_layer_norm: bool = False
+    """normalize the hidden layers of the critics; the default with logs is yes"""
+    data_fraction: float = 0.5
+    """fraction of each batch that is drawn from the given logs, if there are any"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("polyak", 0 < self.polyak <= 1, "within (0, 1]")
+        self._require_fraction("data_fraction")
+
+    def arguments(self) -> dict[str, Any]:
+        """Return arguments of SB3's constructor, except learning rate and networks."""
+        return {**super().arguments(), "tau": self.polyak}
+
+
+@dataclass(frozen=True)
+class SACConfig(ActorCriticConfig):
+    """Settings of SAC."""
+
+    temperature: float = 1.0
+    """initial weight of the policy's entropy beside the rewards"""
+    target_entropy: float = -1.0
+    """entropy per number of an action in [-1, 1] to which the temperature is tuned"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("temperature", 0 < self.temperature < math.inf, "above 0 and finite")
+        allowed = f"below {math.log(2):.2f}, the entropy of uniform numbers"
+        self._require("target_entropy", -math.inf < self.target_entropy < math.log(2), allowed)
+
+    def arguments(self) -> dict[str, Any]:
+        """Return arguments of SB3's constructor, except learning rate, entropy and networks."""
+        return {**super().arguments(), "ent_coef": f"auto_{self.temperature}"}
+
+
+@dataclass(frozen=True)
+class TD3Config(ActorCriticConfig):
+    """Settings of TD3."""
+
+    learning_rate: float = 1e-3
+    exploration_noise: float = 0.1
+    """standard deviation of the noise on the actor's actions, as a fraction of half the Box"""
+    policy_interval: int = 2
+    """updates of the critics per update of the actor and the target networks"""
+    policy_noise: float = 0.2
+    """standard deviation of the noise on target actions, as a fraction of half the Box"""
+    noise_clip: float = 0.5
+    """largest noise on target actions, as a fraction of half the Box"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require_positive("policy_interval")
+        self._require("exploration_noise", self.exploration_noise > 0, "above 0")
+        self._require("policy_noise", self.policy_noise >= 0, "at least 0")
+        self._require("noise_clip", self.noise_clip >= 0, "at least 0")
+
+    def arguments(self) -> dict[str, Any]:
+        """Return arguments of SB3's constructor, except learning rate, noise and networks."""
+        return {
+            **super().arguments(),
+            "policy_delay": self.policy_interval,
+            "target_policy_noise": self.policy_noise,
+            "target_noise_clip": self.noise_clip,
+        }
+
+
+@dataclass(frozen=True)
 class RolloutConfig(OnlineConfig):
     """Settings of algorithms that learn from rollouts of the current policy."""
 
     max_grad_norm: float = 0.5
+    """maximum norm of the gradient"""
     rollout_steps: int = 40
     """environment steps, summed over all environments, between two rounds of updates"""
     gae_lambda: float = 1.0
@@ -168,6 +288,7 @@ class RolloutConfig(OnlineConfig):
     def __post_init__(self) -> None:
         """Validate the settings."""
         super().__post_init__()
+        self._require("max_grad_norm", self.max_grad_norm > 0, "above 0")
         whole = self.rollout_steps >= self.envs and self.rollout_steps % self.envs == 0
         self._require("rollout_steps", whole, f"a multiple of envs ({self.envs})")
 
@@ -175,6 +296,7 @@ class RolloutConfig(OnlineConfig):
         """Return arguments of SB3's constructor, except learning rate and networks."""
         return {
             **super().arguments(),
+            "max_grad_norm": self.max_grad_norm,
             "n_steps": self.rollout_steps // self.envs,
             "gae_lambda": self.gae_lambda,
             "ent_coef": self.entropy_coefficient,
@@ -224,10 +346,21 @@ class A2CConfig(RolloutConfig):
 CONFIGS: Final[dict[str, type[OnlineConfig]]] = {
     "dqn": DQNConfig,
     "double-dqn": DoubleDQNConfig,
+    "sac": SACConfig,
+    "td3": TD3Config,
     "ppo": PPOConfig,
     "a2c": A2CConfig,
 }
 """Settings of the algorithms by name."""
+ENGINES: Final[dict[str, tuple[str, ...]]] = {
+    "mcaprl": ("double-dqn", "sac", "td3"),
+    "sb3": ("dqn", "sac", "td3", "ppo", "a2c"),
+}
+"""Algorithms of this package's learners, and of Stable-Baselines3."""
+FINITE_ALGOS: Final = ("double-dqn", "dqn", "ppo", "a2c")
+"""Algorithms for finite action spaces, the default first."""
+BOX_ALGOS: Final = ("sac", "td3", "ppo", "a2c")
+"""Algorithms for the actions of a Box, the default first."""
 
 
 @dataclass(frozen=True)
@@ -345,6 +478,27 @@ SIM_SETTINGS: Final[dict[str, dict[str, Any]]] = {
 """Settings that differ from the algorithm's defaults, by the sim's short name."""
 
 
+_BOX: Final[dict[str, Any]] = {
+    "learning_rate": 1e-3,
+    "final_learning_rate_fraction": 0.05,
+    "hidden": (128, 128),
+    "batch_size": 128,
+    "steps_per_update": 2,
+    "learning_starts": 1_000,
+    "eval_interval": 2_000,
+    "buffer_size": 100_000,
+}
+BOX_SETTINGS: Final[dict[str, dict[str, Any]]] = {
+    "lane": {**_BOX, "steps": 60_000, "gamma": 0.97},
+    "racer": {**_BOX, "steps": 40_000, "gamma": 0.98},
+    "powerline": {**_BOX, "steps": 60_000, "gamma": 0.95, "n_steps": 3},
+    "highway-lane": {**_BOX, "steps": 40_000, "gamma": 0.97},
+}
+"""Settings for continuous actions that differ from the algorithm's defaults, by sim."""
+TD3_SETTINGS: Final[dict[str, Any]] = {"exploration_noise": 0.2}
+"""Settings of TD3 that replace those of `BOX_SETTINGS`."""
+
+
 _FROM_IMAGES: Final[dict[str, Any]] = {
     **_STEADY,
     "batch_size": 64,
@@ -382,19 +536,36 @@ def find_preset(name: str) -> Preset:
     return PRESETS[name]
 
 
-def settings_for(config_type: type, sim: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tuned settings of a sim.
+def warm_settings(algo: str, *, with_logs: bool, with_policy: bool) -> dict[str, Any]:
+    """Return the settings that have other defaults if an agent starts from logs or a policy.
+
+    Critics have layer normalization with logs, and no policy (https://arxiv.org/abs/2302.02948). A
+    large temperature would make a policy random again.
+    """
+    config_type = CONFIGS[algo]
+    if with_policy:
+        return {"temperature": 0.01} if issubclass(config_type, SACConfig) else {}
+    return (
+        {"critic_layer_norm": True}
+        if with_logs and issubclass(config_type, ActorCriticConfig)
+        else {}
+    )
+
+
+def settings_for(algo: str, sim: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tuned settings of an algorithm for a sim.
 
     The dict is empty for classic rules and for other environments.
     """
-    known = {field.name for field in fields(config_type)}
     default_rules = sim_options.get("rules", "default") == "default"
-    if not (default_rules and {"n_steps", "buffer_size"} <= known):
+    if not (default_rules and issubclass(CONFIGS[algo], ReplayConfig)):
         return {}
     from mcaprl.sims import SIMS
 
     spec = SIMS.find(SIMS.get(sim, sim), loads=False)
     name, observation = spec.name if spec else sim, sim_options.get("observation", "state")
+    is_box = issubclass(CONFIGS[algo], ActorCriticConfig)
     if observation in ("state", "rays"):
-        return dict(SIM_SETTINGS.get(name, {}))
-    return dict(IMAGE_SETTINGS.get((name, observation), {}))
+        settings = BOX_SETTINGS.get(name, {}) if is_box else SIM_SETTINGS.get(name, {})
+        return {**settings, **(TD3_SETTINGS if is_box and settings and algo == "td3" else {})}
+    return {} if is_box else dict(IMAGE_SETTINGS.get((name, observation), {}))

@@ -8,22 +8,38 @@ count environment steps of one agent, summed over its environments.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from mcaprl.offline.algorithms.config import CQLConfig
-from mcaprl.offline.algorithms.config import DoubleDQNConfig as LearnerConfig
+from mcaprl.offline.algorithms import config as learners
 from mcaprl.offline.algorithms.cql import CQL
 from mcaprl.offline.algorithms.dqn import DoubleDQN
 from mcaprl.offline.algorithms.learner import Learner
+from mcaprl.offline.algorithms.sac import SAC
+from mcaprl.offline.algorithms.td3 import TD3
+from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import ObservationEncoder
-from mcaprl.online.collector import Collector, Environments, EpsilonGreedy, epsilon_at
-from mcaprl.online.config import DoubleDQNConfig
-from mcaprl.online.replay import Outcome, ReplayBuffer
+from mcaprl.online.collector import (
+    Behavior,
+    Collector,
+    Environments,
+    EpsilonGreedy,
+    NoisyActions,
+    SquashedSamples,
+)
+from mcaprl.online.config import (
+    ActorCriticConfig,
+    DoubleDQNConfig,
+    DQNConfig,
+    ReplayConfig,
+    SACConfig,
+    TD3Config,
+)
+from mcaprl.online.replay import MixedBuffer, Outcome, ReplayBuffer
 from mcaprl.storage.tensor_files import below
 
 
@@ -52,13 +68,18 @@ class Agents:
 
     def __init__(
         self,
-        config: DoubleDQNConfig,
+        config: ReplayConfig,
         encoder: ObservationEncoder,
         action_space: spaces.Space[Any],
         seeds: Sequence[int],
         device: torch.device,
+        log: Callable[[ReplayBuffer], TransitionBuffer] | None = None,
     ) -> None:
-        """Create agents with new weights."""
+        """Create agents with new weights.
+
+        `log` returns logged transitions, from which a part of each batch is drawn, in the form in
+        which the buffer stores its own.
+        """
         self.config = config
         learner_type, learner_config = _learner_of(config)
         channels = [image.shape[2] for image in encoder.image_inputs]
@@ -74,11 +95,15 @@ class Agents:
             seed=seeds[0],
             image_shift=config.image_shift,
         )
+        if log is not None:
+            assert isinstance(config, ActorCriticConfig)
+            self.buffer = MixedBuffer.of(self.buffer, log(self.buffer), config.data_fraction)
         self.learner: Learner = learner_type(learner_config, self.buffer, seeds)
-        self.learner.max_grad_norm = config.max_grad_norm
+        if isinstance(config, DQNConfig):
+            self.learner.max_grad_norm = config.max_grad_norm
         self.learner.learning_rate_at = lambda _: self.learning_rate
         self.generator = torch.Generator(device).manual_seed(seeds[0])
-        self.behavior = EpsilonGreedy(self.learner, self.generator)
+        self.behavior = _behavior_of(config, self.learner, self.generator)
         self.collector: Collector
         self.steps = self._episodes = 0
         self.learning_starts = config.learning_starts
@@ -93,8 +118,8 @@ class Agents:
     def epsilon(self) -> float:
         """Probability of a random action in the next step."""
         if self.is_pretrained:
-            return self.config.exploration_final_eps
-        return 1.0 if self.steps < self.learning_starts else epsilon_at(self.config, self.steps)
+            return self.config.final_epsilon
+        return 1.0 if self.steps < self.learning_starts else self.config.epsilon_at(self.steps)
 
     @property
     def learning_rate(self) -> float:
@@ -111,17 +136,21 @@ class Agents:
         config = self.config
         outcome = self.collector.step(self.epsilon)
         before, self.steps = self.steps, self.steps + config.envs
-        if config.target_update_episodes:
-            ended = int((outcome.terminated | outcome.truncated).sum())
-            earlier, self._episodes = self._episodes, self._episodes + ended
-            if _due(earlier, self._episodes, config.target_update_episodes):
-                self.learner.sync_targets()
-        elif _due(before, self.steps, config.target_update_interval):
+        if isinstance(config, DQNConfig) and self._is_sync_due(config, before, outcome):
             self.learner.sync_targets()
         if self.steps > self.learning_starts:
             for _ in range(_due(before, self.steps, config.steps_per_update)):
-                self.terms = self.learner.update()
+                # Some updates have no terms of the actor.
+                self.terms = {**self.terms, **self.learner.update()}
         return outcome
+
+    def _is_sync_due(self, config: DQNConfig, before: int, outcome: Outcome) -> bool:
+        """Return whether the target network is synced after a step that began at `before`."""
+        if not config.target_update_episodes:
+            return _due(before, self.steps, config.target_update_interval) > 0
+        ended = int((outcome.terminated | outcome.truncated).sum())
+        earlier, self._episodes = self._episodes, self._episodes + ended
+        return _due(earlier, self._episodes, config.target_update_episodes) > 0
 
     def counters(self) -> dict[str, Any]:
         """Return the numbers of the state, for a checkpoint."""
@@ -169,26 +198,36 @@ def _due(before: int, now: int, interval: int) -> int:
     return now // interval - before // interval
 
 
-def _learner_of(config: DoubleDQNConfig) -> tuple[type[DoubleDQN], LearnerConfig]:
+_OF_NETWORKS = ("hidden", "layer_norm", "frame_stack", "encoder", "channels", "center_images")
+_OF_UPDATES = ("batch_size", "learning_rate", "gamma", "n_steps")
+_OF_CRITICS = ("polyak", "critic_layer_norm")
+
+
+def _learner_of(config: ReplayConfig) -> tuple[type[Learner], learners.TrainingConfig]:
     """Return the learner of an online algorithm, with its settings."""
-    same: dict[str, Any] = {
-        name: getattr(config, name)
-        for name in (
-            "batch_size",
-            "learning_rate",
-            "gamma",
-            "n_steps",
-            "hidden",
-            "layer_norm",
-            "dueling",
-            "frame_stack",
-            "encoder",
-            "channels",
-            "center_images",
-        )
-    }
-    # The target network is synced by environment steps instead of updates.
-    same["target_interval"] = sys.maxsize
-    if config.alpha:
-        return PenalizedDoubleDQN, CQLConfig(**same, alpha=config.alpha)
-    return DoubleDQN, LearnerConfig(**same)
+
+    def same(*names: str) -> dict[str, Any]:
+        return {name: getattr(config, name) for name in (*_OF_NETWORKS, *_OF_UPDATES, *names)}
+
+    if isinstance(config, DoubleDQNConfig):
+        # The target network is synced by environment steps instead of updates.
+        settings = {**same("dueling"), "target_interval": sys.maxsize}
+        if config.alpha:
+            return PenalizedDoubleDQN, learners.CQLConfig(**settings, alpha=config.alpha)
+        return DoubleDQN, learners.DoubleDQNConfig(**settings)
+    unscaled = {"normalize": False, "scale_rewards": False}
+    if isinstance(config, SACConfig):
+        settings = same(*_OF_CRITICS, "temperature", "target_entropy")
+        return SAC, learners.SACConfig(**settings, **unscaled)
+    assert isinstance(config, TD3Config)
+    settings = same(*_OF_CRITICS, "policy_interval", "policy_noise", "noise_clip")
+    interval = config.policy_interval
+    return TD3, learners.TD3Config(**settings, **unscaled, target_interval=interval)
+
+
+def _behavior_of(config: ReplayConfig, learner: Learner, generator: torch.Generator) -> Behavior:
+    """Return how the actions of a training are selected."""
+    if isinstance(config, TD3Config):
+        return NoisyActions(learner, generator, config.exploration_noise)
+    kind = SquashedSamples if isinstance(config, SACConfig) else EpsilonGreedy
+    return kind(learner, generator)

@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.base_policy import BasePolicy
@@ -147,7 +148,7 @@ class FirstEpisodes(VectorWrapper):
     def dataset(self) -> Dataset:
         """Return the episodes, ordered by environment.
 
-        Behavior probabilities are 1, because the actions are greedy.
+        The actions are greedy: their probabilities are 1, and those of a Box have no density.
         """
         environments = np.concatenate([step.environments for step in self._steps])
         order = np.argsort(environments, kind="stable")
@@ -158,9 +159,10 @@ class FirstEpisodes(VectorWrapper):
             )
             for name in _Step._fields[1:]
         }
+        is_box = isinstance(self.single_action_space, spaces.Box)
         return Dataset.from_arrays(
             **columns,
-            behavior_probs=np.ones(len(order)),
+            behavior_probs=None if is_box else np.ones(len(order)),
             env_id=self._env_id,
             observation_space=self.single_observation_space,
             action_space=self.single_action_space,

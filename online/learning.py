@@ -12,32 +12,37 @@ killed between the two writes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from torch import Tensor, nn
 
+from mcaprl.actions import joint_actions
 from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError, SpaceError, TrainingError, UsageError
 from mcaprl.frames import mapped
-from mcaprl.offline.algorithms.heads import build_head
+from mcaprl.offline.algorithms.heads import BoxHead, Deterministic, Gaussian, build_head
 from mcaprl.offline.algorithms.learner import NotFiniteError
+from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import ObservationEncoder
-from mcaprl.offline.policy import Policy, read_policy, save_policy
+from mcaprl.offline.policy import TWIN, Policy, read_policy, save_policy
 from mcaprl.online.agent import Agent, center_images, is_due
-from mcaprl.online.collector import Choice, VectorEnvironments
-from mcaprl.online.config import DoubleDQNConfig
+from mcaprl.online.collector import Choice, EpsilonGreedy, VectorEnvironments
+from mcaprl.online.config import ReplayConfig
 from mcaprl.online.engine import Agents
 from mcaprl.online.live import WATCHED
-from mcaprl.online.replay import Outcome
+from mcaprl.online.replay import Outcome, ReplayBuffer, packed_log, restored_log
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import POLICY_NAME
 from mcaprl.sims.evaluation.rollout import episode_seed
+from mcaprl.storage.tensor_files import below
 
 _CHECKED = 64
 """Number of observations on which a copied network must produce the same values."""
@@ -55,21 +60,30 @@ class LearningAgent(Agent):
 
     def _prepare(self, tensors: dict[str, Tensor] | None) -> None:
         """Create the encoder, and an agent with new weights."""
-        space: Any = self.env.single_observation_space
-        encoder = ObservationEncoder(space, int(self.env.single_action_space.n))
+        joint = joint_actions(self.env.single_action_space)
+        count = 0 if joint is None else joint.count
+        encoder = ObservationEncoder(self.env.single_observation_space, count)
         if tensors is not None:
             _load_normalization(encoder, tensors)
         elif self._task.config.center_images and encoder.image_inputs:
             center_images(encoder, self._task, self._seed)
-        self._create(encoder)
+        logged = {} if tensors is None else below(below(tensors, "buffer"), "log")
+        self._create(encoder, partial(restored_log, logged) if logged else None)
 
-    def _create(self, encoder: ObservationEncoder) -> None:
-        """Create an agent with new weights that observes through an encoder."""
-        config, actions = cast(DoubleDQNConfig, self._task.config), self.env.single_action_space
+    def _create(
+        self,
+        encoder: ObservationEncoder,
+        log: Callable[[ReplayBuffer], TransitionBuffer] | None = None,
+    ) -> None:
+        """Create an agent with new weights that observes through an encoder.
+
+        `log` returns the logged transitions that are a part of each batch, if there are any.
+        """
+        config, actions = cast(ReplayConfig, self._task.config), self.env.single_action_space
         if config.image_shift and not encoder.image_inputs:
             raise UsageError("image_shift is for images, but the observations have none")
         self._encoder = encoder
-        self.agents = Agents(config, encoder, actions, [self._seed], torch.device("cpu"))
+        self.agents = Agents(config, encoder, actions, [self._seed], torch.device("cpu"), log)
         self._environments = VectorEnvironments(self.env, encoder)
         self.agents.connect(self._environments)
         self.agents.collector.before_step = self._before_step
@@ -95,7 +109,12 @@ class LearningAgent(Agent):
             env_kwargs=self._task.sim_options,
             frame_stack=self._task.config.frame_stack,
             encoder=self._encoder,
-            head=build_head(learner.acts_by, networks, self.env.single_action_space).eval(),
+            head=build_head(
+                learner.acts_by,
+                networks,
+                self.env.single_action_space,
+                box=self.agents.buffer.box,
+            ).eval(),
         )
 
     def best_policy(self) -> BasePolicy:
@@ -107,36 +126,58 @@ class LearningAgent(Agent):
         if self.agents.steps:
             # The checkpoint has what the first session started from.
             return
+        box, encoder = self.agents.buffer.box, self._encoder
         if policy is not None:
-            self._take_weights(policy)
+            _check_fits(policy, self.env.single_action_space, self._task.config.frame_stack)
+            if type(policy.encoder) is ObservationEncoder:
+                encoder = policy.encoder
         if data is not None:
-            fill_buffer(self.agents, data)
+            _check_spaces(data, self._encoder.space, self.env.single_action_space)
+        log = None if box is None or data is None else partial(packed_log, data)
+        if log is not None or encoder is not self._encoder:
+            self._create(encoder, log)
+        if policy is not None:
+            (self._take_values if box is None else self._take_actor_and_critics)(policy)
+            self.agents.learner.load_targets()
+        if data is not None:
+            if box is None:
+                fill_buffer(self.agents, data)
             self.agents.learning_starts = 0
         if policy is not None:
             self.agents.learning_starts = self.agents.config.learning_starts
             self.agents.is_pretrained = True
 
-    def _take_weights(self, policy: Policy) -> None:
-        """Copy the network and the normalization of a policy."""
-        _check_fits(policy, self._encoder.space, self._task.config.frame_stack)
-        if type(policy.encoder) is ObservationEncoder:
-            self._create(policy.encoder)
+    def _take_values(self, policy: Policy) -> None:
+        """Copy the Q-network of a policy."""
         theirs, learner = policy.head.networks["q"], self.agents.learner
         ours = learner.network("q", self._seed)
-        if _weights_of(theirs) != _weights_of(ours):
-            raise PolicyError(
-                f"{policy.name} has layers {_chain(theirs)}, but the agent has {_chain(ours)}:"
-                " pass `hidden=`, `encoder=`, `channels=`, `dueling=` or `layer_norm=`"
-            )
+        _check_layers(policy, theirs, ours)
         for source, target in zip(_layers(theirs), _layers(ours), strict=True):
             target.load_state_dict(source.state_dict())
-        learner.sync_targets()
         observations = _sample_stacks(self._encoder.space, policy.frame_stack)
         values = self.policy.q_values(observations)
         if not np.allclose(values, policy.q_values(observations), rtol=1e-4, atol=1e-4):
             raise PolicyError(
                 f"{policy.name} has a network of another architecture (for example, normalized"
                 " inputs): the agent's network produces other values with the same weights"
+            )
+
+    def _take_actor_and_critics(self, policy: Policy) -> None:
+        """Copy the actor of a policy, and its critics if it has them."""
+        learner, head = self.agents.learner, cast(BoxHead, policy.head)
+        _copy_actor(
+            policy, head, learner.network("actor", self._seed), self.agents.buffer.n_actions
+        )
+        for member, name in enumerate(("q", TWIN)):
+            if name in head.networks:
+                theirs, ours = head.networks[name], learner.network("q", self._seed, member)
+                _check_layers(policy, theirs, ours)
+                ours.load_state_dict(theirs.state_dict())
+        observations = _sample_stacks(self._encoder.space, policy.frame_stack)
+        if not np.allclose(self.policy.act(observations), policy.act(observations), atol=1e-4):
+            raise PolicyError(
+                f"{policy.name} has an actor of another architecture (for example, normalized"
+                " inputs): the agent's actor produces other actions with the same weights"
             )
 
     def scalars(self) -> dict[str, float]:
@@ -182,7 +223,8 @@ class LearningAgent(Agent):
         if self._recorder is not None:
             self._recorder.epsilon = self.agents.epsilon
             self._recorder.policy_version = self.agents.learner.step
-            self._recorder.behavior_probs = choice.probabilities().numpy()
+            name = "behavior_probs" if self.agents.buffer.box is None else "behavior_log_probs"
+            setattr(self._recorder, name, choice.behavior().numpy())
 
     def save_policy(self, folder: Path) -> None:
         """Write the current policy into a folder."""
@@ -218,20 +260,23 @@ class LearningAgent(Agent):
         return self.agents.learner.step
 
     def probability(self) -> float:
-        """Return the probability of the action of the watched environment."""
+        """Return the probability, or log density, of the action of the watched environment."""
         assert self._choice is not None
-        return float(self._choice.probabilities()[WATCHED])
+        return float(self._choice.behavior()[WATCHED])
 
-    def values(self) -> tuple[Tensor, Tensor, float]:
+    def values(self) -> tuple[Tensor, Tensor, float] | None:
         """Return Q-values, preferences and the state's value in the watched environment.
 
-        They are those of the forward pass that chose the action, if there was one.
+        They are those of the forward pass that chose the action, if there was one. The result is
+        None for the actions of a Box.
         """
         assert self._choice is not None
-        values = self._choice.values
+        values, behavior = self._choice.values, self.agents.behavior
         if values is None:
+            if not isinstance(behavior, EpsilonGreedy):
+                return None
             with torch.no_grad():
-                values = self.agents.behavior.values(self.agents.buffer.now())
+                values = behavior.values(self.agents.buffer.now())
         q = values[WATCHED]
         return q, q.softmax(0), float(q.max())
 
@@ -261,14 +306,7 @@ def fill_buffer(agents: Agents, dataset: Dataset) -> int:
         Number of copied transitions, a multiple of the number of environments.
     """
     buffer = agents.buffer
-    for role, own in (
-        ("observation_space", buffer.encoder.space),
-        ("action_space", buffer.action_space),
-    ):
-        if getattr(dataset, role) != own:
-            raise SpaceError(
-                f"the logs have {role} {getattr(dataset, role)}, but the environment has {own}"
-            )
+    _check_spaces(dataset, buffer.encoder.space, buffer.action_space)
     envs = buffer.width
     rows = min(len(dataset) // envs, buffer.capacity)
     if rows == 0:
@@ -293,15 +331,61 @@ def fill_buffer(agents: Agents, dataset: Dataset) -> int:
     return rows * envs
 
 
-def _check_fits(policy: Policy, space: Any, frame_stack: int) -> None:
+def _check_spaces(dataset: Dataset, observation_space: Any, action_space: Any) -> None:
+    """Check that logs have the spaces of the environment."""
+    for role, own in (("observation_space", observation_space), ("action_space", action_space)):
+        if getattr(dataset, role) != own:
+            raise SpaceError(
+                f"the logs have {role} {getattr(dataset, role)}, but the environment has {own}"
+            )
+
+
+def _check_fits(policy: Policy, action_space: Any, frame_stack: int) -> None:
     """Check that an agent can take the weights of a policy."""
-    if "q" not in getattr(policy.head, "networks", {}):
+    if isinstance(action_space, spaces.Box):
+        if policy.action_space != action_space:
+            raise PolicyError(
+                f"{policy.name} has actions of {policy.action_space}, but the environment has"
+                f" {action_space}"
+            )
+        if not isinstance(policy.head, Deterministic | Gaussian):
+            raise PolicyError(f"{policy.name} ({policy.algo}) has no actor that can be continued")
+    elif "q" not in getattr(policy.head, "networks", {}):
         raise PolicyError(f"{policy.name} ({policy.algo}) has no Q-values to start from")
     if policy.frame_stack != frame_stack:
         raise PolicyError(
             f"{policy.name} stacks {policy.frame_stack} observations, but the agent stacks another"
             f" number: pass `frame_stack={policy.frame_stack}`"
         )
+
+
+def _check_layers(policy: Policy, theirs: nn.Module, ours: nn.Module) -> None:
+    """Check that two networks have the same layers."""
+    if _weights_of(theirs) != _weights_of(ours):
+        raise PolicyError(
+            f"{policy.name} has layers {_chain(theirs)}, but the agent has {_chain(ours)}:"
+            " pass `hidden=`, `encoder=`, `channels=`, `dueling=`, `layer_norm=` or"
+            " `critic_layer_norm=`"
+        )
+
+
+@torch.no_grad()
+def _copy_actor(policy: Policy, head: BoxHead, ours: nn.Module, size: int) -> None:
+    """Copy an actor for actions of `size` numbers.
+
+    Outputs are means, and the logarithms of the deviations if both networks have them. Where only
+    the agent's has them, they become those of the policy, or 0.
+    """
+    (*theirs, their_last), (*layers, last) = _layers(head.networks["actor"]), _layers(ours)
+    if [layer.weight.shape for layer in theirs] != [layer.weight.shape for layer in layers]:
+        _check_layers(policy, head.networks["actor"], ours)
+    for source, target in zip(theirs, layers, strict=True):
+        target.load_state_dict(source.state_dict())
+    common = min(len(their_last.bias), len(last.bias))
+    last.weight[:common], last.bias[:common] = their_last.weight[:common], their_last.bias[:common]
+    if len(last.bias) > common:
+        last.weight[common:] = 0.0
+        last.bias[common:] = 0.0 if head.log_std is None else head.log_std
 
 
 def _sample_stacks(space: Any, count: int) -> Any:

@@ -11,8 +11,8 @@ All You Need", https://arxiv.org/abs/2004.13649).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, cast
 
@@ -20,10 +20,12 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
+from mcaprl.actions import BoxActions
 from mcaprl.architecture import Architecture
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
 from mcaprl.offline.batches.packing import Packing
+from mcaprl.recorder.dataset.dataset import Dataset
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,8 +135,11 @@ class ReplayBuffer(TransitionBuffer):
         if encoder.mask is not None:
             mask = zeros(2 * rows, *encoder.mask.shape, dtype=torch.bool)
         vectors = zeros(2 * rows, encoder.width, dtype=torch.float32)
-        box = isinstance(action_space, spaces.Box)
-        actions = zeros(rows, *(action_space.shape or () if box else ()), dtype=torch.int64)
+        box = BoxActions.of(action_space) if isinstance(action_space, spaces.Box) else None
+        if box is None:
+            actions = zeros(rows, dtype=torch.int64)
+        else:
+            actions = zeros(rows, box.size, dtype=torch.float32)
         return cls(
             encoder=encoder,
             action_space=action_space,
@@ -142,7 +147,8 @@ class ReplayBuffer(TransitionBuffer):
             frames=Observations(vectors, tuple(images), mask),
             starts=zeros(0, dtype=torch.int64),
             places=torch.arange(2 * rows, device=device).view(2, rows),
-            actions=actions.float() if box else actions,
+            actions=actions,
+            box=box,
             returns=zeros(2, rows, dtype=torch.float32),
             is_fixed=False,
             agents=agents,
@@ -192,7 +198,9 @@ class ReplayBuffer(TransitionBuffer):
         return self.observe(torch.arange(first, first + self.width, device=self.device))
 
     def add(self, actions: Tensor, outcome: Outcome) -> None:
-        """Add a step of all environments: actions (W, *shape) and what followed."""
+        """Add a step of all environments: actions (W, *shape) of the space, and what followed."""
+        if self.box is not None:
+            actions = torch.from_numpy(self.box.scaled(actions.numpy()).clip(-1, 1))
         slot, following = self.steps % self.slots, (self.steps + 1) % self.slots
         over = outcome.terminated | outcome.truncated
         finals = self._finals_of(slot)
@@ -312,12 +320,8 @@ class ReplayBuffer(TransitionBuffer):
 
     def _put(self, first: int, observations: Observations, rows: Tensor | None = None) -> None:
         """Store observations as frames from `first` on, or as some `rows` of these."""
-        images = tuple(
-            averaged(image, pool)
-            for image, pool in zip(observations.images, self.pools, strict=True)
-        )
         assert isinstance(self.frames, Observations)
-        given = replace(observations, images=images)
+        given = _averaged(observations, self.pools)
         for part, values in zip(self.frames.parts(), given.parts(), strict=True):
             if rows is None:
                 part[first : first + self.width] = values
@@ -353,6 +357,107 @@ class ReplayBuffer(TransitionBuffer):
             reaches &= self.goes_on[earlier]
             self._next_places[earlier] = torch.where(reaches, places, self._next_places[earlier])
         self.goes_on[slot] = False
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MixedBuffer(ReplayBuffer):
+    """Replay buffer of one agent with a log, from which a part of each batch is drawn.
+
+    See "Efficient Online Reinforcement Learning with Offline Data",
+    https://arxiv.org/abs/2302.02948. Row i of the log has the number `len(self) + i`.
+
+    Attributes:
+        log: Logged transitions.
+        fraction: Part of each batch that is drawn from the log.
+    """
+
+    log: TransitionBuffer
+    fraction: float
+
+    @classmethod
+    def of(cls, buffer: ReplayBuffer, log: TransitionBuffer, fraction: float) -> MixedBuffer:
+        """Return a buffer that shares the memory of another one."""
+        assert buffer.agents == 1
+        shared = {each.name: getattr(buffer, each.name) for each in fields(ReplayBuffer)}
+        return cls(**shared, log=log, fraction=fraction)
+
+    def draw(self, count: int, generators: Sequence[torch.Generator]) -> Tensor:
+        """Draw `count` rows, those of the log last."""
+        logged = round(self.fraction * count)
+        own = super().draw(count - logged, generators)
+        rows = torch.randint(len(self.log), (logged,), generator=self.generator)
+        return torch.cat((own, rows + len(self)))
+
+    def batch(self, rows: Tensor) -> Batch:
+        """Return the transitions of rows (R,), which `draw` returned."""
+        own = int((rows < len(self)).sum())
+        parts = super().batch(rows[:own]), self.log.batch(rows[own:] - len(self))
+        first, last = parts
+        return Batch(
+            rows,
+            _joined(first.observations, last.observations),
+            torch.cat((first.actions, last.actions)),
+            torch.cat((first.rewards, last.rewards)),
+            torch.cat((first.discounts, last.discounts)),
+            _joined(first.next_observations, last.next_observations),
+        )
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the content, the state of the generator, and the log."""
+        return super().state() | {f"log.{name}": part for name, part in _log_parts(self.log)}
+
+
+_LOG_PARTS = ("starts", "places", "actions", "returns")
+
+
+def _log_parts(log: TransitionBuffer) -> Iterator[tuple[str, Tensor]]:
+    """Yield the tensors of a log by name."""
+    assert isinstance(log.frames, Observations)
+    yield from ((name, getattr(log, name)) for name in _LOG_PARTS)
+    yield from ((f"frames.{number}", part) for number, part in enumerate(log.frames.parts()))
+
+
+def packed_log(dataset: Dataset, buffer: ReplayBuffer) -> TransitionBuffer:
+    """Return logged transitions in the form in which a replay buffer stores its own.
+
+    Raises:
+        SpaceError: The log has other spaces, or actions outside the Box.
+        TrainingError: There are no transitions, or a number is NaN or infinite.
+    """
+    packed = TransitionBuffer.from_dataset(
+        dataset, buffer.packing, encoder=buffer.encoder, reward_scale=1.0, box=buffer.box
+    )
+    frames = packed.frames.rows(torch.arange(len(packed.frames)))
+    return replace(packed, frames=_averaged(frames, buffer.pools))
+
+
+def restored_log(tensors: Mapping[str, Tensor], buffer: ReplayBuffer) -> TransitionBuffer:
+    """Return the log of a `MixedBuffer` from its state, without the prefix `log.`.
+
+    Raises:
+        KeyError: A tensor is missing.
+    """
+    count = sum(name.startswith("frames.") for name in tensors)
+    vector, *images = (tensors[f"frames.{number}"] for number in range(count))
+    return TransitionBuffer(
+        encoder=buffer.encoder,
+        action_space=buffer.action_space,
+        packing=buffer.packing,
+        frames=Observations(vector, tuple(images)),
+        box=buffer.box,
+        **{name: tensors[name] for name in _LOG_PARTS},
+    )
+
+
+def _joined(first: Observations, last: Observations) -> Observations:
+    parts = zip(first.parts(), last.parts(), strict=True)
+    return first.like([torch.cat(pair) for pair in parts])
+
+
+def _averaged(observations: Observations, pools: Sequence[int]) -> Observations:
+    """Return observations with the images of each camera averaged by a factor."""
+    pairs = zip(observations.images, pools, strict=True)
+    return replace(observations, images=tuple(averaged(image, pool) for image, pool in pairs))
 
 
 def averaged(images: Tensor, pool: int) -> Tensor:

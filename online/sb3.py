@@ -1,4 +1,4 @@
-"""Adapter of Stable-Baselines3: its DQN, PPO and A2C, trained and saved as SB3 does.
+"""Adapter of Stable-Baselines3: its DQN, SAC, TD3, PPO and A2C, trained and saved as SB3 does.
 
 SB3's own features extractors are used unless a setting asks for another encoder of images, for
 dueling networks or for layer normalization. The models, their environments with SB3's interface,
@@ -22,10 +22,11 @@ import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
-from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
@@ -33,6 +34,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from torch import Tensor
 
+from mcaprl.actions import BoxActions
 from mcaprl.architecture import SMALL_EDGE, Architecture
 from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import UsageError
@@ -48,7 +50,14 @@ from mcaprl.frames import (
     whole_of,
 )
 from mcaprl.online.agent import Agent, center_images
-from mcaprl.online.config import DQNConfig, OnlineConfig
+from mcaprl.online.config import (
+    ActorCriticConfig,
+    DQNConfig,
+    OnlineConfig,
+    ReplayConfig,
+    SACConfig,
+    TD3Config,
+)
 from mcaprl.online.features import (
     NetworkDQNPolicy,
     channels_first,
@@ -57,14 +66,27 @@ from mcaprl.online.features import (
     policy_arguments,
 )
 from mcaprl.online.live import WATCHED
-from mcaprl.online.zip_file import ModelEncoder, describe_run, policy_of, read_policy, save_policy
+from mcaprl.online.zip_file import (
+    ClampedGaussian,
+    ModelEncoder,
+    describe_run,
+    policy_of,
+    read_policy,
+    save_policy,
+)
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import BEST_NAME
 from mcaprl.sims.evaluation.rollout import episode_seed
 from mcaprl.storage.tensor_files import below
 
-MODELS: Final[dict[str, type[BaseAlgorithm]]] = {"dqn": DQN, "ppo": PPO, "a2c": A2C}
+MODELS: Final[dict[str, type[BaseAlgorithm]]] = {
+    "dqn": DQN,
+    "sac": SAC,
+    "td3": TD3,
+    "ppo": PPO,
+    "a2c": A2C,
+}
 _COUNTERS = (
     "num_timesteps",
     "_n_updates",
@@ -130,9 +152,11 @@ class ModelAgent(Agent):
     def start_from(self, data: Dataset | None, policy: Any) -> None:
         """Refuse data and policies: only this package's learners start from them."""
         if data is not None or policy is not None:
+            is_box = isinstance(self.env.single_action_space, spaces.Box)
+            own = "`algo='sac'`, without `engine=`" if is_box else "`algo='double-dqn'`"
             raise UsageError(
                 f"{self._task.algo} of Stable-Baselines3 cannot start from logs or a policy: train"
-                " with `algo='double-dqn'`"
+                f" with {own}"
             )
 
     def scalars(self) -> dict[str, float]:
@@ -157,7 +181,11 @@ class ModelAgent(Agent):
         self._actions = actions
         if self._recorder is not None:
             self._recorder.epsilon, self._recorder.policy_version = self.epsilon, self.updates
-            self._recorder.behavior_probs = behavior_probabilities(self.model, actions)
+            found = behavior_of(self.model, actions)
+            if isinstance(self.model.action_space, spaces.Box):
+                self._recorder.behavior_log_probs = found
+            else:
+                self._recorder.behavior_probs = found
 
     def save_policy(self, folder: Path) -> None:
         """Write the current model into a folder, in the format of SB3."""
@@ -168,7 +196,8 @@ class ModelAgent(Agent):
         model, buffer = self.model, _buffer_of(self.model)
         tensors = {
             **{f"policy.{name}": value for name, value in model.policy.state_dict().items()},
-            **_optimizer_tensors(model.policy.optimizer),
+            **_optimizer_tensors(model),
+            **_temperature(model),
             **{f"buffer.{name}": torch.from_numpy(v) for name, v in _columns(model).items()},
         }
         counters = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
@@ -180,7 +209,10 @@ class ModelAgent(Agent):
         """Restore what `_state` returned. The environments start new episodes, with a new seed."""
         model, buffer = self.model, _buffer_of(self.model)
         model.policy.load_state_dict(below(tensors, "policy"))
-        _load_optimizer(model.policy.optimizer, below(tensors, "optimizer"))
+        for name, optimizer in _optimizers(model).items():
+            _load_optimizer(optimizer, below(tensors, name))
+        for name, value in _temperature(model).items():
+            value.copy_(tensors[name])
         if buffer is not None:
             buffer.pos, buffer.full = description["place"]
             content = below(tensors, "buffer")
@@ -205,12 +237,17 @@ class ModelAgent(Agent):
         return int(cast(Any, self.model)._n_updates)
 
     def probability(self) -> float:
-        """Return the probability of the action of the watched environment."""
-        return float(behavior_probabilities(self.model, self._actions)[WATCHED])
+        """Return the probability, or log density, of the action of the watched environment."""
+        return float(behavior_of(self.model, self._actions)[WATCHED])
 
-    def values(self) -> tuple[Tensor, Tensor, float]:
-        """Return Q-values, preferences and the state's value in the watched environment."""
+    def values(self) -> tuple[Tensor, Tensor, float] | None:
+        """Return Q-values, preferences and the state's value in the watched environment.
+
+        The result is None for the actions of a Box.
+        """
         model = self.model
+        if isinstance(model.action_space, spaces.Box):
+            return None
         observation = rows_of(model._last_obs, slice(WATCHED, WATCHED + 1))
         tensor: Any = model.policy.obs_to_tensor(observation)[0]
         with torch.inference_mode():
@@ -232,7 +269,7 @@ class ModelAgent(Agent):
             "loss": logged.get("train/loss", logged.get("train/value_loss", math.nan)),
             "epsilon": self.epsilon,
             "mean_q": math.nan,
-            "learning_rate": model.policy.optimizer.param_groups[0]["lr"],
+            "learning_rate": next(iter(_optimizers(model).values())).param_groups[0]["lr"],
             "steps": self.steps,
             "updates": self.updates,
         }
@@ -270,7 +307,7 @@ class _Callbacks(BaseCallback):
 def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseAlgorithm:
     """Create a model with new weights, and seed Python, NumPy and torch."""
     model_type: Any = MODELS[algo]
-    _check(config, env.observation_space)
+    _check(algo, config, env.observation_space)
     architecture = own_architecture(config, env.observation_space)
     policy_kwargs: dict[str, Any] = {"net_arch": list(config.hidden)}
     policy: Any = "CnnPolicy" if is_image(env.observation_space) else "MlpPolicy"
@@ -282,6 +319,14 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
             policy = NetworkDQNPolicy
     if model_type is not A2C:
         policy_kwargs["optimizer_kwargs"] = {"fused": True}
+    box: dict[str, Any] = {}
+    if isinstance(config, ActorCriticConfig):
+        size = math.prod(env.action_space.shape or ())
+        if isinstance(config, SACConfig):
+            box = {"target_entropy": config.target_entropy * size}
+        elif isinstance(config, TD3Config):
+            noise = np.full(size, config.exploration_noise)
+            box = {"action_noise": NormalActionNoise(np.zeros(size), noise)}
     last_rate = config.learning_rate * config.final_learning_rate_fraction
     model: BaseAlgorithm = model_type(
         policy,
@@ -291,6 +336,7 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
         seed=seed,
         device="auto",
         **config.arguments(),
+        **box,
     )
     encoder = "nature" if architecture is None else architecture.encoder
     if encoder == "nature" and _has_images(env.observation_space):
@@ -299,17 +345,21 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
     return model
 
 
-def _check(config: OnlineConfig, space: spaces.Space[Any]) -> None:
-    """Refuse settings that SB3's DQN does not have."""
-    if not isinstance(config, DQNConfig):
+def _check(algo: str, config: OnlineConfig, space: spaces.Space[Any]) -> None:
+    """Refuse settings that SB3's algorithms with a replay buffer do not have."""
+    if not isinstance(config, ReplayConfig):
         return
-    lacks = ("image_shift", "exploration_decay", "target_update_episodes")
-    given = [name for name in lacks if getattr(config, name)]
+    lacks = ("image_shift", "exploration_decay", "target_update_episodes", "critic_layer_norm")
+    given = [name for name in lacks if getattr(config, name, False)]
     if config.n_steps > 1 and isinstance(space, spaces.Dict):
         given.append("n_steps for Dict observations")
+    own = "use `algo='double-dqn'`" if isinstance(config, DQNConfig) else "omit `engine='sb3'`"
     if given:
+        raise UsageError(f"{algo} of Stable-Baselines3 has no {given[0]}: omit it, or {own}")
+    if isinstance(config, ActorCriticConfig) and own_architecture(config, space) is not None:
         raise UsageError(
-            f"dqn of Stable-Baselines3 has no {given[0]}: omit it, or use `algo='double-dqn'`"
+            f"{algo} of Stable-Baselines3 has its own networks only: pass `encoder='nature'`,"
+            f" `center_images=False` and `layer_norm=False`, or {own}"
         )
 
 
@@ -338,14 +388,57 @@ def _has_images(space: spaces.Space[Any]) -> bool:
 
 
 def exploration(model: BaseAlgorithm) -> float:
-    """Return epsilon of the next step; NaN if the policy is stochastic."""
-    if not isinstance(model, DQN):
+    """Return epsilon of the next step; NaN if the policy is stochastic from the start."""
+    if not isinstance(model, OffPolicyAlgorithm):
         return math.nan
-    return 1.0 if model.num_timesteps < model.learning_starts else model.exploration_rate
+    if model.num_timesteps < model.learning_starts:
+        return 1.0
+    return model.exploration_rate if isinstance(model, DQN) else 0.0
+
+
+def behavior_of(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the values of `behavior_prob` or `behavior_log_prob` of actions (N, *shape)."""
+    is_box = isinstance(model.action_space, spaces.Box)
+    return (behavior_log_densities if is_box else behavior_probabilities)(model, actions)
+
+
+def behavior_log_densities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the log densities (N,) with which the model chose these actions of a Box.
+
+    PPO, A2C and TD3 clip their normal distributions, so an action with a number at a bound has a
+    probability instead of a density: NaN.
+
+    Args:
+        model: Model in training, which chose `actions` for its last observations.
+        actions: Actions (N, *shape).
+    """
+    box = BoxActions.of(cast(spaces.Box, model.action_space))
+    numbers = torch.from_numpy(box.scaled(actions)).double()
+    if exploration(model) == 1.0:
+        return np.full(len(actions), box.log_scale - box.size * math.log(2))
+    policy: Any = model.policy
+    with torch.inference_mode():
+        observations = policy.obs_to_tensor(model._last_obs)[0]
+        if isinstance(model, SAC):
+            mean, log_std, _ = policy.actor.get_action_dist_params(observations)
+            found = ClampedGaussian.log_density(torch.stack((mean, log_std), 1).cpu(), numbers)
+            return found.numpy() + box.log_scale
+        if isinstance(model, TD3):
+            assert isinstance(model.action_noise, VectorizedActionNoise | NormalActionNoise)
+            noise: Any = getattr(model.action_noise, "base_noise", model.action_noise)
+            normal = torch.distributions.Normal(
+                policy.actor(observations).cpu().double(), torch.from_numpy(noise._sigma)
+            )
+            found = normal.log_prob(numbers).sum(1) + box.log_scale
+        else:
+            taken = torch.as_tensor(actions, device=policy.device)
+            found = policy.get_distribution(observations).log_prob(taken).cpu()
+    at_bound = (numbers.abs() >= 1).any(1)
+    return cast("NDArray[np.float64]", found.double().masked_fill(at_bound, torch.nan).numpy())
 
 
 def behavior_probabilities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the probabilities with which the model chose these actions.
+    """Return the probabilities with which the model chose these actions of a finite space.
 
     With a Q-network and A actions, the probability of each action is epsilon / A, plus 1 - epsilon
     for the greedy action. At each step, SB3 explores either in all environments or in none; the
@@ -385,9 +478,27 @@ def _columns(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
     return {name: column[: buffer.size()] for name, column in columns.items()}
 
 
-def _optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+def _optimizers(model: BaseAlgorithm) -> dict[str, torch.optim.Optimizer]:
+    """Return the optimizers of a model by their names in checkpoints."""
+    if not isinstance(model, SAC | TD3):
+        return {"optimizer": model.policy.optimizer}
+    found = {f"optimizer_{name}": getattr(model, name).optimizer for name in ("actor", "critic")}
+    if isinstance(model, SAC) and model.ent_coef_optimizer is not None:
+        found["optimizer_temperature"] = model.ent_coef_optimizer
+    return found
+
+
+def _temperature(model: BaseAlgorithm) -> dict[str, Tensor]:
+    """Return the logarithm of SAC's temperature, which is not among the policy's weights."""
+    if not isinstance(model, SAC) or model.log_ent_coef is None:
+        return {}
+    return {"log_temperature": model.log_ent_coef.detach()}
+
+
+def _optimizer_tensors(model: BaseAlgorithm) -> dict[str, Tensor]:
     return {
-        f"optimizer.{index}.{name}": value
+        f"{key}.{index}.{name}": value
+        for key, optimizer in _optimizers(model).items()
         for index, moments in optimizer.state_dict()["state"].items()
         for name, value in moments.items()
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,16 +11,23 @@ from typing import Any
 from gymnasium import Env, spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from mcaprl.actions import joint_actions
+from mcaprl.actions import BoxActions, joint_actions, short_name
 from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
 from mcaprl.frames import parts_of_space
-from mcaprl.online.config import CONFIGS, OnlineConfig, find_preset, settings_for
+from mcaprl.online.config import (
+    BOX_ALGOS,
+    CONFIGS,
+    ENGINES,
+    FINITE_ALGOS,
+    OnlineConfig,
+    find_preset,
+    settings_for,
+    warm_settings,
+)
 from mcaprl.runs import CONFIG_NAME, RunIdentity, check_kind, read_config, run_to_resume
 from mcaprl.settings import check_settings, settings_from_json
-from mcaprl.sims import make_sims
+from mcaprl.sims import make_sim, make_sims
 from mcaprl.sims.evaluation.rollout import make_limited, make_limited_sims
-
-DEFAULT_ALGO = "double-dqn"
 
 
 def find_config(algo: str) -> type[OnlineConfig]:
@@ -34,6 +42,18 @@ def check_spaces(
 ) -> None:
     """Check that an algorithm supports the spaces of an environment."""
     find_config(algo)
+    for space in parts_of_space(observation_space).values():
+        if not isinstance(space, spaces.Box):
+            raise SpaceError(f"{algo} needs Box observations, or a Dict of them, got {space}")
+    if isinstance(action_space, spaces.Box):
+        if algo not in BOX_ALGOS:
+            fitting = f"for {short_name(action_space)} use {' or '.join(BOX_ALGOS[:2])}"
+            raise SpaceError(f"{algo} needs discrete actions; {fitting}")
+        BoxActions.of(action_space)
+        return
+    if algo not in FINITE_ALGOS:
+        fitting = f"for {short_name(action_space)} use {FINITE_ALGOS[0]}"
+        raise SpaceError(f"{algo} needs the actions of a Box; {fitting}")
     joint = joint_actions(action_space)
     if joint is None or joint.shape:
         hint = ""
@@ -46,9 +66,25 @@ def check_spaces(
             f"{algo} needs actions that start at 0, got {action_space}:"
             " wrap the environment in gymnasium.wrappers.TransformAction"
         )
-    for space in parts_of_space(observation_space).values():
-        if not isinstance(space, spaces.Box):
-            raise SpaceError(f"{algo} needs Box observations, or a Dict of them, got {space}")
+
+
+def default_algo(sim: str, sim_options: Mapping[str, Any]) -> str:
+    """Return the default algorithm for the actions of an environment."""
+    with closing(make_sim(sim, **sim_options)) as env:
+        is_box = isinstance(env.action_space, spaces.Box)
+    return BOX_ALGOS[0] if is_box else FINITE_ALGOS[0]
+
+
+def choose_engine(algo: str, engine: str | None) -> str:
+    """Return the engine that trains an algorithm; None selects the first one that has it."""
+    if engine is None:
+        return next(name for name, algos in ENGINES.items() if algo in algos)
+    if engine not in ENGINES:
+        raise UnknownNameError("engine", engine, ENGINES)
+    if algo not in ENGINES[engine]:
+        algos = ", ".join(ENGINES[engine])
+        raise UsageError(f"`engine={engine!r}` has no {algo}, but {algos}")
+    return engine
 
 
 @dataclass(frozen=True)
@@ -63,6 +99,7 @@ class Task:
         max_steps: Steps after which an episode is truncated, in training and evaluation. None
             selects the environment's own limit; evaluations of environments without one then have
             the limit of `mcaprl.sims.evaluation.rollout`.
+        engine: Key of `ENGINES`; empty selects the first one that has the algorithm.
     """
 
     algo: str
@@ -70,6 +107,12 @@ class Task:
     sim: str
     sim_options: dict[str, Any]
     max_steps: int | None = None
+    engine: str = ""
+
+    @property
+    def is_sb3(self) -> bool:
+        """Whether Stable-Baselines3 trains the agents."""
+        return choose_engine(self.algo, self.engine or None) == "sb3"
 
     @classmethod
     def for_sim(
@@ -83,7 +126,7 @@ class Task:
 
         Args:
             sim: Short name or Gymnasium id.
-            algo: Key of `CONFIGS`; None selects Double DQN.
+            algo: Key of `CONFIGS`; None selects the default for the actions of the sim.
             sim_options: Arguments of the environment.
             **settings: Settings that replace the defaults.
 
@@ -91,9 +134,10 @@ class Task:
             UnknownNameError: There is no such algorithm.
             UsageError: The algorithm has no such setting, or a setting is outside its range.
         """
-        algo, options = algo or DEFAULT_ALGO, dict(sim_options or {})
-        config_type = find_config(algo)
-        return cls._checked(algo, sim, options, settings_for(config_type, sim, options), settings)
+        options = dict(sim_options or {})
+        algo = algo or default_algo(sim, options)
+        find_config(algo)
+        return cls._checked(algo, sim, options, settings_for(algo, sim, options), settings)
 
     @classmethod
     def of_preset(
@@ -131,7 +175,7 @@ class Task:
             task = cls._checked(
                 found["algo"], found["sim"], dict(found["sim_options"]), earlier, settings
             )
-            return replace(task, max_steps=found.get("max_steps"))
+            return replace(task, max_steps=found.get("max_steps"), engine=found.get("engine", ""))
         except (KeyError, TypeError) as error:
             raise TrainingError(
                 f"{folder / CONFIG_NAME} does not belong to an online run: {error}"
@@ -171,7 +215,8 @@ class Task:
         parts = {"algo": self.algo, "sim": self.sim, "sim_options": self.sim_options}
         # Runs of earlier versions have no limit in their files.
         limit = {} if self.max_steps is None else {"max_steps": self.max_steps}
-        return RunIdentity({**parts, **limit, "config": self.config.to_json()})
+        engine = {"engine": self.engine} if self.engine else {}
+        return RunIdentity({**parts, **limit, **engine, "config": self.config.to_json()})
 
 
 def choose_task(
@@ -182,14 +227,41 @@ def choose_task(
     *,
     preset: str | None = None,
     max_steps: int | None = None,
+    engine: str | None = None,
     resumed: Path | None = None,
+    with_logs: bool = False,
+    with_policy: bool = False,
 ) -> Task:
-    """Return the task that the arguments of a command line describe."""
+    """Return the task that the arguments of a command line describe.
+
+    `with_logs` and `with_policy` say what the agents start from.
+    """
+    is_resumed = resumed is not None and run_to_resume(resumed)
+    if sim is not None and preset is None and not is_resumed and (with_logs or with_policy):
+        algo = algo or default_algo(sim, sim_options)
+        find_config(algo)
+        given = {**warm_settings(algo, with_logs=with_logs, with_policy=with_policy), **given}
+    task = _described(sim, algo, sim_options, given, preset, max_steps, engine, resumed)
+    choose_engine(task.algo, task.engine or None)
+    return task
+
+
+def _described(
+    sim: str | None,
+    algo: str | None,
+    sim_options: Mapping[str, Any],
+    given: Mapping[str, Any],
+    preset: str | None,
+    max_steps: int | None,
+    engine: str | None,
+    resumed: Path | None,
+) -> Task:
     if resumed is not None and run_to_resume(resumed):
         task = Task.of_run(resumed, **given)
         options = {**task.sim_options, **sim_options}
         limit = max_steps or task.max_steps
-        task = Task(algo or task.algo, task.config, sim or task.sim, options, limit)
+        engine = engine or task.engine
+        task = Task(algo or task.algo, task.config, sim or task.sim, options, limit, engine)
         task.identity.check_same(read_config(resumed), resumed / CONFIG_NAME)
         return task
     if preset is not None:
@@ -197,7 +269,8 @@ def choose_task(
         for what, value, own in (("the sim", sim, task.sim), ("`algo=`", algo, task.algo)):
             if value not in (None, own):
                 raise UsageError(f"preset {preset} sets {what} to {own}: omit {what} {value}")
-        return replace(task, max_steps=max_steps)
+        return replace(task, max_steps=max_steps, engine=engine or "")
     if sim is None:
         raise UsageError("online training needs a sim, such as lane, or `preset=NAME`")
-    return replace(Task.for_sim(sim, algo, sim_options, **given), max_steps=max_steps)
+    task = Task.for_sim(sim, algo, sim_options, **given)
+    return replace(task, max_steps=max_steps, engine=engine or "")

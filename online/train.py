@@ -135,13 +135,13 @@ def train(
 
 def make_agent(task: Task, *arguments: Any, **options: Any) -> Agent:
     """Create the agent of a task; the other arguments are those of `LearningAgent`."""
-    if task.algo == "double-dqn":
-        from mcaprl.online.learning import LearningAgent
+    if task.is_sb3:
+        from mcaprl.online.sb3 import ModelAgent
 
-        return LearningAgent(task, *arguments, **options)
-    from mcaprl.online.sb3 import ModelAgent
+        return ModelAgent(task, *arguments, **options)
+    from mcaprl.online.learning import LearningAgent
 
-    return ModelAgent(task, *arguments, **options)
+    return LearningAgent(task, *arguments, **options)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import io
 import json
+import math
+import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -31,8 +33,11 @@ from stable_baselines3.common.policies import (
     MultiInputActorCriticPolicy,
 )
 from stable_baselines3.dqn.policies import CnnPolicy, DQNPolicy, MultiInputPolicy
+from stable_baselines3.sac import policies as sac
+from stable_baselines3.td3 import policies as td3
 from torch import Tensor, nn
 
+from mcaprl.actions import BoxActions, joint_actions
 from mcaprl.architecture import Architecture, architecture_of
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
 from mcaprl.files import as_type, check_regular, parse_json, write_atomically
@@ -46,7 +51,15 @@ from mcaprl.frames import (
     whole_of,
 )
 from mcaprl.networks import check_size
-from mcaprl.offline.algorithms.heads import build_head
+from mcaprl.offline.algorithms.heads import (
+    BoxHead,
+    Deterministic,
+    Head,
+    SquashedGaussian,
+    build_head,
+    unsquashed,
+)
+from mcaprl.offline.algorithms.losses import squashed_normal_log_density
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
 from mcaprl.offline.policy import Policy
 from mcaprl.online.features import NetworkDQNPolicy, channels_first, inputs_of, policy_arguments
@@ -78,6 +91,8 @@ _LEFT_OUT = (
 _LEAST_IMAGE_FEATURES = 256
 _POLICY_TYPES: Final[dict[str, tuple[type[BasePolicy], ...]]] = {
     "q-network": (DQNPolicy, CnnPolicy, MultiInputPolicy),
+    "sac": (sac.SACPolicy, sac.CnnPolicy, sac.MultiInputPolicy),
+    "td3": (td3.TD3Policy, td3.CnnPolicy, td3.MultiInputPolicy),
     "actor-critic": (ActorCriticPolicy, ActorCriticCnnPolicy, MultiInputActorCriticPolicy),
 }
 """SB3's policy classes for vectors, images and dicts. Files with other classes are refused."""
@@ -155,15 +170,20 @@ def save_policy(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -
         model: Model of SB3.
         description: Description as `describe_run` returns it.
     """
-    q_network = isinstance(model.policy, DQNPolicy)
+    kind = _kind_of(model.policy)
     own = {
         "format_version": FORMAT_VERSION,
-        "network": "q-network" if q_network else "actor-critic",
-        "activation": "ReLU" if q_network else "Tanh",
+        "network": kind,
+        "activation": "Tanh" if kind == "actor-critic" else "ReLU",
         "steps": model.num_timesteps,
         **description,
     }
     write_model(path, model, own)
+
+
+def _kind_of(network: BasePolicy) -> str:
+    """Return the key of `_POLICY_TYPES` of a policy of SB3."""
+    return next(kind for kind, types in _POLICY_TYPES.items() if isinstance(network, types[0]))
 
 
 def describe_run(
@@ -272,9 +292,17 @@ def _policy(network: BasePolicy, description: _Description, name: str, *, exact:
     action_space = space_from_json(json.dumps(description.action_space))
     frames = description.frame_stack
     network.set_training_mode(False)
-    is_critic = isinstance(network, ActorCriticPolicy)
-    inner: nn.Module = _Actor(network) if is_critic else cast(Any, network).q_net
-    model = ModelNetwork(inner, channels_last(observation_space), frames)
+    box = BoxActions.of(action_space) if isinstance(action_space, spaces.Box) else None
+    inner, name_of_network = _inner(network, box)
+    networks = {name_of_network: ModelNetwork(inner, channels_last(observation_space), frames)}
+    kind = _kind_of(network)
+    head: Head
+    if box is None:
+        head = build_head(
+            name_of_network if kind == "actor-critic" else "q_values", networks, action_space
+        )
+    else:
+        head = _BOX_HEADS[kind](networks, box)
     return Policy(
         name=name,
         algo=description.algo,
@@ -284,11 +312,7 @@ def _policy(network: BasePolicy, description: _Description, name: str, *, exact:
         env_kwargs=description.env_kwargs,
         frame_stack=frames,
         encoder=ModelEncoder(observation_space),
-        head=build_head(
-            "logits" if is_critic else "q_values",
-            {"logits" if is_critic else "q": model},
-            action_space,
-        ).eval(),
+        head=head.eval(),
     )
 
 
@@ -302,7 +326,9 @@ def _own_network(
     """Create an SB3 policy with this package's network, after checking the number of weights."""
     parts, (vectors, images) = parts_of_space(space), inputs_of(space)
     width = sum(int(np.prod(parts[key].shape)) for key in vectors)
-    check_size(architecture, width, images, int(cast(spaces.Discrete, action_space).n), weights)
+    joint = joint_actions(action_space)
+    outputs = math.prod(action_space.shape or ()) if joint is None else joint.count
+    check_size(architecture, width, images, outputs, weights)
     policy_type: Any = {"q-network": NetworkDQNPolicy, "actor-critic": ActorCriticPolicy}[kind]
     network: BasePolicy = policy_type(
         space, action_space, lambda _: 0.0, **policy_arguments(architecture)
@@ -383,17 +409,94 @@ class ModelNetwork(nn.Module):
         return cast(Tensor, self.network(whole_of(moved))).cpu()
 
 
-class _Actor(nn.Module):
-    """Logits of an actor-critic policy."""
+class ClampedGaussian(SquashedGaussian):
+    """Squashed Gaussian of SB3's SAC: outputs (B, 2, n) are means and log deviations themselves."""
 
-    def __init__(self, policy: BasePolicy) -> None:
+    @staticmethod
+    def log_density(outputs: Tensor, actions: Tensor, log_std: Tensor | None = None) -> Tensor:
+        """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
+        return squashed_normal_log_density(unsquashed(actions), *outputs.unbind(1)).sum(1)
+
+
+class ClippedGaussian(BoxHead):
+    """Normal distributions of SB3's PPO and A2C, whose actions are clipped to the Box.
+
+    Outputs (B, 2, n) are means and log deviations, for actions scaled to [-1, 1]. At the bounds,
+    the density is that before the clipping.
+    """
+
+    @staticmethod
+    def output_shape(size: int) -> tuple[int, ...]:
+        """Return the shape of the outputs for actions of n numbers."""
+        return (2, size)
+
+    @staticmethod
+    def best(outputs: Tensor) -> Tensor:
+        """Return the means (B, n), clipped."""
+        return outputs[:, 0].clamp(-1, 1)
+
+    @staticmethod
+    def log_density(outputs: Tensor, actions: Tensor, log_std: Tensor | None = None) -> Tensor:
+        """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
+        mean, log_std = outputs.unbind(1)
+        return torch.distributions.Normal(mean, log_std.exp()).log_prob(actions).sum(1)
+
+
+_BOX_HEADS: Final[dict[str, type[BoxHead]]] = {
+    "sac": ClampedGaussian,
+    "td3": Deterministic,
+    "actor-critic": ClippedGaussian,
+}
+"""Heads for the actions of a Box, by the key of `_POLICY_TYPES`."""
+
+
+def _inner(network: BasePolicy, box: BoxActions | None) -> tuple[nn.Module, str]:
+    """Return the part of a policy that computes the outputs of a head, and its name there."""
+    policy: Any = network
+    if isinstance(network, ActorCriticPolicy):
+        return _Actor(network, box), "logits" if box is None else "actor"
+    if isinstance(network, DQNPolicy):
+        return policy.q_net, "q"
+    return _BoxActor(policy.actor), "actor"
+
+
+class _BoxActor(nn.Module):
+    """Outputs of the actor of SAC or TD3."""
+
+    def __init__(self, actor: Any) -> None:
+        super().__init__()
+        self.actor = actor
+
+    def forward(self, inputs: Any) -> Tensor:
+        actor = self.actor
+        if isinstance(actor, sac.Actor):
+            return torch.stack(actor.get_action_dist_params(inputs)[:2], 1)
+        features = actor.extract_features(inputs, actor.features_extractor)
+        # The last layer is a tanh, which the head applies.
+        return cast(Tensor, actor.mu[:-1](features))
+
+
+class _Actor(nn.Module):
+    """Logits of an actor-critic policy; for a Box, scaled means and log deviations."""
+
+    def __init__(self, policy: BasePolicy, box: BoxActions | None) -> None:
         super().__init__()
         self.policy: Any = policy
+        self._is_box = box is not None
+        if box is not None:
+            half = (box.high - box.low) / 2
+            self.register_buffer("_center", torch.from_numpy(box.low + half), persistent=False)
+            self.register_buffer("_half", torch.from_numpy(half), persistent=False)
 
     def forward(self, inputs: Any) -> Tensor:
         policy = self.policy
         features = BasePolicy.extract_features(policy, inputs, policy.pi_features_extractor)
-        return cast(Tensor, policy.action_net(policy.mlp_extractor.forward_actor(features)))
+        outputs: Tensor = policy.action_net(policy.mlp_extractor.forward_actor(features))
+        if not self._is_box:
+            return outputs
+        mean = ((outputs - self._center) / self._half).float()
+        log_std = (policy.log_std - self._half.log()).float().expand_as(mean)
+        return torch.stack((mean, log_std), 1)
 
 
 def channels_last(space: spaces.Space[Any]) -> spaces.Space[Any]:
@@ -459,17 +562,30 @@ def describe_sb3(data: Mapping[str, Any], weights: Mapping[str, Any]) -> dict[st
     unknown = sorted(set(own) - _KNOWN_KWARGS)
     if unknown:
         raise PolicyError(f"policy_kwargs {', '.join(unknown)} of the model are not supported")
-    critic = any(name.startswith("action_net.") for name in weights)
-    if not critic and not any(name.startswith("q_net.q_net.") for name in weights):
-        raise PolicyError("the model is not DQN, PPO or A2C")
+    known = (
+        kind for kind, first in _FIRST_WEIGHTS.items() if any(n.startswith(first) for n in weights)
+    )
+    kind = next(known, None)
+    if kind is None:
+        raise PolicyError("the model is not DQN, SAC, TD3, PPO or A2C")
+    default = "Tanh" if kind == "actor-critic" else "ReLU"
     return {
-        "algo": "actor-critic" if critic else "dqn",
-        "network": "actor-critic" if critic else "q-network",
+        "algo": "dqn" if kind == "q-network" else kind,
+        "network": kind,
         "net_arch": own.get("net_arch"),
-        "activation": _activation(own.get("activation_fn"), "Tanh" if critic else "ReLU"),
+        "activation": _activation(own.get("activation_fn"), default),
         "observation_space": _box(data.get("observation_space")),
-        "action_space": _discrete(data.get("action_space")),
+        "action_space": _actions(data.get("action_space")),
     }
+
+
+_FIRST_WEIGHTS: Final = {
+    "actor-critic": "action_net.",
+    "q-network": "q_net.q_net.",
+    "sac": "actor.log_std.",
+    "td3": "actor.mu.",
+}
+"""Start of the names of weights that only models of a kind have; those of SAC before TD3's."""
 
 
 def _activation(text: object, default: str) -> str:
@@ -482,6 +598,28 @@ def _box(found: Any) -> dict[str, Any]:
     shape, dtype = _attributes(found, "observation", "box.Box", ("_shape", "dtype"))
     low, high = (0, 255) if dtype == "uint8" else ("-inf", "inf")
     return {"type": "Box", "low": low, "high": high, "shape": list(shape), "dtype": dtype}
+
+
+def _actions(found: Any) -> dict[str, Any]:
+    """Return the description of a space of actions as `space_from_json` reads it."""
+    if not (isinstance(found, dict) and "box.Box'" in str(found.get(":type:"))):
+        return _discrete(found)
+    shape, dtype, *texts = _attributes(
+        found, "action", "box.Box", ("_shape", "dtype", "low", "high")
+    )
+    low, high = ([float(number) for number in _NUMBER.findall(str(text))] for text in texts)
+    if not len(low) == len(high) == math.prod(shape):
+        raise PolicyError("the bounds of the model's action space are not stored as numbers")
+    return {
+        "type": "Box",
+        "low": np.reshape(low, shape).tolist(),
+        "high": np.reshape(high, shape).tolist(),
+        "shape": list(shape),
+        "dtype": dtype,
+    }
+
+
+_NUMBER: Final = re.compile(r"-?(?:inf|[0-9.]+(?:e[-+]?[0-9]+)?)")
 
 
 def _discrete(found: Any) -> dict[str, Any]:

@@ -167,6 +167,7 @@ def train_online(
     out: str | Path,
     *,
     algo: str | None = None,
+    engine: str | None = None,
     preset: str | None = None,
     seeds: int | None = None,
     seed: int | None = None,
@@ -195,8 +196,10 @@ def train_online(
         sim: Short name of a sim, or a Gymnasium id; None for the sim of the preset or of the
             resumed run.
         out: Run folder to create.
-        algo: `dqn`, `double-dqn`, `ppo` or `a2c`. None selects the default of the preset, run or
-            sim.
+        algo: `double-dqn` or `dqn` for discrete actions, `sac` or `td3` for those of a Box, `ppo`
+            or `a2c` for both. None selects that of the preset or run, else `double-dqn` or `sac`.
+        engine: `mcaprl`, whose learners are those of offline training, or `sb3` for
+            Stable-Baselines3. None selects `mcaprl` for `double-dqn`, `sac` and `td3`.
         preset: Name of published settings.
         seeds: Number of agents, which are trained one after the other. None selects 1; with
             `resume`, that of the run.
@@ -206,8 +209,8 @@ def train_online(
         record: Output log of all transitions; with several seeds, a folder.
         upload: URL to which the log of `record` is copied at the end of the training; with several
             seeds, the URL of a folder.
-        sources: Logs that fill the replay buffer, and at most one policy whose weights initialize
-            the agents.
+        sources: Logs, and at most one policy whose weights initialize the agents. With discrete
+            actions, the logs fill the replay buffer; else, a part of each batch is drawn from them.
         resume: Whether training continues from the checkpoints in `out`.
         live: Whether viewers can connect during training, and watch one episode after the other.
         live_speed: Simulated seconds per second in the episodes that are shown.
@@ -262,6 +265,7 @@ def train_online(
         if algo not in (None, "double-dqn"):
             raise UsageError(f"`device=` trains double-dqn only: omit `algo={algo!r}`")
         _check_device_request(
+            engine=engine is not None,
             preset=preset is not None,
             record=record is not None,
             sources=bool(as_names(sources)),
@@ -272,11 +276,19 @@ def train_online(
         numbers = choose_seeds(out, seeds, seed, resume)
         found = _train_on_device(sim, out, device, numbers, threads, options, settings, progress)
         return Run(out, found)
-    resumed = out if resume else None
-    task = choose_task(
-        sim, algo, options, settings, preset=preset, max_steps=max_steps, resumed=resumed
-    )
     data, policy = _experience(as_names(sources))
+    task = choose_task(
+        sim,
+        algo,
+        options,
+        settings,
+        preset=preset,
+        max_steps=max_steps,
+        engine=engine,
+        resumed=out if resume else None,
+        with_logs=data is not None,
+        with_policy=policy is not None,
+    )
     with ExitStack() as stack:
         stack.enter_context(torch_threads(threads))
         viewers = None

@@ -6,14 +6,16 @@ TD3, are one ensemble of two networks Q(s, a).
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from mcaprl.architecture import Architecture
 from mcaprl.offline.algorithms.config import ActorCriticConfig
 from mcaprl.offline.algorithms.heads import BOX_HEADS
 from mcaprl.offline.algorithms.learner import Learner
+from mcaprl.offline.algorithms.losses import clipped_double_q_target
 from mcaprl.offline.batches.buffer import Batch
 from mcaprl.offline.batches.observations import Observations
 
@@ -30,6 +32,11 @@ class ActorCritic(Learner):
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shapes of the actor's outputs, and of one value per critic."""
         return {"actor": BOX_HEADS[self.acts_by].output_shape(self.n_actions), "q": (1,)}
+
+    def architecture_of(self, name: str) -> Architecture:
+        """Return the architecture of a model; critics may have layer normalization alone."""
+        normed = self.config.critic_layer_norm and name in self.critics
+        return replace(self.architecture, layer_norm=self.architecture.layer_norm or normed)
 
     def act(self, observations: Observations) -> Tensor:
         """Return the actor's actions (R, n), in [-1, 1]."""
@@ -55,7 +62,14 @@ class ActorCritic(Learner):
             "action_error": error
         }
 
-    @abstractmethod
     @torch.no_grad()
     def learned_targets(self, batch: Batch) -> Tensor:
-        """Return the targets (R,) of the critics, computed with the learning networks."""
+        """Return the targets (R,) of the critics, with the learning networks and without noise."""
+        next_actions = self.act(batch.next_observations)
+        q_t = self.models["q"](batch.next_observations.with_actions(next_actions))
+        penalty = self.next_penalty(batch, next_actions)
+        return clipped_double_q_target(batch.rewards, batch.discounts, q_t, penalty)
+
+    def next_penalty(self, batch: Batch, next_actions: Tensor) -> Tensor | float:
+        """Return the penalty (R,) that is subtracted from the values of next actions (R, n)."""
+        return 0.0

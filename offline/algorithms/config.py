@@ -244,6 +244,8 @@ class ActorCriticConfig(BootstrapConfig):
     """updates between two updates of the target networks"""
     polyak: float = 0.02
     """weight of the learning networks in an update of the target networks; 1 copies them"""
+    critic_layer_norm: bool = False
+    """normalize the hidden layers of the critics"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -296,6 +298,24 @@ class TD3Config(ActorCriticConfig):
 
 
 @dataclass(frozen=True)
+class SACConfig(ActorCriticConfig):
+    """Settings of SAC."""
+
+    temperature: float = 1.0
+    """initial weight of the policy's entropy beside the rewards"""
+    target_entropy: float = -1.0
+    """entropy per number of an action in [-1, 1] to which the temperature is tuned"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("temperature", 0 < self.temperature < math.inf, "above 0 and finite")
+        highest = math.log(2)
+        allowed = f"below {highest:.2f}, the entropy of uniform numbers"
+        self._require("target_entropy", -math.inf < self.target_entropy < highest, allowed)
+
+
+@dataclass(frozen=True)
 class TD3BCConfig(TD3Config):
     """Settings of TD3+BC."""
 
@@ -318,6 +338,7 @@ class ReBRACConfig(TD3Config):
     """weight of the actor's cloning error, beside the values over their mean absolute value"""
     critic_weight: float = 0.01
     """weight of the squared distance of next actions from the logged ones in targets"""
+    critic_layer_norm: bool = True
 
     def __post_init__(self) -> None:
         """Validate the settings."""

@@ -6,11 +6,12 @@
     deterministic       tanh(output), in a Box                                td3-bc, rebrac, bc
     gaussian            normal distribution, truncated to a Box               iql, bc
     mixture             mixture of such distributions                         bc
+    squashed_gaussian   tanh of a normal distribution, scaled to a Box        sac
 
-The last three heads act by the mode of the distribution, or of its most likely component. Inside,
-actions are numbers in [-1, 1]. A normal distribution that is truncated to this interval has a
-finite density at the bounds, where sticks and pilots often are. (After a tanh, the density there
-would be infinite.)
+The last four heads act by the mode of the distribution, or of its most likely component; after a
+tanh, by that of the mean. Inside, actions are numbers in [-1, 1]. A normal distribution that is
+truncated to this interval has a finite density at the bounds, where sticks and pilots often are.
+After a tanh, the density there would be infinite: it is that of an action slightly inside.
 
 A policy uses the members of `Head` alone, so a head for another kind of action space is a class
 here and an entry in `HEADS`.
@@ -34,6 +35,7 @@ from mcaprl.offline.algorithms.losses import (
     allowed_only,
     likely_actions,
     mean_values,
+    squashed_normal_log_density,
     truncated_normal_log_density,
 )
 from mcaprl.offline.batches.buffer import discrete_actions
@@ -277,6 +279,27 @@ class Gaussian(BoxHead):
         return truncated_normal_log_density(actions, mean, log_std).sum(-1)
 
 
+class SquashedGaussian(Gaussian):
+    """Tanh of independent normal distributions; outputs (B, 2, n) are means and deviations."""
+
+    @staticmethod
+    def log_density(outputs: Tensor, actions: Tensor, log_std: Tensor | None = None) -> Tensor:
+        """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
+        mean, raw = outputs.unbind(1)
+        return squashed_normal_log_density(unsquashed(actions), mean, bounded_log_std(raw)).sum(1)
+
+    @staticmethod
+    def sample(outputs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Return actions (B, n) in [-1, 1] from normal noise (B, n), and their log densities (B,).
+
+        Gradients flow through both.
+        """
+        mean, raw = outputs.unbind(1)
+        log_std = bounded_log_std(raw)
+        pre = torch.addcmul(mean, log_std.exp(), noise)
+        return pre.tanh(), squashed_normal_log_density(pre, mean, log_std).sum(1)
+
+
 class Mixture(BoxHead):
     """Mixture of `COMPONENTS` truncated normal distributions, for demonstrations with several ways.
 
@@ -317,6 +340,8 @@ class Mixture(BoxHead):
 COMPONENTS: Final = 5
 """Number of components of a mixture."""
 _LOG_STD_CENTER, _LOG_STD_HALF = -2.0, 3.0
+_LARGEST: Final = 1 - 1e-6
+"""Largest action of which a tanh has a density; larger ones have the same."""
 
 
 def bounded_log_std(raw: Tensor) -> Tensor:
@@ -324,10 +349,16 @@ def bounded_log_std(raw: Tensor) -> Tensor:
     return _LOG_STD_CENTER + _LOG_STD_HALF * (raw / _LOG_STD_HALF).tanh()
 
 
+def unsquashed(actions: Tensor) -> Tensor:
+    """Return the numbers whose tanh are actions, which are moved slightly inside at the bounds."""
+    return actions.clamp(-_LARGEST, _LARGEST).atanh()
+
+
 BOX_HEADS: Final[dict[str, type[BoxHead]]] = {
     "deterministic": Deterministic,
     "gaussian": Gaussian,
     "mixture": Mixture,
+    "squashed_gaussian": SquashedGaussian,
 }
 """Heads for the actions of a Box."""
 HEADS: Final[dict[str, type[DiscreteHead]]] = {

@@ -220,6 +220,13 @@ class Learner(ABC):
         for name, target in self.target_networks.items():
             target.sync(self.models[name])
 
+    @torch.no_grad()
+    def load_targets(self) -> None:
+        """Copy the weights of all models to their target networks, even those that are averages."""
+        for name, target in self.target_networks.items():
+            target.model.weights.copy_(self.models[name].weights)
+            target.reset()
+
     def _gradients(self, rows: Tensor) -> dict[str, Tensor]:
         """Compute the gradients of all weights for rows (R,) of the buffer, on its device.
 
@@ -352,10 +359,10 @@ class Learner(ABC):
         targets = {f"{name}_target": target.model for name, target in self.target_networks.items()}
         return {**self.models, **targets}
 
-    def network(self, name: str, seed: int) -> Network:
-        """Return one seed's network, or the first one of its ensemble, with its current weights."""
+    def network(self, name: str, seed: int, member: int = 0) -> Network:
+        """Return one seed's network, or one of its ensemble, with its current weights."""
         model = self.models[name]
-        return model.networks[self.seeds.index(seed) * model.members]
+        return model.networks[self.seeds.index(seed) * model.members + member]
 
     def architecture_of(self, name: str) -> Architecture:
         """Return the architecture of a model's networks; default: the same one for all models."""

@@ -203,6 +203,29 @@ def truncated_normal_log_density(actions: Tensor, mean: Tensor, log_std: Tensor)
     return -0.5 * scaled.square() - log_std - _LOG_SQRT_TAU - inside.log()
 
 
+def squashed_normal_log_density(pre: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
+    """Return the log densities of actions tanh(pre), where `pre` is normal.
+
+    They are log N(pre; mean, std) - log(1 - tanh(pre)^2). See "Soft Actor-Critic Algorithms and
+    Applications", appendix C, https://arxiv.org/abs/1812.05905.
+    """
+    scaled = (pre - mean) * (-log_std).exp()
+    # log(1 - tanh(x)^2), without the difference of two almost equal numbers.
+    log_gradient = 2 * (math.log(2) - pre - functional.softplus(-2 * pre))
+    return -0.5 * scaled.square() - log_std - _LOG_SQRT_TAU - log_gradient
+
+
+def temperature_loss(log_alpha: Tensor, log_pi: Tensor, target_entropy: float) -> Tensor:
+    """Return the loss (B,) of SAC's log temperature: log alpha * (entropy - target entropy).
+
+    Here, -log pi(a|s) (B,) of the policy's action is the estimate of its entropy. The gradient is
+    0 at the target entropy. See "Soft Actor-Critic Algorithms and Applications", equation 18,
+    https://arxiv.org/abs/1812.05905, with log alpha instead of alpha, as in the authors' code.
+    """
+    _check_shape("log_pi", log_pi, log_alpha.shape)
+    return -log_alpha * (log_pi + target_entropy)
+
+
 def allowed_only(outputs: Tensor, mask: Tensor | None) -> Tensor:
     """Set outputs (B, A) or (B, A, N) of actions that are not allowed to minus infinity.
 

@@ -13,13 +13,10 @@ those of `td3_bc`. The weights depend on the data in the paper; here they have o
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from torch import Tensor
 
-from mcaprl.architecture import Architecture
 from mcaprl.offline.algorithms.config import ReBRACConfig
-from mcaprl.offline.algorithms.td3_bc import TD3
+from mcaprl.offline.algorithms.td3 import TD3
 from mcaprl.offline.batches.buffer import Batch
 
 
@@ -29,11 +26,6 @@ class ReBRAC(TD3):
     name = "rebrac"
     config_type = ReBRACConfig
     config: ReBRACConfig
-
-    def architecture_of(self, name: str) -> Architecture:
-        """Return the architecture of a model: critics have layer normalization."""
-        normed = self.architecture.layer_norm or name in self.critics
-        return replace(self.architecture, layer_norm=normed)
 
     def policy_losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return the actor's loss: the weighted squared distance minus the relative value."""

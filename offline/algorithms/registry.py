@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 
 from gymnasium import spaces
 
+from mcaprl.actions import short_name
 from mcaprl.entry_points import installed, load
 from mcaprl.errors import SpaceError, UnknownNameError, UsageError
 from mcaprl.offline.algorithms.bc import BC, BoxBC
@@ -35,6 +36,8 @@ BOX_ALGORITHMS: dict[str, type[Learner]] = {
 """The built-in algorithms for the actions of a Box."""
 _BUILT_IN: Final = [*ALGORITHMS.values(), *BOX_ALGORITHMS.values()]
 _DEFAULTS: Final = (CQL, BoxIQL)
+_ONLINE: Final = ("sac", "td3")
+"""Names of learners of online training alone, which overestimate actions that no log has."""
 _SUGGESTED: Final = {False: "cql or iql", True: "iql or rebrac"}
 
 
@@ -76,6 +79,8 @@ def algorithms_named(
     if found := [learner for learner in _BUILT_IN if learner.name == algo]:
         return found
     entries = installed(ENTRY_POINT_GROUP)
+    if algo in _ONLINE and algo not in entries:
+        raise UsageError(f"{algo} learns online only, not from logs: use {_SUGGESTED[True]}")
     if algo not in entries:
         known = dict.fromkeys(learner.name for learner in _BUILT_IN)
         raise UnknownNameError("algorithm", algo, [*known, *entries, *others])
@@ -116,7 +121,8 @@ def choose_algorithm(
             return each
     needed = "discrete actions" if is_box else "the actions of a Box"
     raise SpaceError(
-        f"{found[0].learner_type.name} needs {needed}; for {_short(space)} use {_SUGGESTED[is_box]}"
+        f"{found[0].learner_type.name} needs {needed}; for {short_name(space)} use"
+        f" {_SUGGESTED[is_box]}"
     )
 
 
@@ -172,10 +178,3 @@ def _checked(learner: type[Learner]) -> type[Learner]:
             f"the algorithm {learner.__name__} has the name {learner.name!r} of a built-in one"
         )
     return learner
-
-
-def _short(space: spaces.Space[Any]) -> str:
-    """Return a space in messages: that of a Box without its bounds."""
-    if not isinstance(space, spaces.Box):
-        return f"{space}"
-    return f"Box{space.shape}" if len(space.shape) != 1 else f"Box({space.shape[0]},)"

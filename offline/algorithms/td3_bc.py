@@ -15,79 +15,11 @@ a million. The mean of |Q| is that of the batch before the update.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import torch
 from torch import Tensor
 
-from mcaprl.offline.algorithms.actor_critic import ActorCritic
-from mcaprl.offline.algorithms.config import TD3BCConfig, TD3Config
-from mcaprl.offline.algorithms.losses import (
-    clipped_double_q_target,
-    smoothed_actions,
-    twin_regression,
-)
-from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
-
-_SMALLEST_VALUE = 1e-6
-
-
-class TD3(ActorCritic):
-    """Twin critics of a deterministic actor; a subclass defines the actor's loss."""
-
-    config: TD3Config
-
-    def __init__(self, config: TD3Config, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:
-        """Initialize the networks with random weights, and copy them to the target networks."""
-        super().__init__(config, buffer, seeds)
-        for name in ("actor", "q"):
-            self.add_target_network(name, config.target_interval, polyak=config.polyak)
-
-    def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the losses of the critics and, every `policy_interval` updates, of the actor."""
-        noise = self.noise(self.config.policy_noise)
-        target_tm1 = self.targets(batch, noise)
-        q_tm1 = self.models["q"](batch.observations.with_actions(batch.actions))
-        td_loss = twin_regression(q_tm1, target_tm1)
-        terms = {"mean_q": self.in_reward_units(q_tm1.detach().mean(0)), "td_loss": td_loss}
-        is_due = self.is_due(self.config.policy_interval)
-        if not is_due and not self.is_reported:
-            return {**terms, "loss": td_loss}
-        with torch.set_grad_enabled(is_due):
-            policy_terms = self.policy_losses(batch)
-        return {**terms, **policy_terms, "loss": td_loss + policy_terms["policy_loss"]}
-
-    def policy_losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Return terms to log, among them `policy_loss` (R,), which the actor minimizes."""
-        raise NotImplementedError
-
-    @torch.no_grad()
-    def targets(self, batch: Batch, noise: Tensor) -> Tensor:
-        """Return the targets (R,) of the critics, with noise (R, n) on the next actions."""
-        outputs = self.target_networks["actor"].model(batch.next_observations)
-        next_actions = smoothed_actions(outputs.tanh(), noise, self.config.noise_clip)
-        next_inputs = batch.next_observations.with_actions(next_actions)
-        q_t = self.target_networks["q"].model(next_inputs)
-        penalty = self.next_penalty(batch, next_actions)
-        return clipped_double_q_target(batch.rewards, batch.discounts, q_t, penalty)
-
-    @torch.no_grad()
-    def learned_targets(self, batch: Batch) -> Tensor:
-        """Return the targets (R,), computed with the learning networks and without noise."""
-        next_actions = self.act(batch.next_observations)
-        q_t = self.models["q"](batch.next_observations.with_actions(next_actions))
-        penalty = self.next_penalty(batch, next_actions)
-        return clipped_double_q_target(batch.rewards, batch.discounts, q_t, penalty)
-
-    def next_penalty(self, batch: Batch, next_actions: Tensor) -> Tensor | float:
-        """Return the penalty (R,) that is subtracted from the values of next actions (R, n)."""
-        return 0.0
-
-    def relative(self, values: Tensor) -> Tensor:
-        """Divide values (R,) by the mean of their absolute values in each seed's batch."""
-        return self.divided(
-            values, self.batch_means(values.detach().abs()).clamp_min(_SMALLEST_VALUE)
-        )
+from mcaprl.offline.algorithms.config import TD3BCConfig
+from mcaprl.offline.algorithms.td3 import TD3
+from mcaprl.offline.batches.buffer import Batch
 
 
 class TD3BC(TD3):

@@ -86,11 +86,9 @@ class NoisyPolicy(BasePolicy):
     def act(self, observations: Any) -> NDArray[Any]:
         """Return noisy actions (B, *shape)."""
         mean = self._means(observations)
-        low, high = (_probability((bound - mean) / self._sigma) for bound in self._bounds)
-        share = low + (high - low) * self._random.random(mean.shape)
-        noise = self._sigma * _QUANTILE(np.clip(share, 1e-16, 1 - 1e-16))
+        drawn = quantile(self._random.random(mean.shape), mean, self._sigma, *self._bounds)
         assert self.action_space is not None
-        actions: NDArray[Any] = np.clip(mean + noise, *self._bounds).astype(self.action_space.dtype)
+        actions: NDArray[Any] = drawn.astype(self.action_space.dtype)
         return actions
 
     def log_prob(self, observations: Any, actions: NDArray[Any]) -> Floats:
@@ -117,7 +115,26 @@ class NoisyPolicy(BasePolicy):
         return mean
 
 
-def log_density(actions: Floats, mean: Floats, sigma: Floats, low: Floats, high: Floats) -> Floats:
+def quantile(
+    share: Floats, mean: Floats, sigma: Floats | float, low: Floats | float, high: Floats | float
+) -> Floats:
+    """Return the quantiles of normal distributions truncated to [low, high].
+
+    Uniform numbers from 0 to 1 as `share` draw numbers with the density of `log_density`.
+    """
+    first, last = (_probability((bound - mean) / sigma) for bound in (low, high))
+    shares = np.clip(first + (last - first) * share, 1e-16, 1 - 1e-16)
+    found: Floats = np.clip(mean + sigma * _QUANTILE(shares), low, high)
+    return found
+
+
+def log_density(
+    actions: Floats,
+    mean: Floats,
+    sigma: Floats | float,
+    low: Floats | float,
+    high: Floats | float,
+) -> Floats:
     """Return the log densities of numbers under normal distributions truncated to [low, high].
 
     The density is phi(z) / (sigma (Phi(b) - Phi(a))), where z, a and b are the standardized number

@@ -9,14 +9,18 @@ import pytest
 
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.online.config import (
+    BOX_SETTINGS,
     CONFIGS,
     IMAGE_SETTINGS,
     SIM_SETTINGS,
+    TD3_SETTINGS,
     A2CConfig,
     DoubleDQNConfig,
     DQNConfig,
     OnlineConfig,
     PPOConfig,
+    SACConfig,
+    TD3Config,
     settings_for,
 )
 from mcaprl.online.task import Task, find_config
@@ -69,6 +73,13 @@ def test_a_rollout_is_shared_by_the_environments() -> None:
         (DQNConfig, "exploration_fraction", 2.0),
         (DQNConfig, "exploration_final_eps", -0.1),
         (DQNConfig, "steps_per_update", 3),
+        (SACConfig, "polyak", 0.0),
+        (SACConfig, "data_fraction", 1.5),
+        (SACConfig, "temperature", 0.0),
+        (SACConfig, "target_entropy", 1.0),
+        (TD3Config, "exploration_noise", 0.0),
+        (TD3Config, "policy_interval", 0),
+        (PPOConfig, "max_grad_norm", 0.0),
         (PPOConfig, "rollout_steps", 2_047),
         (PPOConfig, "epochs", 0),
         (PPOConfig, "batch_size", 63),
@@ -89,32 +100,40 @@ def test_an_unknown_algorithm_lists_the_known_ones() -> None:
 
 @pytest.mark.parametrize("sim", SIMS)
 def test_every_sim_has_settings_that_are_fields(sim: str) -> None:
-    settings = settings_for(DoubleDQNConfig, sim, {})
+    settings = settings_for("double-dqn", sim, {})
     assert settings == SIM_SETTINGS[sim]
-    assert settings == settings_for(DoubleDQNConfig, SIMS[sim], {"rules": "default"})
+    assert settings == settings_for("double-dqn", SIMS[sim], {"rules": "default"})
     assert DoubleDQNConfig(**settings).steps == settings["steps"]
+
+
+@pytest.mark.parametrize("sim", SIMS)
+def test_every_sim_has_settings_for_continuous_actions(sim: str) -> None:
+    settings = settings_for("sac", sim, {"actions": "continuous"})
+    assert settings == BOX_SETTINGS[sim]
+    continuous_id = SIMS.find(SIMS[sim]).continuous_id
+    assert settings_for("td3", continuous_id, {}) == settings | TD3_SETTINGS
+    assert TD3Config(**settings, **TD3_SETTINGS).steps == settings["steps"]
 
 
 @pytest.mark.parametrize(("sim", "observation"), IMAGE_SETTINGS)
 def test_images_have_settings_that_are_fields(sim: str, observation: str) -> None:
-    settings = settings_for(DoubleDQNConfig, sim, {"observation": observation})
+    settings = settings_for("double-dqn", sim, {"observation": observation})
     assert settings == IMAGE_SETTINGS[sim, observation]
     assert DoubleDQNConfig(**settings).center_images
 
 
 @pytest.mark.parametrize(
-    ("config_type", "sim", "sim_options"),
+    ("algo", "sim", "sim_options"),
     [
-        (DQNConfig, "CartPole-v1", {}),
-        (DQNConfig, "lane", {"observation": "depth", "rules": "classic"}),
-        (DQNConfig, "racer", {"rules": "classic"}),
-        (PPOConfig, "lane", {}),
+        ("dqn", "CartPole-v1", {}),
+        ("dqn", "lane", {"observation": "depth", "rules": "classic"}),
+        ("dqn", "racer", {"rules": "classic"}),
+        ("ppo", "lane", {}),
+        ("td3", "Pendulum-v1", {}),
     ],
 )
-def test_other_tasks_have_sb3s_settings(
-    config_type: type[OnlineConfig], sim: str, sim_options: dict[str, Any]
-) -> None:
-    assert settings_for(config_type, sim, sim_options) == {}
+def test_other_tasks_have_sb3s_settings(algo: str, sim: str, sim_options: dict[str, Any]) -> None:
+    assert settings_for(algo, sim, sim_options) == {}
 
 
 def test_the_users_settings_take_precedence() -> None:
