@@ -183,10 +183,25 @@ def _print_scores(found: Evaluation) -> None:
         ]
         for score in found.policies
     ]
+    columns = [
+        "policy",
+        "mean return",
+        "95 % interval",
+        "IQM",
+        "random 0, pilot 1",
+        "success",
+        "ends",
+    ]
+    changes = [score.command_change for score in found.policies]
+    if any(change is not None for change in changes):
+        columns.append("change a step")
+        texts = ["" if change is None else f"{change:.3g}" for change in changes]
+        first = len(rows) - len(texts)
+        rows = [row + ([texts[k - first]] if k >= first else [""]) for k, row in enumerate(rows)]
     episodes = found.policies[0].returns.shape[1]
     print_table(
         f"{found.sim}: {counted(episodes, 'episode')} for each policy and training seed",
-        ["policy", "mean return", "95 % interval", "IQM", "random 0, pilot 1", "success", "ends"],
+        columns,
         rows,
     )
     if not found.improvements:

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -24,11 +24,11 @@ from mcaprl.errors import TrainingError
 from mcaprl.files import subfolder, write_atomically
 from mcaprl.frames import mapped
 from mcaprl.offline.batches.observations import ObservationEncoder
+from mcaprl.offline.training.metrics import ScalarsWriter
 from mcaprl.online.curves import CurvePoint, write_curve
 from mcaprl.online.evaluation import Evaluation, FirstEpisodes
 from mcaprl.online.live import LiveTraining, Shown
 from mcaprl.online.recording import recorded
-from mcaprl.online.scalars import ScalarsWriter
 from mcaprl.online.task import Task
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -39,6 +39,8 @@ from mcaprl.storage.tensor_files import read_tensors, write_tensors
 LOG_INTERVAL = 1_000
 """Number of environment steps between two rows of scalars, and between two progress reports."""
 EVALUATIONS_NAME = "evaluations"
+PROGRESS_NAME = "progress.csv"
+STEPS_COLUMN = "time/total_timesteps"
 CENTERING_STEPS = 2_000
 """Number of random steps before training; their images determine the image normalization."""
 _BROKEN = (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError, IndexError)
@@ -114,16 +116,12 @@ class Agent(ABC):
             else:
                 self._restore(*found)
             if self._watched is not None:
-                self._watched.shown = self._shown()
+                self._watched.shown = cast(Shown, self)
             self._envs = stack.pop_all()
 
     @abstractmethod
     def _prepare(self, tensors: dict[str, Tensor] | None) -> None:
         """Create what is trained; `tensors` are those of the checkpoint, if there is one."""
-
-    @abstractmethod
-    def _shown(self) -> Shown:
-        """Return what the live view shows."""
 
     @property
     @abstractmethod
@@ -193,7 +191,8 @@ class Agent(ABC):
         if self.steps >= self._task.config.steps:
             return
         self._began_s = time.perf_counter()
-        with closing(ScalarsWriter(self._folder, self.steps)) as self._scalars:
+        path = self._folder / PROGRESS_NAME
+        with closing(ScalarsWriter(path, STEPS_COLUMN, self.steps)) as self._scalars:
             self._train(report)
             if self.steps > self._reported_at:
                 self._report(report)
@@ -221,8 +220,7 @@ class Agent(ABC):
             "eval/mean_ep_length": point.mean_length,
             "eval/score": point.score,
         }
-        assert self._scalars is not None
-        self._scalars.write(point.step, scalars)
+        self._write(scalars)
         if self._recorder is not None:
             folder = self._folder / EVALUATIONS_NAME
             with writing(folder):
@@ -236,13 +234,19 @@ class Agent(ABC):
         seconds = time.perf_counter() - self._began_s
         speed = (self.steps - self.resumed_at) / max(seconds, 1e-9)
         times = {"time/time_elapsed": seconds, "time/fps": float(int(speed))}
-        assert self._scalars is not None
-        self._scalars.write(self.steps, {**times, **self.scalars()})
+        self._write({**times, **self.scalars()})
         terms = {"score": math.nan, "mean_return": math.nan}
         if self.points:
             last = self.points[-1]
             terms = {"score": last.score, "mean_return": last.mean_return}
         report(TrainingProgress(self._seed, self.steps, self._task.config.steps, terms))
+
+    def _write(self, scalars: dict[str, float]) -> None:
+        """Write a row of scalars, without those that are NaN."""
+        assert self._scalars is not None
+        known = {name: value for name, value in scalars.items() if not math.isnan(value)}
+        known.pop(STEPS_COLUMN, None)
+        self._scalars.write_row(self.steps, known)
 
     def _save(self) -> None:
         """Replace the checkpoint."""

@@ -71,7 +71,8 @@ class VectorEnvironments:
 
     def step(self, actions: Tensor) -> Outcome:
         """Take a step with the actions (W, *shape)."""
-        result = self._env.step(actions.numpy())
+        # A copy, because environments may change their arguments.
+        result = self._env.step(actions.numpy().copy())
         observations, rewards, terminated, truncated, infos = result
         self._returns += rewards
         self._lengths += 1

@@ -90,9 +90,6 @@ class LearningAgent(Agent):
         self._choice: Choice | None = None
         self.__dict__.pop("policy", None)
 
-    def _shown(self) -> LearningAgent:
-        return self
-
     @property
     def steps(self) -> int:
         """Number of finished environment steps, summed over all environments."""

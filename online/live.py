@@ -11,8 +11,10 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from gymnasium.vector import SyncVectorEnv, VectorEnv
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.frames import rows_of
@@ -121,7 +123,7 @@ class LiveTraining:
         with closing(self._shown):
             self.stream.close()
 
-    def _source_of(self, batch: Any) -> Callable[[Any], object]:
+    def _source_of(self, batch: Any) -> Callable[[object], object]:
         """Return a function that maps the last action to the object whose scene is shown.
 
         The action is that of the watched environment, or None after a reset. The function returns
@@ -130,7 +132,7 @@ class LiveTraining:
         single = self._shown.unwrapped
         if isinstance(batch, BatchedEnv) and isinstance(single, VehicleEnv):
 
-            def imitate(action: Any) -> object:
+            def imitate(action: object) -> object:
                 single.imitate(batch.fleet, WATCHED, action)
                 return single
 
@@ -153,7 +155,7 @@ class WatchedBatch(VectorWrapper):
         env: VectorEnv[Any, Any, Any],
         stream: LiveStream,
         algo: str,
-        source: Callable[[Any], object],
+        source: Callable[[object], object],
     ) -> None:
         """Wrap `env`, and store the source of the scene.
 
@@ -165,7 +167,7 @@ class WatchedBatch(VectorWrapper):
         self.score = math.nan
         self._stream, self._algo, self._source = stream, algo, source
         self._observations: Any = None
-        self._last_action: Any = None
+        self._last_action: NDArray[Any] | None = None
         self._episode = -1
         self._begin_episode()
 
@@ -197,7 +199,7 @@ class WatchedBatch(VectorWrapper):
                 **before,
             )
             self._is_shown = stream.show(step)
-        self._observations, self._last_action = observations, actions[WATCHED]
+        self._observations, self._last_action = observations, np.copy(actions[WATCHED])
         self._step += 1
         self._return_so_far += float(rewards[WATCHED])
         if any(ends):

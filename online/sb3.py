@@ -87,8 +87,6 @@ MODELS: Final[dict[str, type[BaseAlgorithm]]] = {
     "ppo": PPO,
     "a2c": A2C,
 }
-# SB3 uses NumPy's global generator. NumPy's type stubs do not define `get_bit_generator`.
-_NUMPY_RANDOM: Any = np.random
 _COUNTERS = (
     "num_timesteps",
     "_n_updates",
@@ -136,9 +134,6 @@ class ModelAgent(Agent):
         self._row: dict[str, float] = {}
         self._actions: NDArray[Any] = np.zeros(0)
         self.model.set_logger(Logger(folder=None, output_formats=[_Rows(self._row)]))
-
-    def _shown(self) -> ModelAgent:
-        return self
 
     @property
     def steps(self) -> int:
@@ -199,16 +194,15 @@ class ModelAgent(Agent):
     def _state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return the state for a checkpoint, as tensors and as JSON values."""
         model, buffer = self.model, _buffer_of(self.model)
-        generators, states = _generators(model)
         tensors = {
             **{f"policy.{name}": value for name, value in model.policy.state_dict().items()},
             **_optimizer_tensors(model),
             **_temperature(model),
-            **{f"generator.{name}": value for name, value in generators.items()},
             **{f"buffer.{name}": torch.from_numpy(v) for name, v in _columns(model).items()},
         }
         counters = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
         place = [] if buffer is None else [buffer.pos, buffer.full]
+        states = _generators(model)
         return tensors, {"counters": counters, "place": place, "generators": states}
 
     def _load(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
@@ -226,7 +220,7 @@ class ModelAgent(Agent):
                 rows[:] = content[name].numpy()
         for name, value in description["counters"].items():
             setattr(model, name, value)
-        _load_generators(model, below(tensors, "generator"), description["generators"])
+        _load_generators(model, description["generators"])
         assert model.env is not None
         model.env.seed(episode_seed(self._seed, self.steps))
 
@@ -526,35 +520,23 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tens
     optimizer.load_state_dict({"state": moments, "param_groups": groups})
 
 
-def _generators(model: BaseAlgorithm) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Return the states of the random generators, as tensors and as JSON values."""
-    state = _NUMPY_RANDOM.get_bit_generator().state
-    version, words, next_gauss = random.getstate()
-    tensors = {
-        "torch": torch.get_rng_state(),
-        "numpy": torch.from_numpy(state["state"]["key"].astype(np.int64)),
-        "python": torch.tensor(words, dtype=torch.int64),
-    }
-    plain = {
-        "numpy": state["state"]["pos"],
-        "python": [version, next_gauss],
+def _generators(model: BaseAlgorithm) -> dict[str, Any]:
+    """Return the states of the random generators as JSON values."""
+    name, key, *others = np.random.get_state(legacy=True)  # noqa: NPY002
+    return {
+        "torch": torch.get_rng_state().tolist(),
+        "numpy": [name, cast(Any, key).tolist(), *others],
+        "python": random.getstate(),
         "actions": model.action_space.np_random.bit_generator.state,
     }
-    return tensors, plain
 
 
-def _load_generators(
-    model: BaseAlgorithm, tensors: Mapping[str, Tensor], plain: Mapping[str, Any]
-) -> None:
-    torch.set_rng_state(tensors["torch"])
-    key = tensors["numpy"].numpy().astype(np.uint32)
-    _NUMPY_RANDOM.get_bit_generator().state = {
-        "bit_generator": "MT19937",
-        "state": {"key": key, "pos": plain["numpy"]},
-    }
-    version, next_gauss = plain["python"]
-    random.setstate((version, tuple(tensors["python"].tolist()), next_gauss))
-    model.action_space.np_random.bit_generator.state = plain["actions"]
+def _load_generators(model: BaseAlgorithm, states: Mapping[str, Any]) -> None:
+    torch.set_rng_state(torch.tensor(states["torch"], dtype=torch.uint8))
+    np.random.set_state(tuple(states["numpy"]))  # noqa: NPY002
+    version, words, next_gauss = states["python"]
+    random.setstate((version, tuple(words), next_gauss))
+    model.action_space.np_random.bit_generator.state = states["actions"]
 
 
 class BatchedVecEnv(VecEnv):

@@ -47,6 +47,12 @@ def ours() -> list[Side]:
     return [
         _single("car", make_sim("lane"), 10_000),
         _batch(f"car, {CARS} in a batch", make_sims("lane", CARS), 200),
+        _single("car, continuous actions", make_sim("lane", actions="continuous"), 10_000),
+        _batch(
+            f"car, continuous actions, {CARS} in a batch",
+            make_sims("lane", CARS, actions="continuous"),
+            200,
+        ),
         _single("car with 16 rays", make_sim("lane", observation="rays"), 2_000),
         _frames_of("depth image of 84x84", make_sim("lane"), 100),
         _single("car with a depth image", make_sim("lane", observation="depth"), 100),
@@ -56,8 +62,20 @@ def ours() -> list[Side]:
             40,
             QUADROTOR_STEPS,
         ),
+        # Random velocities would end an episode after a few steps.
+        _batch(
+            f"quadrotor, increments, 0.1 s of flight, {DRONES} in a batch",
+            make_sims("powerline", DRONES, actions="increments"),
+            40,
+            QUADROTOR_STEPS,
+        ),
         _single("racer with 18 rays", make_sim("racer"), 4_000),
         _batch(f"racer with 18 rays, {RACERS} in a batch", make_sims("racer", RACERS), 50),
+        _batch(
+            f"racer, continuous actions, {RACERS} in a batch",
+            make_sims("racer", RACERS, actions="continuous"),
+            50,
+        ),
     ]
 
 
@@ -188,8 +206,12 @@ def _frames_of(name: str, env: gym.Env[Any, Any], frames: int) -> Side:
 
 def _batch(name: str, env: gym.vector.VectorEnv[Any, Any, Any], steps: int, each: int = 1) -> Side:
     random = np.random.default_rng(0)
-    count = len(env.unwrapped.action_meanings)
-    actions = random.integers(count, size=(steps, env.num_envs))
+    space = env.single_action_space
+    if isinstance(space, gym.spaces.Discrete):
+        actions: NDArray[Any] = random.integers(int(space.n), size=(steps, env.num_envs))
+    else:
+        shape = (steps, env.num_envs, *(space.shape or ()))
+        actions = random.uniform(-1.0, 1.0, shape).astype(np.float32)
     env.reset(seed=0)
 
     def run() -> None:

@@ -135,7 +135,7 @@ def _fill(folder: Path, sim: str, names: Sequence[str], algos: Sequence[str]) ->
     """Compute the missing cells of a sim."""
     results = folder / "box-scores.json"
     with closing(make_sim(sim, **BOX)) as env:
-        random, pilot = (_run(sim, [policy]) for policy in (None, make_pilot(env)))
+        random, pilot = _run(sim, [None]), _run(sim, [make_pilot(env)], env)
     for name in names:
         for algo in algos:
             cells = read_cells(results)
@@ -167,10 +167,17 @@ def _learn(
     return cell_of(_run(sim, load_policies(out)), random, pilot)
 
 
-def _run(sim: str, policies: Sequence[Policy | None]) -> PolicyScore:
-    """Run the same episodes for each policy, in a batch."""
-    with closing(make_sim(sim, **BOX)) as env, closing(make_sims(sim, EPISODES, **BOX)) as envs:
-        return evaluate(env, policies, name="", episodes=EPISODES, seed=EPISODE_SEED, envs=envs)
+def _run(sim: str, policies: Sequence[Policy | None], env: Any = None) -> PolicyScore:
+    """Run the same episodes for each policy, in a batch, or one by one in `env`."""
+    with closing(make_sim(sim, **BOX)) as own, closing(make_sims(sim, EPISODES, **BOX)) as envs:
+        return evaluate(
+            env or own,
+            policies,
+            name="",
+            episodes=EPISODES,
+            seed=EPISODE_SEED,
+            envs=None if env else envs,
+        )
 
 
 def _table(sim: str, cells: dict[str, dict[str, Cell]]) -> str:

@@ -51,7 +51,6 @@ class BoxBC(Learner):
     acts_by = "deterministic"
     policy_models = ("actor",)
     continuous = True
-    can_be_captured = True
     config: BoxBCConfig
 
     def __init__(self, config: BoxBCConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:

@@ -196,7 +196,7 @@ class CQLConfig(DoubleDQNConfig):
     """Settings of CQL: those of Double DQN, plus alpha and its target."""
 
     alpha: float = 1.0
-    """weight of the penalty on actions that are not in the data; 0 is Double DQN"""
+    """weight of the penalty on actions that are not in the data (td3-bc: of the values)"""
     target_gap: float = 0.0
     """mean penalty to which alpha is tuned, starting at its setting; 0 leaves alpha fixed"""
 

@@ -110,7 +110,6 @@ class BoxIQL(ActorCritic):
     name = "iql"
     config_type = BoxIQLConfig
     acts_by = "gaussian"
-    can_be_captured = True
     config: BoxIQLConfig
 
     def __init__(

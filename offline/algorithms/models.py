@@ -109,6 +109,8 @@ class AnyModel(Model):
 
     def _apply(self, network: Network, row: Tensor, observations: Observations) -> Tensor:
         """Apply one network with the weights in `row`; gradients flow back to the weight matrix."""
+        if not torch.is_grad_enabled():
+            return cast(Tensor, network(observations))
         parts = zip(self._names, self._shapes, row.split_with_sizes(self._sizes), strict=False)
         weights = {name: part.view(shape) for name, shape, part in parts}
         return cast(Tensor, functional_call(network, weights, (observations,)))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -19,8 +20,63 @@ from mcaprl.sims.evaluation.statistics import mean_interval
 from mcaprl.texts import counted
 
 
-class MetricsWriter:
-    """Writer of metrics to CSV and TensorBoard, one row per call.
+class ScalarsWriter:
+    """Writer of scalars to CSV and TensorBoard, one row per call of `write`."""
+
+    def __init__(self, path: Path, index: str, done: int, prefix: str = "") -> None:
+        """Open both files; rows of a CSV file after `done` are those of a broken-off session.
+
+        Args:
+            path: CSV file; TensorBoard's file is in the same folder.
+            index: Column with the number of updates or steps, the first one.
+            done: Number of updates or steps of earlier sessions.
+            prefix: Prefix of the names in TensorBoard.
+        """
+        # Imported here because a process that only handles summaries does not need torch.
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._path, self._index, self._prefix = path, index, prefix
+        self._rows = [row for row in _read(path) if _is_within(row.get(index, ""), done)]
+        self._columns = list(dict.fromkeys(name for row in self._rows for name in row))
+        self._rewrite()
+        with writing(path):
+            self._board = SummaryWriter(str(path.parent), purge_step=done + 1)
+
+    def write_row(self, number: int, scalars: Mapping[str, float]) -> None:
+        """Append the values after `number` updates or steps; names may differ between rows."""
+        row = {self._index: str(number), **{name: str(value) for name, value in scalars.items()}}
+        self._rows.append(row)
+        new = [name for name in row if name not in self._columns]
+        with writing(self._path):
+            if new:
+                self._columns += new
+                self._rewrite()
+            else:
+                with self._path.open("a", newline="") as file:
+                    self._writer(file).writerow(row)
+            for name, value in scalars.items():
+                self._board.add_scalar(f"{self._prefix}{name}", value, number)
+
+    def close(self) -> None:
+        """Close the files."""
+        with writing(self._path):
+            self._board.close()
+
+    def _rewrite(self) -> None:
+        """Replace the file; it gets a column for each name so far."""
+        text = io.StringIO()
+        writer = self._writer(text)
+        if self._columns:
+            writer.writeheader()
+        writer.writerows(self._rows)
+        write_atomically(self._path, text.getvalue().encode(), TrainingError)
+
+    def _writer(self, file: TextIO) -> csv.DictWriter[str]:
+        return csv.DictWriter(file, self._columns, lineterminator="\n")
+
+
+class MetricsWriter(ScalarsWriter):
+    """Writer of metrics, one row per call of `write`.
 
     The CSV has the columns `update`, `learning_rate` and the algorithm's terms. Each value comes
     from one batch and is not a running average, so the same seed writes the same file.
@@ -28,37 +84,11 @@ class MetricsWriter:
 
     def __init__(self, folder: Path, first_update: int) -> None:
         """Open both files in `folder`."""
-        # Imported here because a process that only handles summaries does not need torch.
-        from torch.utils.tensorboard import SummaryWriter
-
-        self._path = path = folder / METRICS_NAME
-        kept = _rows_before(path, first_update)
-        write_atomically(path, "".join(kept).encode(), TrainingError)
-        with writing(path):
-            self._file = path.open("a", newline="")
-            self._board = SummaryWriter(str(folder), purge_step=first_update)
-        self._rows = csv.writer(self._file, lineterminator="\n")
-        self._has_header = bool(kept)
+        super().__init__(folder / METRICS_NAME, "update", first_update - 1, "train/")
 
     def write(self, update: int, learning_rate: float, terms: Mapping[str, float]) -> None:
         """Append the values of one update."""
-        scalars = {"learning_rate": learning_rate, **terms}
-        with writing(self._path):
-            if not self._has_header:
-                self._rows.writerow(["update", *scalars])
-                self._has_header = True
-            self._rows.writerow([update, *scalars.values()])
-            self._file.flush()
-            for name, value in scalars.items():
-                self._board.add_scalar(f"train/{name}", value, update)
-
-    def close(self) -> None:
-        """Close both files."""
-        with writing(self._path):
-            try:
-                self._file.close()
-            finally:
-                self._board.close()
+        self.write_row(update, {"learning_rate": learning_rate, **terms})
 
 
 @dataclass(frozen=True)
@@ -95,18 +125,18 @@ def describe_seeds(summaries: Sequence[OfflineSummary]) -> list[str]:
     return lines
 
 
-def _rows_before(path: Path, update: int) -> list[str]:
-    """Return the header and the rows of earlier updates, without damaged rows or cut ones."""
-    if update == 1 or not path.exists():
+def _read(path: Path) -> list[dict[str, str]]:
+    """Return the rows of an earlier session, without empty values, and without cut rows."""
+    if not path.exists():
         return []
-    header, *rows = path.read_text(errors="replace").splitlines(keepends=True) or [""]
-    whole = (row for row in rows if row.count(",") == header.count(","))
-    numbered = ((row.split(",")[0], row) for row in whole)
-    return [header, *(row for number, row in numbered if _is_before(number, update))]
+    with writing(path), path.open(newline="", errors="replace") as file:
+        rows = list(csv.DictReader(file))
+    whole = (row for row in rows if None not in row and None not in row.values())
+    return [{name: value for name, value in row.items() if value} for row in whole]
 
 
-def _is_before(number: str, update: int) -> bool:
-    return number.isascii() and number.isdecimal() and len(number) < 20 and int(number) < update
+def _is_within(number: str, done: int) -> bool:
+    return number.isascii() and number.isdecimal() and len(number) < 20 and int(number) <= done
 
 
 CURVES_NAME = "curves.png"

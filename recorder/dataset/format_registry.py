@@ -48,7 +48,7 @@ def _has_final_infos(data: Dataset) -> bool:
 
 
 def _has_behavior(field: BehaviorField, data: Dataset) -> bool:
-    return data.behavior_field is field and not np.isnan(data.behavior).all()
+    return data.behavior_field == field and not np.isnan(data.behavior).all()
 
 
 FACTS: Mapping[str, Callable[[Dataset], bool]] = {

@@ -259,7 +259,7 @@ def _mixed_policies(dataset: Dataset) -> Iterator[Problem]:
 def _unknown_probabilities(dataset: Dataset) -> Iterator[Problem]:
     unknown, field = int(np.isnan(dataset.behavior).sum()), dataset.behavior_field
     if unknown:
-        way = "" if field is LOG_DENSITY else " without `estimate_behavior=True`"
+        way = "" if field == LOG_DENSITY else " without `estimate_behavior=True`"
         yield _note(
             f"{field.name} is unknown in {_steps(dataset, unknown)}",
             _places(dataset, lambda episode: np.isnan(episode.behavior)),

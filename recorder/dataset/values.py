@@ -80,7 +80,7 @@ def behavior_of(
         name = f"{place}{given.name if is_table else given.plural}"
         array = numbers(name, values)
         wrong, expected = given.is_impossible(array), given.expected
-        if given is LOG_DENSITY and field is PROBABILITY:
+        if given == LOG_DENSITY and field == PROBABILITY:
             wrong |= field.is_impossible(np.exp(array.astype(np.float64)))
             expected = f"the logarithm of {field.expected}"
         if wrong.any():

@@ -78,13 +78,13 @@ class BehaviorField:
 
         Values of the other kind are converted. The result is None if both arguments are None.
         """
-        own, other = (log_probs, probs) if self is LOG_DENSITY else (probs, log_probs)
+        own, other = (log_probs, probs) if self == LOG_DENSITY else (probs, log_probs)
         if own is None and other is None:
             return None
         with np.errstate(all="ignore"):
             if own is not None:
                 return np.asarray(own).astype(np.float32, copy=False)
-            convert = np.log if self is LOG_DENSITY else np.exp
+            convert = np.log if self == LOG_DENSITY else np.exp
             found: NDArray[np.float32] = convert(np.asarray(other, np.float64)).astype(np.float32)
         return found
 
@@ -94,13 +94,13 @@ class BehaviorField:
         Raises:
             SpaceError: The actions have densities; the message names the attribute `instead`.
         """
-        if self is LOG_DENSITY:
+        if self == LOG_DENSITY:
             raise SpaceError(f"actions of floats have densities, not probabilities: use {instead}")
         return values
 
     def log_probs(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return values of this column as logarithms of probabilities or densities."""
-        if self is LOG_DENSITY:
+        if self == LOG_DENSITY:
             return values
         with np.errstate(all="ignore"):
             found: NDArray[np.float32] = np.log(values)
@@ -108,7 +108,7 @@ class BehaviorField:
 
     def from_log_probs(self, values: Any) -> Any:
         """Return logarithms of probabilities or densities as values, which `check` checks."""
-        if self is LOG_DENSITY:
+        if self == LOG_DENSITY:
             return values
         try:
             with np.errstate(all="ignore"):

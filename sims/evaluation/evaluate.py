@@ -64,6 +64,15 @@ class PolicyScore:
         return dict(Counter(e.reason for seed in self.results for e in seed).most_common())
 
     @property
+    def command_change(self) -> float | None:
+        """Mean change of the commands a step, in their units; None if they are not those of a Box.
+
+        The smaller it is, the smoother the policy drives.
+        """
+        changes = [episode.command_change for seed in self.results for episode in seed]
+        return float(np.nanmean(changes)) if np.isfinite(changes).any() else None
+
+    @property
     def success_rate(self) -> float | None:
         """Share of successful episodes; None if the environment does not define success."""
         if self.successes is None:
@@ -88,6 +97,7 @@ class PolicyScore:
             },
             "seed_means": returns.mean(axis=1).tolist(),
             "success_rate": self.success_rate,
+            "command_change": self.command_change,
             "mean_length": float(np.mean([e.length for seed in self.results for e in seed])),
             "ends": self.ends,
             "returns": returns.ravel().tolist(),

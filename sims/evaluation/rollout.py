@@ -138,6 +138,8 @@ class EpisodeResult:
         reason: Reason why the episode ended; `interrupted` if the maximum number of steps was
             reached.
         positions: (length + 1, 2) x and y, meters; (0, 2) if the environment does not report them.
+        command_change: Mean absolute change of the numbers of a Box action from step to step, in
+            their units; NaN for other actions, and for episodes of one step.
     """
 
     seed: int
@@ -145,6 +147,7 @@ class EpisodeResult:
     length: int
     reason: str
     positions: NDArray[np.float64] = field(repr=False)
+    command_change: float = math.nan
 
 
 class EpsilonGreedy:
@@ -260,11 +263,13 @@ def run_episode(
     behavior.begin(seed)
     telemetry = getattr(env.unwrapped, "telemetry", None)
     positions = [_position(telemetry)]
+    changes = _Changes(env.action_space, 1)
     total, length, reason = 0.0, 0, "interrupted"
     while max_steps is None or length < max_steps:
         action, probability = behavior.choose(observation, info)
         if on_action is not None:
             on_action(probability)
+        changes.add(np.asarray(action)[None])
         observation, reward, terminated, truncated, info = env.step(action)
         positions.append(_position(telemetry))
         total += float(reward.item() if isinstance(reward, np.ndarray) else reward)
@@ -273,7 +278,30 @@ def run_episode(
             reason = str(info.get("reason") or ("terminated" if terminated else "time_limit"))
             break
     known = np.array([position for position in positions if position is not None])
-    return EpisodeResult(seed, total, length, reason, known.reshape(-1, 2))
+    return EpisodeResult(seed, total, length, reason, known.reshape(-1, 2), changes.mean(0))
+
+
+class _Changes:
+    """Sums of the absolute changes of commands in several environments."""
+
+    def __init__(self, space: spaces.Space[Any], envs: int) -> None:
+        self._is_box = isinstance(space, spaces.Box)
+        self._last: NDArray[np.float64] | None = None
+        self._sums, self._steps = np.zeros(envs), 0
+
+    def add(self, actions: NDArray[Any]) -> None:
+        """Add the actions (E, *shape) of a step."""
+        if not self._is_box:
+            return
+        now = np.asarray(actions, np.float64).reshape(len(actions), -1)
+        if self._last is not None:
+            self._sums += np.abs(now - self._last).mean(1)
+            self._steps += 1
+        self._last = now
+
+    def mean(self, env: int) -> float:
+        """Return the mean change in an environment so far."""
+        return float(self._sums[env] / self._steps) if self._steps else math.nan
 
 
 def rollout(
@@ -347,8 +375,10 @@ def batch_rollout(
     running = np.ones(len(seeds), dtype=np.bool_)
     totals, length = np.zeros(len(seeds)), 0
     places = [_places(envs)]
+    changes = _Changes(envs.single_action_space, len(seeds))
     while running.any():
         actions = policy.act(observations)
+        changes.add(actions)
         observations, rewards, terminated, truncated, infos = envs.step(actions)
         totals[running] += rewards[running]
         length += 1
@@ -356,7 +386,9 @@ def batch_rollout(
         for i in np.flatnonzero(running & (terminated | truncated)).tolist():
             reason = _reason(infos, i) or ("terminated" if terminated[i] else "time_limit")
             path = np.array([place[i] for place in places if place is not None])
-            result = EpisodeResult(seeds[i], float(totals[i]), length, reason, path.reshape(-1, 2))
+            result = EpisodeResult(
+                seeds[i], float(totals[i]), length, reason, path.reshape(-1, 2), changes.mean(i)
+            )
             results[i] = result
             if on_episode is not None:
                 on_episode(result)

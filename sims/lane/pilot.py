@@ -48,7 +48,7 @@ class Gains(NamedTuple):
 
 
 GAINS = Gains(8.0, 0.4, 7.0, 1.5, 2.0)
-CONTINUOUS_GAINS = Gains(8.8, 0.5, 10.2, 7.6, 8.6)
+CONTINUOUS_GAINS = Gains(7.0, 0.4, 9.0, 6.0, 7.0)
 HORIZON = 12
 """Number of decisions in a plan (3 s by default). The episode must not end during a plan."""
 

@@ -134,6 +134,22 @@ def test_counts_of_one_are_singular(capsys: pytest.CaptureFixture[str]) -> None:
     assert "two.mcap: 1 episode, 7 messages" in capsys.readouterr().out
 
 
+def test_recordings_with_noise_repeat_and_have_densities(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    options = ["--actions", "continuous", "--noise", "0.1", "--noise-per-episode", "--steps", "50"]
+    for name in ("a", "b"):
+        assert run(["record", "racer", *options, "--out", f"{name}.mcap"]) == 0
+    first, second = mcaprl.open("a.mcap"), mcaprl.open("b.mcap")
+    assert first.fingerprint == second.fingerprint
+    assert first.action_part_names == ("acceleration", "turn")
+    assert np.isfinite(first.behavior_log_probs).all()
+    assert run(["record", "racer", "--actions", "5", "--steps", "9", "--out", "c.mcap"]) == 0
+    assert mcaprl.open("c.mcap").env_kwargs == {"actions": 5}
+    assert run(["record", "racer", "--noise", "0.1", "--steps", "9", "--out", "d.mcap"]) == 2
+    assert "--noise needs a Box of floats, not Discrete(9)" in capsys.readouterr().err
+
+
 def test_recordings_repeat(capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("a", "b"):
         arguments = ["--policy", "pilot", "--epsilon", "0.3", "--steps", "50", "--seed", "3"]

@@ -58,8 +58,9 @@ def test_settings_are_listed_with_the_algorithms_that_have_them() -> None:
     text = help_of("train-offline")
     sections = {part.split(":")[0]: part for part in text.split("\nSettings of ")[1:]}
     assert "--updates" in sections["all algorithms"]
-    assert "--expectile" in sections["iql"]
-    assert "--gamma" in sections["dqn, double-dqn, cql, bcq, iql, auto"]
+    assert "--expectile" in sections["iql, iql (Box)"]
+    learners = " ".join(text.split())
+    assert "of dqn, double-dqn, cql, bcq, iql, td3-bc, rebrac, iql (Box), auto: --gamma" in learners
     assert "--dueling" in sections["dqn, double-dqn, cql, bcq"]
     assert "--gamma" not in sections["all algorithms"]
     online = help_of("train-online")
@@ -71,7 +72,7 @@ def test_defaults_that_differ_between_algorithms_and_sims_are_all_shown() -> Non
     offline, online = (
         " ".join(help_of(command).split()) for command in ("train-offline", "train-online")
     )
-    assert "[default: 500; iql: 50; auto: 150]" in offline
+    assert "[default: 500; iql: 50; td3-bc, rebrac: 2; iql (Box): 1; auto: 150]" in offline
     assert "[default: 10.0; ppo, a2c: 0.5]" in online
     assert "[default: 32; ppo: 64; lane, racer, powerline, highway-lane: 128]" in online
     switch = SettingsCommand(

@@ -93,6 +93,7 @@ def test_an_argument_in_a_quoted_message_or_a_table_becomes_an_option() -> None:
         ("`algo='auto'` or `speed=0.5`", "--algo auto or --speed 0.5"),
         ("`behavior='a`b'` is odd", "--behavior a`b is odd"),
         ("`sources=`, `sim_options={'map_name': 'a b'}`", "--from, --env-arg 'map_name=\"a b\"'"),
+        ("`sim_options={'actions': 'continuous'}`", "--actions continuous"),
         ("`sim_options={'config': {'a b'…`", "--env-arg {'config': {'a b'…"),
         ("set `missing`, or `x: 1`; `/rl/step`", "set `missing`, or `x: 1`; `/rl/step`"),
     ],

@@ -16,8 +16,10 @@ from mcaprl.sims.drawing.shapes import arc
 CASES = [
     ("lane", {}, 4),
     ("lane", {"rules": "classic"}, 19),
+    ("lane", {"actions": "continuous"}, 4),
     ("powerline", {"gust_m_s": 1.0}, 9),
     ("powerline", {"plant": "point"}, 9),
+    ("powerline", {"actions": "increments"}, 9),
     ("powerline", {"rules": "classic"}, 99),
     ("powerline", {"rules": "classic", "plant": "quad"}, 99),
     ("racer", {}, 1),

@@ -420,6 +420,13 @@ def test_each_sim_has_a_time_limit_and_a_pilot(name: str) -> None:
     description = SIMS.find(spec.id)
     assert description is not None
     assert description.pilot is not None
+    assert description.continuous_id is not None
+    continuous = make_sim(description.continuous_id)
+    assert continuous.action_space == make_sim(name, actions="continuous").action_space
+    assert isinstance(continuous.action_space, spaces.Box)
+    assert make_pilot(continuous).action_space == continuous.action_space
+    discrete = make_sim(description.continuous_id, actions="discrete")
+    assert isinstance(discrete.action_space, spaces.Discrete)
 
 
 @every_sim
@@ -444,6 +451,18 @@ def test_an_invalid_action_is_refused(name: str, kwargs: dict[str, Any]) -> None
             sim.step(action)
     with pytest.raises(UsageError, match="is not an integer"):
         sim.step(1.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("lane", "continuous"), ("racer", "continuous"), ("powerline", "increments")],
+)
+def test_the_published_rules_have_discrete_actions(name: str, kind: str) -> None:
+    words = (
+        f"actions '{kind}' need the rules 'default': the rules 'classic' are published with disc"
+    )
+    with pytest.raises(UsageError, match=words):
+        unwrapped(name, rules="classic", actions=kind)
 
 
 @pytest.mark.parametrize("name", SIMS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 import warnings
 from contextlib import closing
 from pathlib import Path
@@ -70,6 +71,15 @@ def test_densities_of_arrays() -> None:
     assert data.batch(np.array([2, 0])).behavior_log_probs.tolist() == [-300, 5.5]
     assert data.episodes[0].behavior_log_probs[2] == -300
     assert np.isnan(made().behavior_log_probs).all()
+
+
+def test_pickled_parts_keep_the_meaning_of_the_column() -> None:
+    data = made(behavior_log_probs=[5.5, 0, -300])
+    for part in (data, data.episodes[0], data.batch(np.arange(3))):
+        again = pickle.loads(pickle.dumps(part))
+        assert again.behavior_log_probs.tolist() == [5.5, 0, -300]
+        with pytest.raises(SpaceError, match="use behavior_log_probs"):
+            _ = again.behavior_probs
 
 
 def test_probabilities_of_arrays() -> None:

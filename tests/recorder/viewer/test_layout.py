@@ -258,7 +258,7 @@ def test_continuous_actions_are_plotted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("sim", ["lane", "racer", "powerline"])
 def test_commands_have_names_limits_and_dials(tmp_path: Path, sim: str) -> None:
-    """Up to two dials are above the plot; more of them are on a tab of their own."""
+    """Up to two dials are above the plot; more of them are on a separate tab."""
     path = tmp_path / "log.mcap"
     with closing(mcaprl.RecordMcap(make_sim(sim, actions="continuous"), path)) as env:
         env.reset(seed=0)

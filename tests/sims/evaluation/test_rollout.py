@@ -222,3 +222,34 @@ def test_policies_fit_environments_with_other_bounds() -> None:
         trained.observation_space = other
         with pytest.raises(PolicyError, match="was trained on observation_space"):
             check_fit(trained, env)
+
+
+class Alternating(BasePolicy):
+    """Policy whose commands are 1, -1, 1, ... newton meters."""
+
+    name = "alternating"
+
+    def begin(self) -> None:
+        self.step = 0
+
+    def act(self, observations: Any) -> NDArray[Any]:
+        self.step += 1
+        return np.full((len(observations), 1), 1 if self.step % 2 else -1, np.float32)
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_the_change_of_the_command_is_in_its_units(batched: bool) -> None:
+    env = gym.make("Pendulum-v1", max_episode_steps=5)
+    envs = None
+    if batched:
+        envs = gym.make_vec("Pendulum-v1", 3, vectorization_mode="sync", max_episode_steps=5)
+    policy = Alternating()
+    policy.begin()
+    score = evaluate(env, [policy], name="alternating", episodes=3, seed=0, envs=envs)
+    assert score.command_change == pytest.approx(2.0)
+    assert score.to_json()["command_change"] == pytest.approx(2.0)
+
+
+def test_numbered_actions_have_no_change(env: gym.Env[Any, Any]) -> None:
+    score = evaluate(env, [AlwaysLeft()], name="left", episodes=2, seed=0)
+    assert score.command_change is None

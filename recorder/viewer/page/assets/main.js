@@ -129,7 +129,7 @@ function commandPlots({ actions, policies }, plot, rows) {
   ], { title: `Action: ${part}` }));
 }
 
-/** Return the plots of a policy's values of the logged commands and of its own. */
+/** Return the plots of a policy's values of the logged commands and of the policy's. */
 function valuePlots(policy, plot) {
   if (!policy.q.some(Number.isFinite)) return [];
   const values = [{ name: "log", values: policy.q }, { name: "policy", values: policy.value, dash: [3, 3] }];
