@@ -215,7 +215,7 @@ def _learner_of(config: ReplayConfig) -> tuple[type[Learner], learners.TrainingC
         if config.alpha:
             return PenalizedDoubleDQN, learners.CQLConfig(**settings, alpha=config.alpha)
         return DoubleDQN, learners.DoubleDQNConfig(**settings)
-    unscaled = {"normalize": False, "scale_rewards": False}
+    unscaled: dict[str, Any] = {"normalize": False, "scale_rewards": False}
     if isinstance(config, SACConfig):
         settings = same(*_OF_CRITICS, "temperature", "target_entropy")
         return SAC, learners.SACConfig(**settings, **unscaled)

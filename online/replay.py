@@ -439,13 +439,14 @@ def restored_log(tensors: Mapping[str, Tensor], buffer: ReplayBuffer) -> Transit
     """
     count = sum(name.startswith("frames.") for name in tensors)
     vector, *images = (tensors[f"frames.{number}"] for number in range(count))
+    parts: dict[str, Any] = {name: tensors[name] for name in _LOG_PARTS}
     return TransitionBuffer(
         encoder=buffer.encoder,
         action_space=buffer.action_space,
         packing=buffer.packing,
         frames=Observations(vector, tuple(images)),
         box=buffer.box,
-        **{name: tensors[name] for name in _LOG_PARTS},
+        **parts,
     )
 
 

@@ -426,7 +426,7 @@ def behavior_log_densities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArr
         if isinstance(model, TD3):
             assert isinstance(model.action_noise, VectorizedActionNoise | NormalActionNoise)
             noise: Any = getattr(model.action_noise, "base_noise", model.action_noise)
-            normal = torch.distributions.Normal(
+            normal: Any = torch.distributions.Normal(
                 policy.actor(observations).cpu().double(), torch.from_numpy(noise._sigma)
             )
             found = normal.log_prob(numbers).sum(1) + box.log_scale

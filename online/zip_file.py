@@ -439,7 +439,8 @@ class ClippedGaussian(BoxHead):
     def log_density(outputs: Tensor, actions: Tensor, log_std: Tensor | None = None) -> Tensor:
         """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
         mean, log_std = outputs.unbind(1)
-        return torch.distributions.Normal(mean, log_std.exp()).log_prob(actions).sum(1)
+        normal: Any = torch.distributions.Normal(mean, log_std.exp())
+        return cast(Tensor, normal.log_prob(actions).sum(1))
 
 
 _BOX_HEADS: Final[dict[str, type[BoxHead]]] = {
@@ -494,8 +495,9 @@ class _Actor(nn.Module):
         outputs: Tensor = policy.action_net(policy.mlp_extractor.forward_actor(features))
         if not self._is_box:
             return outputs
-        mean = ((outputs - self._center) / self._half).float()
-        log_std = (policy.log_std - self._half.log()).float().expand_as(mean)
+        center, half = cast(Tensor, self._center), cast(Tensor, self._half)
+        mean = ((outputs - center) / half).float()
+        log_std = (policy.log_std - half.log()).float().expand_as(mean)
         return torch.stack((mean, log_std), 1)
 
 

@@ -110,7 +110,10 @@ def test_every_sim_has_settings_that_are_fields(sim: str) -> None:
 def test_every_sim_has_settings_for_continuous_actions(sim: str) -> None:
     settings = settings_for("sac", sim, {"actions": "continuous"})
     assert settings == BOX_SETTINGS[sim]
-    continuous_id = SIMS.find(SIMS[sim]).continuous_id
+    spec = SIMS.find(SIMS[sim])
+    assert spec is not None
+    continuous_id = spec.continuous_id
+    assert continuous_id is not None
     assert settings_for("td3", continuous_id, {}) == settings | TD3_SETTINGS
     assert TD3Config(**settings, **TD3_SETTINGS).steps == settings["steps"]
 

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from mcaprl.offline.algorithms.cql import CQL
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
-from mcaprl.online.collector import VectorEnvironments, epsilon_at
+from mcaprl.online.collector import VectorEnvironments
 from mcaprl.online.config import DoubleDQNConfig
 from mcaprl.online.engine import Agents
 
@@ -117,7 +117,7 @@ def test_epsilon_and_the_learning_rate_follow_the_steps() -> None:
     slower.steps = 100
     assert slower.learning_rate == pytest.approx(0.8)
     decay = DoubleDQNConfig(exploration_decay=0.5, exploration_final_eps=0.1)
-    assert [epsilon_at(decay, steps) for steps in (0, 1, 3, 4)] == [1.0, 0.5, 0.125, 0.1]
+    assert [decay.epsilon_at(steps) for steps in (0, 1, 3, 4)] == [1.0, 0.5, 0.125, 0.1]
 
 
 def test_gradients_of_each_seed_are_clipped_by_themselves() -> None:
@@ -159,7 +159,7 @@ def test_probabilities_are_those_of_the_choices() -> None:
     choice = agents.behavior.choose(seen, epsilon)
     assert choice.values is not None
     best = int(choice.values[0].argmax())
-    found = choice.probabilities()
+    found = choice.behavior()
     for action in range(3):
         expected = epsilon / 3 + (1 - epsilon) * (action == best)
         taken = choice.actions == action
@@ -169,7 +169,7 @@ def test_probabilities_are_those_of_the_choices() -> None:
         assert float(taken.double().mean()) == pytest.approx(expected, abs=0.03)
     random = agents.behavior.choose(seen, 1.0)
     assert random.values is None
-    assert set(random.probabilities().tolist()) == {1 / 3}
+    assert set(random.behavior().tolist()) == {1 / 3}
 
 
 @pytest.mark.parametrize("epsilon", [0.0, 0.5, 1.0])
@@ -181,7 +181,7 @@ def test_only_allowed_actions_are_chosen(epsilon: float) -> None:
     x = np.random.default_rng(0).uniform(-1, 1, (200, 2)).astype(np.float32)
     choice = agents.behavior.choose(encoder.encode({"action_mask": masks, "x": x}), epsilon)
     assert masks[np.arange(200), choice.actions.numpy()].all()
-    chances = choice.probabilities().numpy()
+    chances = choice.behavior().numpy()
     np.testing.assert_allclose(chances[masks.sum(1) == 1], 1)
     if epsilon == 1.0:
         np.testing.assert_allclose(chances, 1 / masks.sum(1))

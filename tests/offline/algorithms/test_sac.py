@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,12 @@ from mcaprl.offline.algorithms.td3 import TD3
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.recorder.dataset.dataset import Dataset
 
-SMALL = {"hidden": (8, 8), "batch_size": 4, "normalize": False, "scale_rewards": False}
+SMALL: dict[str, Any] = {
+    "hidden": (8, 8),
+    "batch_size": 4,
+    "normalize": False,
+    "scale_rewards": False,
+}
 
 
 def buffer() -> TransitionBuffer:
@@ -61,7 +67,7 @@ def test_targets_of_td3_clip_the_noise_and_the_actions() -> None:
 def test_the_temperature_falls_above_the_target_entropy() -> None:
     log_alpha = torch.zeros(2, requires_grad=True)
     # Entropies of 3 and -4 at a target of -1: gradients 4 and -3.
-    temperature_loss(log_alpha, torch.tensor([-3.0, 4.0]), -1.0).sum().backward()
+    torch.autograd.backward(temperature_loss(log_alpha, torch.tensor([-3.0, 4.0]), -1.0).sum())
     assert log_alpha.grad is not None
     assert log_alpha.grad.tolist() == [4.0, -3.0]
 
