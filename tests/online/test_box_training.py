@@ -183,7 +183,7 @@ def test_a_run_with_a_log_resumes_without_it(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("offline", "algo"), [("iql", "sac"), ("td3-bc", "sac"), ("iql", "td3")])
 def test_an_agent_continues_an_offline_policy(tmp_path: Path, offline: str, algo: str) -> None:
-    settings = {"updates": 4, "hidden": (8, 8), "log_interval": 2, "held_out": 0.0}
+    settings = {"updates": 10, "hidden": (8, 8), "gamma": 0.5, "polyak": 1.0, "held_out": 0.0}
     from mcaprl.offline.algorithms.registry import configured
 
     chosen = configured(offline, settings, space=logged().action_space)
