@@ -101,15 +101,17 @@ class AnyModel(Model):
     def _outputs(self, observations: Observations, weights: Tensor, members: int) -> Tensor:
         seeds = len(weights) // members
         parts = observations.split(len(observations) // seeds)
-        outputs = [
-            self._apply(self.networks[0], row, parts[number // members])
-            for number, row in enumerate(weights.unbind())
-        ]
+        outputs = []
+        for number, row in enumerate(weights.unbind()):
+            seed, member = divmod(number, members)
+            network = self.networks[seed * self.members + member]
+            outputs.append(self._apply(network, row, parts[seed]))
         return torch.cat(outputs)
 
     def _apply(self, network: Network, row: Tensor, observations: Observations) -> Tensor:
         """Apply one network with the weights in `row`; gradients flow back to the weight matrix."""
         if not torch.is_grad_enabled():
+            # The parameters of the network share memory with the row.
             return cast(Tensor, network(observations))
         parts = zip(self._names, self._shapes, row.split_with_sizes(self._sizes), strict=False)
         weights = {name: part.view(shape) for name, shape, part in parts}
