@@ -133,18 +133,8 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         **_BAGS,
     },
     "evaluate": {
-        "Episodes in a sim": (
-            "sim",
-            "episodes",
-            "max_steps",
-            "seed",
-            "observation",
-            "rules",
-            "actions",
-            "sim_options",
-            "trust_env",
-            "behavior",
-        ),
+        "Episodes in a sim": ("sim", "episodes", "max_steps", "seed", "behavior"),
+        "Arguments of the sim": ("observation", "rules", "actions", "sim_options", "trust_env"),
         "Estimates from logs": (
             "data",
             "gamma",

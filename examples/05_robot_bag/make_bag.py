@@ -1,7 +1,6 @@
-r"""Make a robot's bag from the drives in a log of the lane sim.
+"""Make a robot's bag from the drives in a log of the lane sim.
 
-    mcaprl record lane --actions continuous --policy pilot --noise 0.1 --noise-per-episode \
-      --episodes 40 --out native.mcap
+    mcaprl record lane --actions continuous --noise 0.1 --noise-per-episode --out native.mcap
     python examples/05_robot_bag/make_bag.py native.mcap bag                  # ROS 2, by rosbags
     python examples/05_robot_bag/make_bag.py native.mcap drive.mcap --format protobuf
 

@@ -82,7 +82,7 @@ def limited(limit: int, command: Sequence[str], folder: Path, errors: Connection
         (2_000, ["convert", LANE, "x.npz", "--lossy"], "x.npz"),
         (2_000, ["info", LOG, "--report"], "x"),
         (2_000, ["train-offline", LOG, *SMALL], "x/seed-0/"),
-        (900, ["train-offline", LOG, *SMALL, *OFTEN], "x/seed-0/metrics.csv"),
+        (1_000, ["train-offline", LOG, *SMALL, *OFTEN], "x/seed-0/metrics.csv"),
         (2_000, ONLINE, "run/seed-0/"),
         (5_000, [*ONLINE, "--record", "x.mcap"], "x.mcap"),
     ],
