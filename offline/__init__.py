@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from mcaprl.offline.algorithms.heads import build_head
     from mcaprl.offline.algorithms.learner import Learner
     from mcaprl.offline.algorithms.registry import ALGORITHMS, BOX_ALGORITHMS
+    from mcaprl.offline.algorithms.sac import SAC
+    from mcaprl.offline.algorithms.td3 import TD3
     from mcaprl.offline.batches.buffer import TransitionBuffer
     from mcaprl.offline.estimate.evidence import EvidenceCollector, fqe_config
     from mcaprl.offline.estimate.fqe import FQEConfig
@@ -50,6 +52,8 @@ __all__ = [
     "CQL",
     "DETERMINISTIC",
     "ESTIMATORS",
+    "SAC",
+    "TD3",
     "BootstrapConfig",
     "CQLConfig",
     "DQNConfig",
@@ -81,6 +85,8 @@ __getattr__ = lazy_attributes(
         "mcaprl.offline.algorithms.heads": ("build_head",),
         "mcaprl.offline.algorithms.learner": ("Learner",),
         "mcaprl.offline.algorithms.registry": ("ALGORITHMS", "BOX_ALGORITHMS"),
+        "mcaprl.offline.algorithms.sac": ("SAC",),
+        "mcaprl.offline.algorithms.td3": ("TD3",),
         "mcaprl.offline.batches.buffer": ("TransitionBuffer",),
         "mcaprl.offline.estimate.evidence": ("EvidenceCollector", "fqe_config"),
         "mcaprl.offline.estimate.fqe": ("FQEConfig",),

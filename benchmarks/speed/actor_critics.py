@@ -22,19 +22,16 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from benchmarks.speed.continuous import ACTION, HIDDEN, ROWS, WIDTH, transitions
 from benchmarks.speed.learning import Turns, Update, best_rates
-from mcaprl.offline import TransitionBuffer
-from mcaprl.offline.algorithms.config import SACConfig, TD3Config
-from mcaprl.offline.algorithms.sac import SAC
-from mcaprl.offline.algorithms.td3 import TD3
+from mcaprl.offline import SAC, TD3, TransitionBuffer
 
 GOALS = {256: 1.3, 64: 2.0}
-OURS: dict[str, Any] = {"sac": (SAC, SACConfig), "td3": (TD3, TD3Config)}
+OURS: dict[str, Any] = {"sac": SAC, "td3": TD3}
 
 
 def ours(algo: str, batch_size: int) -> Update:
     """Return a function that makes one update of this package's learner."""
-    learner_type, config_type = OURS[algo]
-    config = config_type(batch_size=batch_size, hidden=HIDDEN, normalize=False)
+    learner_type = OURS[algo]
+    config = learner_type.config_type(batch_size=batch_size, hidden=HIDDEN, normalize=False)
     buffer = TransitionBuffer.from_dataset(transitions(), config.packing)
     update: Update = learner_type(config, buffer, [0]).update
     return update

@@ -453,8 +453,8 @@ def test_training_refuses_continuous_actions_before_it_prints_anything(
     for command in (
         ["train-offline", log, "--algo", "cql", "--out", "run"],
         ["train-offline", log, "--algo", "auto", "--out", "run"],
-        ["train-online", "Pendulum-v1", "--out", "run"],
-        ["train-online", "Pendulum-v1", "--out", "run", "--live", "--port", "0"],
+        ["train-online", "Pendulum-v1", "--algo", "dqn", "--out", "run"],
+        ["train-online", "Pendulum-v1", "--algo", "double-dqn", "--out", "run", "--live"],
     ):
         assert run(command) == 1
         out, err = capsys.readouterr()
@@ -465,9 +465,14 @@ def test_training_refuses_continuous_actions_before_it_prints_anything(
         SpaceError, match=r"dqn needs discrete actions; for Box.* use iql or rebrac"
     ):
         mcaprl.train(log, "run", algo="dqn", progress=lambda now: pytest.fail("training began"))
-    with pytest.raises(SpaceError, match="needs discrete actions, got Box"):
+    with pytest.raises(SpaceError, match="dqn needs discrete actions"):
         mcaprl.train_online(
-            "Pendulum-v1", "run", live=True, port=0, on_live=lambda _: pytest.fail("it listens")
+            "Pendulum-v1",
+            "run",
+            algo="dqn",
+            live=True,
+            port=0,
+            on_live=lambda _: pytest.fail("it listens"),
         )
     assert not Path("run").exists()
 
@@ -597,4 +602,8 @@ def test_help_has_the_defaults_of_each_sim(capsys: pytest.CaptureFixture[str]) -
         steps = Task.for_sim(name).config.steps
         shown = text.partition("over all environments [default: ")[2].partition("]")[0]
         assert f"{name}: {steps}" in shown or shown.startswith(f"{steps};")
-    assert "[default: 0.99; lane, highway-lane: 0.97; racer: 0.98; powerline: 0.95]" in text
+    shown = text.partition("discount per step [default: ")[2].partition("]")[0]
+    assert shown.startswith("0.99; lane, highway-lane, lane (continuous),")
+    assert shown.endswith(
+        "racer, racer (continuous): 0.98; powerline, powerline (continuous): 0.95"
+    )

@@ -25,6 +25,7 @@ from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 
 from mcaprl.api.policies import load_policies
 from mcaprl.errors import PolicyError
+from mcaprl.online import zip_file
 from mcaprl.online.zip_file import OWN_NAME, describe_run, read_policy, save_policy
 from mcaprl.runs import BEST_NAME, policy_files
 
@@ -197,9 +198,10 @@ def test_files_that_are_not_zip_are_refused(tmp_path: Path) -> None:
         read_policy(tmp_path / "none.zip")
 
 
-def test_other_algorithms_are_refused(tmp_path: Path) -> None:
+def test_other_algorithms_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zip_file, "_FIRST_WEIGHTS", {"q-network": "q_net.q_net."})
     SAC("MlpPolicy", gym.make("Pendulum-v1"), buffer_size=10, **small()).save(tmp_path / "sac.zip")
-    with pytest.raises(PolicyError, match="not DQN, PPO or A2C"):
+    with pytest.raises(PolicyError, match="not DQN, SAC, TD3, PPO or A2C"):
         read_policy(tmp_path / "sac.zip")
 
 
