@@ -32,12 +32,20 @@ import torch
 
 import mcaprl
 from benchmarks.page import write_section
-from benchmarks.studies.sim_grid import Cell, cell_of, normalize_mean, read_cells, score_text
+from benchmarks.studies.sim_grid import (
+    SEEDS,
+    Cell,
+    cell_of,
+    normalize_mean,
+    read_cells,
+    run,
+    table,
+)
 from mcaprl.api import load_policies
 from mcaprl.files import write_json
-from mcaprl.sims import Policy, PolicyScore, evaluate, make_pilot, make_sim, make_sims
+from mcaprl.sims import PolicyScore, make_pilot, make_sim
 
-STEPS, SEEDS, EPISODES, EPISODE_SEED = 20_000, 4, 30, 1_000_000
+STEPS = 20_000
 NAMES: Final = ("expert", "noisy", "mixed", "replay", "random")
 NOISE: Final = {"lane": 0.1, "powerline": 0.1, "racer": 0.3}
 """Standard deviation of the noise by sim; .3 ends almost every episode of car and drone."""
@@ -74,7 +82,8 @@ def main() -> None:
                 make_log(folder, sim, name)
         _fill(folder, sim, names, arguments.algos.split(";"))
         found = {each: read_cells(arguments.folder / each / "box-scores.json") for each in NOISE}
-        write_section("box-grid", "\n".join(_table(each, found[each]) for each in NOISE))
+        tables = [table(each, found[each], NAMES, ALGOS) for each in NOISE]
+        write_section("box-grid", "\n".join(tables))
 
 
 def make_log(folder: Path, sim: str, name: str) -> None:
@@ -135,7 +144,7 @@ def _fill(folder: Path, sim: str, names: Sequence[str], algos: Sequence[str]) ->
     """Compute the missing cells of a sim."""
     results = folder / "box-scores.json"
     with closing(make_sim(sim, **BOX)) as env:
-        random, pilot = _run(sim, [None]), _run(sim, [make_pilot(env)], env)
+        random, pilot = run(sim, [None], **BOX), run(sim, [make_pilot(env)], env, **BOX)
     for name in names:
         for algo in algos:
             cells = read_cells(results)
@@ -164,32 +173,7 @@ def _learn(
     if settings["algo"] == "bc":
         del settings["gamma"]
     mcaprl.train(data, out, seeds=SEEDS, progress=lambda _: None, **settings)
-    return cell_of(_run(sim, load_policies(out)), random, pilot)
-
-
-def _run(sim: str, policies: Sequence[Policy | None], env: Any = None) -> PolicyScore:
-    """Run the same episodes for each policy, in a batch, or one by one in `env`."""
-    with closing(make_sim(sim, **BOX)) as own, closing(make_sims(sim, EPISODES, **BOX)) as envs:
-        return evaluate(
-            env or own,
-            policies,
-            name="",
-            episodes=EPISODES,
-            seed=EPISODE_SEED,
-            envs=None if env else envs,
-        )
-
-
-def _table(sim: str, cells: dict[str, dict[str, Cell]]) -> str:
-    """Return the table as Markdown: each cell has the mean score and its interval."""
-    lines = [f"**{sim}**", "", f"| log (behavior) | {' | '.join(ALGOS)} |"]
-    lines.append("|---|" + "---|" * len(ALGOS))
-    for name in NAMES:
-        row = cells.get(name, {})
-        behavior = f" ({row['behavior']['score']:.2f})" if row else ""
-        texts = [score_text(row.get(algo)) for algo in ALGOS]
-        lines.append(f"| {name}{behavior} | {' | '.join(texts)} |")
-    return "\n".join([*lines, ""])
+    return cell_of(run(sim, load_policies(out), **BOX), random, pilot)
 
 
 if __name__ == "__main__":

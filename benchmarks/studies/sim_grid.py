@@ -24,7 +24,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -193,12 +193,17 @@ def settings_of(sim: str, algo: str, special: dict[str, Any]) -> TrainingConfig:
     return config_type(**given)
 
 
-def run(sim: str, policies: Sequence[Policy | None], env: Any = None) -> PolicyScore:
-    """Run the same episodes for each policy.
+def run(
+    sim: str, policies: Sequence[Policy | None], env: Any = None, **options: Any
+) -> PolicyScore:
+    """Run the same episodes of a sim with these arguments for each policy.
 
     They run one by one in `env`, or in a batch if `env` is None.
     """
-    with closing(make_sim(sim)) as own, closing(make_sims(sim, EPISODES)) as envs:
+    with (
+        closing(make_sim(sim, **options)) as own,
+        closing(make_sims(sim, EPISODES, **options)) as envs,
+    ):
         return evaluate(
             env or own,
             policies,
@@ -214,14 +219,19 @@ def normalize_mean(mean_return: float, random: PolicyScore, pilot: PolicyScore) 
     return (mean_return - random.mean_return) / (pilot.mean_return - random.mean_return)
 
 
-def table(sim: str, cells: dict[str, dict[str, Cell]]) -> str:
+def table(
+    sim: str,
+    cells: dict[str, dict[str, Cell]],
+    names: Sequence[str] = NAMES,
+    columns: Collection[str] = ALGOS,
+) -> str:
     """Return the table as Markdown: each cell has the mean score and its interval."""
-    lines = [f"**{sim}**", "", f"| log (behavior) | {' | '.join(ALGOS)} |"]
-    lines.append("|---|" + "---|" * len(ALGOS))
-    for name in NAMES:
+    lines = [f"**{sim}**", "", f"| log (behavior) | {' | '.join(columns)} |"]
+    lines.append("|---|" + "---|" * len(columns))
+    for name in names:
         row = cells.get(name, {})
         behavior = f" ({row['behavior']['score']:.2f})" if row else ""
-        texts = [score_text(row.get(algo)) for algo in ALGOS]
+        texts = [_text(row.get(column)) for column in columns]
         lines.append(f"| {name}{behavior} | {' | '.join(texts)} |")
     return "\n".join([*lines, ""])
 
@@ -234,7 +244,7 @@ def study_table(cells: dict[str, dict[str, dict[str, Cell]]]) -> str:
         for name in log_names(sim):
             row = of_sim.get(name, {})
             behavior = f" ({row['behavior']['score']:.2f})" if row else ""
-            texts = [score_text(row.get(column)) for column in STUDY]
+            texts = [_text(row.get(column)) for column in STUDY]
             lines.append(f"| {sim} {name}{behavior} | {' | '.join(texts)} |")
             for column, found in scores.items():
                 found.append(row[column]["score"] if column in row else np.nan)
@@ -260,8 +270,7 @@ def _interval_text(values: Any) -> str:
     return f"{values.mean():.2f} ({low:.2f} to {high:.2f}; n = {len(values)})"
 
 
-def score_text(cell: Cell | None) -> str:
-    """Return a score with its interval; a dash for a missing cell."""
+def _text(cell: Cell | None) -> str:
     if cell is None:
         return "-"
     low, high = cell["interval"]

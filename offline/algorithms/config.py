@@ -259,21 +259,13 @@ class ActorCriticConfig(BootstrapConfig):
 
 
 @dataclass(frozen=True)
-class BoxIQLConfig(ActorCriticConfig):
+class BoxIQLConfig(ActorCriticConfig, IQLConfig):
     """Settings of IQL for the actions of a Box."""
 
     expectile: float = 0.7
     """expectile of the action values that V estimates; 0.5 is the mean, near 1 the maximum"""
     beta: float = 3.0
     """inverse temperature of the advantage weights in cloning; 0 weights all actions equally"""
-    normalize_advantages: bool = True
-    """divide advantages by their root mean square in the batch, so that beta has no unit"""
-
-    def __post_init__(self) -> None:
-        """Validate the settings."""
-        super().__post_init__()
-        self._require("expectile", 0 < self.expectile < 1, "within (0, 1)")
-        self._require("beta", self.beta >= 0, "at least 0")
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@
         pi        minimize actor_weight |pi(s) - a_data|^2 - Q(s, pi(s)) / mean |Q(s, pi(s))|
 
 Here Q is the smaller one of the two critics, and a'_data is the logged action of the next state.
-At the end of an episode, there is no such action, and the penalty is 0.
+The last step of an episode has no next logged action; its penalty is 0.
 
 Departures from the paper: batches of 256 instead of 1,024, three layers of 128 instead of 256, and
 those of `td3_bc`. The weights depend on the data in the paper; here they have one default.

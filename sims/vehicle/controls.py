@@ -69,7 +69,7 @@ class Controls:
         """Validate one action, and return its command.
 
         Raises:
-            UsageError: There is no such action.
+            UsageError: The action does not exist.
         """
         if self.commands is not None:
             command: list[float] = self.commands[check_action(action, len(self.commands))].tolist()
