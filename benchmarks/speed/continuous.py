@@ -77,8 +77,12 @@ def d3rlpys(data: mcaprl.Dataset, algo: str, batch_size: int) -> Update:
         action_space=d3rlpy.ActionSpace.CONTINUOUS,
     )
     encoder = d3rlpy.models.VectorEncoderFactory(list(HIDDEN))
-    names = ["encoder"] if algo == "bc" else ["actor_encoder", "critic_encoder"]
-    settings: dict[str, Any] = {f"{name}_factory": encoder for name in names}
+    normed = d3rlpy.models.VectorEncoderFactory(list(HIDDEN), use_layer_norm=True)
+    settings: dict[str, Any] = {"encoder_factory": encoder}
+    if algo != "bc":
+        # The critics of ReBRAC have layer normalization, as in its paper.
+        critics = normed if algo == "rebrac" else encoder
+        settings = {"actor_encoder_factory": encoder, "critic_encoder_factory": critics}
     config = getattr(d3rlpy.algos, RIVALS[algo])(batch_size=batch_size, **settings)
     learner = config.create("cpu")
     learner.build_with_dataset(log)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -30,6 +30,7 @@ Rows of weights are padded to a multiple of this number, so that the results of 
 on the number of seeds K.
 """
 _ROWS_AT_ONCE = 1024
+_NORM_EPSILON = 1e-5
 
 
 class Model(ABC):
@@ -158,9 +159,7 @@ class StackedMLP(Model):
         for matrix, bias, *norm in (parts[k : k + step] for k in range(0, len(parts) - 2, step)):
             columns = torch.baddbmm(bias.unsqueeze(2), matrix, columns)
             if norm:
-                normal = functional.layer_norm(columns.mT, columns.shape[1:2]).mT
-                gain, shift = (part.unsqueeze(2) for part in norm)
-                columns = torch.addcmul(shift, gain, normal)
+                columns = _normalized(columns, *norm)
             columns = columns.relu_()
         matrix, bias = parts[-2:]
         outputs = matrix.shape[1]
@@ -170,6 +169,33 @@ class StackedMLP(Model):
         columns = torch.baddbmm(bias.unsqueeze(2), matrix, columns)
         shape = self.networks[0].output_shape
         return columns[:, :outputs, :rows].mT.reshape(-1, *shape)
+
+
+class _ColumnNorm(torch.autograd.Function):
+    """Layer normalization of columns: `torch.nn.functional.layer_norm` would have to copy them."""
+
+    @staticmethod
+    def forward(ctx: Any, columns: Tensor) -> Tensor:
+        """Normalize columns (C, width, B) to mean 0 and variance 1 over the width."""
+        centered = columns - columns.mean(1, keepdim=True)
+        scale = (centered.square().mean(1, keepdim=True) + _NORM_EPSILON).rsqrt_()
+        normal = centered.mul_(scale)
+        ctx.save_for_backward(normal, scale)
+        return normal
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        """Return the gradient of the columns."""
+        normal, scale = ctx.saved_tensors
+        along = (gradient * normal).mean(1, keepdim=True)
+        result = torch.addcmul(gradient, normal, along, value=-1)
+        return result.sub_(gradient.mean(1, keepdim=True)).mul_(scale)
+
+
+def _normalized(columns: Tensor, gain: Tensor, shift: Tensor) -> Tensor:
+    """Normalize columns (C, width, B), and apply gains and shifts (C, width)."""
+    normal: Tensor = _ColumnNorm.apply(columns)
+    return torch.addcmul(shift.unsqueeze(2), gain.unsqueeze(2), normal)
 
 
 def build_model(networks: Sequence[Network], members: int = 1) -> Model:
