@@ -4,9 +4,10 @@
 
 Both libraries take turns in one process, on the same random transitions (17 numbers, actions of 6)
 and with networks of 256x256; otherwise, settings are the defaults. The measure is CPU time on one
-thread, the best of several turns. The ratios are printed and written to
-benchmarks/speed/continuous.json, and the table to docs/results.md; with --size or --algo, they are
-only printed.
+thread, the best of several turns. The limit is the ratio that would be reached if our update
+consisted of its matrix products alone, at the speed of the largest of them. The ratios are printed
+and written to benchmarks/speed/continuous.json, and the table to docs/results.md; with --size or
+--algo, they are only printed.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
+from torch.utils.flop_counter import FlopCounterMode
 
 import mcaprl
 from benchmarks.page import write_section
@@ -89,13 +91,29 @@ def d3rlpys(data: mcaprl.Dataset, algo: str, batch_size: int) -> Update:
     return lambda: learner.update(log.sample_transition_batch(batch_size))
 
 
-def ratios(algo: str, size: int, turns: Turns) -> tuple[float, float]:
-    """Return our updates per CPU second, and their ratio to d3rlpy's."""
+def product_flops(update: Update, count: int = 4) -> float:
+    """Return the floating-point operations of the matrix products of an update, on average."""
+    with FlopCounterMode(display=False) as counter:
+        for _ in range(count):
+            update()
+    return counter.get_total_flops() / count
+
+
+def ratios(algo: str, size: int, turns: Turns) -> tuple[float, float, float]:
+    """Return our updates per CPU second, their ratio to d3rlpy's, and the limit of the ratio."""
     data = transitions()
-    sides = {"ours": (ours(data, algo, size), 1), "d3rlpy": (d3rlpys(data, algo, size), 1)}
+    mine = ours(data, algo, size)
+    weights, columns = torch.randn(2, HIDDEN[0], HIDDEN[1]), torch.randn(2, HIDDEN[1], size)
+    sides: dict[str, tuple[Update, int]] = {
+        "ours": (mine, 1),
+        "d3rlpy": (d3rlpys(data, algo, size), 1),
+        "product": (lambda: torch.bmm(weights, columns), 1),
+    }
     rates = best_rates(sides, turns)
     print(algo, size, {name: round(rate, 1) for name, rate in rates.items()}, flush=True)
-    return rates["ours"], rates["ours"] / rates["d3rlpy"]
+    flops_per_s = rates["product"] * 2 * weights.numel() * size
+    limit = flops_per_s / product_flops(mine)
+    return rates["ours"], rates["ours"] / rates["d3rlpy"], limit / rates["d3rlpy"]
 
 
 def main() -> None:
@@ -119,13 +137,14 @@ def main() -> None:
         write_section("continuous-speed", table)
 
 
-def as_table(found: dict[str, tuple[float, float]]) -> str:
-    """Return the table as Markdown, with the goals and the versions."""
-    lines = ["| what | updates per CPU second | d3rlpy's times | goal |", "|---|---|---|---|"]
-    for name, (rate, ratio) in found.items():
+def as_table(found: dict[str, tuple[float, float, float]]) -> str:
+    """Return the table as Markdown, with the goals, the limits and the versions."""
+    lines = ["| what | updates per CPU second | d3rlpy's times | goal | limit |"]
+    lines.append("|---|---|---|---|---|")
+    for name, (rate, ratio, limit) in found.items():
         algo, size = name.split(", batch ")
         goal = GOALS.get((algo, int(size)), GOAL)
-        lines.append(f"| {name} | {rate:.0f} | {ratio:.2f} | {goal} |")
+        lines.append(f"| {name} | {rate:.0f} | {ratio:.2f} | {goal} | {limit:.2f} |")
     versions = ", ".join(f"{name} {version(name)}" for name in ("torch", "d3rlpy"))
     return "\n".join([*lines, "", f"Versions: {versions}."])
 
