@@ -148,11 +148,10 @@ class StackedMLP(Model):
         columns = observations.vector.view(seeds, -1, observations.vector.shape[1]).mT
         if members > 1:
             columns = columns.unsqueeze(1).expand(-1, members, -1, -1).flatten(0, 1)
+        # With columns that do not fill registers, or with another layout, products round
+        # differently for one seed than for several.
         rows = columns.shape[2]
-        if rows == 1:
-            # Add a second column, because matrix-vector products round differently for one seed
-            # than for several.
-            columns = columns.expand(-1, -1, 2)
+        columns = functional.pad(columns, (0, -rows % ALIGNMENT)).contiguous()
         sizes_and_shapes = zip(weights.split_with_sizes(self._sizes, 1), self._shapes, strict=False)
         parts = [part.view(count, *shape) for part, shape in sizes_and_shapes]
         step = 4 if self._is_normed else 2
@@ -168,7 +167,8 @@ class StackedMLP(Model):
             matrix = matrix.expand(-1, 2, -1)
         columns = torch.baddbmm(bias.unsqueeze(2), matrix, columns)
         shape = self.networks[0].output_shape
-        return columns[:, :outputs, :rows].mT.reshape(-1, *shape)
+        # The copy gives the gradient the same layout for one seed as for several.
+        return columns[:, :outputs, :rows].mT.contiguous().view(-1, *shape)
 
 
 class _ColumnNorm(torch.autograd.Function):

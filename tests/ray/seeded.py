@@ -20,10 +20,12 @@ class Seeded(gym.Env[Any, Any]):
     """Environment with episodes of 5 to 34 steps, and random observations and rewards."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
-    action_space = spaces.Discrete(4)
+    action_space: spaces.Space[Any] = spaces.Discrete(4)
 
-    def __init__(self, pause_s: float = STEP_S, dies: bool = False) -> None:
+    def __init__(self, pause_s: float = STEP_S, dies: bool = False, box: bool = False) -> None:
         self._pause_s, self._dies = pause_s, dies
+        if box:
+            self.action_space = spaces.Box(-3.0, 3.0, (2,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
@@ -36,7 +38,7 @@ class Seeded(gym.Env[Any, Any]):
             os._exit(7)
         self._left -= 1
         observation = self.np_random.normal(size=3).astype(np.float32)
-        reward = float(self.np_random.normal()) + 0.1 * int(action)
+        reward = float(self.np_random.normal()) + 0.1 * float(np.sum(action))
         return observation, reward, self._left == 0, False, {}
 
 

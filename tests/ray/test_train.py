@@ -141,6 +141,21 @@ def test_a_run_is_resumed_with_and_without_ray(
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize("algo", ["bc", "td3-bc", "rebrac", "iql"])
+def test_weights_of_learners_of_a_box_are_those_of_one_process(tmp_path: Path, algo: str) -> None:
+    log, box = tmp_path / "log.mcap", {"pause_s": 0.0, "box": True}
+    mcaprl.record(SEEDED, log, policy="random", episodes=8, seed=0, sim_options=box)
+    sizes = {"updates": 40, "batch_size": 16, "hidden": (8, 8), "seeds": 2}
+    if algo != "bc":
+        sizes["gamma"] = 0.5
+    for name, workers in (("ray", {"ray": ClusterOptions(workers=2)}), ("local", {})):
+        mcaprl.train(log, tmp_path / name, algo=algo, **workers, **sizes)
+    for seed in (0, 1):
+        for file in ("metrics.csv", "policy.safetensors", "policy.json"):
+            mine, theirs = (tmp_path / one / f"seed-{seed}" / file for one in ("ray", "local"))
+            assert mine.read_bytes() == theirs.read_bytes()
+
+
 def test_options_that_cannot_be_used_with_ray(logs: Path, tmp_path: Path) -> None:
     def train(data: Any = logs, **options: Any) -> None:
         mcaprl.train(data, tmp_path / "run", algo="bc", updates=1, **options)

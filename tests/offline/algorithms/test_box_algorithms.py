@@ -258,6 +258,20 @@ def test_a_resumed_run_has_the_same_bits(config: TrainingConfig, tmp_path: Path)
 
 
 @pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("batch_size", [16, 33])
+def test_a_seeds_weights_do_not_depend_on_other_seeds(
+    config: TrainingConfig, batch_size: int
+) -> None:
+    config = replace(config, batch_size=batch_size, hidden=(8, 8))
+    alone, together = (learner_of(config, regulator(64), *seeds) for seeds in ([3], [4, 3, 7]))
+    for _ in range(12):
+        alone.update()
+        together.update()
+    for name, tensor in alone.state(3).items():
+        assert torch.equal(tensor, together.state(3)[name]), name
+
+
+@pytest.mark.parametrize("config", CONFIGS)
 def test_a_policy_acts_in_the_units_of_the_space(config: TrainingConfig, tmp_path: Path) -> None:
     learner = learner_of(config, regulator(64), 3, 4)
     policy = policy_of(learner, tmp_path, 4)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
 from typing import Any
 
 import pytest
 import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from mcaprl.architecture import Architecture
@@ -180,27 +182,39 @@ def test_frozen_weights_have_no_gradient(kind: type[Model]) -> None:
     assert seen.vector.grad.abs().min() > 0
 
 
-def alone_and_together(
-    model_type: type[Model], rows: int, outputs: int
-) -> Sequence[tuple[Tensor, Tensor]]:
-    seen, d_output = vectors(4 * rows, 5), torch.randn(4 * rows, outputs)
-    together = gradients(model_type(networks(4, outputs=outputs)), seen, d_output)
-    pairs = []
-    for k, network in enumerate(networks(4, outputs=outputs)):
-        mine = slice(k * rows, (k + 1) * rows)
-        alone = gradients(model_type([network]), Observations(seen.vector[mine]), d_output[mine])
-        pairs += [(alone[0], together[0][mine]), (alone[1][0], together[1][k])]
-    return pairs
-
-
-@pytest.mark.parametrize("model_type", [StackedMLP, AnyModel])
-@pytest.mark.parametrize("outputs", [1, 4])
-@pytest.mark.parametrize("rows", [1, 32, 256])
-def test_a_seed_gets_the_same_bits_alone_and_in_a_batch(
-    model_type: type[Model], rows: int, outputs: int
+@settings(max_examples=60, deadline=None)
+@given(
+    rows=st.integers(1, 70),
+    outputs=st.integers(1, 9),
+    hidden=st.lists(st.integers(2, 40), max_size=2),
+    layer_norm=st.booleans(),
+    members=st.sampled_from([1, 2]),
+)
+@example(rows=256, outputs=1, hidden=[128, 128], layer_norm=False, members=2)
+@example(rows=256, outputs=2, hidden=[128, 128], layer_norm=True, members=1)
+def test_a_seed_gets_the_same_bits_alone_and_with_others(
+    rows: int, outputs: int, hidden: list[int], layer_norm: bool, members: int
 ) -> None:
-    pairs = alone_and_together(model_type, rows, outputs)
-    assert all(torch.equal(alone, beside) for alone, beside in pairs)
+    outputs = 1 if members > 1 else outputs
+    each = networks(3 * members, tuple(hidden), outputs=outputs, layer_norm=layer_norm)
+    seen = vectors(3 * rows, 5).vector
+
+    def found(first: int, last: int) -> list[Tensor]:
+        own = [copy.deepcopy(network) for network in each[first * members : last * members]]
+        model = build_model(own, members)
+        # As in a loss, the gradient of the outputs depends on them, and on their layout in memory.
+        inputs = seen[first * rows : last * rows].clone().requires_grad_()
+        values = model(Observations(inputs))
+        torch.autograd.backward(values.tanh().square().sum())
+        assert model.weights.grad is not None
+        assert inputs.grad is not None
+        values = values.T if members > 1 else values
+        return [values.detach(), inputs.grad, model.weights.grad]
+
+    together = found(0, 3)
+    for k in range(3):
+        for alone, beside in zip(found(k, k + 1), together, strict=True):
+            assert torch.equal(alone, beside[k * len(alone) : (k + 1) * len(alone)])
 
 
 def test_a_network_has_the_weights_of_its_model() -> None:

@@ -6,11 +6,13 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 
 import mcaprl
 from mcaprl.cli import run
@@ -31,10 +33,10 @@ SMALL = CQLConfig(
 
 
 class Recorder:
-    """A recorder of random CartPole episodes into one log."""
+    """A recorder of random episodes into one log."""
 
-    def __init__(self, path: Path) -> None:
-        self.env = mcaprl.RecordMcap(gym.make("CartPole-v1"), path)
+    def __init__(self, path: Path, env: gym.Env[Any, Any] | None = None) -> None:
+        self.env = mcaprl.RecordMcap(env or gym.make("CartPole-v1"), path)
         self.behavior = EpsilonGreedy(None, 1.0, self.env.action_space)
         self.seed = 0
 
@@ -169,6 +171,44 @@ def test_new_episodes_are_learned_from(tmp_path: Path) -> None:
     whole = np.cumsum(mcaprl.open(tmp_path / "log.mcap").episode_lengths)
     metrics = read_curve(tmp_path / "run" / "seed-0" / "metrics.csv")
     assert metrics["transitions"].tolist() == [whole[2]] * per_check + [whole[6]] * per_check
+
+
+@pytest.mark.filterwarnings("ignore:.*values cover")
+@pytest.mark.parametrize("algo", ["bc", "td3-bc", "rebrac", "iql"])
+def test_new_episodes_of_a_box_are_learned_from(tmp_path: Path, algo: str) -> None:
+    """The scaling of the actions is that of the first episodes, also where a bound is infinite."""
+    recorder = Recorder(tmp_path / "log.mcap", Unbounded(gym.make("Pendulum-v1")))
+    recorder.record(1)
+    data = mcaprl.open(tmp_path / "log.mcap", follow=True)
+    low, high = data.actions.min(), data.actions.max()
+
+    def report(now: TrainingProgress) -> None:
+        if now.done == 200:
+            recorder.record(2)
+
+    sizes = {"updates": 2 * CHECK_INTERVAL, "hidden": (8,), "batch_size": 8, "log_interval": 100}
+    with pytest.warns(UserWarning, match="infinite bounds"):
+        found = mcaprl.train(data, tmp_path / "run", algo=algo, progress=report, **sizes)
+    recorder.env.close()
+    metrics = read_curve(tmp_path / "run" / "seed-0" / "metrics.csv")
+    assert sorted(set(metrics["transitions"].tolist())) == [200, 600]
+    # Later commands are beyond the first ones.
+    whole = mcaprl.open(tmp_path / "log.mcap").actions
+    assert whole.min() < low
+    assert whole.max() > high
+    box = found.policy.head.box
+    np.testing.assert_allclose([box.low[0], box.high[0]], [low, high])
+
+
+class Unbounded(gym.ActionWrapper[Any, Any, Any]):
+    """Pendulum, whose torque is the tanh of an unbounded command."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.action_space = spaces.Box(-np.inf, np.inf, (1,), np.float32, seed=0)
+
+    def action(self, action: Any) -> Any:
+        return np.tanh(action)
 
 
 def test_the_command_learns_beside_a_recorder_in_another_process(tmp_path: Path) -> None:
