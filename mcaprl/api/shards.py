@@ -36,7 +36,7 @@ from mcaprl.recorder.dataset.manifest import (
     unfinished_folder,
     write_manifest,
 )
-from mcaprl.recorder.format.episode_summary import INTERRUPTED
+from mcaprl.recorder.format.messages import INTERRUPTED
 from mcaprl.recorder.repair.recover import recover_log
 from mcaprl.sims.evaluation.rollout import EpisodeResult
 from mcaprl.texts import counted

@@ -15,7 +15,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.mapped import MappedImages
 from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, Transitions
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.source import Data, opened
 

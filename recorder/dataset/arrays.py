@@ -17,7 +17,7 @@ from mcaprl.errors import SpaceError
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.dataset.values import exactly, flags, numbers, rewards_of
 from mcaprl.recorder.format.behavior import behavior_field
-from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
+from mcaprl.recorder.format.messages import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata, installed_versions
 from mcaprl.recorder.format.spaces import (
     MAX_ACTIONS,

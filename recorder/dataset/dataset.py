@@ -21,10 +21,9 @@ from mcaprl.recorder.dataset.mapped import MappedImages, blocks_of, rows_of
 from mcaprl.recorder.dataset.origin import Origin
 from mcaprl.recorder.dataset.statistics import Statistics, describe_columns
 from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, TransitionBatch, Transitions
-from mcaprl.recorder.format.action_commands import ActionCommands
 from mcaprl.recorder.format.behavior import BehaviorField, behavior_field
-from mcaprl.recorder.format.episode_summary import add_up_each
-from mcaprl.recorder.format.metadata import ESTIMATED, LogMetadata
+from mcaprl.recorder.format.messages import add_up_each
+from mcaprl.recorder.format.metadata import ESTIMATED, ActionCommands, LogMetadata
 from mcaprl.recorder.format.spaces import nest, space_to_json
 
 if TYPE_CHECKING:

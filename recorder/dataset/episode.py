@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.recorder.format.behavior import BehaviorField
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.infos import Masked
+from mcaprl.recorder.format.messages import EpisodeSummary
 
 
 @dataclass(frozen=True, eq=False, repr=False)

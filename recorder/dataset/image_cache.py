@@ -15,9 +15,8 @@ from mcaprl.errors import LogError
 from mcaprl.files import replacing
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.reading import McapReader, chunk_header
-from mcaprl.recorder.format.rows import ImageRows
+from mcaprl.recorder.format.schema import IMAGES_PER_CHUNK, ImageRows
 from mcaprl.recorder.format.spaces import Leaf
-from mcaprl.recorder.format.topics import IMAGES_PER_CHUNK
 
 Storage = Literal["auto", "memory", "mapped"]
 """Where images are stored: `memory`, `mapped` (on disk) or `auto`.

@@ -20,8 +20,8 @@ from mcaprl.recorder.format.reading import (
     Topic,
     chunk_header,
 )
+from mcaprl.recorder.format.schema import IMAGES_PER_CHUNK, STEP_TOPIC
 from mcaprl.recorder.format.spaces import Leaf
-from mcaprl.recorder.format.topics import IMAGES_PER_CHUNK, STEP_TOPIC
 
 _FIELDS = ("height", "width", "encoding", "step", "data")
 

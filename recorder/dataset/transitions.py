@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.dataset.mapped import Frames, joined, rows_of
 from mcaprl.recorder.format.behavior import BehaviorField
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.infos import Masked, is_exact, kind_of
+from mcaprl.recorder.format.messages import EpisodeSummary
 
 STEP_COLUMNS = ("actions", "rewards", "terminated", "truncated", "behavior")
 """The columns with one row per transition."""

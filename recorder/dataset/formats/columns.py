@@ -23,7 +23,7 @@ from mcaprl.recorder.dataset.values import (
     rewards_of,
 )
 from mcaprl.recorder.format.behavior import BehaviorField, behavior_field
-from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up, summary_of
+from mcaprl.recorder.format.messages import EpisodeSummary, add_up, summary_of
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
 from mcaprl.texts import shortened

@@ -45,8 +45,8 @@ from mcaprl.recorder.dataset.tables import (
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.dataset.values import behavior_of, exactly
 from mcaprl.recorder.format.behavior import FIELDS, PROBABILITY, behavior_field
-from mcaprl.recorder.format.episode_summary import EpisodeSummary, summary_of
 from mcaprl.recorder.format.infos import Masked
+from mcaprl.recorder.format.messages import EpisodeSummary, summary_of
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of
 

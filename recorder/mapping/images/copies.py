@@ -30,8 +30,8 @@ from mcaprl.recorder.dataset.image_cache import (
 from mcaprl.recorder.dataset.images import mapped_images
 from mcaprl.recorder.dataset.mapped import MappedImages
 from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.format.schema import IMAGES_PER_CHUNK
 from mcaprl.recorder.format.spaces import IMAGE_ENCODINGS, Leaf
-from mcaprl.recorder.format.topics import IMAGES_PER_CHUNK
 from mcaprl.texts import size
 
 if TYPE_CHECKING:

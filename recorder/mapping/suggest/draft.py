@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.bag import Bag, Stream
 from mcaprl.recorder.bags.overview import TopicOverview, topics_of
-from mcaprl.recorder.format.topics import STEP_TOPIC
+from mcaprl.recorder.format.schema import STEP_TOPIC
 from mcaprl.recorder.mapping.blame import Blame
 from mcaprl.recorder.mapping.config import Place, parse_mapping
 from mcaprl.recorder.mapping.images.reader import ImageReader

@@ -30,7 +30,7 @@ from mcaprl.recorder.dataset.formats.minari.description import (
     MAIN,
     description_text,
 )
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import observation_leaves
 
