@@ -29,7 +29,7 @@ from mcaprl.errors import LogError, McaprlError, NoStepsError, OutputExistsError
 from mcaprl.files import check_target, locked_file, locked_folder
 from mcaprl.progress import Advance
 from mcaprl.recorder.dataset.log_reader import LogReader
-from mcaprl.recorder.dataset.manifest import (
+from mcaprl.recorder.dataset.open import (
     MANIFEST_NAME,
     UNFINISHED_NAME,
     LogFile,

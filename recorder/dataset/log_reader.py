@@ -41,11 +41,8 @@ from mcaprl.recorder.dataset.episodes import (
     step_order,
     summaries,
 )
-from mcaprl.recorder.dataset.image_cache import Storage, fingerprint
-from mcaprl.recorder.dataset.images import read_images
-from mcaprl.recorder.dataset.mapped import Frames
-from mcaprl.recorder.dataset.origin import Origin
-from mcaprl.recorder.dataset.transitions import Transitions, ranges
+from mcaprl.recorder.dataset.images import Frames, Storage, fingerprint, read_images
+from mcaprl.recorder.dataset.transitions import Origin, Transitions, ranges
 from mcaprl.recorder.format.behavior import FIELDS, behavior_field
 from mcaprl.recorder.format.infos import read_infos
 from mcaprl.recorder.format.messages import EpisodeSummary

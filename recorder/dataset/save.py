@@ -12,7 +12,7 @@ import numpy as np
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.files import replacing
 from mcaprl.recorder.dataset.arrays import with_fresh_times
-from mcaprl.recorder.dataset.mapped import Frames
+from mcaprl.recorder.dataset.images import Frames
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.log_writer import InfoTopics, LogWriter, info_array
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata

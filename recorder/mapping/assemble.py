@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.image_cache import Storage
-from mcaprl.recorder.dataset.mapped import Frames
-from mcaprl.recorder.dataset.origin import Origin
-from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.dataset.images import Frames, Storage
+from mcaprl.recorder.dataset.transitions import Origin, Transitions
 from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.format.messages import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import (

@@ -18,7 +18,7 @@ from mcaprl.errors import LogError
 from mcaprl.problem import Problem
 from mcaprl.recorder.bags.bag import Bag, open_bag
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.image_cache import Storage
+from mcaprl.recorder.dataset.images import Storage
 from mcaprl.recorder.mapping.actions import Actions
 from mcaprl.recorder.mapping.assemble import assembled, element_names, vector_names
 from mcaprl.recorder.mapping.blame import Blame

@@ -38,7 +38,6 @@ from mcaprl.errors import (
 from mcaprl.problem import LISTED, Problem, Shortlist
 from mcaprl.recorder.bags.bag import Bag, open_bag
 from mcaprl.recorder.bags.files import is_bag_file
-from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.episodes import (
     COUNTERS,
     EpisodeTopic,
@@ -47,6 +46,7 @@ from mcaprl.recorder.dataset.episodes import (
     summaries_of_records,
 )
 from mcaprl.recorder.dataset.log_reader import LogReader, described
+from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.behavior import FIELDS
 from mcaprl.recorder.format.messages import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata

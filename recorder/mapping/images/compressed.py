@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
 from mcaprl.limits import MAX_IMAGE_PIXELS
-from mcaprl.recorder.dataset.image_files import FORMATS, decoded_file
+from mcaprl.recorder.dataset.images import FORMATS, decoded_file
 from mcaprl.recorder.mapping.images.pixels import CERTAIN_DEPTH, MM_PER_M, UNITS_PER_M, Pixels
 
 _MAX_NIBBLES = 11

@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError
 from mcaprl.files import parse_json
 from mcaprl.recorder.bags.bag import Failure
-from mcaprl.recorder.dataset.image_cache import (
+from mcaprl.recorder.dataset.images import (
     CACHE_NOTES,
     Blocks,
+    MappedImages,
     cache_path,
+    mapped_images,
     open_cache,
     write_cache,
 )
-from mcaprl.recorder.dataset.images import mapped_images
-from mcaprl.recorder.dataset.mapped import MappedImages
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.format.schema import IMAGES_PER_CHUNK
 from mcaprl.recorder.format.spaces import IMAGE_ENCODINGS, Leaf

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError, import_extra
-from mcaprl.recorder.dataset.mapped import Frames
+from mcaprl.recorder.dataset.images import Frames
 from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.images.pixels import Pixels, one_line
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, UsageError
 from mcaprl.problem import Problem
 from mcaprl.recorder.bags.bag import Bag, Failure, TopicInfo
-from mcaprl.recorder.dataset.image_cache import Storage, is_mapped
-from mcaprl.recorder.dataset.mapped import Frames, as_pixels
+from mcaprl.recorder.dataset.images import Frames, Storage, as_pixels, is_mapped
 from mcaprl.recorder.format.spaces import MAX_ELEMENTS
 from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.images.compressed import compressed_pixels, is_video

@@ -22,7 +22,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.format.schema import LOG_TOPIC
