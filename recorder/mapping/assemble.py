@@ -24,9 +24,8 @@ from mcaprl.recorder.format.metadata import (
     LogMetadata,
 )
 from mcaprl.recorder.format.spaces import leaves_of
-from mcaprl.recorder.mapping.align import NS_PER_S
+from mcaprl.recorder.mapping.align import NS_PER_S, as_numbers
 from mcaprl.recorder.mapping.config import Action, Limits, Quantity
-from mcaprl.recorder.mapping.paths import as_numbers
 from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.runs import Segment
 from mcaprl.recorder.mapping.steps import Steps

@@ -19,7 +19,7 @@ from PIL import Image
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.images import FORMATS, decoded_file
-from mcaprl.recorder.mapping.images.compressed import compressed_pixels, rvl_decoded
+from mcaprl.recorder.mapping.image_pixels import compressed_pixels, rvl_decoded
 
 
 def rvl_encoded(pixels: list[int]) -> bytes:

@@ -19,8 +19,8 @@ import mcaprl
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.dataset import images
 from mcaprl.recorder.dataset.images import MappedImages
-from mcaprl.recorder.mapping.images import copies as image_copy
-from mcaprl.recorder.mapping.images.reader import ImageReader
+from mcaprl.recorder.mapping import images as image_copy
+from mcaprl.recorder.mapping.images import ImageReader
 from tests.support.bags import Channel, integers, write_channels, write_rosbag1, write_rosbag2
 from tests.support.recordings import assert_same_bits
 
