@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from mcaprl.api.train import train, train_online
     from mcaprl.recorder.bags.bag import OpenBag, open_bag
     from mcaprl.recorder.dataset.dataset import Dataset
-    from mcaprl.recorder.dataset.episode import Episode
     from mcaprl.recorder.dataset.format_registry import Format
+    from mcaprl.recorder.dataset.transitions import Episode
     from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
     from mcaprl.recorder.record.wrapper import RecordMcap
     from mcaprl.recorder.source import open_data as open
@@ -120,7 +120,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.torch": ["torch"],
         "mcaprl.recorder.bags.bag": ["OpenBag", "open_bag"],
         "mcaprl.recorder.dataset.dataset": ["Dataset"],
-        "mcaprl.recorder.dataset.episode": ["Episode"],
+        "mcaprl.recorder.dataset.transitions": ["Episode"],
         "mcaprl.recorder.dataset.format_registry": ["Format"],
         "mcaprl.recorder.record.wrapper": ["RecordMcap"],
         "mcaprl.recorder.record.vector_wrapper": ["RecordVecMcap"],

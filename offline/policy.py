@@ -33,7 +33,7 @@ from mcaprl.offline.algorithms.heads import Head, build_head
 from mcaprl.offline.algorithms.iql import LOG_STD
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
-from mcaprl.recorder.format.action_commands import ActionCommands
+from mcaprl.recorder.format.metadata import ActionCommands
 from mcaprl.recorder.format.spaces import (
     check_actions,
     check_elements,

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mcaprl.frames import rows_of
 from mcaprl.online.task import Task, check_spaces
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.record.session import reason_of
 from mcaprl.recorder.record.vector_wrapper import VectorWrapper

@@ -8,9 +8,9 @@ Arrows show how data flows through the modules:
     file -> reader -> log_reader -> dataset -> statistics, tables
                    -> check
     bag -> bags -> mapping -> dataset                                 (convert)
-    damaged file -> salvage -> valid_copy -> recover -> file
+    damaged file -> salvage -> recover -> file
 
-`chunks`, `message_rows`, `schema` and `messages` encode and decode logs. `spaces` and `metadata`
+`chunks`, `records`, `schema` and `messages` encode and decode logs. `spaces` and `metadata`
 describe the contents of a log. `scene` and `layout` define what viewers show.
 """
 
@@ -45,8 +45,12 @@ __getattr__ = lazy_attributes(
         "mcaprl.recorder.columns.reader": ("McapReader",),
         "mcaprl.recorder.columns.records": ("crc32", "map_file"),
         "mcaprl.recorder.dataset.log_reader": ("LogReader",),
-        "mcaprl.recorder.format.schema": ("message_dtype", "step_schema"),
-        "mcaprl.recorder.format.topics": ("EPISODE_TOPIC", "STEP_TOPIC"),
+        "mcaprl.recorder.format.schema": (
+            "EPISODE_TOPIC",
+            "STEP_TOPIC",
+            "message_dtype",
+            "step_schema",
+        ),
         "mcaprl.recorder.mapping.config": ("MAPPING_SECTIONS",),
         "mcaprl.recorder.viewer.playback": ("Player", "Track"),
     },

@@ -17,7 +17,7 @@ from mcaprl.recorder.dataset.format_registry import (
     other_format,
     read_format,
 )
-from mcaprl.recorder.dataset.image_cache import STORAGES, Storage
+from mcaprl.recorder.dataset.images import STORAGES, Storage
 from mcaprl.recorder.dataset.open import Episodes, GrowingLogs, open_logs, weighted_logs
 
 Paths = str | Path | Sequence[str | Path]

@@ -25,7 +25,7 @@ from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.format.infos import shape_of
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import outside
-from mcaprl.recorder.mapping.suggest.likely_action import box_limits
+from mcaprl.recorder.mapping.likely import box_limits
 from mcaprl.runs import choose_seeds, read_config, saved_updates
 from tests.support.bags import numbers, write_channels
 from tests.support.damage.changed import changed_archive, changed_json

@@ -13,7 +13,7 @@ from mcaprl.files import size_of
 from mcaprl.recorder.dataset.open import find_logs
 from mcaprl.recorder.format.metadata import METADATA_NAME
 from mcaprl.recorder.format.reading import McapReader
-from mcaprl.recorder.format.topics import STEP_TOPIC
+from mcaprl.recorder.format.schema import STEP_TOPIC
 from mcaprl.recorder.source import Definitions, Paths
 from mcaprl.storage.remote import is_url
 from mcaprl.texts import counted, size

@@ -178,7 +178,7 @@ def suggest_mapping(data: Paths, *, bins: int | None = None, definitions: Defini
     from contextlib import closing
 
     from mcaprl.recorder.bags.bag import open_bag
-    from mcaprl.recorder.mapping.suggest.draft import suggested
+    from mcaprl.recorder.mapping.draft import suggested
 
     if bins is not None:
         check_least(2, bins=bins)

@@ -22,7 +22,7 @@ from mcaprl.base_policy import Actor
 from mcaprl.errors import UsageError
 from mcaprl.files import check_log_name
 from mcaprl.progress import ProgressBar, no_progress
-from mcaprl.recorder.dataset.manifest import MANIFEST_NAME
+from mcaprl.recorder.dataset.open import MANIFEST_NAME
 from mcaprl.sims.evaluation.rollout import EpisodeResult, warn_of_cuts
 from mcaprl.storage.remote import check_upload, upload_all
 

@@ -21,8 +21,8 @@ from mcaprl.errors import LogError, UsageError
 from mcaprl.files import temporary_folder, write_json
 from mcaprl.progress import Advance, ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.open import find_logs
+from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.display import SCENE

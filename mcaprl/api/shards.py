@@ -29,14 +29,14 @@ from mcaprl.errors import LogError, McaprlError, NoStepsError, OutputExistsError
 from mcaprl.files import check_target, locked_file, locked_folder
 from mcaprl.progress import Advance
 from mcaprl.recorder.dataset.log_reader import LogReader
-from mcaprl.recorder.dataset.manifest import (
+from mcaprl.recorder.dataset.open import (
     MANIFEST_NAME,
     UNFINISHED_NAME,
     LogFile,
     unfinished_folder,
     write_manifest,
 )
-from mcaprl.recorder.format.episode_summary import INTERRUPTED
+from mcaprl.recorder.format.messages import INTERRUPTED
 from mcaprl.recorder.repair.recover import recover_log
 from mcaprl.sims.evaluation.rollout import EpisodeResult
 from mcaprl.texts import counted

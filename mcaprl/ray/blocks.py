@@ -39,19 +39,19 @@ from mcaprl.errors import (
 )
 from mcaprl.files import parse_json, temporary_folder
 from mcaprl.ray.tasks import check_machine
-from mcaprl.recorder.dataset.arrays import columns_of_arrays
+from mcaprl.recorder.dataset.arrays import behavior_of, columns_of_arrays
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
-from mcaprl.recorder.dataset.manifest import (
+from mcaprl.recorder.dataset.open import (
     MANIFEST_NAME,
+    Episodes,
     LogFile,
+    episode_indexes,
     unfinished_folder,
     write_manifest,
 )
-from mcaprl.recorder.dataset.open import Episodes, episode_indexes
 from mcaprl.recorder.dataset.tables import described, observation_names, step_columns
 from mcaprl.recorder.dataset.transitions import Transitions
-from mcaprl.recorder.dataset.values import behavior_of
 from mcaprl.recorder.format.behavior import FIELDS, behavior_field
 from mcaprl.recorder.format.metadata import METADATA_NAME, NO_TIMES, LogMetadata, installed_versions
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of, nest

@@ -27,7 +27,7 @@ from mcaprl.networks import ImageInput
 from mcaprl.offline.batches.items import n_step_returns, returns_to_go
 from mcaprl.offline.batches.observations import FramesOnDisk, ObservationEncoder, Observations
 from mcaprl.offline.batches.packing import Packing
-from mcaprl.recorder.dataset.values import is_beyond_float32
+from mcaprl.recorder.dataset.arrays import is_beyond_float32
 from mcaprl.recorder.format.spaces import check_actions
 from mcaprl.texts import counted
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
-from mcaprl.recorder.dataset.mapped import Frames
+from mcaprl.recorder.dataset.images import Frames
 from mcaprl.recorder.format.spaces import leaves_of, nest
 
 if TYPE_CHECKING:

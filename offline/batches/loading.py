@@ -12,10 +12,9 @@ import torch.utils.data
 from mcaprl.errors import UsageError
 from mcaprl.offline.batches.items import Arrays, ItemOptions, Items
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.mapped import MappedImages
-from mcaprl.recorder.dataset.origin import Origin
-from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, Transitions
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.dataset.images import MappedImages
+from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, Origin, Transitions
+from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.source import Data, opened
 

@@ -24,7 +24,7 @@ from mcaprl.actions import MASK_KEY, JointActions, allowed_actions, joint_action
 from mcaprl.architecture import SMALL_EDGE
 from mcaprl.errors import SpaceError
 from mcaprl.networks import ImageInput
-from mcaprl.recorder.dataset.mapped import Frames, MappedImages
+from mcaprl.recorder.dataset.images import Frames, MappedImages
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, observation_leaves
 
 

@@ -22,7 +22,7 @@ from mcaprl.files import read_json
 from mcaprl.frames import mapped, rows_of, stacked_frames
 from mcaprl.offline.algorithms.config import DQNConfig
 from mcaprl.offline.algorithms.losses import q_learning_target
-from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.runs import CONFIG_NAME
 
 Columns = dict[str, NDArray[Any]]

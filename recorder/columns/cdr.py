@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 
 from mcaprl.errors import CorruptLogError, LogError
-from mcaprl.recorder.columns.definition_text import full_name
 from mcaprl.recorder.columns.definitions import (
     TIME_TYPES,
     clear_definitions,
     definitions_of,
+    full_name,
     leaf_kinds,
 )
 

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.limits import MAX_CHUNK_BYTES
-from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, RECORD_HEADER_BYTES, LazySequence
-from mcaprl.recorder.columns.records import crc32
+from mcaprl.recorder.columns.records import INDEX_ENTRY, RECORD_HEADER_BYTES, LazySequence, crc32
 
 _CHUNK_START = struct.Struct("<BQQQQII")
 _ZSTD = zstandard.ZstdCompressionParameters.from_level

@@ -12,22 +12,20 @@ from numpy.typing import NDArray
 
 from mcaprl.problem import Problem
 from mcaprl.recorder.columns.chunks import chunk_header
-from mcaprl.recorder.columns.message_rows import (
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.records import (
     INDEX_ENTRY,
+    MAGIC,
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
     FieldCopy,
     are_adjacent,
-    message_index,
-    windows,
-)
-from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import (
-    MAGIC,
     contents_of,
     crc32,
     is_intact_attachment,
+    message_index,
     parse_record,
+    windows,
 )
 
 

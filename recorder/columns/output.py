@@ -1,4 +1,4 @@
-"""MCAP file that is being written, and the compaction of a finished one.
+"""MCAP file that is being written: its lock, delayed signals, and compaction at the end.
 
 A writer that flushes often leaves many small chunks. A reader needs as much time for a small chunk
 as for hundreds of messages, so compaction merges them. The compacted file is written beside the
@@ -7,33 +7,209 @@ file with all messages.
 
 Only chunks of the same kind are merged; channels that share a chunk are of the same kind. All other
 bytes are copied unchanged, so that the messages of each kind keep their order.
+
+Readers need no lock, since a file only grows by whole records or is replaced as a whole: a writer
+never changes or cuts off bytes that a reader may have mapped.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import inspect
 import os
+import signal
 import stat
+import sys
+import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from io import FileIO
 from pathlib import Path
-from typing import NoReturn
+from types import FrameType, TracebackType
+from typing import Any, ClassVar, NoReturn
 
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, DataEnd, McapRecord
 
 from mcaprl.errors import CorruptLogError, LogError
-from mcaprl.files import is_at, work_folder
+from mcaprl.files import check_regular, check_target, hold, is_at, taken, try_lock, work_folder
 from mcaprl.limits import MAX_CHUNK_BYTES
 from mcaprl.recorder.columns.chunks import ChunkHeader, Compressors, Scratch, chunk_records
-from mcaprl.recorder.columns.file_lock import create, release
-from mcaprl.recorder.columns.message_rows import message_index_head
 from mcaprl.recorder.columns.reader import end_of
-from mcaprl.recorder.columns.records import MAGIC, contents_of, crc32, map_file, records_of
-from mcaprl.recorder.columns.signals import HoldSignals
+from mcaprl.recorder.columns.records import (
+    MAGIC,
+    contents_of,
+    crc32,
+    map_file,
+    message_index_head,
+    records_of,
+)
 from mcaprl.recorder.columns.summary import Summary
+
+try:
+    # These functions return plain numbers. Their wrappers in `signal` convert the numbers to enums,
+    # which takes ten times as long.
+    from _signal import getsignal  # type: ignore[import-not-found]
+    from _signal import signal as set_handler
+except ImportError:
+    from signal import getsignal
+    from signal import signal as set_handler
+
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
+# Windows has no SIGHUP.
+_HELD = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
+
+
+class HoldSignals:
+    """Context manager that delays signals until its end, where they are handled as usual.
+
+    A context has an effect only in the main thread, where Python runs all handlers. A nested
+    context has no effect.
+    """
+
+    _is_held: ClassVar[bool] = False
+
+    def __enter__(self) -> None:
+        """Start to delay signals."""
+        self._holds = not self._is_held and (threading.current_thread() is threading.main_thread())
+        if not self._holds:
+            return
+        self._handlers: dict[int, Any] = {}
+        self._waiting: list[int] = []
+        try:
+            HoldSignals._is_held = True
+            for number in _HELD:
+                handler = getsignal(number)
+                # A handler that was not installed from Python (None) cannot be restored.
+                if handler is not None:
+                    self._handlers[number] = handler
+                    set_handler(number, self._note)
+        except BaseException:
+            self._restore()
+            raise
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Handle the delayed signals."""
+        if not self._holds:
+            return
+        self._restore()
+        for number in self._waiting:
+            handler = self._handlers[number]
+            if callable(handler):
+                handler(number, inspect.currentframe())
+            elif handler == signal.SIG_DFL:
+                signal.raise_signal(number)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        # The frame is not stored: it would keep its local variables alive.
+        self._waiting.append(number)
+
+    def _restore(self) -> None:
+        HoldSignals._is_held = False
+        for number, handler in self._handlers.items():
+            set_handler(number, handler)
+
+
+if sys.platform != "win32":
+    import fcntl
+
+_COPIED_BYTES = 2**20
+
+
+def create(path: Path, *, overwrite: bool) -> FileIO:
+    """Create and lock a file and the missing folders of its path.
+
+    If a file is overwritten, processes that have it open still read the old contents.
+    """
+    check_target(path, overwrite=overwrite)
+    try:
+        if path.exists():
+            return replaced(path, reopen(path), 0)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            file = _locked(FileIO(path, "x"), path)
+            if is_at(file.fileno(), path):
+                return file
+            release(file)
+    except OSError as error:
+        raise LogError(f"cannot write {path}: {error.strerror or error}") from error
+    # Another process has created or replaced the file in the meantime.
+    raise taken(path)
+
+
+def reopen(path: Path) -> FileIO:
+    """Open and lock an existing file."""
+    try:
+        while True:
+            check_regular(path)
+            file = _locked(FileIO(path, "r+"), path)
+            if is_at(file.fileno(), path):
+                return file
+            release(file)
+    except OSError as error:
+        raise LogError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def release(file: FileIO) -> None:
+    """Unlock and close a file, even if a child process still has it open."""
+    if not file.closed and sys.platform != "win32":
+        with contextlib.suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_UN)
+    file.close()
+
+
+def replaced(path: Path, locked: FileIO, length: int) -> FileIO:
+    """Replace a file with a locked copy of its first bytes. Current readers keep the old file.
+
+    The old file is released once the copy is in place; an error leaves the old file unchanged.
+
+    Args:
+        path: Path of the file; a symbolic link is followed.
+        locked: The file, locked by the caller.
+        length: Number of bytes to copy; the returned file is positioned after them.
+    """
+    path = path.resolve()
+    with work_folder(path) as folder:
+        unfinished = folder / path.name
+        file = _locked(FileIO(unfinished, "x+"), path)
+        try:
+            copy_start(locked, file, length)
+            os.chmod(unfinished, stat.S_IMODE(os.fstat(locked.fileno()).st_mode))
+            os.replace(unfinished, path)
+        except BaseException:
+            release(file)
+            raise
+    release(locked)
+    return file
+
+
+def copy_start(source: FileIO, target: FileIO, length: int) -> None:
+    """Copy the first bytes of a file."""
+    source.seek(0)
+    while length:
+        part = memoryview(source.read(min(length, _COPIED_BYTES)))
+        if not part:
+            raise OSError(errno.EIO, "the file became shorter while it was copied")
+        length -= len(part)
+        while part:
+            part = part[target.write(part) :]
+
+
+def _locked(file: FileIO, path: Path) -> FileIO:
+    if not try_lock(file.fileno()):
+        error = taken(path, file.fileno())
+        file.close()
+        raise error
+    hold(file, records=True)
+    return file
+
 
 # Up to this total size, joining the parts is faster than one system call for each part.
 _JOINED_BYTES = 2**16

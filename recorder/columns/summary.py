@@ -25,9 +25,14 @@ from mcap.records import (
 
 from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.recorder.columns.chunks import chunk_index_record
-from mcaprl.recorder.columns.message_rows import RECORD_HEADER_BYTES
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import MAGIC, crc32, is_intact_attachment, parse_record
+from mcaprl.recorder.columns.records import (
+    MAGIC,
+    RECORD_HEADER_BYTES,
+    crc32,
+    is_intact_attachment,
+    parse_record,
+)
 
 
 @dataclass

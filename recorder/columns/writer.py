@@ -27,11 +27,18 @@ from mcaprl.recorder.columns.chunks import (
     TEXT_BYTES,
     Compressors,
 )
-from mcaprl.recorder.columns.file_lock import copy_start, create, release, reopen, replaced
-from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, adjacent_offsets, message_record
-from mcaprl.recorder.columns.output import SMALL_CHUNK_BYTES, OutputFile, compact
-from mcaprl.recorder.columns.records import MAGIC
-from mcaprl.recorder.columns.signals import HoldSignals
+from mcaprl.recorder.columns.output import (
+    SMALL_CHUNK_BYTES,
+    HoldSignals,
+    OutputFile,
+    compact,
+    copy_start,
+    create,
+    release,
+    reopen,
+    replaced,
+)
+from mcaprl.recorder.columns.records import INDEX_ENTRY, MAGIC, adjacent_offsets, message_record
 from mcaprl.recorder.columns.summary import Summary, TopLevelRecord, WrittenState, written_state
 
 COMPRESSIONS = ("zstd", "lz4", "none")

@@ -14,17 +14,21 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError, UnknownNameError, UsageError
-from mcaprl.recorder.dataset.action_mask import with_mask
 from mcaprl.recorder.dataset.conversions import Conversions
-from mcaprl.recorder.dataset.episode import Episode, shapes
-from mcaprl.recorder.dataset.mapped import MappedImages, blocks_of, rows_of
-from mcaprl.recorder.dataset.origin import Origin
+from mcaprl.recorder.dataset.images import MappedImages, blocks_of, rows_of
 from mcaprl.recorder.dataset.statistics import Statistics, describe_columns
-from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, TransitionBatch, Transitions
-from mcaprl.recorder.format.action_commands import ActionCommands
+from mcaprl.recorder.dataset.transitions import (
+    STEP_COLUMNS,
+    Episode,
+    Origin,
+    TransitionBatch,
+    Transitions,
+    shapes,
+    with_mask,
+)
 from mcaprl.recorder.format.behavior import BehaviorField, behavior_field
-from mcaprl.recorder.format.episode_summary import add_up_each
-from mcaprl.recorder.format.metadata import ESTIMATED, LogMetadata
+from mcaprl.recorder.format.messages import add_up_each
+from mcaprl.recorder.format.metadata import ESTIMATED, ActionCommands, LogMetadata
 from mcaprl.recorder.format.spaces import nest, space_to_json
 
 if TYPE_CHECKING:
@@ -99,8 +103,13 @@ class Dataset(Conversions):
             SpaceError: Lengths or shapes do not agree with each other or with the spaces, or an
                 action, probability or density is not possible.
         """
-        from mcaprl.recorder.dataset.arrays import columns_of_arrays, description_of
-        from mcaprl.recorder.dataset.values import behavior_of_arrays, check_finite, numbers
+        from mcaprl.recorder.dataset.arrays import (
+            behavior_of_arrays,
+            check_finite,
+            columns_of_arrays,
+            description_of,
+            numbers,
+        )
 
         check_finite("actions", numbers("actions", actions))
         description = description_of(env_id, observations, actions, observation_space, action_space)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.format import messages
-from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up_each
+from mcaprl.recorder.format.messages import EpisodeSummary, add_up_each
 from mcaprl.recorder.format.reading import Columns, Topic
-from mcaprl.recorder.format.topics import STEP_TOPIC
+from mcaprl.recorder.format.schema import STEP_TOPIC
 
 COUNTERS = ("episode", "step", "final")
 """Fields of `/rl/step` that locate a record: episode, step and final-record flag."""

@@ -18,7 +18,7 @@ import numpy as np
 from mcaprl.entry_points import installed, load
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.files import check_plain, replacing, replacing_folder
-from mcaprl.recorder.dataset.origin import Origin
+from mcaprl.recorder.dataset.transitions import Origin
 from mcaprl.recorder.format.behavior import FIELDS, BehaviorField
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
 from mcaprl.storage.remote import is_url

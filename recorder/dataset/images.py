@@ -1,16 +1,33 @@
-"""Reader of image observations, one image per record of `/rl/step`."""
+"""Images of observations, in memory or on disk, and their reader.
+
+Pillow knows dozens of formats. Some of its decoders are rarely tested, and that of PostScript
+starts the program `gs`. Only the formats in `FORMATS` are decoded, and only images of a declared
+size within `mcaprl.limits`.
+
+In uncompressed chunks, images are stored as plain bytes, so a batch is gathered from the
+memory-mapped file at memory speed. The CRC of a chunk is checked at the first read of its images.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import hashlib
+import math
+import mmap
+import os
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import CorruptLogError
+from mcaprl.errors import CorruptLogError, LogError, import_extra
+from mcaprl.files import replacing
+from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.episodes import time_order
-from mcaprl.recorder.dataset.image_cache import IMAGE_TYPE, Storage, image_cache, is_mapped
-from mcaprl.recorder.dataset.mapped import Frames, ImageFile, MappedImages
+from mcaprl.recorder.format.messages import definition
 from mcaprl.recorder.format.reading import (
     MESSAGE_HEADER,
     Columns,
@@ -19,9 +36,389 @@ from mcaprl.recorder.format.reading import (
     MessageRange,
     Topic,
     chunk_header,
+    prefetch,
+    release,
 )
+from mcaprl.recorder.format.schema import IMAGES_PER_CHUNK, STEP_TOPIC, ImageRows
 from mcaprl.recorder.format.spaces import Leaf
-from mcaprl.recorder.format.topics import IMAGES_PER_CHUNK, STEP_TOPIC
+
+FORMATS: Final = ("JPEG", "PNG", "WEBP", "TIFF")
+"""Formats of image files, by Pillow's names; TIFF stores depth as floats."""
+
+
+def decoded_file(
+    data: bytes,
+    extra: str,
+    *,
+    formats: Sequence[str] = FORMATS,
+    max_pixels: int = MAX_IMAGE_PIXELS,
+) -> Any:
+    """Decode an image file to a Pillow image.
+
+    Args:
+        data: Content of the file.
+        extra: Extra of `mcaprl` that installs Pillow.
+        formats: Formats that may be decoded.
+        max_pixels: Maximum of width times height, which is checked before pixels are decoded.
+    """
+    pillow = import_extra("PIL.Image", extra)
+    try:
+        with warnings.catch_warnings():
+            # Pillow warns about sizes above its limit, and about damaged EXIF data.
+            warnings.simplefilter("ignore")
+            image = pillow.open(BytesIO(data), formats=list(formats))
+            width, height = image.size
+            if width * height > max_pixels:
+                raise LogError(
+                    f"it declares {width} x {height} pixels; at most {max_pixels} can be read"
+                )
+            image.load()
+    except LogError:
+        raise
+    except pillow.UnidentifiedImageError as error:
+        raise LogError(f"{len(data)} bytes are not {', '.join(formats)}") from error
+    # Pillow raises errors of many types for damaged images.
+    except Exception as error:
+        raise LogError(f"the {len(data)} bytes are damaged: {error}") from error
+    return image
+
+
+_UINT8 = np.dtype(np.uint8)
+_BLOCK_BYTES = 1 << 24
+_PREFETCHED_BYTES = 1 << 30
+"""Size of the images from which on they are prefetched. Fewer are soon in the system's cache."""
+
+
+class ImageFile:
+    """A memory-mapped file that contains images of one size.
+
+    Attributes:
+        name: Name of the file, for messages.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        view: memoryview,
+        image_bytes: int,
+        checks: Sequence[Callable[[], None]],
+        check_unchanged: Callable[[], None],
+    ) -> None:
+        """Create a view of the file's images without reading them.
+
+        Each function in `checks` raises an error if its chunk is damaged. `check_unchanged` raises
+        an error if the file was changed in place.
+        """
+        self.name, self._check_unchanged = name, check_unchanged
+        bytes_ = np.frombuffer(view, np.uint8)
+        # Element k is the image that starts at byte k. Indexing a void dtype is as fast as memcpy.
+        self._windows = np.lib.stride_tricks.as_strided(
+            bytes_[:image_bytes].view(np.dtype((np.void, image_bytes))),
+            (len(bytes_) - image_bytes + 1,),
+            (1,),
+        )
+        self._view = view
+        self._checks = checks
+        self._is_checked = np.zeros(len(checks), bool)
+
+    def prefetch(self, start: int, stop: int) -> None:
+        """Let the system start to load the pages of a range of bytes from the disk."""
+        prefetch(self._view, start, stop)
+
+    def release(self) -> None:
+        """Let the system take back the memory of the file; it is read again when it is needed."""
+        release(self._view)
+
+    def read(self, offsets: NDArray[np.int64], chunks: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Copy K images, given their byte offsets (K,) and the indexes (K,) of their chunks."""
+        self._check_unchanged()
+        checked = self._is_checked[chunks]
+        if not checked.all():
+            for chunk in np.unique(chunks[~checked]).tolist():
+                self._checks[chunk]()
+                self._is_checked[chunk] = True
+        return self._windows[offsets].view(np.uint8)
+
+
+class MappedImages:
+    """An array of (F, *shape) images on disk; indexing reads images, `rows` selects them.
+
+    An element may be a stack of K images, joined along their last axis. The file contains each
+    image once, however many stacks it is in.
+
+    Attributes:
+        shape: Shape of the corresponding array.
+        dtype: Data type of the corresponding array.
+    """
+
+    def __init__(
+        self,
+        files: Sequence[ImageFile],
+        image_shape: tuple[int, ...],
+        places: NDArray[np.int64],
+        dtype: np.dtype[Any] = _UINT8,
+    ) -> None:
+        """Create an array of images of one shape without reading them.
+
+        Each row of `places` (F, 3), or (F, K, 3) for stacks, contains the index of the file, the
+        index of the chunk in the file, and the byte offset of the image.
+        """
+        self._files, self._places, self._image_shape = tuple(files), places, image_shape
+        self.dtype = dtype
+        *edges, channels = image_shape
+        is_stacked = places.ndim == 3
+        last = channels * places.shape[1] if is_stacked else channels
+        self.shape = (len(places), *edges, last)
+
+    @property
+    def ndim(self) -> int:
+        """Number of dimensions."""
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return math.prod(self.shape)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of all images in bytes."""
+        return self.size * self.dtype.itemsize
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the files."""
+        return tuple(file.name for file in self._files)
+
+    def release(self) -> None:
+        """Let the system take back the memory of the files."""
+        for file in self._files:
+            file.release()
+
+    def rows(self, rows: Any) -> MappedImages:
+        """Select images without reading them; `rows` (N, K) selects N stacks of K images."""
+        return MappedImages(self._files, self._image_shape, self._places[rows], self.dtype)
+
+    def __len__(self) -> int:
+        """Return the number of images."""
+        return self.shape[0]
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        """Read the images one by one."""
+        return (self[row] for row in range(len(self)))
+
+    def __getitem__(self, key: Any) -> NDArray[Any]:
+        """Read images or parts of images; `key` is a NumPy index."""
+        first, rest = (key[0], key[1:]) if isinstance(key, tuple) else (key, ())
+        places = self._places[first]
+        if places.ndim < self._places.ndim:
+            image: NDArray[Any] = self._read(places[None])[0]
+            return image[rest] if rest else image
+        images = self._read(places)
+        return images[(slice(None), *rest)] if rest else images
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """Read all images."""
+        if copy is False:
+            raise ValueError("images on disk cannot be converted to an array without a copy")
+        return self[:] if dtype is None else self[:].astype(dtype, copy=False)
+
+    def _read(self, places: NDArray[np.int64]) -> NDArray[Any]:
+        if places.ndim == 2:
+            return self._images(places)
+        count, stack, _ = places.shape
+        pixels = as_pixels(self._images(places.reshape(-1, 3)))
+        found = np.empty((count, *pixels.shape[1:], stack), pixels.dtype)
+        for k in range(stack):
+            found[..., k] = pixels[k::stack]
+        return found.view(self.dtype).reshape(count, *self.shape[1:])
+
+    def _images(self, places: NDArray[np.int64]) -> NDArray[Any]:
+        """Read images (M, *image_shape) at places (M, 3)."""
+        shape = (len(places), *self._image_shape)
+        if len(self._files) == 1:
+            if self.nbytes >= _PREFETCHED_BYTES:
+                self._prefetch(places[np.argsort(places[:, 2])])
+            found = self._files[0].read(places[:, 2], places[:, 1])
+            return found.view(self.dtype).reshape(shape)
+        order = np.lexsort((places[:, 2], places[:, 0]))
+        if self.nbytes >= _PREFETCHED_BYTES:
+            self._prefetch(places[order])
+        number, chunk, offset = places[order].T
+        images = np.empty(shape, self.dtype)
+        ends = [*(np.flatnonzero(np.diff(number)) + 1).tolist(), len(order)]
+        for first, stop in zip([0, *ends], ends, strict=False):
+            if first < stop:
+                found = self._files[number[first]].read(offset[first:stop], chunk[first:stop])
+                images[order[first:stop]] = found.view(self.dtype).reshape(-1, *shape[1:])
+        return images
+
+    def _prefetch(self, places: NDArray[np.int64]) -> None:
+        """Let the system start to load images, given in the order of their files and offsets.
+
+        Without this, `read` would wait for one image after the other, and the system would load
+        their surroundings too.
+        """
+        if not len(places):
+            return
+        number, _, offset = places.T
+        first = offset // mmap.PAGESIZE * mmap.PAGESIZE
+        stop = offset + math.prod(self._image_shape) * self.dtype.itemsize
+        apart = (np.diff(number) != 0) | (first[1:] > stop[:-1])
+        begins = np.flatnonzero(np.concatenate([[True], apart]))
+        ends = np.flatnonzero(np.concatenate([apart, [True]]))
+        ranges = (number[begins], first[begins], stop[ends])
+        for index, start, end in zip(*(part.tolist() for part in ranges), strict=True):
+            self._files[index].prefetch(start, end)
+
+
+def as_pixels(images: NDArray[Any]) -> NDArray[Any]:
+    """Return images (..., H, W, C) as (..., H, W) items, each with the C values of a pixel.
+
+    Copying such items is two to three times as fast as copying channels.
+    """
+    channels = images.shape[-1]
+    item = np.dtype((np.void, channels * images.itemsize)) if channels > 1 else images.dtype
+    return np.ascontiguousarray(images).view(item)[..., 0]
+
+
+Frames = NDArray[Any] | MappedImages
+"""All frames of one observation leaf, in memory or on disk."""
+
+
+def rows_of(frames: Frames, rows: Any) -> Frames:
+    """Select rows of an array or of images on disk; images on disk are not read."""
+    return frames.rows(rows) if isinstance(frames, MappedImages) else frames[rows]
+
+
+def joined(parts: Sequence[Frames]) -> Frames:
+    """Concatenate the frames of several logs; the result is on disk if all frames are on disk."""
+    mapped = [part for part in parts if isinstance(part, MappedImages)]
+    if len(mapped) < len(parts):
+        return np.concatenate([np.asarray(part) for part in parts])
+    files: list[ImageFile] = []
+    places = []
+    for part in mapped:
+        moved = part._places.copy()
+        moved[..., 0] += len(files)
+        files += part._files
+        places.append(moved)
+    return MappedImages(files, mapped[0]._image_shape, np.concatenate(places), mapped[0].dtype)
+
+
+def blocks_of(frames: Frames) -> Iterator[NDArray[Any]]:
+    """Yield all frames in blocks of a few MB, which fit into memory."""
+    if not len(frames):
+        return
+    rows = max(1, _BLOCK_BYTES * len(frames) // max(frames.nbytes, 1))
+    for start in range(0, len(frames), rows):
+        yield np.ascontiguousarray(frames[start : start + rows])
+
+
+Storage = Literal["auto", "memory", "mapped"]
+"""Where images are stored: `memory`, `mapped` (on disk) or `auto`.
+
+`auto` is `mapped` if the images exceed `MEMORY_SHARE` of the free memory, otherwise `memory`.
+"""
+
+STORAGES: Final[tuple[str, ...]] = get_args(Storage)
+IMAGE_TYPE = "sensor_msgs/msg/Image"
+CACHE_METADATA, CACHE_NOTES = "mcaprl.images", "mcaprl.images.notes"
+MEMORY_SHARE = 0.5
+
+
+def is_mapped(storage: Storage, image_bytes: int) -> bool:
+    """Return whether images of this total size stay on disk."""
+    if storage == "auto":
+        return image_bytes > MEMORY_SHARE * free_memory_bytes()
+    return storage == "mapped"
+
+
+def free_memory_bytes() -> float:
+    """Return the free memory in bytes; infinity where the system does not report it."""
+    try:
+        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):
+        return float("inf")
+
+
+Blocks = Iterator[tuple[NDArray[np.int64], NDArray[Any]]]
+"""Log_times (K,) and images (K, *shape), block by block."""
+
+
+def image_cache(reader: McapReader, leaf: Leaf, blocks: Blocks) -> McapReader:
+    """Open the uncompressed copy of a log's images; write the copy beside the log if needed.
+
+    `blocks` yields the images of the whole topic. It is iterated only if the copy is written.
+    """
+    path = cache_path(reader.path, leaf)
+    description = {"fingerprint": fingerprint(reader), "topic": leaf.topic}
+    return open_cache(path, description) or write_cache(path, description, leaf, blocks)
+
+
+def cache_path(path: Path, leaf: Leaf) -> Path:
+    """Return the path of the copy of a leaf's images, beside the file that they come from."""
+    return path.with_name(f"{path.name}.{leaf.name}.images")
+
+
+def open_cache(path: Path, description: dict[str, str]) -> McapReader | None:
+    """Open a copy of images; return None if there is none, or if it has another description."""
+    if not path.exists():
+        return None
+    try:
+        cache = McapReader(path)
+    except LogError:
+        # The existing file is not a readable log: replace it.
+        return None
+    is_wanted = cache.complete and cache.metadata.get(CACHE_METADATA) == description
+    return cache if is_wanted else None
+
+
+def write_cache(
+    path: Path,
+    description: dict[str, str],
+    leaf: Leaf,
+    blocks: Blocks,
+    *,
+    most: int = IMAGES_PER_CHUNK,
+    notes: dict[str, str] | None = None,
+) -> McapReader:
+    """Write the uncompressed copy of images, and open it."""
+    from mcaprl.recorder.format.writing import McapWriter
+
+    with replacing(path, LogError, concurrent=True) as unfinished:
+        writer = McapWriter(unfinished, compression="none", overwrite=True)
+        try:
+            writer.add_metadata(CACHE_METADATA, description)
+            channel = writer.add_channel(leaf.topic, IMAGE_TYPE, definition(IMAGE_TYPE))
+            rows = ImageRows.of_shape(
+                leaf.shape, leaf.encoding or "", channel, most, writer.write_rows
+            )
+            for times, images in blocks:
+                rows.write_columns(times, {"data": np.ascontiguousarray(images).view(np.uint8)})
+            if notes:
+                writer.add_metadata(CACHE_NOTES, notes)
+            writer.close()
+        finally:
+            writer.abandon()
+    return McapReader(path)
+
+
+def fingerprint(reader: McapReader) -> str:
+    """Return the SHA-256 of the offsets, sizes and CRCs of a log's chunks.
+
+    If a chunk has no CRC, the hash includes the mtime of the log.
+    """
+    digest = hashlib.sha256(str(len(reader.view)).encode())
+    has_crcs = bool(reader.chunks)
+    for chunk in reader.chunks:
+        header = chunk_header(reader.view, chunk.chunk_start_offset)
+        digest.update(f"{header.data.start} {header.uncompressed_bytes} {header.crc} ".encode())
+        has_crcs &= header.crc != 0
+    if not has_crcs:
+        digest.update(str(reader.path.stat().st_mtime_ns).encode())
+    return digest.hexdigest()
+
 
 _FIELDS = ("height", "width", "encoding", "step", "data")
 

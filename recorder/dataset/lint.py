@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from mcaprl.actions import MASK_KEY, JointActions, allowed_actions, joint_actions
 from mcaprl.problem import Problem
+from mcaprl.recorder.dataset.arrays import is_beyond_float32
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.episode import Episode
-from mcaprl.recorder.dataset.mapped import blocks_of
+from mcaprl.recorder.dataset.images import blocks_of
 from mcaprl.recorder.dataset.statistics import calibration
-from mcaprl.recorder.dataset.values import is_beyond_float32
+from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.behavior import LOG_DENSITY
 from mcaprl.recorder.format.spaces import (
     Leaf,

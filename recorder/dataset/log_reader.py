@@ -41,17 +41,14 @@ from mcaprl.recorder.dataset.episodes import (
     step_order,
     summaries,
 )
-from mcaprl.recorder.dataset.image_cache import Storage, fingerprint
-from mcaprl.recorder.dataset.images import read_images
-from mcaprl.recorder.dataset.mapped import Frames
-from mcaprl.recorder.dataset.origin import Origin
-from mcaprl.recorder.dataset.transitions import Transitions, ranges
+from mcaprl.recorder.dataset.images import Frames, Storage, fingerprint, read_images
+from mcaprl.recorder.dataset.transitions import Origin, Transitions, ranges
 from mcaprl.recorder.format.behavior import FIELDS, behavior_field
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.infos import read_infos
+from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.reading import LOG_TIME, Columns, McapReader, Topic
-from mcaprl.recorder.format.schema import is_intact, stored_dtype
+from mcaprl.recorder.format.schema import EPISODE_TOPIC, STEP_TOPIC, is_intact, stored_dtype
 from mcaprl.recorder.format.spaces import (
     IMAGE_ENCODINGS,
     Leaf,
@@ -60,7 +57,6 @@ from mcaprl.recorder.format.spaces import (
     restricted,
     select,
 )
-from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 
 _OBSERVATION, _STATE, _IMAGE_TOPIC = "observation", "observation_state", "/rl/observation/"
 

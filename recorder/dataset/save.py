@@ -12,13 +12,12 @@ import numpy as np
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.files import replacing
 from mcaprl.recorder.dataset.arrays import with_fresh_times
-from mcaprl.recorder.dataset.mapped import Frames
+from mcaprl.recorder.dataset.images import Frames
 from mcaprl.recorder.dataset.transitions import Transitions
-from mcaprl.recorder.format.info_topics import InfoTopics, info_array
-from mcaprl.recorder.format.log_writer import LogWriter
+from mcaprl.recorder.format.log_writer import InfoTopics, LogWriter, info_array
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
+from mcaprl.recorder.format.schema import STEPS_PER_CHUNK
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
-from mcaprl.recorder.format.topics import STEPS_PER_CHUNK
 
 
 def save_log(

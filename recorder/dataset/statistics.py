@@ -21,7 +21,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.actions import joint_actions
-from mcaprl.recorder.dataset.mapped import Frames, MappedImages, blocks_of
+from mcaprl.recorder.dataset.images import Frames, MappedImages, blocks_of
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.behavior import PROBABILITY
 from mcaprl.recorder.format.spaces import Leaf

@@ -7,18 +7,59 @@ stored twice.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import SpaceError
-from mcaprl.recorder.dataset.mapped import Frames, joined, rows_of
+from mcaprl.actions import MASK_KEY, OBSERVATION_KEY, info_name
+from mcaprl.errors import SpaceError, UnknownNameError
+from mcaprl.recorder.dataset.images import Frames, joined, rows_of
 from mcaprl.recorder.format.behavior import BehaviorField
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.infos import Masked, is_exact, kind_of
+from mcaprl.recorder.format.messages import EpisodeSummary
+from mcaprl.recorder.format.metadata import LogMetadata
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Files and mapping of a dataset.
+
+    Attributes:
+        sources: Files that the data was read from.
+        logs: Absolute path and weight of each log if the dataset has all of their episodes
+            unchanged, else empty. Other processes read the data again from these logs.
+        mapping: Keys and values of the mapping that the data was read by, as JSON types.
+        report: Report of the mapping on what was read and what was left out.
+        grow: Function that returns the data with the episodes that have ended since; None if the
+            logs are not followed.
+    """
+
+    sources: tuple[Path, ...] = ()
+    logs: tuple[tuple[Path, float], ...] = ()
+    mapping: Mapping[str, Any] | None = None
+    report: Any = None
+    grow: Callable[[], Any] | None = None
+
+    @classmethod
+    def common(cls, origins: Sequence[Origin]) -> Origin:
+        """Return the origin of concatenated datasets."""
+        mappings = [one.mapping for one in origins]
+        return cls(
+            tuple(path for one in origins for path in one.sources),
+            tuple(log for one in origins for log in one.logs if all(o.logs for o in origins)),
+            mappings[0] if all(mapping == mappings[0] for mapping in mappings) else None,
+        )
+
+    def changed(self) -> Origin:
+        """Return the origin of a dataset with other episodes or values."""
+        return Origin(self.sources, mapping=self.mapping, report=self.report)
+
 
 STEP_COLUMNS = ("actions", "rewards", "terminated", "truncated", "behavior")
 """The columns with one row per transition."""
@@ -179,3 +220,148 @@ def ranges(starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> NDArray[np.
     """Return the concatenated indexes of ranges that start at `starts` and have these lengths."""
     ends = np.cumsum(lengths)
     return np.repeat(starts - (ends - lengths), lengths) + np.arange(int(lengths.sum()))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Episode:
+    """One episode of T transitions; its arrays are views into the Dataset.
+
+    Attributes:
+        index: Index in the Dataset, from 0.
+        observations: (T, *shape), or nested dicts of such arrays.
+        actions: (T,) int64, or (T, *shape).
+        rewards: (T,) float64.
+        terminated: (T,) bool; only the last element can be set.
+        truncated: (T,) bool; only the last element can be set.
+        next_observations: Next observations, in the form of `observations`.
+        behavior: (T,) float32 probability of each action under the behavior policy, or natural
+            logarithm of its density if actions are floats; NaN where unknown.
+        behavior_field: Meaning of `behavior`.
+        log_time_ns: (T + 1,) log_time of each observation, nanoseconds.
+        summary: The log's summary of the episode: seed, end reason, policy, ...
+        infos: (T + 1, *shape) masked array of each info by its dotted name; see `Dataset.infos`.
+    """
+
+    index: int
+    observations: Any
+    actions: NDArray[Any]
+    rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    next_observations: Any
+    behavior: NDArray[np.float32]
+    behavior_field: BehaviorField
+    log_time_ns: NDArray[np.int64]
+    summary: EpisodeSummary
+    infos: Mapping[str, Masked] = field(default_factory=dict)
+
+    @property
+    def length(self) -> int:
+        """Number of transitions."""
+        return len(self.rewards)
+
+    @property
+    def behavior_probs(self) -> NDArray[np.float32]:
+        """(T,) float32 probabilities; see `Dataset.behavior_probs`."""
+        return self.behavior_field.probs(self.behavior)
+
+    @property
+    def behavior_log_probs(self) -> NDArray[np.float32]:
+        """(T,) float32 logarithms; see `Dataset.behavior_log_probs`."""
+        return self.behavior_field.log_probs(self.behavior)
+
+    @property
+    def total_reward(self) -> float:
+        """Undiscounted return."""
+        return self.summary.total_reward
+
+    @property
+    def reason(self) -> str:
+        """Reason of the episode's end, as the environment reported it."""
+        return self.summary.reason
+
+    @property
+    def seed(self) -> int | None:
+        """Seed passed to `reset`; None if there was none."""
+        return self.summary.seed
+
+    @property
+    def policy(self) -> str:
+        """Name of the behavior policy."""
+        return self.summary.policy
+
+    @property
+    def epsilon(self) -> float:
+        """Probability of a random action; NaN if unknown."""
+        return self.summary.epsilon
+
+    def __len__(self) -> int:
+        """Return the number of transitions."""
+        return self.length
+
+    def __repr__(self) -> str:
+        """Return a summary with shapes instead of arrays."""
+        return (
+            f"Episode(index={self.index}, length={self.length},"
+            f" total_reward={self.total_reward:.6g}, reason={self.reason!r}, seed={self.seed},"
+            f" observations={shapes(self.observations)}, actions={shapes(self.actions)})"
+        )
+
+
+# Reprs and pickles name the class by this public import path.
+Episode.__module__ = "mcaprl"
+
+
+def shapes(array: Any) -> str:
+    """Format the shape and dtype of an array, or of each array in nested dicts."""
+    if isinstance(array, dict):
+        return "{" + ", ".join(f"{key}: {shapes(part)}" for key, part in array.items()) + "}"
+    return f"<{'x'.join(map(str, array.shape))} {array.dtype}>"
+
+
+def with_mask(
+    columns: Transitions, description: LogMetadata, source: str
+) -> tuple[Transitions, LogMetadata]:
+    """Add the flags of the allowed actions to the observations.
+
+    Returns:
+        The columns and metadata of Dict observations, whose part `observation` is the original one.
+    """
+    space = description.observation_space
+    if isinstance(space, spaces.Dict) and MASK_KEY in space.spaces:
+        raise SpaceError(f"the observations already have a part {MASK_KEY}: omit mask_from")
+    name = info_name(source)
+    flags = _part(columns, description, source) if name is None else _info(columns, name)
+    if flags.ndim != 2 or not np.isin(flags, (0, 1)).all():
+        raise SpaceError(f"{source} is no action mask: expected one flag (0 or 1) for each action")
+    masked = spaces.Dict([(OBSERVATION_KEY, space), (MASK_KEY, spaces.MultiBinary(flags.shape[1]))])
+    return (
+        dataclasses.replace(columns, frames=(*columns.frames, flags.astype(np.int8))),
+        dataclasses.replace(description, observation_space=masked, observation_names=()),
+    )
+
+
+def _part(columns: Transitions, description: LogMetadata, source: str) -> NDArray[Any]:
+    names = {"/".join(leaf.path): k for k, leaf in enumerate(description.leaves) if leaf.path}
+    if source not in names:
+        raise UnknownNameError("part of the observation", source, names)
+    return np.asarray(columns.frames[names[source]])
+
+
+def _info(columns: Transitions, name: str) -> NDArray[Any]:
+    """Return an info (F, A); all actions are allowed in terminal states without the info."""
+    if name not in columns.infos:
+        raise UnknownNameError("info", name, columns.infos)
+    info = columns.infos[name]
+    missing = np.ma.getmaskarray(info).reshape(len(info), -1).any(1)
+    last = columns.first_frames + columns.lengths
+    ends = columns.terminated[columns.first_steps + columns.lengths - 1]
+    needed = np.ones(len(info), bool)
+    needed[last[ends]] = False
+    if (missing & needed).any():
+        frame = int((missing & needed).argmax())
+        raise SpaceError(
+            f"the environment returned no info {name} with frame {frame}: it must return one with"
+            " each observation, also in reset"
+        )
+    return np.where(missing.reshape(-1, *[1] * (info.ndim - 1)), 1, np.ma.getdata(info))

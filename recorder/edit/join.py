@@ -35,6 +35,7 @@ from mcaprl.recorder.format.reading import (
     definitions_of,
     full_name,
 )
+from mcaprl.recorder.format.schema import STEP_TOPIC
 from mcaprl.recorder.format.selected_copy import (
     NewTopics,
     Source,
@@ -42,7 +43,6 @@ from mcaprl.recorder.format.selected_copy import (
     copy_selected,
     times_of,
 )
-from mcaprl.recorder.format.topics import STEP_TOPIC
 
 _NS_PER_S = 10**9
 _TIME = "builtin_interfaces/msg/Time"

@@ -21,11 +21,9 @@ from mcaprl.files import replacing, replacing_folder
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 from mcaprl.recorder.edit.source import Edited, FinishedLog
 from mcaprl.recorder.format import messages
-from mcaprl.recorder.format.episode_summary import INTERRUPTED, EpisodeSummary, add_up
-from mcaprl.recorder.format.rows import Part, Shorten
-from mcaprl.recorder.format.schema import message_dtype
+from mcaprl.recorder.format.messages import INTERRUPTED, EpisodeSummary, add_up
+from mcaprl.recorder.format.schema import EPISODE_TOPIC, STEP_TOPIC, Part, Shorten, message_dtype
 from mcaprl.recorder.format.selected_copy import Source, copy_selected
-from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 from mcaprl.recorder.mapping.expression import Column, Expression
 from mcaprl.texts import counted
 

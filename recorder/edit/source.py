@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NoStepsError
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.format.schema import PHASE_TOPIC, STEP_TOPIC
 from mcaprl.recorder.format.selected_copy import Times, times_of
-from mcaprl.recorder.format.topics import PHASE_TOPIC, STEP_TOPIC
 from mcaprl.recorder.format.writing import finished_state
 from mcaprl.recorder.record.display import CAMERA_INFO, SCENE, SCENE_STATIC, TF, TF_STATIC
 from mcaprl.storage.remote import as_path

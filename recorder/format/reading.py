@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from mcaprl.recorder.columns.cdr import ROS_TO_NUMPY
 from mcaprl.recorder.columns.chunks import Scratch, chunk_header
-from mcaprl.recorder.columns.decoder import Columns, Decoder
-from mcaprl.recorder.columns.definition_text import full_name, parsed_types
 from mcaprl.recorder.columns.definitions import (
     ROS1,
     UNREADABLE,
     TypeSource,
     definitions_of,
+    full_name,
     leaf_kinds,
+    parsed_types,
 )
 from mcaprl.recorder.columns.file_check import check_chunk, check_file, check_statistics, place
-from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, MessageRange
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import prefetch, release
-from mcaprl.recorder.columns.salvage import Damage
-from mcaprl.recorder.columns.topic import LOG_TIME, Topic
+from mcaprl.recorder.columns.records import MESSAGE_HEADER, MessageRange, prefetch, release
+from mcaprl.recorder.columns.topic import LOG_TIME, Columns, Decoder, Topic
 
 __all__ = [
     "LOG_TIME",
@@ -27,7 +25,6 @@ __all__ = [
     "ROS_TO_NUMPY",
     "UNREADABLE",
     "Columns",
-    "Damage",
     "Decoder",
     "McapReader",
     "MessageRange",

@@ -19,20 +19,21 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.recorder.columns.chunks import Scratch
-from mcaprl.recorder.columns.message_rows import (
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.records import (
     INDEX_ENTRY,
+    MAGIC,
     MESSAGE_HEADER,
+    RECORD_HEADER,
     RECORD_HEADER_BYTES,
+    contents_of,
     message_index,
 )
-from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import MAGIC, RECORD_HEADER, contents_of
+from mcaprl.recorder.columns.salvage import writer_like
 from mcaprl.recorder.columns.summary import TopLevelRecord
-from mcaprl.recorder.columns.valid_copy import writer_like
 from mcaprl.recorder.columns.writer import McapWriter
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
-from mcaprl.recorder.format.messages import EPISODE_TEXT, EPISODE_TYPE
-from mcaprl.recorder.format.topics import EPISODE_TOPIC
+from mcaprl.recorder.format.messages import EPISODE_TEXT, EPISODE_TYPE, EpisodeSummary
+from mcaprl.recorder.format.schema import EPISODE_TOPIC
 
 Times = NDArray[np.int64]
 Change = Callable[[Channel, int, memoryview], None]

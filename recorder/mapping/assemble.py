@@ -13,18 +13,19 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.image_cache import Storage
-from mcaprl.recorder.dataset.mapped import Frames
-from mcaprl.recorder.dataset.origin import Origin
-from mcaprl.recorder.dataset.transitions import Transitions
-from mcaprl.recorder.format.action_commands import ActionCommands, Command
+from mcaprl.recorder.dataset.images import Frames, Storage
+from mcaprl.recorder.dataset.transitions import Origin, Transitions
 from mcaprl.recorder.format.behavior import behavior_field
-from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
-from mcaprl.recorder.format.metadata import MAX_NUMBERED_ACTIONS, LogMetadata
+from mcaprl.recorder.format.messages import EpisodeSummary, add_up
+from mcaprl.recorder.format.metadata import (
+    MAX_NUMBERED_ACTIONS,
+    ActionCommands,
+    Command,
+    LogMetadata,
+)
 from mcaprl.recorder.format.spaces import leaves_of
-from mcaprl.recorder.mapping.align import NS_PER_S
+from mcaprl.recorder.mapping.align import NS_PER_S, as_numbers
 from mcaprl.recorder.mapping.config import Action, Limits, Quantity
-from mcaprl.recorder.mapping.paths import as_numbers
 from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.runs import Segment
 from mcaprl.recorder.mapping.steps import Steps

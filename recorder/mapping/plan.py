@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag
-from mcaprl.recorder.mapping.align import TopicStream
+from mcaprl.recorder.mapping.align import TopicStream, topic_of
 from mcaprl.recorder.mapping.config import (
     Clock,
     Mapping,
@@ -22,9 +22,8 @@ from mcaprl.recorder.mapping.config import (
     TimeSource,
 )
 from mcaprl.recorder.mapping.expression import Expression
-from mcaprl.recorder.mapping.images.reader import ImageReader
+from mcaprl.recorder.mapping.images import ImageReader
 from mcaprl.recorder.mapping.observe import Source, source_of
-from mcaprl.recorder.mapping.paths import topic_of
 
 Columns = MappingOf[str, NDArray[Any]]
 Reward = Callable[[Columns, NDArray[np.int64]], NDArray[np.float64]]

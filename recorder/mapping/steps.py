@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.format.behavior import PROBABILITY, BehaviorField, behavior_field
-from mcaprl.recorder.mapping.actions import Actions, CommandPart, actions_of
-from mcaprl.recorder.mapping.align import NS_PER_S, time_order
+from mcaprl.recorder.mapping.actions import Actions, CommandPart, actions_of, unit_of
+from mcaprl.recorder.mapping.align import NS_PER_S, as_numbers, time_order
 from mcaprl.recorder.mapping.config import Stamp, TimeSource
 from mcaprl.recorder.mapping.expression import Expression
 from mcaprl.recorder.mapping.observe import Values, pose_of, values_of
-from mcaprl.recorder.mapping.paths import as_numbers
 from mcaprl.recorder.mapping.plan import Plan, Wanted
-from mcaprl.recorder.mapping.poses.transforms import Transforms
 from mcaprl.recorder.mapping.runs import (
     Marks,
     Messages,
@@ -34,7 +32,7 @@ from mcaprl.recorder.mapping.runs import (
     runs_of,
     segments,
 )
-from mcaprl.recorder.mapping.units import unit_of
+from mcaprl.recorder.mapping.transforms import Transforms
 
 _Times = NDArray[np.int64]
 

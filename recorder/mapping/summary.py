@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.problem import Problem
-from mcaprl.recorder.format.action_commands import Command
+from mcaprl.recorder.format.metadata import Command
 from mcaprl.texts import counted
 
 Floats = NDArray[np.float64]

@@ -20,8 +20,8 @@ import warnings
 from collections.abc import Sequence
 from operator import itemgetter
 
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.log_writer import LogTopics
+from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.schema import telemetry_message, telemetry_schema
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.layout import RETURN_SO_FAR

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mcaprl.recorder.format.info_topics import InfoTopics, flat_infos, info_array
+from mcaprl.recorder.format.log_writer import InfoTopics, flat_infos, info_array
 from mcaprl.recorder.record.array_types import as_array, is_other_array
 
 

@@ -14,10 +14,9 @@ from typing import Any
 
 from gymnasium import spaces
 
-from mcaprl.recorder.format.episode_summary import INTERRUPTED
+from mcaprl.recorder.format.messages import INTERRUPTED
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.spaces import observation_leaves
-from mcaprl.recorder.format.topics import (
+from mcaprl.recorder.format.schema import (
     EPISODE_TOPIC,
     IMAGE_FRAME,
     LOG_TOPIC,
@@ -25,6 +24,7 @@ from mcaprl.recorder.format.topics import (
     RUNNING,
     STEP_TOPIC,
 )
+from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.record import panels
 from mcaprl.recorder.record.panels import Node, Panel
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.recorder.format import messages
-from mcaprl.recorder.format.topics import IMAGE_FRAME
+from mcaprl.recorder.format.schema import IMAGE_FRAME
 
 Vector = tuple[float, float, float]
 Quad = tuple[float, float, float, float]

@@ -23,11 +23,11 @@ from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.files import check_target, locked_file
 from mcaprl.limits import MAX_TIME_NS
 from mcaprl.recorder.format import messages
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.log_writer import LogWriter
+from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader, Topic
-from mcaprl.recorder.format.topics import LOG_TOPIC, PHASE_TOPIC, STEP_TOPIC
+from mcaprl.recorder.format.schema import LOG_TOPIC, PHASE_TOPIC, STEP_TOPIC
 from mcaprl.recorder.record.display import Display
 from mcaprl.recorder.record.layout import LAYOUT_NAME, layout_bytes, layout_of
 from mcaprl.texts import encodable

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError
-from mcaprl.recorder.format.episode_summary import add_up
 from mcaprl.recorder.format.log_writer import LogTopics
+from mcaprl.recorder.format.messages import add_up
 from mcaprl.recorder.format.spaces import Leaf
 from mcaprl.recorder.record.array_types import as_array
 from mcaprl.recorder.record.recorded_space import RecordedSpace

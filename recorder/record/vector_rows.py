@@ -13,8 +13,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
-from mcaprl.recorder.format.rows import StepRows, TopicRows, part_of
+from mcaprl.recorder.format.messages import EpisodeSummary
+from mcaprl.recorder.format.schema import StepRows, TopicRows, part_of
 
 # Limits of the initial capacity: number of rows, and number of bytes per environment. The capacity
 # doubles when an episode needs more.

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.format.behavior import behavior_field
-from mcaprl.recorder.format.episode_summary import INTERRUPTED, EpisodeSummary
-from mcaprl.recorder.format.info_topics import InfoTopics
+from mcaprl.recorder.format.log_writer import InfoTopics
+from mcaprl.recorder.format.messages import INTERRUPTED, EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.rows import TopicRows
+from mcaprl.recorder.format.schema import TopicRows
 from mcaprl.recorder.format.spaces import action_leaf
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.array_types import (

@@ -19,8 +19,8 @@ import numpy as np
 
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.format.behavior import behavior_field
-from mcaprl.recorder.format.episode_summary import INTERRUPTED
-from mcaprl.recorder.format.info_topics import InfoTopics
+from mcaprl.recorder.format.log_writer import InfoTopics
+from mcaprl.recorder.format.messages import INTERRUPTED
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import action_leaf
 from mcaprl.recorder.format.writing import HoldSignals

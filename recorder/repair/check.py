@@ -38,7 +38,6 @@ from mcaprl.errors import (
 from mcaprl.problem import LISTED, Problem, Shortlist
 from mcaprl.recorder.bags.bag import Bag, open_bag
 from mcaprl.recorder.bags.files import is_bag_file
-from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.episodes import (
     COUNTERS,
     EpisodeTopic,
@@ -47,8 +46,9 @@ from mcaprl.recorder.dataset.episodes import (
     summaries_of_records,
 )
 from mcaprl.recorder.dataset.log_reader import LogReader, described
+from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.behavior import FIELDS
-from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
+from mcaprl.recorder.format.messages import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.reading import (
     LOG_TIME,
@@ -63,9 +63,13 @@ from mcaprl.recorder.format.reading import (
     check_statistics,
     place,
 )
-from mcaprl.recorder.format.schema import earlier_step_schemas, step_schema
+from mcaprl.recorder.format.schema import (
+    EPISODE_TOPIC,
+    STEP_TOPIC,
+    earlier_step_schemas,
+    step_schema,
+)
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves, outside, part_names
-from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 from mcaprl.storage.remote import RemotePath, as_path
 from mcaprl.texts import counted
 

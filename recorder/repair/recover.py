@@ -29,21 +29,18 @@ from mcaprl.errors import CorruptLogError, LogError, NoEpisodesError, NoStepsErr
 from mcaprl.files import locked_file, replacing
 from mcaprl.problem import Problem, Shortlist
 from mcaprl.recorder.dataset.log_reader import described
-from mcaprl.recorder.format.episode_summary import INTERRUPTED, EpisodeSummary, add_up
+from mcaprl.recorder.format.messages import INTERRUPTED, EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import METADATA_NAME
 from mcaprl.recorder.format.reading import (
     LOG_TIME,
     Columns,
-    Damage,
     McapReader,
     Topic,
 )
-from mcaprl.recorder.format.rows import Part, Shorten
-from mcaprl.recorder.format.schema import message_dtype
+from mcaprl.recorder.format.schema import EPISODE_TOPIC, STEP_TOPIC, Part, Shorten, message_dtype
 from mcaprl.recorder.format.selected_copy import Copied, Source, copy_selected, within
 from mcaprl.recorder.format.spaces import observation_leaves
-from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
-from mcaprl.recorder.format.writing import finished_state, recover_file
+from mcaprl.recorder.format.writing import Damage, finished_state, recover_file
 from mcaprl.recorder.repair.check import IMPOSSIBLE_ACTION, check_log
 from mcaprl.storage.remote import as_path
 from mcaprl.texts import counted

@@ -18,11 +18,11 @@ from mcap.records import Attachment
 from mcaprl.errors import LogError, UsageError
 from mcaprl.files import replacing
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.log_reader import describe
+from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.log_writer import LogWriter
 from mcaprl.recorder.format.reading import McapReader
-from mcaprl.recorder.format.topics import LOG_TOPIC
+from mcaprl.recorder.format.schema import LOG_TOPIC
 from mcaprl.recorder.record.display import SCENE, Display
 from mcaprl.recorder.record.layout import LAYOUT_NAME, VALUES_TOPIC, layout_bytes
 from mcaprl.recorder.viewer.log_layout import layout_of_log

@@ -26,13 +26,18 @@ from mcap.records import Schema
 from numpy.typing import NDArray
 
 from mcaprl.recorder.format import messages
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.log_writer import LogTopics, Message, MessageSink
+from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.rows import ImageRows, TopicRows
-from mcaprl.recorder.format.schema import telemetry_message, telemetry_schema
+from mcaprl.recorder.format.schema import (
+    LOG_TOPIC,
+    PHASE_TOPIC,
+    ImageRows,
+    TopicRows,
+    telemetry_message,
+    telemetry_schema,
+)
 from mcaprl.recorder.format.spaces import observation_leaves
-from mcaprl.recorder.format.topics import LOG_TOPIC, PHASE_TOPIC
 from mcaprl.recorder.record.display import (
     DEPTH,
     SCENE,

@@ -17,7 +17,7 @@ from typing import Any
 
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.reading import McapReader
-from mcaprl.recorder.format.topics import EPISODE_TOPIC, LOG_TOPIC
+from mcaprl.recorder.format.schema import EPISODE_TOPIC, LOG_TOPIC
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT, ViewerServer
 from mcaprl.recorder.viewer.playback import Played, Player
 

@@ -15,8 +15,8 @@ from mcaprl.figures import COLORS, INK, PALE, Panel, save_panels, tick_labels, t
 from mcaprl.page import Card, Figure, Section, Table, write_page
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.statistics import calibration
+from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.record.display import TELEMETRY

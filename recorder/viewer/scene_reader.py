@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
-from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.display import SCENE, SCENE_STATIC, TF, TF_STATIC

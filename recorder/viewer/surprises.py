@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.recorder.format.reading import Columns, McapReader, Topic
-from mcaprl.recorder.format.topics import STEP_TOPIC
+from mcaprl.recorder.format.schema import STEP_TOPIC
 from mcaprl.recorder.record.layout import is_values_topic
 
 _OF_ACTIONS = ("td_error", "advantage", "entropy", "agrees")

@@ -22,8 +22,8 @@ from mcaprl.frames import rows_of
 from mcaprl.limits import STEP_LIMIT
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.episode import Episode
-from mcaprl.recorder.format.episode_summary import INTERRUPTED
+from mcaprl.recorder.dataset.transitions import Episode
+from mcaprl.recorder.format.messages import INTERRUPTED
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 from mcaprl.recorder.record.recorded_space import recorded_like, value_at
 from mcaprl.recorder.record.step_rows import as_declared

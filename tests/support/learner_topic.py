@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
 from mcaprl.recorder.format.reading import McapReader, Topic
-from mcaprl.recorder.format.topics import LEARNER_TOPIC
+from mcaprl.recorder.format.schema import LEARNER_TOPIC
 
 
 @dataclass(frozen=True, eq=False)

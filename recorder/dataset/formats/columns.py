@@ -1,32 +1,82 @@
-"""Conversion of separate arrays for each episode, as in most formats, to a dataset."""
+"""Conversion of separate arrays for each episode, as in most formats, to a dataset.
+
+In a row for which the environment returned no info, a float is stored as NaN, and a string as the
+empty string. If integers or flags have such rows, all their values are stored as floats, with NaN
+in these rows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError
-from mcaprl.limits import MAX_TIME_NS
-from mcaprl.recorder.dataset.arrays import with_fresh_times
-from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.transitions import Transitions, joined_infos
-from mcaprl.recorder.dataset.values import (
+from mcaprl.limits import (
+    ARRAY_COST_BYTES,
+    MAX_TIME_NS,
+    MAX_UNPACKED_RATIO,
+    UNPACKED_ALLOWANCE_BYTES,
+)
+from mcaprl.recorder.dataset.arrays import (
     behavior_of,
     check_finite,
     check_inside,
     exactly,
     numbers,
     rewards_of,
+    with_fresh_times,
 )
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.transitions import Transitions, joined_infos
 from mcaprl.recorder.format.behavior import BehaviorField, behavior_field
-from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up, summary_of
+from mcaprl.recorder.format.messages import EpisodeSummary, add_up, summary_of
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
-from mcaprl.texts import shortened
+from mcaprl.texts import printable, shortened, size
+
+_MAX_SHOWN = 80
+
+
+class Budget:
+    """Bytes that the arrays of a file or folder may take in memory.
+
+    Files can declare arrays of any size, and compression can make large arrays of few bytes.
+
+    Attributes:
+        where: Name of the source, for errors.
+    """
+
+    def __init__(self, where: object, stored_bytes: int) -> None:
+        """Create a budget in proportion to the size of the source."""
+        self.where, self._stored = where, stored_bytes
+        self._left = UNPACKED_ALLOWANCE_BYTES + MAX_UNPACKED_RATIO * stored_bytes
+
+    @classmethod
+    def of_files(cls, where: object, files: Sequence[Path]) -> Budget:
+        """Create a budget for files."""
+        try:
+            return cls(where, sum(file.stat().st_size for file in files))
+        except OSError as error:
+            raise LogError(f"{where} cannot be read: {error}") from error
+
+    def take(self, name: str, shape: Sequence[int], item_bytes: int) -> None:
+        """Subtract an array before it is read."""
+        count = math.prod(shape)
+        self._left -= count * item_bytes + ARRAY_COST_BYTES
+        if self._left < 0:
+            declared = shortened(str(tuple(shape)), _MAX_SHOWN)
+            raise LogError(
+                f"{self.where}: {printable(name)} has shape {declared}, which is too large for the"
+                f" {size(self._stored)} that are stored: unpack the data, or divide it into several"
+                " files"
+            )
 
 
 @dataclass(frozen=True)
@@ -237,3 +287,91 @@ def _summary(index: int, episode: EpisodeArrays) -> EpisodeSummary:
             "end_time_ns": 0 if times is None else int(times[-1]),
         }
     )
+
+
+NO_NAME = r"[/\0\ud800-\udfff]"
+"""Pattern of the characters that names in archives and HDF5 files do not have."""
+# Floats cannot represent larger integers exactly.
+_MAX_EXACT = 2**53
+
+
+def stored_infos(infos: Mapping[str, Any]) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    """Return the values (F, *shape) to store by name, and a sentence for each info left out."""
+    found, lost = {}, []
+    for name, values in infos.items():
+        stored = _stored(values)
+        if isinstance(stored, str):
+            lost.append(f"the info '{name}' is left out, because {stored}")
+        else:
+            found[name] = stored
+    return found, lost
+
+
+def missing_rows(values: Any) -> NDArray[np.bool_]:
+    """Return flags (F,): whether the environment returned no info for the row."""
+    mask = np.ma.getmaskarray(values)
+    found = np.zeros(len(mask), bool)
+    if mask.size:
+        found[:] = mask.reshape(len(mask), -1).any(axis=1)
+    return found
+
+
+def masked(values: NDArray[Any], is_missing: NDArray[np.bool_]) -> np.ma.MaskedArray[Any, Any]:
+    """Return an info (F, *shape) whose rows are masked where `is_missing` (F,) is set."""
+    mask = np.broadcast_to(is_missing.reshape(-1, *[1] * (values.ndim - 1)), values.shape)
+    return np.ma.MaskedArray(values, mask.copy())
+
+
+def info_type(text: str) -> np.dtype[Any]:
+    """Return the dtype with this name."""
+    try:
+        dtype = np.dtype(text)
+    except TypeError as error:
+        raise ValueError(f"unknown dtype {text!r}") from error
+    if dtype.kind not in "biufU":
+        raise ValueError(f"dtype {text!r}")
+    return dtype
+
+
+def nested_names(names: Iterable[str]) -> tuple[dict[str, tuple[str, ...]], list[str]]:
+    """Split each dotted name into the names of nested groups and of an array.
+
+    Returns:
+        The parts of each name, and one sentence for each name that cannot be split.
+    """
+    found: dict[str, tuple[str, ...]] = {}
+    lost = []
+    every = set(names)
+    for name in sorted(every):
+        parts = tuple(name.split("."))
+        is_group = any(other.startswith(f"{name}.") for other in every)
+        if is_group or not all(parts) or re.search(NO_NAME, name):
+            reason = "its name is not valid in HDF5"
+            if is_group:
+                reason = f"another name starts with '{name}.'"
+            lost.append(f"the info '{name}' is left out, because {reason}")
+        else:
+            found[name] = parts
+    return found, lost
+
+
+def _stored(values: Any) -> NDArray[Any] | str:
+    """Return the values to store, or the reason why they cannot be stored."""
+    data, mask, is_missing = np.ma.getdata(values), np.ma.getmaskarray(values), missing_rows(values)
+    if data.dtype.kind not in "biufU":
+        return f"values of dtype {data.dtype} cannot be stored"
+    if data.dtype.kind == "U":
+        if any(re.search(r"[\0\ud800-\udfff]", text) for text in data[~is_missing].ravel()):
+            return "a text is not UTF-8"
+        return np.where(mask, "", data)
+    if not is_missing.any():
+        return data
+    if data.dtype.kind == "f":
+        return np.where(mask, np.nan, data).astype(data.dtype)
+    if data.dtype.kind in "iu" and _is_large(data[~is_missing]):
+        return "some rows are missing, and the integers are too large for floats"
+    return np.where(mask, np.nan, data.astype(np.float64))
+
+
+def _is_large(values: NDArray[Any]) -> bool:
+    return bool(values.size) and max(int(values.max()), -int(values.min())) > _MAX_EXACT

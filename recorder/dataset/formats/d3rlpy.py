@@ -26,13 +26,11 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, MissingExtraError, SpaceError, UsageError, import_extra
-from mcaprl.recorder.dataset.arrays import action_space_of, box_of
+from mcaprl.recorder.dataset.arrays import action_space_of, box_of, exactly, flags, numbers
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats import hdf5_nodes as nodes
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
-from mcaprl.recorder.dataset.formats.ends import Kind
-from mcaprl.recorder.dataset.formats.flat import NAMES, FlatOptions, flat_dataset, unread_note
-from mcaprl.recorder.dataset.values import exactly, flags, numbers
+from mcaprl.recorder.dataset.formats.flat import NAMES, FlatOptions, Kind, flat_dataset, unread_note
 from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
 from mcaprl.recorder.format.spaces import (
     MIN_IMAGE_EDGE,

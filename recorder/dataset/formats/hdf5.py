@@ -18,23 +18,26 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError, import_extra
-from mcaprl.recorder.dataset.arrays import description_of
+from mcaprl.recorder.dataset.arrays import description_of, flags
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats import hdf5_nodes as nodes
-from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
-from mcaprl.recorder.dataset.formats.ends import Kind
+from mcaprl.recorder.dataset.formats.columns import (
+    EpisodeArrays,
+    dataset_of,
+    nested_names,
+    stored_infos,
+)
 from mcaprl.recorder.dataset.formats.flat import (
     INFOS,
     NAMES,
     FlatOptions,
+    Kind,
     flat_dataset,
     joined_trees,
     named_leaves,
     rows_of_tree,
     unread_note,
 )
-from mcaprl.recorder.dataset.formats.infos import nested_names, stored_infos
-from mcaprl.recorder.dataset.values import flags
 from mcaprl.recorder.format.spaces import leaves_of
 from mcaprl.texts import counted
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, McaprlError, import_extra
 from mcaprl.files import open_at_once
 from mcaprl.limits import MAX_NESTED_GROUPS, MAX_READ_RATIO, UNPACKED_ALLOWANCE_BYTES
-from mcaprl.recorder.dataset.formats.budget import Budget
+from mcaprl.recorder.dataset.formats.columns import Budget
 from mcaprl.texts import printable
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"

@@ -35,12 +35,16 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, McaprlError, SpaceError
 from mcaprl.limits import MAX_NPY_HEADER_BYTES
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.formats.budget import Budget
-from mcaprl.recorder.dataset.formats.columns import episode_slices
-from mcaprl.recorder.dataset.formats.ends import Kind
-from mcaprl.recorder.dataset.formats.flat import FINALS, INFOS, NAMES, FlatOptions, flat_dataset
+from mcaprl.recorder.dataset.formats.columns import NO_NAME, Budget, episode_slices, stored_infos
+from mcaprl.recorder.dataset.formats.flat import (
+    FINALS,
+    INFOS,
+    NAMES,
+    FlatOptions,
+    Kind,
+    flat_dataset,
+)
 from mcaprl.recorder.dataset.formats.hdf5_nodes import with_names_for_hdf5
-from mcaprl.recorder.dataset.formats.infos import NO_NAME, stored_infos
 from mcaprl.recorder.format.metadata import NO_TIMES
 from mcaprl.recorder.format.spaces import leaves_of
 from mcaprl.texts import printable, shortened

@@ -22,11 +22,11 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader, Topic
+from mcaprl.recorder.format.schema import LOG_TOPIC
 from mcaprl.recorder.format.spaces import observation_leaves
-from mcaprl.recorder.format.topics import LOG_TOPIC
 from mcaprl.recorder.record.display import (
     DEPTH,
     SCENE,

@@ -10,7 +10,7 @@ import pytest
 from gymnasium import spaces
 
 import mcaprl
-from mcaprl.recorder.dataset.mapped import MappedImages
+from mcaprl.recorder.dataset.images import MappedImages
 
 SPACE = spaces.Dict(
     {

@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from mcaprl.errors import LogError
 from mcaprl.recorder.bags.bag import open_bag
 from mcaprl.recorder.bags.decoders import JsonDecoder
-from mcaprl.recorder.mapping.paths import field_path
+from mcaprl.recorder.mapping.align import field_path
 from tests.support.bags import START_NS
 
 NUMBER = {"type": "number"}

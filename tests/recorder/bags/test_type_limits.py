@@ -12,7 +12,7 @@ import pytest
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.bag import open_bag
 from mcaprl.recorder.bags.decoders import RosDecoder
-from mcaprl.recorder.mapping.paths import field_path
+from mcaprl.recorder.mapping.align import field_path
 from tests.support.bags import Channel, write_channels
 
 LINE = f"\n{'=' * 80}\nMSG: "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mcaprl.recorder.columns import message_rows
+from mcaprl.recorder.columns import records
 from tests.conftest import need
 
 
@@ -12,6 +12,6 @@ from tests.conftest import need
 def each_copy(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run a test twice: with the compiled copy of messages, and with that of NumPy."""
     if request.param == "numpy":
-        monkeypatch.setattr(message_rows, "copy_fields", None)
+        monkeypatch.setattr(records, "copy_fields", None)
     else:
-        need(message_rows.copy_fields is not None, "the C extension was not built")
+        need(records.copy_fields is not None, "the C extension was not built")

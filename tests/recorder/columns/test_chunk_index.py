@@ -25,9 +25,8 @@ from mcaprl.recorder.columns.chunks import (
     indexes_of_one,
     parse_chunk_index,
 )
-from mcaprl.recorder.columns.message_rows import message_index
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import RECORD_HEADER
+from mcaprl.recorder.columns.records import RECORD_HEADER, message_index
 from mcaprl.recorder.columns.summary import Summary
 from tests.support.recordings import MIXED_SPACE, record
 

@@ -19,7 +19,7 @@ from mcap.records import ChunkIndex
 import mcaprl
 from mcaprl.errors import LogError
 from mcaprl.files import is_at, try_lock
-from mcaprl.recorder.columns import file_lock, output
+from mcaprl.recorder.columns import output
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.repair.check import check_log
 from tests.recorder.repair.test_faults_writes import FailingFile, failing
@@ -157,7 +157,7 @@ def test_the_last_steps_fail(
     assert len(mcaprl.open(log_path).episodes) == 6
     monkeypatch.undo()
     # Afterwards, the log is not locked.
-    file_lock.release(file_lock.reopen(log_path))
+    output.release(output.reopen(log_path))
 
 
 @pytest.mark.parametrize("writes", [0, 1, 2, 4, 6])
@@ -211,10 +211,10 @@ def test_readers_keep_the_old_file(log_path: Path, monkeypatch: pytest.MonkeyPat
     def look(*paths: Any) -> None:
         opened.append(McapReader(log_path))
         with pytest.raises(LogError, match="has an open recorder"):
-            file_lock.reopen(log_path)
+            output.reopen(log_path)
         replace(*paths)
         with pytest.raises(LogError, match="has an open recorder"):
-            file_lock.reopen(log_path)
+            output.reopen(log_path)
 
     monkeypatch.setattr(os, "replace", look)
     write_log(log_path, 6)
@@ -246,10 +246,10 @@ def test_a_writer_that_opened_the_old_file_gets_the_new_one(
             os.replace(other, log_path)
         return locked(descriptor)
 
-    monkeypatch.setattr(file_lock, "try_lock", replaced)
-    file = file_lock.reopen(log_path)
+    monkeypatch.setattr(output, "try_lock", replaced)
+    file = output.reopen(log_path)
     assert is_at(file.fileno(), log_path)
-    file_lock.release(file)
+    output.release(file)
 
 
 def test_links_and_modes_stay(tmp_path: Path) -> None:

@@ -11,8 +11,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Channel
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns.message_rows import message_record
-from mcaprl.recorder.columns.records import contents_of
+from mcaprl.recorder.columns.records import contents_of, message_record
 
 Messages = list[tuple[int, int, bytes]]
 MESSAGES = st.lists(

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import mcaprl
-from mcaprl.recorder.columns.message_rows import message_rows
 from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.records import message_rows
 from mcaprl.recorder.columns.writer import McapWriter
 from mcaprl.sims import make_sim
 

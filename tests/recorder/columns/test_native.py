@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 import mcaprl
 from mcaprl.errors import McaprlError
-from mcaprl.recorder.columns import message_rows
-from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, message_record
+from mcaprl.recorder.columns import records
 from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.records import INDEX_ENTRY, MESSAGE_HEADER, message_record
 from mcaprl.recorder.columns.topic import Topic
 from tests.conftest import need
 from tests.support.paths import FUZZ_CORPUS, GOLDEN
@@ -30,8 +30,8 @@ COUNT = 300
 
 
 def copy_fields(*arguments: Any) -> bool:
-    need(message_rows.copy_fields is not None, "the C extension was not built")
-    return message_rows.copy_fields(*arguments)
+    need(records.copy_fields is not None, "the C extension was not built")
+    return records.copy_fields(*arguments)
 
 
 def message(k: int) -> bytes:
@@ -167,7 +167,7 @@ def test_arguments_of_other_types_are_refused() -> None:
 )
 def test_numpy_reads_the_same(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both read the same values, and report the same problems or the same error."""
-    need(message_rows.copy_fields is not None, "the C extension was not built")
+    need(records.copy_fields is not None, "the C extension was not built")
     # The inputs of the fuzzer have other names.
     (tmp_path / "log.mcap").write_bytes(path.read_bytes())
 
@@ -186,5 +186,5 @@ def test_numpy_reads_the_same(path: Path, tmp_path: Path, monkeypatch: pytest.Mo
         return found
 
     compiled = read()
-    monkeypatch.setattr(message_rows, "copy_fields", None)
+    monkeypatch.setattr(records, "copy_fields", None)
     assert read() == compiled

@@ -12,8 +12,8 @@ from gymnasium import spaces
 import mcaprl
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.columns import output
-from mcaprl.recorder.columns.message_rows import INDEX_ENTRY
 from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.records import INDEX_ENTRY
 from tests.support.recordings import MIXED_SPACE, ScriptedEnv, record
 
 LENGTHS = [1, 5, 2, 40, 3] * 12

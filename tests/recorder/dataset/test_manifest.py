@@ -9,7 +9,7 @@ import pytest
 
 import mcaprl
 from mcaprl.errors import LogError
-from mcaprl.recorder.dataset.manifest import LogFile, write_manifest
+from mcaprl.recorder.dataset.open import LogFile, write_manifest
 from tests.support.damage.faults import write_log
 
 

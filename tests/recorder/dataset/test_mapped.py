@@ -13,9 +13,9 @@ from gymnasium import spaces
 
 import mcaprl
 from mcaprl.errors import CorruptLogError, UnknownNameError
-from mcaprl.recorder.dataset import image_cache as storage
-from mcaprl.recorder.dataset import mapped as mapped_images
-from mcaprl.recorder.dataset.mapped import MappedImages
+from mcaprl.recorder.dataset import images as mapped_images
+from mcaprl.recorder.dataset import images as storage
+from mcaprl.recorder.dataset.images import MappedImages
 from tests.recorder.dataset.test_selection import damage
 from tests.support.recordings import MIXED_SPACE, assert_same_bits, leaves_of, record
 

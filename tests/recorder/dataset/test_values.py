@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mcaprl import Dataset
 from mcaprl.errors import SpaceError
-from mcaprl.recorder.dataset.values import exactly, numbers
+from mcaprl.recorder.dataset.arrays import exactly, numbers
 
 
 def _dataset(**changes: Any) -> Dataset:

@@ -21,7 +21,7 @@ from rosbags.highlevel import AnyReader
 
 import mcaprl
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.schema import stored_dtype
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.viewer.annotate import annotated_copy

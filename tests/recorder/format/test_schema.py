@@ -21,7 +21,7 @@ import mcaprl
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.format import messages
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.schema import (
     action_constants,

@@ -16,10 +16,10 @@ import mcaprl
 from mcaprl.api.convert import Conversion
 from mcaprl.errors import UsageError
 from mcaprl.files import parse_json, write_json
+from mcaprl.recorder.mapping.actions import unit_of
 from mcaprl.recorder.mapping.config import parse_mapping
+from mcaprl.recorder.mapping.draft import suggested
 from mcaprl.recorder.mapping.read import MappedBag, read_open_bag
-from mcaprl.recorder.mapping.suggest.draft import suggested
-from mcaprl.recorder.mapping.units import unit_of
 from tests.support.memory_bag import MemoryBag
 
 TWIST = "geometry_msgs/msg/Twist"

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaprl.errors import LogError, UsageError
+from mcaprl.recorder.mapping.align import padded, pooled
 from mcaprl.recorder.mapping.config import parse_mapping
-from mcaprl.recorder.mapping.paths import padded, pooled
 from mcaprl.recorder.mapping.read import MappedBag, read_bag, read_open_bag
 from tests.support.memory_bag import MemoryBag
 from tests.support.nested_bags import FORMATS, SCHEMA, motors, write_json

@@ -11,8 +11,7 @@ import pytest
 
 import mcaprl
 from mcaprl.errors import LogError, UsageError
-from mcaprl.recorder.format.action_commands import ActionCommands
-from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.metadata import ActionCommands, LogMetadata
 from mcaprl.recorder.mapping.config import parse_mapping
 from mcaprl.recorder.mapping.read import MappedBag, read_open_bag
 from tests.support.memory_bag import MemoryBag

@@ -21,7 +21,7 @@ import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import LogError, McaprlError, OutputExistsError
 from mcaprl.files import replacing, write_atomically
-from mcaprl.recorder.columns import valid_copy
+from mcaprl.recorder.columns import salvage
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import recover_log
@@ -376,7 +376,7 @@ def test_chunks_with_equal_crcs_are_different_chunks(
 ) -> None:
     """In a long log, some chunks have equal lengths and CRCs by chance."""
     write_log(log_path, 60)
-    monkeypatch.setattr(valid_copy, "crc32", lambda data: 0)
+    monkeypatch.setattr(salvage, "crc32", lambda data: 0)
     recovery = recover_log(log_path, log_path.with_name("out.mcap"))
     assert recovery.problems == []
     assert recovery.episodes == 60

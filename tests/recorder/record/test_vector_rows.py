@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mcaprl.recorder.format.rows import TopicRows
-from mcaprl.recorder.format.schema import LEARNER_TEXT
+from mcaprl.recorder.format.schema import LEARNER_TEXT, TopicRows
 from mcaprl.recorder.record import vector_rows
 from mcaprl.recorder.record.vector_rows import OpenRows
 

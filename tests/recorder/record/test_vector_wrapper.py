@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 import mcaprl
 from mcaprl.errors import LogError, NoStepsError, SpaceError, UsageError
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.record import vector_rows
 from mcaprl.recorder.record.vector_rows import OpenSteps
 from mcaprl.recorder.record.vector_wrapper import VectorWrapper

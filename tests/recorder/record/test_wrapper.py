@@ -30,9 +30,8 @@ from mcaprl.errors import (
     SpaceError,
     UsageError,
 )
-from mcaprl.recorder.columns.file_lock import create
+from mcaprl.recorder.columns.output import HoldSignals, create
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.signals import HoldSignals
 from mcaprl.recorder.repair.check import check_log
 from tests.support.paths import ROOT
 from tests.support.recordings import KnownCommands, ScriptedEnv

@@ -18,8 +18,8 @@ from mcap.writer import Writer
 import mcaprl
 from mcaprl.errors import CorruptLogError, LogError, NoStepsError, NotMcapError
 from mcaprl.recorder.columns.chunks import chunk_records
-from mcaprl.recorder.columns.message_rows import gather, message_rows
 from mcaprl.recorder.columns.reader import McapReader, end_of
+from mcaprl.recorder.columns.records import gather, message_rows
 from mcaprl.recorder.format.schema import message_dtype
 from mcaprl.recorder.repair.check import check_log
 from tests.support.recordings import record

@@ -20,9 +20,8 @@ from mcaprl.errors import LogError
 from mcaprl.problem import LISTED, Problem, Shortlist
 from mcaprl.recorder.columns import chunks, file_check
 from mcaprl.recorder.columns import reader as mcap_reader
-from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import contents_of
+from mcaprl.recorder.columns.records import INDEX_ENTRY, MESSAGE_HEADER, contents_of
 from mcaprl.recorder.columns.summary import Summary
 from mcaprl.recorder.columns.writer import McapWriter
 from mcaprl.recorder.format.metadata import LogMetadata

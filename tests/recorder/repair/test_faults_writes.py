@@ -58,7 +58,7 @@ def failing(writes: int, chance: random.Random) -> Iterator[None]:
     FailingFile.part = chance.choice([0.0, 0.5, 0.99])
     FailingFile.truncates = chance.random() < 0.5
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mcaprl.recorder.columns.file_lock.FileIO", FailingFile)
+        patch.setattr("mcaprl.recorder.columns.output.FileIO", FailingFile)
         yield
 
 

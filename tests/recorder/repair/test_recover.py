@@ -23,8 +23,8 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import LogError, NoEpisodesError, NotMcapError, OutputExistsError, UsageError
-from mcaprl.recorder.columns.message_rows import RECORD_HEADER_BYTES
 from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.records import RECORD_HEADER_BYTES
 from mcaprl.recorder.columns.salvage import Damage, valid_records
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import Recovery, recover_log

@@ -26,7 +26,7 @@ import mcaprl
 from mcaprl.errors import UsageError
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.format import messages
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.record.layout import layout_of
 from mcaprl.recorder.viewer.live_stream import LiveStep, LiveStream

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 import mcaprl
-from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.dataset.transitions import Episode
 
 LARGE = os.environ.get("MCAPRL_FAULTS") == "large"
 # File to which results are appended; see `fault_table`.

@@ -15,7 +15,7 @@ import pytest
 import mcaprl
 from mcaprl.errors import LogError, McaprlError
 from mcaprl.recorder.dataset.format_registry import FORMATS, write_format
-from mcaprl.recorder.dataset.formats import budget, parquet_files
+from mcaprl.recorder.dataset.formats import columns
 from tests.support.damage.datasets import dataset, write_all
 
 h5py = pytest.importorskip("h5py", reason="needs the extra interop")
@@ -87,7 +87,7 @@ def test_arrays_that_nobody_needs_are_not_unpacked(tmp_path: Path) -> None:
 
 @pytest.fixture
 def small_budget(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(budget, "UNPACKED_ALLOWANCE_BYTES", 1 << 20)
+    monkeypatch.setattr(columns, "UNPACKED_ALLOWANCE_BYTES", 1 << 20)
 
 
 @pytest.mark.usefixtures("small_budget")
@@ -235,7 +235,7 @@ def test_sizes_in_the_footer_of_parquet_are_those_of_pyarrow(nested_table: Path)
         for group in groups
         for column in (group.column(number) for number in range(group.num_columns))
     ]
-    found = parquet_files._row_groups(nested_table)
+    found = parquet._row_groups(nested_table)
     assert [rows for rows, _ in found] == [3, 3]
     assert expected == [
         (".".join(each.words), each.values, each.stored_bytes)
@@ -250,7 +250,7 @@ def test_no_damaged_byte_in_the_footer_of_parquet_ends_the_process(nested_table:
         "import struct, sys\n"
         "from pathlib import Path\n"
         "from mcaprl.errors import LogError\n"
-        "from mcaprl.recorder.dataset.formats.parquet_files import read_table\n"
+        "from mcaprl.recorder.dataset.formats.parquet import read_table\n"
         "path = Path(sys.argv[1])\n"
         "data, refused = path.read_bytes(), 0\n"
         "start = len(data) - 8 - struct.unpack('<I', data[-8:-4])[0]\n"

@@ -12,7 +12,7 @@ import pytest
 import mcaprl
 from mcaprl import Dataset
 from mcaprl.errors import LogError, SpaceError, UsageError
-from mcaprl.recorder.dataset.formats.ends import MEANINGS
+from mcaprl.recorder.dataset.formats.flat import MEANINGS
 
 h5py = pytest.importorskip("h5py", reason="needs the extra interop")
 

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 import mcaprl
 from mcaprl import Dataset
 from mcaprl.errors import LogError, SpaceError
+from mcaprl.recorder.dataset.formats import lerobot_writer
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
-from mcaprl.recorder.dataset.formats.lerobot import writer
-from mcaprl.recorder.dataset.formats.lerobot.features import Feature
-from mcaprl.recorder.dataset.formats.lerobot.writer import QUANTILES, describe, pooled, sampled
+from mcaprl.recorder.dataset.formats.lerobot_features import Feature
+from mcaprl.recorder.dataset.formats.lerobot_writer import QUANTILES, describe, pooled, sampled
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of
 from tests.conftest import need
@@ -332,8 +332,8 @@ def test_statistics_of_images_are_those_of_their_pixels(pixels: NDArray[np.uint8
 def test_a_file_ends_at_its_size_and_a_folder_at_its_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(writer, "MAX_FILE_BYTES", 1)
-    monkeypatch.setattr(writer, "CHUNK_FILES", 2)
+    monkeypatch.setattr(lerobot_writer, "MAX_FILE_BYTES", 1)
+    monkeypatch.setattr(lerobot_writer, "CHUNK_FILES", 2)
     dataset = Dataset.concatenate([_cameras(), _cameras()])
     dataset.to_lerobot(tmp_path / "out")
     files = sorted(str(p.relative_to(tmp_path / "out")) for p in tmp_path.glob("out/data/*/*"))
@@ -591,7 +591,7 @@ def test_a_changed_byte_of_the_data_is_found(written: Path) -> None:
 
 def test_videos_in_several_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("av", reason="needs the extra video")
-    monkeypatch.setattr(writer, "MAX_VIDEO_BYTES", 1)
+    monkeypatch.setattr(lerobot_writer, "MAX_VIDEO_BYTES", 1)
     dataset = Dataset.concatenate([_cameras(), _cameras()])
     dataset.to_lerobot(tmp_path / "out", video=True, lossy=True)
     # The encoder delays some images, so a file can contain more than one episode.
@@ -696,7 +696,7 @@ def test_lerobot_merges_what_we_write(tmp_path: Path) -> None:
 
 def test_rates_and_tasks() -> None:
     metadata = LogMetadata(spaces.Discrete(2), spaces.Discrete(2))
-    assert writer.task_of("", metadata) == "act"
-    assert writer.task_of("[1]", metadata) == "act"
-    assert writer.task_of('{"task": "lift"}', metadata) == "lift"
-    assert writer.frames_per_second(33_333_333) == 30
+    assert lerobot_writer.task_of("", metadata) == "act"
+    assert lerobot_writer.task_of("[1]", metadata) == "act"
+    assert lerobot_writer.task_of('{"task": "lift"}', metadata) == "lift"
+    assert lerobot_writer.frames_per_second(33_333_333) == 30

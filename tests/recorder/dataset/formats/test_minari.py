@@ -19,7 +19,7 @@ import mcaprl
 from mcaprl import Dataset
 from mcaprl.errors import LogError, OutputExistsError, SpaceError, UsageError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
-from mcaprl.recorder.dataset.formats.minari.description import local_path, space_to_text
+from mcaprl.recorder.dataset.formats.minari_metadata import local_path, space_to_text
 from mcaprl.recorder.format.metadata import LogMetadata
 from tests.conftest import need
 from tests.recorder.dataset.formats.minari_sets import Cameras, collect

@@ -20,8 +20,7 @@ from mcaprl import Dataset
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.dataset.format_registry import FACTS, FORMATS
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
-from mcaprl.recorder.format.action_commands import ActionCommands
-from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.metadata import ActionCommands, LogMetadata
 
 for _package in ("h5py", "pyarrow", "PIL", "stable_baselines3"):
     pytest.importorskip(_package, reason="needs the extras interop, tables, video and online")

@@ -18,8 +18,8 @@ from PIL import Image
 
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.limits import MAX_IMAGE_PIXELS
-from mcaprl.recorder.dataset.image_files import FORMATS, decoded_file
-from mcaprl.recorder.mapping.images.compressed import compressed_pixels, rvl_decoded
+from mcaprl.recorder.dataset.images import FORMATS, decoded_file
+from mcaprl.recorder.mapping.image_pixels import compressed_pixels, rvl_decoded
 
 
 def rvl_encoded(pixels: list[int]) -> bytes:
@@ -175,7 +175,7 @@ def test_no_format_starts_a_program_or_is_decoded_without_being_listed(ghostscri
 
 def test_image_columns_of_lerobot_open_the_same_formats(ghostscript: Path) -> None:
     pytest.importorskip("pyarrow", reason="needs PyArrow")
-    from mcaprl.recorder.dataset.formats.lerobot.features import image_of
+    from mcaprl.recorder.dataset.formats.lerobot_features import image_of
 
     for data in (POSTSCRIPT, file_of("GIF"), file_of("PPM")):
         with pytest.raises(LogError, match=r"an image of front is damaged: .* are not JPEG, PNG"):
@@ -190,18 +190,18 @@ def test_images_of_lerobot_are_limited_by_their_declared_shape(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     arrow = pytest.importorskip("pyarrow", reason="needs PyArrow")
-    from mcaprl.recorder.dataset.formats.lerobot import features
+    from mcaprl.recorder.dataset.formats import lerobot_features
 
     def column(*files: bytes) -> Any:
         found = arrow.array([{"bytes": file} for file in files])
         return arrow.chunked_array([found])
 
-    front = features.Feature("front", "image", (3, 8, 8))
+    front = lerobot_features.Feature("front", "image", (3, 8, 8))
     assert front.decode(column(file_of("PNG"))).shape == (1, 8, 8, 3)
     with pytest.raises(LogError, match=r"it declares 13000 x 13000 pixels; at most 192 can be"):
         front.decode(column(png_of(13000, 13000)))
     with pytest.raises(SpaceError, match="a space of 169000000 elements is too large"):
-        features.Feature("front", "image", (13000, 13000, 1)).decode(column(b""))
+        lerobot_features.Feature("front", "image", (13000, 13000, 1)).decode(column(b""))
 
     def fail(*_: object) -> None:
         raise MemoryError

@@ -17,10 +17,10 @@ from PIL import Image
 
 import mcaprl
 from mcaprl.errors import LogError, UsageError
-from mcaprl.recorder.dataset import image_cache
-from mcaprl.recorder.dataset.mapped import MappedImages
-from mcaprl.recorder.mapping.images import copies as image_copy
-from mcaprl.recorder.mapping.images.reader import ImageReader
+from mcaprl.recorder.dataset import images
+from mcaprl.recorder.dataset.images import MappedImages
+from mcaprl.recorder.mapping import images as image_copy
+from mcaprl.recorder.mapping.images import ImageReader
 from tests.support.bags import Channel, integers, write_channels, write_rosbag1, write_rosbag2
 from tests.support.recordings import assert_same_bits
 
@@ -213,7 +213,7 @@ def test_automatic_storage_depends_on_the_free_memory(
 ) -> None:
     bag = write_bag(tmp_path / "bag.mcap", [file_of(each) for each in noise(20, 10, 10)])
     for stack, free_bytes, expected in ((1, 4000, False), (1, 3998, True), (3, 6000, True)):
-        monkeypatch.setattr(image_cache, "free_memory_bytes", lambda free=free_bytes: free)
+        monkeypatch.setattr(images, "free_memory_bytes", lambda free=free_bytes: free)
         found = mcaprl.open(bag, mapping=mapping(stack))
         # 20 frames of 100 bytes, more than half of the free memory or not.
         assert isinstance(found.observations, MappedImages) == expected
@@ -225,12 +225,12 @@ def test_a_damaged_image_is_left_out_in_the_copy_as_in_memory(tmp_path: Path) ->
     bag = write_bag(tmp_path / "bag.mcap", files)
     expected = [0, 1, 2, 3, 3, 5, 6, 7, 8, 9, 10, 10, 12, 13, 14, 15, 16, 17, 18]
     times = []
-    for images in ("memory", "mapped", "mapped"):
+    for storage in ("memory", "mapped", "mapped"):
         with pytest.warns(UserWarning, match="2 images cannot be decoded, the first is message 4"):
-            found = mcaprl.open(bag, mapping=mapping(), images=images)
+            found = mcaprl.open(bag, mapping=mapping(), images=storage)
         assert found.observations[:, 0, 0, 0].tolist() == expected
         times.append(
-            (tmp_path / "bag.mcap.camera.images").stat().st_mtime_ns if images == "mapped" else 0
+            (tmp_path / "bag.mcap.camera.images").stat().st_mtime_ns if storage == "mapped" else 0
         )
     assert times[1] == times[2]
     (problem,) = mcaprl.check(found).problems
@@ -267,11 +267,11 @@ def test_a_copy_with_forged_failures_or_images_is_replaced(tmp_path: Path) -> No
     copy = tmp_path / "bag.mcap.camera.images"
     from mcaprl.recorder.format.reading import McapReader
 
-    description = McapReader(copy).metadata[image_cache.CACHE_METADATA]
+    description = McapReader(copy).metadata[images.CACHE_METADATA]
     for failures in ("[", "[1]", '[["x", ""]]', "[[[0], {}]]", "[[1e999, 2]]", "[[99, 2]]", "{}"):
         with McapWriterOf(McapWriter(copy, compression="none", overwrite=True)) as writer:
-            writer.add_metadata(image_cache.CACHE_METADATA, description)
-            writer.add_metadata(image_cache.CACHE_NOTES, {"failures": failures})
+            writer.add_metadata(images.CACHE_METADATA, description)
+            writer.add_metadata(images.CACHE_NOTES, {"failures": failures})
         found = mcaprl.open(bag, mapping=mapping(), images="mapped")
         assert_same_bits(found.observations[:], memory.observations)
 

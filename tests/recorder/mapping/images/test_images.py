@@ -17,7 +17,7 @@ import mcaprl
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.bag import Failure
 from mcaprl.recorder.mapping.config import Quantity, parse_mapping
-from mcaprl.recorder.mapping.images.reader import ImageReader
+from mcaprl.recorder.mapping.images import ImageReader
 from mcaprl.recorder.mapping.read import read_open_bag
 from tests.support.memory_bag import MemoryBag
 

@@ -9,7 +9,7 @@ import pytest
 
 from mcaprl.errors import LogError
 from mcaprl.limits import MAX_IMAGE_PIXELS
-from mcaprl.recorder.mapping.images.pixels import ENCODINGS, raw_pixels
+from mcaprl.recorder.mapping.image_pixels import ENCODINGS, raw_pixels
 
 # ITU-R BT.601 with limited range, by hand, such as for red (Y 81, U 90, V 240):
 # R = 1.164 * (81 - 16) + 1.596 * (240 - 128) = 75.7 + 178.7 = 254.4

@@ -10,7 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mcaprl.recorder.mapping.poses.transforms import euler_of, product, rotated, unit, upper
+from mcaprl.recorder.mapping.transforms import euler_of, product, rotated, unit, upper
 
 HALF = math.sqrt(0.5)
 

@@ -18,8 +18,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import open_bag
-from mcaprl.recorder.mapping.poses import transforms as transform_messages
-from mcaprl.recorder.mapping.poses.transforms import Transforms, transform_topic
+from mcaprl.recorder.mapping import transforms as transform_messages
+from mcaprl.recorder.mapping.transforms import Transforms, transform_topic
 from tests.conftest import need
 
 STEPS, STEP_NS, STAMP_NS = 3, 10**8, 5 * 10**9

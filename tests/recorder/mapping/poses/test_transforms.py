@@ -11,9 +11,9 @@ import pytest
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.mapping.config import parse_mapping
-from mcaprl.recorder.mapping.poses.transforms import Transforms
 from mcaprl.recorder.mapping.read import MappedBag, read_open_bag
 from mcaprl.recorder.mapping.runs import Run
+from mcaprl.recorder.mapping.transforms import Transforms
 from tests.support.memory_bag import SECOND_NS, MemoryBag
 
 HALF = math.sqrt(0.5)

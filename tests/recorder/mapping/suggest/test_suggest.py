@@ -14,7 +14,7 @@ import mcaprl
 from mcaprl.errors import LogError
 from mcaprl.recorder.bags.bag import open_bag
 from mcaprl.recorder.mapping.config import load_mapping
-from mcaprl.recorder.mapping.suggest.draft import suggested
+from mcaprl.recorder.mapping.draft import suggested
 from tests.support.bags import numbers, write_channels
 
 EVIL = "\x1b[2J\x9b1m\u202e\r"

@@ -18,7 +18,7 @@ import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import McaprlError, UsageError
 from mcaprl.recorder.mapping.config import Mapping, Quantity, load_mapping
-from mcaprl.recorder.mapping.suggest.likely_action import box_limits, quantile_edges
+from mcaprl.recorder.mapping.likely import box_limits, quantile_edges
 from tests.support.bags import Channel, numbers, write_channels
 from tests.support.robots import (
     FORMATS,

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag, TopicInfo
 from mcaprl.recorder.bags.decoders import value_at
-from mcaprl.recorder.mapping.align import NONE, NS_PER_S, last, nearest, time_order
+from mcaprl.recorder.mapping.align import NONE, NS_PER_S, last, nearest, time_order, topic_of
 from mcaprl.recorder.mapping.config import TimeSource
-from mcaprl.recorder.mapping.paths import topic_of
 from mcaprl.recorder.mapping.runs import Recorded, Run
 
 STATIC = "_static"

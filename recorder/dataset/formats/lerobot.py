@@ -1,4 +1,4 @@
-"""Reading of LeRobot datasets, version 3.0, which have no final observations."""
+"""LeRobot datasets, version 3.0: folders of Parquet files, images and videos."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError, import_extra
-from mcaprl.files import parse_json
-from mcaprl.recorder.dataset.arrays import action_space_of, box_of
+from mcaprl.files import parse_json, read_file
+from mcaprl.recorder.dataset.arrays import action_space_of, box_of, flags
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.formats import parquet_files
+from mcaprl.recorder.dataset.formats import lerobot_features, parquet
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.dataset.formats.flat import unread_note
-from mcaprl.recorder.dataset.formats.lerobot import features
-from mcaprl.recorder.dataset.formats.lerobot.features import (
+from mcaprl.recorder.dataset.formats.lerobot_features import (
     ACTION,
     DEFAULTS,
     DONE,
@@ -30,9 +29,9 @@ from mcaprl.recorder.dataset.formats.lerobot.features import (
     TRUNCATED,
     VIDEO_PATH,
     Feature,
+    read_frames,
 )
-from mcaprl.recorder.dataset.formats.lerobot.video import read_frames
-from mcaprl.recorder.dataset.values import flags
+from mcaprl.recorder.dataset.formats.lerobot_writer import write
 from mcaprl.recorder.format.behavior import FIELDS
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import MAX_ACTIONS
@@ -178,8 +177,8 @@ class Files:
 def read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
     """Read a Parquet file, and check the CRCs of its pages if it has any."""
     if columns is None:
-        return parquet_files.read_table(path)
-    return parquet_files.read_table(path, set(columns).__contains__)
+        return parquet.read_table(path)
+    return parquet.read_table(path, set(columns).__contains__)
 
 
 # Types of the errors that invalid values in damaged files cause.
@@ -239,26 +238,26 @@ def _dataset_of(files: Files) -> Dataset:
     """Convert a dataset that has no final observations; warn about the missing data."""
     values, parts, labels = _observations(files)
     steps = files.steps()
-    if features.ACTION not in steps:
-        raise LogError(f"{files.path} has no feature '{features.ACTION}'")
+    if lerobot_features.ACTION not in steps:
+        raise LogError(f"{files.path} has no feature '{lerobot_features.ACTION}'")
     _warn_of_steps(files, steps)
     if unread := files.unread():
         _warn(files, unread_note(unread))
-    actions, action_space = _values_and_space(steps[features.ACTION], is_action=True)
+    actions, action_space = _values_and_space(steps[lerobot_features.ACTION], is_action=True)
     is_single = len(parts) == 1
     metadata = LogMetadata(
         next(iter(parts.values())) if is_single else spaces.Dict(list(parts.items())),
         action_space,
         observation_names=labels if is_single else (),
-        action_part_names=_labels(files.features[features.ACTION])
+        action_part_names=_labels(files.features[lerobot_features.ACTION])
         if isinstance(action_space, spaces.Box)
         else (),
         step_duration_ns=_step_ns(files),
     )
-    rewards = steps.get(features.REWARD, np.full((len(actions), 1), np.nan))
+    rewards = steps.get(lerobot_features.REWARD, np.full((len(actions), 1), np.nan))
     behavior: dict[str, Any] = {
         field.plural: steps[name][:, 0]
-        for field, name in zip(FIELDS, features.BEHAVIORS, strict=True)
+        for field, name in zip(FIELDS, lerobot_features.BEHAVIORS, strict=True)
         if name in steps
     }
     times, infos = _times_ns(files), _infos(files)
@@ -281,7 +280,7 @@ def _dataset_of(files: Files) -> Dataset:
         episodes,
         metadata,
         files.path,
-        has_rewards=features.REWARD in steps,
+        has_rewards=lerobot_features.REWARD in steps,
     )
 
 
@@ -303,7 +302,7 @@ def _observed(files: Files) -> dict[str, Feature]:
         if not name.startswith(_OBSERVATION) or not _is_kept(files, feature):
             continue
         full = name.removeprefix(_OBSERVATION).strip(".") or "state"
-        short = name.removeprefix(features.IMAGES)
+        short = name.removeprefix(lerobot_features.IMAGES)
         key = short if short != name and short not in found else full
         if key in found:
             raise SpaceError(f"{files.path}: two observations have the name '{key}'")
@@ -315,12 +314,12 @@ def _observed(files: Files) -> dict[str, Feature]:
 
 def _infos(files: Files) -> dict[str, NDArray[Any]]:
     """Return the infos: the values (N, *shape) of each feature that becomes one, by name."""
-    taken = {*features.STEPS, *features.DEFAULTS}
+    taken = {*lerobot_features.STEPS, *lerobot_features.DEFAULTS}
     found = {}
     for name, feature in files.features.items():
         is_other = name not in taken and not name.startswith(_OBSERVATION)
         if is_other and _is_kept(files, feature, images=False):
-            found[name.removeprefix(features.INFO)] = files.values(feature)
+            found[name.removeprefix(lerobot_features.INFO)] = files.values(feature)
     return found
 
 
@@ -340,21 +339,21 @@ def _is_kept(files: Files, feature: Feature, *, images: bool = True) -> bool:
 
 
 def _warn_of_steps(files: Files, steps: Mapping[str, Any]) -> None:
-    if features.REWARD not in steps:
-        _warn(files, f"there is no feature '{features.REWARD}': all rewards are NaN")
-    if features.DONE in steps and features.TRUNCATED not in steps:
+    if lerobot_features.REWARD not in steps:
+        _warn(files, f"there is no feature '{lerobot_features.REWARD}': all rewards are NaN")
+    if lerobot_features.DONE in steps and lerobot_features.TRUNCATED not in steps:
         _warn(
             files,
-            f"'{features.DONE}' may also mean truncation, because there is no feature"
-            f" '{features.TRUNCATED}'; it is read as termination",
+            f"'{lerobot_features.DONE}' may also mean truncation, because there is no feature"
+            f" '{lerobot_features.TRUNCATED}'; it is read as termination",
         )
 
 
 def _parts(files: Files, steps: Mapping[str, NDArray[Any]]) -> list[_Part]:
     """Divide the rows into episodes; `next.done` or `next.truncated` ends an episode."""
     none = np.zeros((sum(files.lengths), 1), bool)
-    done = steps.get(features.DONE, none)[:, 0]
-    truncated = steps.get(features.TRUNCATED, none)[:, 0]
+    done = steps.get(lerobot_features.DONE, none)[:, 0]
+    truncated = steps.get(lerobot_features.TRUNCATED, none)[:, 0]
     found: list[_Part] = []
     repeated = dropped = 0
     for source, start, stop, is_last in _stretches(files, done | truncated):
@@ -470,3 +469,15 @@ def _info_rows(values: NDArray[Any]) -> Any:
 
 def _warn(files: Files, text: str) -> None:
     warnings.warn(f"{files.path}: {text}", stacklevel=2)
+
+
+__all__ = ["matches", "read", "write"]
+
+
+def matches(path: Path) -> bool:
+    """Return whether a folder is a LeRobot dataset of any version."""
+    try:
+        info = parse_json(read_file(path / "meta/info.json"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(info, dict) and "codebase_version" in info

@@ -20,24 +20,26 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.bag import Bag, Stream
 from mcaprl.recorder.bags.overview import TopicOverview, topics_of
-from mcaprl.recorder.format.topics import STEP_TOPIC
-from mcaprl.recorder.mapping.blame import Blame
+from mcaprl.recorder.format.schema import STEP_TOPIC
 from mcaprl.recorder.mapping.config import Place, parse_mapping
-from mcaprl.recorder.mapping.images.reader import ImageReader
-from mcaprl.recorder.mapping.plan import Plan
-from mcaprl.recorder.mapping.steps import StepReader
-from mcaprl.recorder.mapping.suggest.likely import (
+from mcaprl.recorder.mapping.images import ImageReader
+from mcaprl.recorder.mapping.likely import (
     IMAGES,
     LIKELY,
     Candidate,
+    action_spec,
     candidates,
+    command_of,
     is_never_observed,
     kind_of,
+    likelihood,
     number_fields,
     shares_of_time,
     transforms,
 )
-from mcaprl.recorder.mapping.suggest.likely_action import action_spec, command_of, likelihood
+from mcaprl.recorder.mapping.plan import Plan
+from mcaprl.recorder.mapping.read import Blame
+from mcaprl.recorder.mapping.steps import StepReader
 from mcaprl.texts import printable
 
 _MAX_RATE_HZ, _MIN_RATE_HZ, _GAP_S = 20.0, 1.0, 2.0

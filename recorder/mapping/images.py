@@ -1,34 +1,302 @@
-"""Images of a bag as observations, in memory or on disk.
+"""Images of a bag as observations, in memory or in a copy on disk.
 
-Raw and compressed images of ROS and Foxglove are supported; see `pixels` and `compressed`.
-`image_options` describes what they become.
+Colors become uint8 (H, W, 3) or, if gray, (H, W, 1). Depth becomes float32 meters (H, W, 1), with
+the value 0 where there is no surface, or uint8 if the mapping sets `range_m`. With `as: intensity`,
+images of 16 bits or floats become float32 (H, W, 1) with the values of the messages, or uint8 if
+the mapping sets `range`; values that are not finite become 0.
+
+The copy is beside the first file of the bag, `BAG.NAME.images`, where NAME is the name of the
+quantity. It is an MCAP file whose log_times are the positions of the messages in their topic. It is
+used again as long as the files of the bag and the options of the image are the same.
+
+`image_pixels` decodes raw and compressed images of ROS and Foxglove.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
+import json
 import math
+import shutil
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, UsageError
+from mcaprl.errors import LogError, UsageError, import_extra
+from mcaprl.files import parse_json
 from mcaprl.problem import Problem
 from mcaprl.recorder.bags.bag import Bag, Failure, TopicInfo
-from mcaprl.recorder.dataset.image_cache import Storage, is_mapped
-from mcaprl.recorder.dataset.mapped import Frames, as_pixels
-from mcaprl.recorder.format.spaces import MAX_ELEMENTS
+from mcaprl.recorder.dataset.images import (
+    CACHE_NOTES,
+    Blocks,
+    Frames,
+    MappedImages,
+    Storage,
+    as_pixels,
+    cache_path,
+    is_mapped,
+    mapped_images,
+    open_cache,
+    write_cache,
+)
+from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.format.schema import IMAGES_PER_CHUNK
+from mcaprl.recorder.format.spaces import IMAGE_ENCODINGS, MAX_ELEMENTS, Leaf
 from mcaprl.recorder.mapping.config import Quantity
-from mcaprl.recorder.mapping.images.compressed import compressed_pixels, is_video
-from mcaprl.recorder.mapping.images.copies import copied_images
-from mcaprl.recorder.mapping.images.options import ImageOptions
-from mcaprl.recorder.mapping.images.pixels import Pixels, one_line, raw_pixels
+from mcaprl.recorder.mapping.image_pixels import (
+    Pixels,
+    compressed_pixels,
+    is_video,
+    one_line,
+    raw_pixels,
+)
 from mcaprl.texts import counted, size
 
 Image = NDArray[Any]
+
+_GRAY_WEIGHTS = np.array([0.299, 0.587, 0.114])
+"""ITU-R BT.601 weights of red, green and blue."""
+
+
+class ImageOptions:
+    """Options of an image quantity.
+
+    Attributes:
+        ambiguous: Encoding of images that were read as depth, although it does not say that they
+            are; empty if there were none.
+    """
+
+    def __init__(self, topic: str, quantity: Quantity) -> None:
+        """Store the options; `topic` is for error messages."""
+        self._topic, self._quantity = topic, quantity
+        self.ambiguous = ""
+
+    def to_json(self) -> str:
+        """Return the options that determine the pixels."""
+        names = {"crop", "resize", "gray", "range_m", "range", "as_"}
+        return self._quantity.model_dump_json(include=names)
+
+    def space(self, images: Frames) -> spaces.Box:
+        """Return the space of one image or stack of images (N, H, W, C)."""
+        if images.dtype == np.uint8:
+            return spaces.Box(0, 255, images.shape[1:], np.uint8)
+        low = -np.inf if self._quantity.as_ == "intensity" else 0.0
+        return spaces.Box(low, np.inf, images.shape[1:], np.float32)
+
+    def applied(self, pixels: Pixels) -> Image:
+        """Return the image (H, W, C) of an observation."""
+        quantity, is_depth = self._quantity, self._is_depth(pixels)
+        image, is_number = pixels.image, pixels.units_per_m > 0
+        if is_number:
+            image = _meters(image, pixels.units_per_m) if is_depth else _finite(image)
+        if quantity.crop is not None:
+            image = self._cropped(image, *quantity.crop)
+        if quantity.resize is not None:
+            image = _resized(image, *quantity.resize, is_depth=is_depth)
+        values: Image = np.asarray(image)
+        if quantity.gray and values.ndim == 3:
+            values = np.rint(values @ _GRAY_WEIGHTS).astype(np.uint8)
+        limits = quantity.range_m if is_depth else quantity.range
+        if limits is not None:
+            share = np.clip((values - limits[0]) / (limits[1] - limits[0]), 0.0, 1.0)
+            codes = np.rint(255 * share)
+            # Pixels without a surface get the largest value, as in the depth images of the sims.
+            values = (np.where(values > 0, codes, 255) if is_depth else codes).astype(np.uint8)
+        return values if values.ndim == 3 else values[..., np.newaxis]
+
+    def _is_depth(self, pixels: Pixels) -> bool:
+        """Return whether the pixels are read as depth."""
+        wanted, kind = self._quantity.as_, one_line(pixels.encoding)
+        if wanted == "intensity":
+            return False
+        if pixels.has_lost_depth:
+            raise UsageError(
+                f"{self._topic}: images '{kind}' have 8 bits per pixel and have lost the depth: use"
+                " a raw, PNG or compressedDepth topic, or `as: intensity` to read them as gray"
+            )
+        if not pixels.units_per_m:
+            key = "range_m" if self._quantity.range_m is not None else f"as: {wanted}"
+            if key == "range_m" or wanted is not None:
+                raise UsageError(
+                    f"{self._topic}: images '{kind}' are not depth: remove {key} from the mapping"
+                )
+            return False
+        if not pixels.is_certain and wanted is None and self._quantity.range_m is None:
+            self.ambiguous = kind
+        return True
+
+    def _cropped(self, image: Any, left: int, top: int, width: int, height: int) -> Any:
+        full_width, full_height = _size(image)
+        if min(left, top) < 0 or left + width > full_width or top + height > full_height:
+            raise UsageError(
+                f"{self._topic}: crop {[left, top, width, height]} is outside of the image of"
+                f" {full_width} x {full_height} pixels"
+            )
+        if isinstance(image, np.ndarray):
+            return image[top : top + height, left : left + width]
+        return image.crop((left, top, left + width, top + height))
+
+
+def _meters(depth: Image, units_per_m: float) -> Image:
+    meters = depth.astype(np.float32)
+    if units_per_m != 1:
+        # A division, unlike a multiplication by 0.001, is exact to the last bit: 1500 is 1.5.
+        meters /= np.float32(units_per_m)
+    return np.where(np.isfinite(meters) & (meters > 0), meters, np.float32(0))
+
+
+def _finite(image: Image) -> Image:
+    values = image.astype(np.float32)
+    return np.where(np.isfinite(values), values, np.float32(0))
+
+
+def _size(image: Any) -> tuple[int, int]:
+    """Return width and height of a Pillow image or a NumPy array."""
+    if isinstance(image, np.ndarray):
+        return image.shape[1], image.shape[0]
+    width, height = image.size
+    return width, height
+
+
+def _resized(image: Any, width: int, height: int, *, is_depth: bool) -> Any:
+    """Resize an image by averaging.
+
+    Depth is resized by the nearest pixel: the mean of two depths may not be on any surface.
+    """
+    if _size(image) == (width, height):
+        return image
+    pillow = import_extra("PIL.Image", "bags")
+    method = pillow.Resampling.NEAREST if is_depth else pillow.Resampling.BOX
+    image = pillow.fromarray(image) if isinstance(image, np.ndarray) else image
+    return image.resize((width, height), method)
+
+
+_VERSION = "1"
+"""Version of the decoders. It changes if they decode the same message to other pixels."""
+_FAILURES = "failures"
+_COPIED_BYTES = 1 << 20
+"""Size of the images that are in memory at a time, but for one that is larger."""
+
+
+def copied_images(
+    reader: ImageReader, rows: NDArray[np.int64], like: NDArray[Any]
+) -> MappedImages | None:
+    """Return the images of messages from the copy on disk; write the copy if needed.
+
+    Args:
+        reader: Reader of the topic.
+        rows: (N,) ascending positions of the messages in the topic.
+        like: One of the images.
+
+    Returns:
+        (N, H, W, C) images; None if one cannot be decoded.
+    """
+    encoding = IMAGE_ENCODINGS[like.shape[2]] if like.dtype == np.uint8 else "32FC1"
+    leaf = Leaf(reader.name, (), like.shape, like.dtype, encoding)
+    path = cache_path(reader.bag.paths[0], leaf)
+    description = {
+        "bag": _fingerprint(reader.bag.paths),
+        "topic": reader.topic,
+        "options": reader.options.to_json(),
+        "image": f"{like.shape} {like.dtype}",
+        "version": _VERSION,
+    }
+    found = _existing(reader, open_cache(path, description), leaf, rows)
+    if found is None:
+        _write(reader, path, description, leaf, rows)
+        found = _existing(reader, open_cache(path, description), leaf, rows)
+    if found is None:
+        raise LogError(f"{path} was changed by another process: try again")
+    return found if len(found) == len(rows) else None
+
+
+def _existing(
+    reader: ImageReader, cache: McapReader | None, leaf: Leaf, rows: NDArray[np.int64]
+) -> MappedImages | None:
+    """Return the images of a copy, without those that could not be decoded.
+
+    The result is None if the copy is missing or damaged, or lacks other messages.
+    """
+    if cache is None:
+        return None
+    try:
+        failed = _failures(cache, reader.bag.times(reader.topic))
+        is_failed = np.isin(rows, [each.row for each in failed])
+        found = mapped_images(cache, leaf, rows[~is_failed])
+    except (LogError, ValueError, TypeError):
+        return None
+    if found is not None:
+        for each in failed:
+            reader.leave_out(each)
+    return found
+
+
+def _failures(cache: McapReader, times_ns: NDArray[np.int64]) -> list[Failure]:
+    """Return the failures that a copy lists."""
+    found = []
+    for row, reason in parse_json(cache.metadata.get(CACHE_NOTES, {}).get(_FAILURES, "[]")):
+        if not isinstance(row, int) or not 0 <= row < len(times_ns):
+            raise ValueError(row)
+        found.append(Failure(row, int(times_ns[row]), str(reason)))
+    return found
+
+
+def _write(
+    reader: ImageReader,
+    path: Path,
+    description: dict[str, str],
+    leaf: Leaf,
+    rows: NDArray[np.int64],
+) -> None:
+    image_bytes = leaf.size * leaf.dtype.itemsize
+    needed, notes = len(rows) * image_bytes, dict[str, str]()
+    remedy = "set `resize`, `crop` or a lower rate in the mapping, or images='memory'"
+    try:
+        free = shutil.disk_usage(path.parent).free
+    except OSError as error:
+        raise LogError(f"cannot write {path}: {error.strerror}") from error
+    if needed > free:
+        raise LogError(
+            f"cannot write {path}: the images need {size(needed)}, {size(free)} are free; {remedy}"
+        )
+
+    most = max(1, min(IMAGES_PER_CHUNK, _COPIED_BYTES // image_bytes))
+
+    def blocks() -> Blocks:
+        yield from reader.blocks(rows, leaf.shape, leaf.dtype, most)
+        if reader.failures:
+            failed = [(each.row, each.reason) for each in reader.failures.values()]
+            notes[_FAILURES] = json.dumps(failed)
+
+    try:
+        write_cache(path, description, leaf, blocks(), most=most, notes=notes)
+    except LogError as error:
+        if isinstance(error.__cause__, OSError):
+            raise LogError(f"{error}; images are copied there: {remedy}") from error
+        raise
+
+
+def _fingerprint(paths: tuple[Path, ...]) -> str:
+    """Return the SHA-256 of the paths, sizes and times of change of files."""
+    digest = hashlib.sha256()
+    try:
+        for file in _files(paths):
+            state = file.stat()
+            digest.update(f"{file.resolve()} {state.st_size} {state.st_mtime_ns}\n".encode())
+    except OSError as error:
+        raise LogError(f"{error.filename}: {error.strerror}") from error
+    return digest.hexdigest()
+
+
+def _files(paths: tuple[Path, ...]) -> Iterator[Path]:
+    for path in paths:
+        yield from sorted(path.iterdir()) if path.is_dir() else [path]
+
 
 _BLOCK_ROWS, _BLOCK_BYTES = 32, 1 << 22
 """Largest number and size of the messages that are in memory at a time."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, import_extra
 from mcaprl.files import parse_json
-from mcaprl.recorder.dataset.formats import parquet_files
+from mcaprl.recorder.dataset.formats import parquet
 
 
 def read_table(folder: Path, form: str) -> Any:
@@ -123,7 +123,7 @@ def _whole(column: Any) -> Any:
 
 def _read_file(file: Path, form: str) -> Any:
     if form == "parquet":
-        return parquet_files.read_table(file)
+        return parquet.read_table(file)
     ipc = import_extra("pyarrow.ipc", "interop")
     with ipc.open_file(str(file)) as opened:
         return opened.read_all()

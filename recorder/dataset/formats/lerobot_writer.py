@@ -22,15 +22,15 @@ from numpy.typing import NDArray
 from mcaprl.errors import SpaceError, import_extra
 from mcaprl.files import parse_json
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats import lerobot_features
 from mcaprl.recorder.dataset.formats.columns import episode_slices
-from mcaprl.recorder.dataset.formats.lerobot import features
-from mcaprl.recorder.dataset.formats.lerobot.features import (
+from mcaprl.recorder.dataset.formats.lerobot_features import (
     DATA_PATH,
     EPISODES_PATH,
     VIDEO_PATH,
     Feature,
+    VideoWriter,
 )
-from mcaprl.recorder.dataset.formats.lerobot.video import VideoWriter
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of
 from mcaprl.texts import counted
@@ -285,8 +285,8 @@ def task_of(options: str, metadata: LogMetadata) -> str:
 def _losses(dataset: Dataset, *, lossy: bool, video: bool) -> list[str]:
     """Return one sentence for each change that loses data."""
     leaves = leaves_of(dataset.observation_space)
-    named = zip(features.observation_names(leaves), leaves, strict=True)
-    every = [*named, (features.ACTION, action_leaf(dataset.action_space))]
+    named = zip(lerobot_features.observation_names(leaves), leaves, strict=True)
+    every = [*named, (lerobot_features.ACTION, action_leaf(dataset.action_space))]
     for name, leaf in every:
         if leaf.dtype == np.uint64 and _is_large(dataset, leaf):
             raise SpaceError(
@@ -294,15 +294,15 @@ def _losses(dataset: Dataset, *, lossy: bool, video: bool) -> list[str]:
             )
     found = [
         f"{name} of shape {leaf.shape} is flattened, because LeRobot has at most"
-        f" {features.MAX_DIMENSIONS} dimensions"
+        f" {lerobot_features.MAX_DIMENSIONS} dimensions"
         for name, leaf in every
-        if len(leaf.shape) > features.MAX_DIMENSIONS
+        if len(leaf.shape) > lerobot_features.MAX_DIMENSIONS
     ]
     if video:
         found += [
             f"{name} is compressed as video, which changes its pixels"
             for name, leaf in every
-            if features.feature_of(name, leaf, video=True).dtype == "video"
+            if lerobot_features.feature_of(name, leaf, video=True).dtype == "video"
         ]
     if found and not lossy:
         raise SpaceError(f"{found[0]}; pass `lossy=True` to write the dataset")
@@ -324,13 +324,13 @@ class _Writer:
         self._leaves = leaves_of(dataset.observation_space)
         self._fps = frames_per_second(self._metadata.step_duration_ns)
         labels = self._metadata.observation_names
-        named = zip(features.observation_names(self._leaves), self._leaves, strict=True)
+        named = zip(lerobot_features.observation_names(self._leaves), self._leaves, strict=True)
         self._observations = [
-            features.feature_of(name, leaf, () if leaf.path else labels, video=video)
+            lerobot_features.feature_of(name, leaf, () if leaf.path else labels, video=video)
             for name, leaf in named
         ]
-        self._infos = features.info_features(dataset.infos, dataset.frame_of_step + 1)
-        others = [*self._infos.values(), *features.default_features()]
+        self._infos = lerobot_features.info_features(dataset.infos, dataset.frame_of_step + 1)
+        others = [*self._infos.values(), *lerobot_features.default_features()]
         self._features = [*self._observations, *_step_features(dataset), *others]
         self._slices = episode_slices(dataset)
         self._tasks: dict[str, int] = {}
@@ -406,10 +406,10 @@ class _Writer:
         count = steps.stop - steps.start
         times = (np.arange(count) / float(self._fps)).astype(np.float32)
         given: dict[str, Any] = {
-            features.ACTION: self._dataset.actions[steps],
-            features.REWARD: self._dataset.rewards[steps],
-            features.DONE: self._dataset.terminated[steps],
-            features.TRUNCATED: self._dataset.truncated[steps],
+            lerobot_features.ACTION: self._dataset.actions[steps],
+            lerobot_features.REWARD: self._dataset.rewards[steps],
+            lerobot_features.DONE: self._dataset.terminated[steps],
+            lerobot_features.TRUNCATED: self._dataset.truncated[steps],
             _behavior_feature(self._dataset): self._dataset.behavior[steps],
             "timestamp": times,
             "frame_index": np.arange(count),
@@ -474,10 +474,10 @@ def _step_features(dataset: Dataset) -> list[Feature]:
     with np.errstate(over="ignore"):
         fits = np.array_equal(rewards.astype(np.float32), rewards, equal_nan=True)
     found = [
-        features.feature_of(features.ACTION, leaf, dataset.action_part_names),
-        Feature(features.REWARD, "float32" if fits else "float64", (1,)),
-        Feature(features.DONE, "bool", (1,)),
-        Feature(features.TRUNCATED, "bool", (1,)),
+        lerobot_features.feature_of(lerobot_features.ACTION, leaf, dataset.action_part_names),
+        Feature(lerobot_features.REWARD, "float32" if fits else "float64", (1,)),
+        Feature(lerobot_features.DONE, "bool", (1,)),
+        Feature(lerobot_features.TRUNCATED, "bool", (1,)),
     ]
     if not np.isnan(dataset.behavior).all():
         found.append(Feature(_behavior_feature(dataset), "float32", (1,)))
@@ -485,7 +485,7 @@ def _step_features(dataset: Dataset) -> list[Feature]:
 
 
 def _behavior_feature(dataset: Dataset) -> str:
-    return f"{features.INFO}{dataset.behavior_field.name}"
+    return f"{lerobot_features.INFO}{dataset.behavior_field.name}"
 
 
 def _plain(stats: Stats) -> dict[str, Any]:

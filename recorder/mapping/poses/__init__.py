@@ -1,1 +1,0 @@
-"""Poses of coordinate frames, from the transforms of a bag."""

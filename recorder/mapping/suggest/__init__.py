@@ -1,1 +1,0 @@
-"""Suggestion of a mapping file, from the messages of a bag."""
