@@ -27,13 +27,13 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     given = parser.parse_args()
     figure, axes = new_figure((7.0, 3.4), 2)
-    for panel, log, name, color in zip(axes, given.logs, ("buttons", "wheel"), COLORS, strict=False):
-        data = mcaprl.open(log)
+    for k, (panel, name) in enumerate(zip(axes, ("buttons", "wheel"), strict=True)):
+        data = mcaprl.open(given.logs[k])
         first = data.episodes[0]
         after = first.next_observations[:STEPS, data.observation_names.index("steering")]
         steering = after / FULL_STEERING
         change = np.abs(np.diff(steering)).mean()
-        panel.step(STEP_S * np.arange(len(steering)), steering, where="post", color=color)
+        panel.step(STEP_S * np.arange(len(steering)), steering, where="post", color=COLORS[k])
         panel.set_title(f"{name}: return {first.total_reward:.0f}, mean change a step {change:.3f}")
         panel.set_ylim(-1.05, 1.05)
         panel.set_ylabel("steering")
