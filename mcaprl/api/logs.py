@@ -21,7 +21,7 @@ from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.dataset.statistics import Calibration, calibration
 from mcaprl.recorder.format.behavior import PROBABILITY
 from mcaprl.recorder.source import Definitions, Source, open_data, opened
-from mcaprl.recorder.viewer.surprises import Surprise, moments_of
+from mcaprl.recorder.viewer.report import Surprise, moments_of
 from mcaprl.texts import counted, size
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.messages import INTERRUPTED
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
-from mcaprl.recorder.record.recorded_space import recorded_like, value_at
+from mcaprl.recorder.record.recordable import recorded_like, value_at
 from mcaprl.recorder.record.step_rows import as_declared
 from mcaprl.texts import counted
 
