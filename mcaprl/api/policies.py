@@ -161,7 +161,7 @@ def policies_of(name: str | BasePolicy, env: gym.Env[Any, Any]) -> list[BasePoli
     if name == "random":
         return [RandomPolicy(env.action_space)]
     if name == "pilot":
-        from mcaprl.sims.evaluation.pilots import has_pilot, make_pilot
+        from mcaprl.sims.evaluation.evaluate import has_pilot, make_pilot
 
         if not has_pilot(env):
             sim = env.spec.id if env.spec else "the environment"

@@ -27,9 +27,8 @@ from mcaprl.figures import (
 from mcaprl.page import PAGE_NAME, Card, Figure, Section, Table, write_page
 from mcaprl.sims.drawing.scene import Shape
 from mcaprl.sims.drawing.top_view import patches
-from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore
+from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore, interquartile_mean, median
 from mcaprl.sims.evaluation.rollout import EpisodeResult
-from mcaprl.sims.evaluation.statistics import interquartile_mean, median
 from mcaprl.texts import counted
 
 _MAX_PATHS = 30
