@@ -12,9 +12,21 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.figures import COLORS, INK, PALE, Panel, save_panels, tick_labels, to_svg
-from mcaprl.page import Card, Figure, Section, Table, write_page
-from mcaprl.problem import Problem
+from mcaprl.errors import Problem
+from mcaprl.page import (
+    COLORS,
+    INK,
+    PALE,
+    Card,
+    Figure,
+    Panel,
+    Section,
+    Table,
+    save_panels,
+    tick_labels,
+    to_svg,
+    write_page,
+)
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.statistics import calibration
 from mcaprl.recorder.dataset.transitions import Episode

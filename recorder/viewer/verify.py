@@ -16,11 +16,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, McaprlError, SpaceError
+from mcaprl.errors import LogError, McaprlError, Problem, SpaceError
 from mcaprl.files import parse_json
 from mcaprl.frames import rows_of
 from mcaprl.limits import STEP_LIMIT
-from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.messages import INTERRUPTED
