@@ -15,7 +15,7 @@ import pytest
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.viewer.scene_reader import moments_of_episode
+from mcaprl.recorder.viewer.playback import moments_of_episode
 from mcaprl.recorder.viewer.video import (
     VIDEO_KINDS,
     contact_sheet,
