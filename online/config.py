@@ -207,12 +207,15 @@ class ActorCriticConfig(ReplayConfig):
     """normalize the hidden layers of the critics; the default with logs is yes"""
     data_fraction: float = 0.5
     """fraction of each batch that is drawn from the given logs, if there are any"""
+    smoothness: float = 0.0
+    """weight of the mean change of the actor's action until the next state, in [-1, 1]"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
         super().__post_init__()
         self._require("polyak", 0 < self.polyak <= 1, "within (0, 1]")
         self._require_fraction("data_fraction")
+        self._require("smoothness", 0 <= self.smoothness < math.inf, "at least 0 and finite")
 
     def arguments(self) -> dict[str, Any]:
         """Return arguments of SB3's constructor, except learning rate and networks."""
@@ -487,6 +490,7 @@ _BOX: Final[dict[str, Any]] = {
     "learning_starts": 1_000,
     "eval_interval": 2_000,
     "buffer_size": 100_000,
+    "smoothness": 0.1,
 }
 BOX_SETTINGS: Final[dict[str, dict[str, Any]]] = {
     "lane": {**_BOX, "steps": 60_000, "gamma": 0.97},
@@ -495,8 +499,11 @@ BOX_SETTINGS: Final[dict[str, dict[str, Any]]] = {
     "highway-lane": {**_BOX, "steps": 40_000, "gamma": 0.97},
 }
 """Settings for continuous actions that differ from the algorithm's defaults, by sim."""
-TD3_SETTINGS: Final[dict[str, Any]] = {"exploration_noise": 0.2}
-"""Settings of TD3 that replace those of `BOX_SETTINGS`."""
+BOX_ALGO_SETTINGS: Final[dict[str, dict[str, Any]]] = {
+    "sac": {"target_entropy": -2.0},
+    "td3": {"exploration_noise": 0.2},
+}
+"""Settings of each algorithm in addition to those of `BOX_SETTINGS`."""
 
 
 _FROM_IMAGES: Final[dict[str, Any]] = {
@@ -552,6 +559,11 @@ def warm_settings(algo: str, *, with_logs: bool, with_policy: bool) -> dict[str,
     )
 
 
+def reference_settings(algo: str) -> dict[str, Any]:
+    """Return the settings that replace the tuned ones of a sim, because SB3 lacks them."""
+    return {"smoothness": 0.0} if issubclass(CONFIGS[algo], ActorCriticConfig) else {}
+
+
 def settings_for(algo: str, sim: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the tuned settings of an algorithm for a sim.
 
@@ -567,5 +579,5 @@ def settings_for(algo: str, sim: str, sim_options: Mapping[str, Any]) -> dict[st
     is_box = issubclass(CONFIGS[algo], ActorCriticConfig)
     if observation in ("state", "rays"):
         settings = BOX_SETTINGS.get(name, {}) if is_box else SIM_SETTINGS.get(name, {})
-        return {**settings, **(TD3_SETTINGS if is_box and settings and algo == "td3" else {})}
+        return {**settings, **(BOX_ALGO_SETTINGS[algo] if is_box and settings else {})}
     return {} if is_box else dict(IMAGE_SETTINGS.get((name, observation), {}))

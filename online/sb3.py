@@ -349,7 +349,8 @@ def _check(algo: str, config: OnlineConfig, space: spaces.Space[Any]) -> None:
     """Refuse settings that SB3's algorithms with a replay buffer do not have."""
     if not isinstance(config, ReplayConfig):
         return
-    lacks = ("image_shift", "exploration_decay", "target_update_episodes", "critic_layer_norm")
+    lacks = ("image_shift", "exploration_decay", "target_update_episodes")
+    lacks += ("critic_layer_norm", "smoothness")
     given = [name for name in lacks if getattr(config, name, False)]
     if config.n_steps > 1 and isinstance(space, spaces.Dict):
         given.append("n_steps for Dict observations")

@@ -187,6 +187,17 @@ def smoothed_actions(a_t: Tensor, noise: Tensor, limit: float) -> Tensor:
     return (a_t + noise.clamp(-limit, limit)).clamp(-1, 1)
 
 
+def action_change(a_tm1: Tensor, a_t: Tensor) -> Tensor:
+    """Return the mean absolute change (B,) of the numbers of successive actions (B, n).
+
+    This is the temporal term of CAPS, "Regularizing Action Policies for Smooth Control with
+    Reinforcement Learning", equation 2, https://arxiv.org/abs/2012.06644, with the mean absolute
+    difference in place of the Euclidean distance, so that it is the change that evaluations report.
+    """
+    _check_shape("a_t", a_t, a_tm1.shape)
+    return (a_t - a_tm1).abs().mean(1)
+
+
 def truncated_normal_log_density(actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """Return the log densities of actions in [-1, 1], with the shape of the broadcast arguments.
 
