@@ -208,7 +208,7 @@ class ActorCriticConfig(ReplayConfig):
     data_fraction: float = 0.5
     """fraction of each batch that is drawn from the given logs, if there are any"""
     smoothness: float = 0.0
-    """weight of the mean change of the actor's action until the next state, in [-1, 1]"""
+    """weight of the mean change of the actions in [-1, 1] from a state to the next one"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -490,12 +490,13 @@ _BOX: Final[dict[str, Any]] = {
     "learning_starts": 1_000,
     "eval_interval": 2_000,
     "buffer_size": 100_000,
+    "polyak": 0.02,
     "smoothness": 0.1,
 }
 BOX_SETTINGS: Final[dict[str, dict[str, Any]]] = {
-    "lane": {**_BOX, "steps": 60_000, "gamma": 0.97},
+    "lane": {**_BOX, "steps": 80_000, "gamma": 0.97},
     "racer": {**_BOX, "steps": 40_000, "gamma": 0.98},
-    "powerline": {**_BOX, "steps": 60_000, "gamma": 0.95, "n_steps": 3},
+    "powerline": {**_BOX, "steps": 100_000, "gamma": 0.95, "n_steps": 3, "smoothness": 0.2},
     "highway-lane": {**_BOX, "steps": 40_000, "gamma": 0.97},
 }
 """Settings for continuous actions that differ from the algorithm's defaults, by sim."""
