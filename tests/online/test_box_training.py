@@ -254,8 +254,8 @@ def test_runs_of_versions_without_a_setting_are_resumed(tmp_path: Path) -> None:
     written = json.loads(path.read_text())
     assert written["config"].pop("smoothness") == 0
     path.write_text(json.dumps(written))
-    train(Task.of_run(tmp_path), tmp_path, resume=True, progress=silent)
-    train(task, tmp_path, resume=True, progress=silent)
     other = Task.for_sim(PENDULUM, "sac", **SHORT, smoothness=1.0)
     with pytest.raises(TrainingError, match=r"has smoothness None, not 1\.0"):
         train(other, tmp_path, resume=True, progress=silent)
+    (summary,) = train(task, tmp_path, resume=True, progress=silent)
+    assert summary.resumed_at == SHORT["steps"]
