@@ -16,7 +16,7 @@ from mcaprl.errors import UsageError
 from mcaprl.texts import counted
 
 if TYPE_CHECKING:
-    from mcaprl.recorder.edit.source import Edited
+    from mcaprl.recorder.edit.piece import Edited
 
 _overwrite_option = click.option("--overwrite", is_flag=True, help="Replace existing output.")
 

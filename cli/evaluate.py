@@ -179,7 +179,7 @@ def _print_scores(found: Evaluation) -> None:
 
 def _score_rows(found: Evaluation) -> list[dict[str, str | None]]:
     """Return the cells of the table by column, for the behavior in a log and for each policy."""
-    from mcaprl.sims.evaluation.statistics import interquartile_mean
+    from mcaprl.sims.evaluation.evaluate import interquartile_mean
 
     rows: list[dict[str, str | None]] = []
     if (logged := found.behavior) is not None:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 import click
 
+from mcaprl.errors import Problem
 from mcaprl.files import json_text
-from mcaprl.problem import Problem
 from mcaprl.settings import flag
 from mcaprl.texts import counted, printable, shortened
 

@@ -26,8 +26,7 @@ from mcaprl.offline.algorithms.losses import mean_values
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
 from mcaprl.online.replay import Outcome, ReplayBuffer
 from mcaprl.sims import DeviceSims
-from mcaprl.sims.evaluation.noise import log_density, quantile
-from mcaprl.sims.evaluation.rollout import episode_seed
+from mcaprl.sims.evaluation.rollout import episode_seed, log_density, quantile
 from mcaprl.sims.vehicle.device import Batch
 
 

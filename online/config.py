@@ -16,6 +16,9 @@ has the command and the scores of four seeds. Important settings are:
   oscillates until the end.
 - `n_steps` is 3 for powerline and racer, whose rewards are sparse or late. Their target networks
   are updated only every 2,000 steps (powerline, `gamma` 0.95) or 4,000 steps (racer, `gamma` 0.98).
+- For continuous actions, `polyak` is 0.02: with 0.005, critics lag behind the policy, and the car
+  of the lane stays slow. `smoothness` makes the commands smooth. The measurements are in
+  docs/decisions/14-continuous-actions.md.
 - Checkpoints are compared on separate episodes and the best one is stored, because scores can still
   drop during training.
 """
@@ -27,8 +30,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from mcaprl.architecture import Architecture, NetworkSettings
 from mcaprl.errors import UnknownNameError
+from mcaprl.settings import Architecture, NetworkSettings
 
 
 @dataclass(frozen=True)
@@ -207,12 +210,15 @@ class ActorCriticConfig(ReplayConfig):
     """normalize the hidden layers of the critics; the default with logs is yes"""
     data_fraction: float = 0.5
     """fraction of each batch that is drawn from the given logs, if there are any"""
+    smoothness: float = 0.0
+    """weight of the mean change of the actions in [-1, 1] from a state to the next one"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
         super().__post_init__()
         self._require("polyak", 0 < self.polyak <= 1, "within (0, 1]")
         self._require_fraction("data_fraction")
+        self._require("smoothness", 0 <= self.smoothness < math.inf, "at least 0 and finite")
 
     def arguments(self) -> dict[str, Any]:
         """Return arguments of SB3's constructor, except learning rate and networks."""
@@ -487,16 +493,21 @@ _BOX: Final[dict[str, Any]] = {
     "learning_starts": 1_000,
     "eval_interval": 2_000,
     "buffer_size": 100_000,
+    "polyak": 0.02,
+    "smoothness": 0.1,
 }
 BOX_SETTINGS: Final[dict[str, dict[str, Any]]] = {
-    "lane": {**_BOX, "steps": 60_000, "gamma": 0.97},
+    "lane": {**_BOX, "steps": 80_000, "gamma": 0.97},
     "racer": {**_BOX, "steps": 40_000, "gamma": 0.98},
-    "powerline": {**_BOX, "steps": 60_000, "gamma": 0.95, "n_steps": 3},
+    "powerline": {**_BOX, "steps": 100_000, "gamma": 0.95, "n_steps": 3, "smoothness": 0.2},
     "highway-lane": {**_BOX, "steps": 40_000, "gamma": 0.97},
 }
 """Settings for continuous actions that differ from the algorithm's defaults, by sim."""
-TD3_SETTINGS: Final[dict[str, Any]] = {"exploration_noise": 0.2}
-"""Settings of TD3 that replace those of `BOX_SETTINGS`."""
+BOX_ALGO_SETTINGS: Final[dict[str, dict[str, Any]]] = {
+    "sac": {"target_entropy": -2.0},
+    "td3": {"exploration_noise": 0.2},
+}
+"""Settings of each algorithm in addition to those of `BOX_SETTINGS`."""
 
 
 _FROM_IMAGES: Final[dict[str, Any]] = {
@@ -552,6 +563,11 @@ def warm_settings(algo: str, *, with_logs: bool, with_policy: bool) -> dict[str,
     )
 
 
+def reference_settings(algo: str) -> dict[str, Any]:
+    """Return the settings that replace the tuned ones of a sim, because SB3 lacks them."""
+    return {"smoothness": 0.0} if issubclass(CONFIGS[algo], ActorCriticConfig) else {}
+
+
 def settings_for(algo: str, sim: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the tuned settings of an algorithm for a sim.
 
@@ -567,5 +583,5 @@ def settings_for(algo: str, sim: str, sim_options: Mapping[str, Any]) -> dict[st
     is_box = issubclass(CONFIGS[algo], ActorCriticConfig)
     if observation in ("state", "rays"):
         settings = BOX_SETTINGS.get(name, {}) if is_box else SIM_SETTINGS.get(name, {})
-        return {**settings, **(TD3_SETTINGS if is_box and settings and algo == "td3" else {})}
+        return {**settings, **(BOX_ALGO_SETTINGS[algo] if is_box and settings else {})}
     return {} if is_box else dict(IMAGE_SETTINGS.get((name, observation), {}))

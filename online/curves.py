@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import TrainingError
-from mcaprl.figures import BACKGROUND, COLORS, INK, PALE, new_figure, save_png
 from mcaprl.files import read_json, write_atomically
+from mcaprl.page import BACKGROUND, COLORS, INK, PALE, new_figure, save_png
 from mcaprl.runs import CURVE_NAME, Curve, read_curves
 
 IMAGE_NAME = "curve.png"

@@ -200,7 +200,7 @@ def _due(before: int, now: int, interval: int) -> int:
 
 _OF_NETWORKS = ("hidden", "layer_norm", "frame_stack", "encoder", "channels", "center_images")
 _OF_UPDATES = ("batch_size", "learning_rate", "gamma", "n_steps")
-_OF_CRITICS = ("polyak", "critic_layer_norm")
+_OF_ACTOR_CRITIC = ("polyak", "critic_layer_norm", "smoothness")
 
 
 def _learner_of(config: ReplayConfig) -> tuple[type[Learner], learners.TrainingConfig]:
@@ -217,10 +217,10 @@ def _learner_of(config: ReplayConfig) -> tuple[type[Learner], learners.TrainingC
         return DoubleDQN, learners.DoubleDQNConfig(**settings)
     unscaled: dict[str, Any] = {"normalize": False, "scale_rewards": False}
     if isinstance(config, SACConfig):
-        settings = same(*_OF_CRITICS, "temperature", "target_entropy")
+        settings = same(*_OF_ACTOR_CRITIC, "temperature", "target_entropy")
         return SAC, learners.SACConfig(**settings, **unscaled)
     assert isinstance(config, TD3Config)
-    settings = same(*_OF_CRITICS, "policy_interval", "policy_noise", "noise_clip")
+    settings = same(*_OF_ACTOR_CRITIC, "policy_interval", "policy_noise", "noise_clip")
     interval = config.policy_interval
     return TD3, learners.TD3Config(**settings, **unscaled, target_interval=interval)
 

@@ -20,8 +20,7 @@ from mcaprl.limits import STEP_LIMIT
 from mcaprl.online.curves import CurvePoint
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.vector_wrapper import VectorWrapper
-from mcaprl.sims.evaluation.evaluate import Scale, evaluate
-from mcaprl.sims.evaluation.pilots import has_pilot, make_pilot
+from mcaprl.sims.evaluation.evaluate import Scale, evaluate, has_pilot, make_pilot
 from mcaprl.sims.evaluation.rollout import batch_rollout, episode_seed
 
 SELECTION_SEED: Final = 3_000_000

@@ -12,8 +12,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import LogError, NoStepsError, NotMcapError, OutputExistsError, UsageError
 from mcaprl.files import check_target
-from mcaprl.recorder.edit.piece import filter_log
-from mcaprl.recorder.edit.source import FinishedLog
+from mcaprl.recorder.edit.piece import FinishedLog, filter_log
 from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
 from mcaprl.recorder.repair.recover import recover_log
 

@@ -35,7 +35,6 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from torch import Tensor
 
 from mcaprl.actions import BoxActions
-from mcaprl.architecture import SMALL_EDGE, Architecture
 from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import UsageError
 from mcaprl.frames import (
@@ -77,6 +76,7 @@ from mcaprl.online.zip_file import (
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import BEST_NAME
+from mcaprl.settings import SMALL_EDGE, Architecture
 from mcaprl.sims.evaluation.rollout import episode_seed
 from mcaprl.storage.tensor_files import below
 
@@ -349,7 +349,8 @@ def _check(algo: str, config: OnlineConfig, space: spaces.Space[Any]) -> None:
     """Refuse settings that SB3's algorithms with a replay buffer do not have."""
     if not isinstance(config, ReplayConfig):
         return
-    lacks = ("image_shift", "exploration_decay", "target_update_episodes", "critic_layer_norm")
+    lacks = ("image_shift", "exploration_decay", "target_update_episodes")
+    lacks += ("critic_layer_norm", "smoothness")
     given = [name for name in lacks if getattr(config, name, False)]
     if config.n_steps > 1 and isinstance(space, spaces.Dict):
         given.append("n_steps for Dict observations")

@@ -21,6 +21,7 @@ from mcaprl.online.config import (
     FINITE_ALGOS,
     OnlineConfig,
     find_preset,
+    reference_settings,
     settings_for,
     warm_settings,
 )
@@ -216,7 +217,8 @@ class Task:
         # Runs of earlier versions have no limit in their files.
         limit = {} if self.max_steps is None else {"max_steps": self.max_steps}
         engine = {"engine": self.engine} if self.engine else {}
-        return RunIdentity({**parts, **limit, **engine, "config": self.config.to_json()})
+        own = {**parts, **limit, **engine, "config": self.config.to_json()}
+        return RunIdentity(own, defaults=type(self.config)().to_json())
 
 
 def choose_task(
@@ -237,10 +239,15 @@ def choose_task(
     `with_logs` and `with_policy` say what the agents start from.
     """
     is_resumed = resumed is not None and run_to_resume(resumed)
-    if sim is not None and preset is None and not is_resumed and (with_logs or with_policy):
+    is_other = with_logs or with_policy or engine == "sb3"
+    if sim is not None and preset is None and not is_resumed and is_other:
         algo = algo or default_algo(sim, sim_options)
         find_config(algo)
-        given = {**warm_settings(algo, with_logs=with_logs, with_policy=with_policy), **given}
+        if engine == "sb3":
+            replaced = reference_settings(algo)
+        else:
+            replaced = warm_settings(algo, with_logs=with_logs, with_policy=with_policy)
+        given = {**replaced, **given}
     task = _described(sim, algo, sim_options, given, preset, max_steps, engine, resumed)
     choose_engine(task.algo, task.engine or None)
     return task

@@ -27,10 +27,8 @@ if TYPE_CHECKING:
     from mcaprl.base_policy import BasePolicy as Policy
     from mcaprl.sims.drawing.camera import lens
     from mcaprl.sims.drawing.depth import DepthCamera, encode_depth
-    from mcaprl.sims.evaluation.evaluate import PolicyScore, Scale, evaluate, normalize
-    from mcaprl.sims.evaluation.noise import NoisyPolicy
-    from mcaprl.sims.evaluation.pilots import make_pilot
-    from mcaprl.sims.evaluation.rollout import EpsilonGreedy, episode_seed, rollout
+    from mcaprl.sims.evaluation.evaluate import PolicyScore, Scale, evaluate, make_pilot, normalize
+    from mcaprl.sims.evaluation.rollout import EpsilonGreedy, NoisyPolicy, episode_seed, rollout
     from mcaprl.sims.lane.camera import CarCamera
     from mcaprl.sims.lane.env import LaneKeepingEnv
     from mcaprl.sims.vehicle.device import DeviceSims
@@ -219,10 +217,19 @@ __getattr__ = lazy_attributes(
         "mcaprl.sims.drawing.camera": ("lens",),
         "mcaprl.sims.drawing.depth": ("DepthCamera", "encode_depth"),
         "mcaprl.base_policy": ("BasePolicy as Policy",),
-        "mcaprl.sims.evaluation.evaluate": ("PolicyScore", "Scale", "evaluate", "normalize"),
-        "mcaprl.sims.evaluation.noise": ("NoisyPolicy",),
-        "mcaprl.sims.evaluation.pilots": ("make_pilot",),
-        "mcaprl.sims.evaluation.rollout": ("EpsilonGreedy", "episode_seed", "rollout"),
+        "mcaprl.sims.evaluation.evaluate": (
+            "PolicyScore",
+            "Scale",
+            "evaluate",
+            "make_pilot",
+            "normalize",
+        ),
+        "mcaprl.sims.evaluation.rollout": (
+            "EpsilonGreedy",
+            "NoisyPolicy",
+            "episode_seed",
+            "rollout",
+        ),
         "mcaprl.sims.lane.camera": ("CarCamera",),
         "mcaprl.sims.lane.env": ("LaneKeepingEnv",),
         "mcaprl.sims.vehicle.device": ("DeviceSims",),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mcaprl.figures import new_figure, save_png, tick_labels, to_svg
+from mcaprl.page import new_figure, save_png, tick_labels, to_svg
 
 BAD = r"$\bad$"
 

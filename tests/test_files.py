@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from mcaprl.errors import LogError, ReportError, UsageError
+from mcaprl.errors import LogError, Problem, ReportError, UsageError
 from mcaprl.files import (
     TemporaryFolder,
     locked_folder,
@@ -25,7 +25,6 @@ from mcaprl.files import (
     write_atomically,
     write_json,
 )
-from mcaprl.problem import Problem
 from mcaprl.storage import work_folders
 
 

@@ -14,9 +14,8 @@ import pytest
 
 import mcaprl
 from mcaprl.api.evaluate import learning_curves
-from mcaprl.figures import COLORS, new_figure, to_svg
 from mcaprl.online.curves import CurvePoint, write_curve
-from mcaprl.page import Card, Figure, Section, Table, write_page
+from mcaprl.page import COLORS, Card, Figure, Section, Table, new_figure, to_svg, write_page
 from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.recorder.viewer.report import dataset_page, tracks_of

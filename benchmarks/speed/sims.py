@@ -23,7 +23,8 @@ CARS, DRONES, RACERS = 1024, 64, 256
 QUADROTOR_STEPS = 5
 """Number of steps of 0.1 s in one drone action (0.5 s); a step has 50 integration steps."""
 
-
+NO_CHANGE = 6
+"""Discrete action of the drone that keeps the commanded velocity."""
 STEPS = 1_000_000
 """Number of steps to which the measured time of each sim is scaled up."""
 
@@ -62,12 +63,16 @@ def ours() -> list[Side]:
             40,
             QUADROTOR_STEPS,
         ),
-        # Random velocities would end an episode after a few steps.
-        _batch(
-            f"quadrotor, increments, 0.1 s of flight, {DRONES} in a batch",
-            make_sims("powerline", DRONES, actions="increments"),
-            40,
-            QUADROTOR_STEPS,
+        # Random increments end more episodes than random discrete actions, and starts take time.
+        *(
+            _batch(
+                f"quadrotor, {actions}, no change, 0.1 s of flight, {DRONES} in a batch",
+                make_sims("powerline", DRONES, actions=actions),
+                40,
+                QUADROTOR_STEPS,
+                action,
+            )
+            for actions, action in (("discrete", NO_CHANGE), ("increments", np.zeros(3, "f4")))
         ),
         _single("racer with 18 rays", make_sim("racer"), 4_000),
         _batch(f"racer with 18 rays, {RACERS} in a batch", make_sims("racer", RACERS), 50),
@@ -204,11 +209,21 @@ def _frames_of(name: str, env: gym.Env[Any, Any], frames: int) -> Side:
     return Side(name, run, share=frames / STEPS)
 
 
-def _batch(name: str, env: gym.vector.VectorEnv[Any, Any, Any], steps: int, each: int = 1) -> Side:
+def _batch(
+    name: str,
+    env: gym.vector.VectorEnv[Any, Any, Any],
+    steps: int,
+    each: int = 1,
+    action: Any = None,
+) -> Side:
+    """Return a side that steps a batch with one action, or with random ones."""
     random = np.random.default_rng(0)
     space = env.single_action_space
-    if isinstance(space, gym.spaces.Discrete):
-        actions: NDArray[Any] = random.integers(int(space.n), size=(steps, env.num_envs))
+    actions: NDArray[Any]
+    if action is not None:
+        actions = np.array([[action] * env.num_envs] * steps)
+    elif isinstance(space, gym.spaces.Discrete):
+        actions = random.integers(int(space.n), size=(steps, env.num_envs))
     else:
         shape = (steps, env.num_envs, *(space.shape or ()))
         actions = random.uniform(-1.0, 1.0, shape).astype(np.float32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mcaprl.figures import COLORS, INK, new_figure, save_png
+from mcaprl.page import COLORS, INK, new_figure, save_png
 from mcaprl.runs import Curve
 
 

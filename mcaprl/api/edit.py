@@ -7,8 +7,7 @@ from pathlib import Path
 
 from mcaprl.files import check_log_name
 from mcaprl.recorder.edit.join import merge_logs
-from mcaprl.recorder.edit.piece import Bounds, filter_log, slice_log, split_log
-from mcaprl.recorder.edit.source import Edited
+from mcaprl.recorder.edit.piece import Bounds, Edited, filter_log, slice_log, split_log
 from mcaprl.recorder.source import Paths
 
 

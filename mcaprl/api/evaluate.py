@@ -31,14 +31,14 @@ from mcaprl.sims.evaluation.evaluate import (
     PolicyScore,
     Scale,
     greedy_episodes,
+    has_pilot,
     improvements,
+    mean_interval,
     normalize,
     score_of,
 )
 from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
-from mcaprl.sims.evaluation.pilots import has_pilot
 from mcaprl.sims.evaluation.rollout import EpisodeResult, StepLimit, make_limited, warn_of_cuts
-from mcaprl.sims.evaluation.statistics import mean_interval
 
 # Number of episodes that a worker runs as one task. The number of workers has no effect on the
 # parts, and thus on the results.

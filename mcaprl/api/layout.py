@@ -13,7 +13,7 @@ from mcaprl.files import temporary_folder, write_json
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.scene import DepthSource
 from mcaprl.recorder.record.wrapper import RecordMcap
-from mcaprl.recorder.viewer.log_layout import attached_layout
+from mcaprl.recorder.viewer.annotate import attached_layout
 from mcaprl.sims import SIMS, make_sim
 from mcaprl.storage.remote import is_url
 

@@ -12,16 +12,15 @@ import numpy as np
 
 from mcaprl.api.bags import BagInfo, bag_info, logs_or_bags
 from mcaprl.api.ranges import check_least
-from mcaprl.errors import LogError, NoEpisodesError, ReportError, UsageError, import_extra
+from mcaprl.errors import LogError, NoEpisodesError, Problem, ReportError, UsageError, import_extra
 from mcaprl.files import check_log_name, size_of, write_json
 from mcaprl.page import PAGE_NAME
-from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.dataset.statistics import Calibration, calibration
 from mcaprl.recorder.format.behavior import PROBABILITY
 from mcaprl.recorder.source import Definitions, Source, open_data, opened
-from mcaprl.recorder.viewer.surprises import Surprise, moments_of
+from mcaprl.recorder.viewer.report import Surprise, moments_of
 from mcaprl.texts import counted, size
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from mcaprl.base_policy import BasePolicy, RandomPolicy, as_policy
 from mcaprl.errors import McaprlError, PolicyError, UnknownNameError, UsageError
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.record.recorded_space import RecordedSpace, recorded_like
+from mcaprl.recorder.record.recordable import RecordedSpace, recorded_like
 from mcaprl.runs import BEST_NAME, CONFIG_NAME, POLICY_NAME, RunSummary, policy_files
 from mcaprl.sims.evaluation.rollout import check_fit, same_form
 
@@ -161,7 +161,7 @@ def policies_of(name: str | BasePolicy, env: gym.Env[Any, Any]) -> list[BasePoli
     if name == "random":
         return [RandomPolicy(env.action_space)]
     if name == "pilot":
-        from mcaprl.sims.evaluation.pilots import has_pilot, make_pilot
+        from mcaprl.sims.evaluation.evaluate import has_pilot, make_pilot
 
         if not has_pilot(env):
             sim = env.spec.id if env.spec else "the environment"

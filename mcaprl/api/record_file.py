@@ -16,12 +16,13 @@ from mcaprl.base_policy import BasePolicy
 from mcaprl.files import work_folder
 from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.record.wrapper import RecordMcap
-from mcaprl.sims.evaluation.noise import NoisyPolicy, noisy_name
 from mcaprl.sims.evaluation.rollout import (
     EpisodeResult,
     EpsilonGreedy,
+    NoisyPolicy,
     make_limited,
     make_or_borrow,
+    noisy_name,
     rollout,
 )
 

@@ -29,9 +29,9 @@ from mcaprl.recorder.record.display import SCENE
 from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.record.panels import bounded_actions
 from mcaprl.recorder.source import Paths, open_data
+from mcaprl.recorder.viewer.annotate import attached_layout
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
-from mcaprl.recorder.viewer.log_layout import attached_layout
-from mcaprl.recorder.viewer.playback import Player, Track
+from mcaprl.recorder.viewer.playback import Player, SeenStep, Track, moments_of_episode
 from mcaprl.recorder.viewer.player_server import (
     MAX_SPEED,
     MIN_SPEED,
@@ -39,7 +39,6 @@ from mcaprl.recorder.viewer.player_server import (
     prefixes_of,
     side_by_side,
 )
-from mcaprl.recorder.viewer.scene_reader import SeenStep, moments_of_episode
 from mcaprl.recorder.viewer.verify import Comparison, Verification
 from mcaprl.recorder.viewer.verify import verify as verify_dataset
 from mcaprl.recorder.viewer.video import (

@@ -31,13 +31,12 @@ from mcaprl.errors import (
     TrainingError,
     import_extra,
 )
-from mcaprl.figures import COLORS, new_figure, save_png
 from mcaprl.files import locked_folder, read_json, work_folder, write_atomically, write_json
 from mcaprl.offline.estimate.fqe import FQEConfig
 from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
 from mcaprl.offline.policy import read_policy
 from mcaprl.offline.training.train import train
-from mcaprl.page import PAGE_NAME, Figure, Section, Table, write_page
+from mcaprl.page import COLORS, PAGE_NAME, Figure, Section, Table, new_figure, save_png, write_page
 from mcaprl.progress import Advance, TrainingProgress
 from mcaprl.ray.cluster import restored_handlers
 from mcaprl.ray.sweep_file import SweepPlan, Trial

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from mcaprl import limits
 from mcaprl.errors import LogError, OutputExistsError, UsageError, import_extra
-from mcaprl.files import TemporaryFolder, open_own, replacing, subfolder, waiting_lock
+from mcaprl.storage.locks import waiting_lock
+from mcaprl.storage.work_folders import TemporaryFolder, open_own, replacing, subfolder
 
 CACHE_VARIABLE = "MCAPRL_CACHE"
 """Name of the environment variable for the folder that keeps fetched parts for later commands."""

@@ -14,7 +14,9 @@ from safetensors.torch import save
 from torch import Tensor
 
 from mcaprl.errors import TrainingError
-from mcaprl.files import check_regular, parse_json, write_atomically
+from mcaprl.storage.documents import parse_json
+from mcaprl.storage.locks import check_regular
+from mcaprl.storage.work_folders import write_atomically
 
 _DESCRIPTION = "description"
 

@@ -11,13 +11,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mcaprl.architecture import Architecture
 from mcaprl.offline.algorithms.config import ActorCriticConfig
 from mcaprl.offline.algorithms.heads import BOX_HEADS
 from mcaprl.offline.algorithms.learner import Learner
-from mcaprl.offline.algorithms.losses import clipped_double_q_target
+from mcaprl.offline.algorithms.losses import action_change, clipped_double_q_target
 from mcaprl.offline.batches.buffer import Batch
 from mcaprl.offline.batches.observations import Observations
+from mcaprl.settings import Architecture
 
 
 class ActorCritic(Learner):
@@ -41,6 +41,16 @@ class ActorCritic(Learner):
     def act(self, observations: Observations) -> Tensor:
         """Return the actor's actions (R, n), in [-1, 1]."""
         return BOX_HEADS[self.acts_by].best(self.models["actor"](observations))
+
+    def smoothness_loss(self, batch: Batch, weight: float) -> Tensor | float:
+        """Return the weighted change (R,) of the actor's action until the next observation.
+
+        With n-step returns, that is the observation n steps later.
+        """
+        if not weight:
+            return 0.0
+        actions, next_actions = self.act(batch.observations), self.act(batch.next_observations)
+        return weight * action_change(actions, next_actions)
 
     def validate(self, batch: Batch) -> dict[str, Tensor]:
         """Return metrics of the values in units of the logged rewards, and the actor's error.

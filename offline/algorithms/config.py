@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
-from mcaprl.architecture import Architecture, NetworkSettings
 from mcaprl.entry_points import installed
 from mcaprl.offline.batches.packing import Packing
+from mcaprl.settings import Architecture, NetworkSettings
 
 ENTRY_POINT_GROUP: Final = "mcaprl.algorithms"
 HEADS: Final = ("deterministic", "gaussian", "mixture")
@@ -280,6 +280,8 @@ class TD3Config(ActorCriticConfig):
     """standard deviation of the noise on target actions, as a fraction of half the Box"""
     noise_clip: float = 0.5
     """largest noise on target actions, as a fraction of half the Box"""
+    smoothness: float = 0.0
+    """weight of the mean change of the actions in [-1, 1] from a state to the next one"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -287,6 +289,7 @@ class TD3Config(ActorCriticConfig):
         self._require_positive("policy_interval")
         self._require("policy_noise", self.policy_noise >= 0, "at least 0")
         self._require("noise_clip", self.noise_clip >= 0, "at least 0")
+        self._require("smoothness", 0 <= self.smoothness < math.inf, "at least 0 and finite")
 
 
 @dataclass(frozen=True)
@@ -297,6 +300,8 @@ class SACConfig(ActorCriticConfig):
     """initial weight of the policy's entropy beside the rewards"""
     target_entropy: float = -1.0
     """entropy per number of an action in [-1, 1] to which the temperature is tuned"""
+    smoothness: float = 0.0
+    """weight of the mean change of the actions in [-1, 1] from a state to the next one"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -305,6 +310,7 @@ class SACConfig(ActorCriticConfig):
         highest = math.log(2)
         allowed = f"below {highest:.2f}, the entropy of uniform numbers"
         self._require("target_entropy", -math.inf < self.target_entropy < highest, allowed)
+        self._require("smoothness", 0 <= self.smoothness < math.inf, "at least 0 and finite")
 
 
 @dataclass(frozen=True)

@@ -82,11 +82,10 @@ def expected_sarsa_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, pi_t: Te
     return r_t + discount_t * (pi_t * q_t).sum(1)
 
 
-def square_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:
-    """Return half the squared error (B,) of Q(s, a), whose minimum is at the mean target."""
-    _check_actions(q_tm1, a_tm1)
-    _check_shape("target_tm1", target_tm1, (len(q_tm1),))
-    return 0.5 * (chosen(q_tm1, a_tm1) - target_tm1).square()
+def square_regression(v_tm1: Tensor, target_tm1: Tensor) -> Tensor:
+    """Return half the squared error (B,) of values (B,), whose minimum is at the mean target."""
+    _check_shape("target_tm1", target_tm1, v_tm1.shape)
+    return 0.5 * (v_tm1 - target_tm1).square()
 
 
 def temporal_difference_loss(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:
@@ -185,6 +184,17 @@ def smoothed_actions(a_t: Tensor, noise: Tensor, limit: float) -> Tensor:
     """
     _check_shape("noise", noise, a_t.shape)
     return (a_t + noise.clamp(-limit, limit)).clamp(-1, 1)
+
+
+def action_change(a_tm1: Tensor, a_t: Tensor) -> Tensor:
+    """Return the mean absolute change (B,) of the numbers of successive actions (B, n).
+
+    This is the temporal term of CAPS, "Regularizing Action Policies for Smooth Control with
+    Reinforcement Learning", equation 2, https://arxiv.org/abs/2012.06644, with the mean absolute
+    difference in place of the Euclidean distance, so that it is the change that evaluations report.
+    """
+    _check_shape("a_t", a_t, a_tm1.shape)
+    return (a_t - a_tm1).abs().mean(1)
 
 
 def truncated_normal_log_density(actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:

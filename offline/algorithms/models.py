@@ -194,7 +194,7 @@ class _ColumnNorm(torch.autograd.Function):
 
 def _normalized(columns: Tensor, gain: Tensor, shift: Tensor) -> Tensor:
     """Normalize columns (C, width, B), and apply gains and shifts (C, width)."""
-    normal: Tensor = _ColumnNorm.apply(columns)
+    normal: Tensor = _ColumnNorm.apply(columns)  # type: ignore[no-untyped-call]
     return torch.addcmul(shift.unsqueeze(2), gain.unsqueeze(2), normal)
 
 

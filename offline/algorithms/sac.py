@@ -3,6 +3,7 @@
     https://arxiv.org/abs/1812.05905
         Q_e(s,a)  regression to r + gamma (min_e Q'_e(s', a') - alpha log pi(a'|s')), a' ~ pi(s')
         pi        minimize alpha log pi(a|s) - min_e Q_e(s, a), a ~ pi(s)
+                  + smoothness |mode of pi(s) - mode of pi(s')|, https://arxiv.org/abs/2012.06644
         alpha     minimize log(alpha) (entropy of pi - target entropy)
 
 Q' are target networks, averages of the learning networks. The policy is the tanh of a normal
@@ -60,6 +61,7 @@ class SAC(ActorCritic):
         actions, log_pi = SquashedGaussian.sample(outputs, self.noise(1.0))
         q = self.models["q"](batch.observations.with_actions(actions), frozen=True)
         policy_loss = alpha * log_pi - q.amin(0)
+        smoothness_loss = self.smoothness_loss(batch, self.config.smoothness)
         entropy_loss = temperature_loss(log_alpha, log_pi.detach(), self._target_entropy)
         return {
             "mean_q": self.in_reward_units(q_tm1.detach().mean(0)),
@@ -67,7 +69,7 @@ class SAC(ActorCritic):
             "policy_loss": policy_loss,
             "entropy": -log_pi,
             "temperature": alpha,
-            "loss": td_loss + policy_loss + entropy_loss,
+            "loss": td_loss + policy_loss + smoothness_loss + entropy_loss,
         }
 
     @torch.no_grad()

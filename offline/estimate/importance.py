@@ -47,7 +47,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, t
 
-from mcaprl.sims.evaluation.statistics import LEAST_RESAMPLED
+from mcaprl.sims.evaluation.evaluate import LEAST_RESAMPLED
 
 Floats = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ class RatioEstimate:
         A resampling in which all episodes are equal has no standard error and is excluded. If most
         resamplings are excluded, the method returns the percentile interval. With fewer than
         `LEAST_RESAMPLED` episodes, it returns the interval of Student's t; see
-        `mcaprl.sims.evaluation.statistics`.
+        `mcaprl.sims.evaluation.evaluate`.
 
         Args:
             counts: Number of times (B, E) that each resampling contains each episode.

@@ -13,10 +13,10 @@ from typing import Any, TextIO
 import numpy as np
 
 from mcaprl.errors import ReportError, TrainingError
-from mcaprl.figures import COLORS, Panel, save_panels
 from mcaprl.files import write_atomically
+from mcaprl.page import COLORS, Panel, save_panels
 from mcaprl.runs import METRICS_NAME, Curve, RunSummary, read_curves, writing
-from mcaprl.sims.evaluation.statistics import mean_interval
+from mcaprl.sims.evaluation.evaluate import mean_interval
 from mcaprl.texts import counted
 
 

@@ -16,13 +16,18 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.limits import MAX_TIME_NS
 from mcaprl.recorder.bags.decoders import MessageDecoder, decoder_of, merged
-from mcaprl.recorder.bags.definition_files import DefinitionFiles
-from mcaprl.recorder.bags.files import find_bags, open_recordings
-from mcaprl.recorder.bags.mcap_file import McapFile
-from mcaprl.recorder.bags.path_steps import NAMES, general_path, kind_at, steps_of
-from mcaprl.recorder.bags.rosbag_file import RosbagFile
-from mcaprl.recorder.bags.source import Definition, RawMessage, TopicSource
-from mcaprl.recorder.bags.values import ABSENT, NUMBERS, column_of, value_at
+from mcaprl.recorder.bags.files import DefinitionFiles, find_bags, open_recordings
+from mcaprl.recorder.bags.source import Definition, McapFile, RawMessage, RosbagFile, TopicSource
+from mcaprl.recorder.bags.values import (
+    ABSENT,
+    NAMES,
+    NUMBERS,
+    column_of,
+    general_path,
+    kind_at,
+    steps_of,
+    value_at,
+)
 from mcaprl.texts import counted, printable
 
 _PUBLISH_TIME = "publish_time"

@@ -10,7 +10,7 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Statistics
 from numpy.typing import NDArray
 
-from mcaprl.problem import Problem
+from mcaprl.errors import Problem
 from mcaprl.recorder.columns.chunks import chunk_header
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import (

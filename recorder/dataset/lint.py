@@ -13,7 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.actions import MASK_KEY, JointActions, allowed_actions, joint_actions
-from mcaprl.problem import Problem
+from mcaprl.errors import Problem
 from mcaprl.recorder.dataset.arrays import is_beyond_float32
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.images import blocks_of

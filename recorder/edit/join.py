@@ -18,7 +18,7 @@ from mcaprl.errors import CorruptLogError, LogError, SpaceError, UsageError
 from mcaprl.files import replacing
 from mcaprl.recorder.dataset.log_reader import described
 from mcaprl.recorder.dataset.open import find_logs
-from mcaprl.recorder.edit.source import Edited, FinishedLog
+from mcaprl.recorder.edit.piece import Edited, FinishedLog
 from mcaprl.recorder.format.behavior import FIELDS
 from mcaprl.recorder.format.messages import EPISODE_TYPE
 from mcaprl.recorder.format.metadata import (

@@ -15,8 +15,17 @@ from numpy.typing import NDArray
 from mcaprl.errors import UsageError
 from mcaprl.limits import MAX_TIME_NS
 from mcaprl.recorder.bags.bag import Bag, Failure, Stream
-from mcaprl.recorder.bags.path_steps import Step, is_mapped, path_text, steps_of
-from mcaprl.recorder.bags.values import ABSENT, Lack, as_array, element_of, without_lacks
+from mcaprl.recorder.bags.values import (
+    ABSENT,
+    Lack,
+    Step,
+    as_array,
+    element_of,
+    is_mapped,
+    path_text,
+    steps_of,
+    without_lacks,
+)
 from mcaprl.recorder.mapping.config import Stamp, TimeSource
 
 Floats = NDArray[np.float64]

@@ -27,9 +27,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, UsageError, import_extra
+from mcaprl.errors import LogError, Problem, UsageError, import_extra
 from mcaprl.files import parse_json
-from mcaprl.problem import Problem
 from mcaprl.recorder.bags.bag import Bag, Failure, TopicInfo
 from mcaprl.recorder.dataset.images import (
     CACHE_NOTES,

@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import Bag, TopicInfo
-from mcaprl.recorder.bags.path_steps import NAMES, path_text, steps_of
 from mcaprl.recorder.bags.values import (
+    NAMES,
     PARALLEL,
     Lack,
     as_array,
     element_of,
+    path_text,
+    steps_of,
     texts_of,
     without_lacks,
 )

@@ -14,8 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError
-from mcaprl.problem import Problem
+from mcaprl.errors import LogError, Problem
 from mcaprl.recorder.bags.bag import Bag, open_bag
 from mcaprl.recorder.bags.overview import instants_of, is_fresh
 from mcaprl.recorder.dataset.dataset import Dataset

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.problem import Problem
+from mcaprl.errors import Problem
 from mcaprl.recorder.format.metadata import Command
 from mcaprl.texts import counted
 

@@ -28,18 +28,22 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.schema import TopicRows
 from mcaprl.recorder.format.spaces import action_leaf
 from mcaprl.recorder.format.writing import HoldSignals
-from mcaprl.recorder.record.array_types import (
+from mcaprl.recorder.record.display import Display
+from mcaprl.recorder.record.recordable import (
+    EpisodeInfos,
     as_array,
     as_arrays,
+    autoreset_mode,
+    check_vector,
+    final_info,
     final_observation,
+    info_of,
+    info_reason,
     one_each,
+    recorded_space,
 )
-from mcaprl.recorder.record.display import Display
-from mcaprl.recorder.record.infos import EpisodeInfos, final_info, info_of, info_reason
-from mcaprl.recorder.record.recorded_space import autoreset_mode, check_vector, recorded_space
 from mcaprl.recorder.record.session import EpisodeLog, FinishesAtExit, OpenEpisode, reason_of
-from mcaprl.recorder.record.step_rows import converter, converters
-from mcaprl.recorder.record.vector_rows import OpenRows, OpenSteps
+from mcaprl.recorder.record.step_rows import OpenRows, OpenSteps, converter, converters
 
 if TYPE_CHECKING:
     VectorWrapper = gym.vector.VectorWrapper[Any, Any, Any, Any, Any]

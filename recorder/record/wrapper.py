@@ -25,8 +25,7 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import action_leaf
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
-from mcaprl.recorder.record.infos import EpisodeInfos
-from mcaprl.recorder.record.recorded_space import check_single, recorded_space
+from mcaprl.recorder.record.recordable import EpisodeInfos, check_single, recorded_space
 from mcaprl.recorder.record.session import EpisodeLog, FinishesAtExit, OpenEpisode, reason_of
 from mcaprl.recorder.record.step_rows import (
     ImageColumn,

@@ -28,14 +28,16 @@ from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from mcaprl.errors import (
+    LISTED,
     CorruptLogError,
     LogError,
     NoEpisodesError,
     NoStepsError,
     NotMcapError,
+    Problem,
+    Shortlist,
     SpaceError,
 )
-from mcaprl.problem import LISTED, Problem, Shortlist
 from mcaprl.recorder.bags.bag import Bag, open_bag
 from mcaprl.recorder.bags.files import is_bag_file
 from mcaprl.recorder.dataset.episodes import (

@@ -25,9 +25,16 @@ import numpy as np
 from mcap.records import Channel, ChunkIndex, Metadata, Schema
 from numpy.typing import NDArray
 
-from mcaprl.errors import CorruptLogError, LogError, NoEpisodesError, NoStepsError, UsageError
+from mcaprl.errors import (
+    CorruptLogError,
+    LogError,
+    NoEpisodesError,
+    NoStepsError,
+    Problem,
+    Shortlist,
+    UsageError,
+)
 from mcaprl.files import locked_file, replacing
-from mcaprl.problem import Problem, Shortlist
 from mcaprl.recorder.dataset.log_reader import described
 from mcaprl.recorder.format.messages import INTERRUPTED, EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import METADATA_NAME

@@ -16,16 +16,15 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, McaprlError, SpaceError
+from mcaprl.errors import LogError, McaprlError, Problem, SpaceError
 from mcaprl.files import parse_json
 from mcaprl.frames import rows_of
 from mcaprl.limits import STEP_LIMIT
-from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.messages import INTERRUPTED
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
-from mcaprl.recorder.record.recorded_space import recorded_like, value_at
+from mcaprl.recorder.record.recordable import recorded_like, value_at
 from mcaprl.recorder.record.step_rows import as_declared
 from mcaprl.texts import counted
 

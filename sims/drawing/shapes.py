@@ -23,7 +23,7 @@ from mcaprl.sims.drawing.scene import (
     raised,
     yaw_rotation,
 )
-from mcaprl.sims.geometry.paths import wrap_angle
+from mcaprl.sims.geometry import wrap_angle
 
 Vector = tuple[float, float, float]
 

@@ -12,24 +12,28 @@ from typing import Any
 
 import numpy as np
 
-from mcaprl.figures import (
+from mcaprl.page import (
     BACKGROUND,
     COLORS,
     INK,
+    PAGE_NAME,
     PALE,
+    Card,
+    Figure,
     Panel,
+    Section,
+    Table,
     new_figure,
     save_panels,
     save_png,
     tick_labels,
     to_svg,
+    write_page,
 )
-from mcaprl.page import PAGE_NAME, Card, Figure, Section, Table, write_page
 from mcaprl.sims.drawing.scene import Shape
 from mcaprl.sims.drawing.top_view import patches
-from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore
+from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore, interquartile_mean, median
 from mcaprl.sims.evaluation.rollout import EpisodeResult
-from mcaprl.sims.evaluation.statistics import interquartile_mean, median
 from mcaprl.texts import counted
 
 _MAX_PATHS = 30

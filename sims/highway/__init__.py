@@ -8,6 +8,6 @@ SPEC = SimSpec(
     continuous_id="mcaprl/HighwayLaneContinuous-v0",
     entry_point="mcaprl.sims.highway.env:HighwayLaneEnv",
     max_episode_steps=700,
-    pilot="mcaprl.sims.highway.pilot:HighwayPilot",
+    pilot="mcaprl.sims.highway.env:HighwayPilot",
     engine="highway_env",
 )

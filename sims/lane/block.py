@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import Arrays, array_at, compiled, inlined
-from mcaprl.sims.geometry.bicycle import Motion, roll_pose
-from mcaprl.sims.geometry.paths import Heading, heading_of, turned
+from mcaprl.sims.geometry import Heading, Motion, heading_of, roll_pose, turned
 from mcaprl.sims.lane.rules import (
     OBSERVATION_NAMES,
     STARTED_AT,

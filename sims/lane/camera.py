@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.camera import lens, level_axes
 from mcaprl.sims.drawing.depth import DepthCamera
-from mcaprl.sims.geometry.mesh import box_mesh, ground_mesh
+from mcaprl.sims.geometry import box_mesh, ground_mesh
 from mcaprl.sims.lane.course import (
     CAMERA_FORWARD_M,
     CAMERA_HEIGHT_M,

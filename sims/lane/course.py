@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import inlined
-from mcaprl.sims.geometry.paths import Projection, closed_path, scattered
+from mcaprl.sims.geometry import Projection, closed_path, scattered
 
 CORNERS_M = (
     (0.0, 1.0),

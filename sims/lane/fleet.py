@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from mcaprl.compiled import Arrays, array_at, compiled, ready, ready_at
 from mcaprl.errors import UsageError
 from mcaprl.sims.drawing.depth import encode_depth, encode_nearness
-from mcaprl.sims.geometry.bicycle import moving
-from mcaprl.sims.geometry.paths import project, wrap_angle
+from mcaprl.sims.geometry import moving, project, wrap_angle
 from mcaprl.sims.lane.block import car_info, observe_cars, step_cars, step_only_car
 from mcaprl.sims.lane.camera import IMAGE_SHAPE, CarCamera
 from mcaprl.sims.lane.classic import CLASSIC_DECISION_S, CLASSIC_SUBSTEPS, STRAIGHT, step_classic

@@ -9,8 +9,7 @@ import math
 from typing import NamedTuple
 
 from mcaprl.compiled import compiled
-from mcaprl.sims.geometry.bicycle import steering_of
-from mcaprl.sims.geometry.paths import in_body_frame, leg_at, point_at
+from mcaprl.sims.geometry import in_body_frame, leg_at, point_at, steering_of
 from mcaprl.sims.lane.course import COURSE
 from mcaprl.sims.lane.env import LaneKeepingEnv
 from mcaprl.sims.lane.rules import (

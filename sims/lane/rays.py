@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled
-from mcaprl.sims.geometry.paths import in_body_frame, point_at
-from mcaprl.sims.geometry.ray_code import FAR_M, log_code, ray_name
+from mcaprl.sims.geometry import FAR_M, in_body_frame, log_code, point_at, ray_name
 from mcaprl.sims.lane.course import COURSE, SECOND_SQUARE_M, Box, barriers, buildings, rails
 from mcaprl.sims.lane.rules import MAX_SPEED_M_S, Car, car_at
 

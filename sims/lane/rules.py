@@ -9,14 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled, inlined
-from mcaprl.sims.geometry.bicycle import (
+from mcaprl.sims.geometry import (
+    Heading,
     Motion,
+    heading_of,
+    in_body_frame,
     moving,
     roll,
     slip_of,
     steering_of,
+    wrap_angle,
 )
-from mcaprl.sims.geometry.paths import Heading, heading_of, in_body_frame, wrap_angle
 from mcaprl.sims.lane.course import (
     LANE_HALF_WIDTH_M,
     CourseSpot,

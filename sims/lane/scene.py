@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mcaprl.sims.drawing import shapes
 from mcaprl.sims.drawing.scene import Color, Frame, Shape, coarse, cut, raised
 from mcaprl.sims.drawing.shapes import LOOK, TAIL_LAMP, WHITE, car_part
-from mcaprl.sims.geometry.paths import point_at
+from mcaprl.sims.geometry import point_at
 from mcaprl.sims.lane import course
 from mcaprl.sims.lane.rays import BODY_FORWARD_M, BODY_LENGTH_M, BODY_WIDTH_M, ray_lines, world_at
 from mcaprl.sims.lane.rules import LOOKAHEADS_M, WHEELBASE_M, Car, wheel_angle

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled, inlined
-from mcaprl.sims.geometry.vectors import Quaternion, Vector
+from mcaprl.sims.geometry import Quaternion, Vector
 from mcaprl.sims.powerline.quadrotor import (
     DRONE_SIZE,
     QUAD,

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.camera import lens
 from mcaprl.sims.drawing.depth import DepthCamera
-from mcaprl.sims.geometry.mesh import box_mesh, frustum_mesh
-from mcaprl.sims.geometry.vectors import Vector, plus, rotate
+from mcaprl.sims.geometry import Vector, box_mesh, frustum_mesh, plus, rotate
 from mcaprl.sims.powerline.course import (
     ARM_HALF_LENGTH_M,
     WIRES_M,

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled
-from mcaprl.sims.geometry.paths import scattered
-from mcaprl.sims.geometry.vectors import Vector, cross, minus, norm
+from mcaprl.sims.geometry import Vector, cross, minus, norm, scattered
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.sims.drawing.depth import encode_depth, encode_nearness
-from mcaprl.sims.geometry.vectors import Vector, norm, plus
+from mcaprl.sims.geometry import Vector, norm, plus
 from mcaprl.sims.powerline.camera import CAMERAS, IMAGE_SHAPE, DroneCamera
 from mcaprl.sims.powerline.course import (
     LENGTH_M,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from mcaprl.compiled import compiled
-from mcaprl.sims.geometry.vectors import Vector, minus, norm, times
+from mcaprl.sims.geometry import Vector, minus, norm, times
 from mcaprl.sims.powerline.course import ALONG_M, LEGS, TANGENTS, nearest_on_line, point_on_line
 from mcaprl.sims.powerline.env import PowerlineEnv
 from mcaprl.sims.powerline.rules import ACTION_MEANINGS, DIRECTIONS, MAX_COMMAND_M_S, Flight

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled, inlined
-from mcaprl.sims.geometry.vectors import (
+from mcaprl.sims.geometry import (
     Quaternion,
     Vector,
     cross,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled
-from mcaprl.sims.geometry.vectors import Vector, minus, norm, plus, times
+from mcaprl.sims.geometry import Vector, minus, norm, plus, times
 from mcaprl.sims.powerline.block import fly_all
 from mcaprl.sims.powerline.course import (
     ALONG_M,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mcaprl.sims.drawing.scene import Color, Frame, Kind, Shape, coarse, cut, no_points, path
 from mcaprl.sims.drawing.shapes import LOOK, STEEL, TRAIL, WHITE, label
 from mcaprl.sims.drawing.top_view import SIDE_PX, Body, FollowView, rgb
-from mcaprl.sims.geometry.vectors import Vector, norm
+from mcaprl.sims.geometry import Vector, norm
 from mcaprl.sims.powerline import camera, course
 from mcaprl.sims.powerline.course import (
     ALONG_M,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled, inlined
-from mcaprl.sims.geometry.ray_code import log_code
+from mcaprl.sims.geometry import log_code
 from mcaprl.sims.racer.course import METERS_PER_PX, Track, car_at, store_car
 from mcaprl.sims.racer.rays import BLOCK_SIZE, LENGTH, RAYS, measure
 from mcaprl.sims.racer.rules import (

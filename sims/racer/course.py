@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled
-from mcaprl.sims.geometry.paths import Path, closed_path, project, wrap_angle
+from mcaprl.sims.geometry import Path, closed_path, project, wrap_angle
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mcaprl.compiled import compiled
-from mcaprl.sims.geometry.paths import Path
+from mcaprl.sims.geometry import Path
 from mcaprl.sims.racer.course import Car, Track, store_car
 from mcaprl.sims.racer.fleet import ANYWHERE, RacerFleet, start_anywhere, start_on_line
 from mcaprl.sims.racer.rays import BLOCK_SIZE

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled, ready
 from mcaprl.errors import UsageError
-from mcaprl.sims.geometry.paths import leg_at, point_at
+from mcaprl.sims.geometry import leg_at, point_at
 from mcaprl.sims.racer.block import StepResult, car_info, step_cars, step_only_car
 from mcaprl.sims.racer.course import (
     HALF_WIDTH_PX,

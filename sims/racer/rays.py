@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled
-from mcaprl.sims.geometry.paths import heading_of
-from mcaprl.sims.geometry.ray_code import FAR_M, ray_name
+from mcaprl.sims.geometry import FAR_M, heading_of, ray_name
 from mcaprl.sims.racer.course import METERS_PER_PX, Car, corner_at
 
 FAR_PX = FAR_M / METERS_PER_PX

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.compiled import compiled, inlined
-from mcaprl.sims.geometry.paths import project, wrap_angle
-from mcaprl.sims.geometry.ray_code import log_code
+from mcaprl.sims.geometry import log_code, project, wrap_angle
 from mcaprl.sims.racer.course import (
     CAR_LENGTH_PX,
     CAR_WIDTH_PX,

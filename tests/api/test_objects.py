@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import mcaprl
 from mcaprl.base_policy import BasePolicy, RandomPolicy, as_policy
 from mcaprl.errors import PolicyError, UsageError
-from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.evaluation.evaluate import make_pilot
 
 SMALL: dict[str, Any] = {"algo": "bc", "updates": 5, "batch_size": 8, "hidden": (4,)}
 

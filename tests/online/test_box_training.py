@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,7 +14,7 @@ import torch
 from gymnasium import spaces
 
 import mcaprl
-from mcaprl.errors import SpaceError, UnknownNameError, UsageError
+from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
 from mcaprl.offline.algorithms.heads import Deterministic, SquashedGaussian
 from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.training.train import train as train_offline
@@ -229,6 +231,31 @@ def test_wrong_combinations_name_those_that_fit(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="unknown engine"):
         choose_engine("sac", "sb2")
     assert [choose_engine(algo, None) for algo in ("sac", "ppo")] == ["mcaprl", "sb3"]
-    task = choose_task(PENDULUM, "td3", {}, {"critic_layer_norm": True}, engine="sb3")
-    with pytest.raises(UsageError, match="td3 of Stable-Baselines3 has no critic_layer_norm"):
-        train(task, tmp_path / "run", progress=silent)
+    lacking: dict[str, Any] = {"critic_layer_norm": True, "smoothness": 0.1}
+    for name, value in lacking.items():
+        task = choose_task(PENDULUM, "td3", {}, {name: value}, engine="sb3")
+        with pytest.raises(UsageError, match=f"td3 of Stable-Baselines3 has no {name}"):
+            train(task, tmp_path / name, progress=silent)
+
+
+def test_the_reference_has_the_settings_of_a_sim_without_those_that_it_lacks() -> None:
+    options = {"actions": "continuous"}
+    own = choose_task("lane", "sac", options, {}).config
+    reference = choose_task("lane", "sac", options, {}, engine="sb3").config
+    assert isinstance(own, SACConfig)
+    assert own.smoothness > 0
+    assert reference == dataclasses.replace(own, smoothness=0.0)
+
+
+def test_runs_of_versions_without_a_setting_are_resumed(tmp_path: Path) -> None:
+    task = Task.for_sim(PENDULUM, "sac", **SHORT)
+    train(task, tmp_path, progress=silent)
+    path = tmp_path / "config.json"
+    written = json.loads(path.read_text())
+    assert written["config"].pop("smoothness") == 0
+    path.write_text(json.dumps(written))
+    other = Task.for_sim(PENDULUM, "sac", **SHORT, smoothness=1.0)
+    with pytest.raises(TrainingError, match=r"has smoothness None, not 1\.0"):
+        train(other, tmp_path, resume=True, progress=silent)
+    (summary,) = train(task, tmp_path, resume=True, progress=silent)
+    assert summary.resumed_at == SHORT["steps"]

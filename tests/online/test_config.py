@@ -9,11 +9,11 @@ import pytest
 
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.online.config import (
+    BOX_ALGO_SETTINGS,
     BOX_SETTINGS,
     CONFIGS,
     IMAGE_SETTINGS,
     SIM_SETTINGS,
-    TD3_SETTINGS,
     A2CConfig,
     DoubleDQNConfig,
     DQNConfig,
@@ -77,6 +77,7 @@ def test_a_rollout_is_shared_by_the_environments() -> None:
         (SACConfig, "data_fraction", 1.5),
         (SACConfig, "temperature", 0.0),
         (SACConfig, "target_entropy", 1.0),
+        (SACConfig, "smoothness", -0.1),
         (TD3Config, "exploration_noise", 0.0),
         (TD3Config, "policy_interval", 0),
         (PPOConfig, "max_grad_norm", 0.0),
@@ -109,13 +110,15 @@ def test_every_sim_has_settings_that_are_fields(sim: str) -> None:
 @pytest.mark.parametrize("sim", SIMS)
 def test_every_sim_has_settings_for_continuous_actions(sim: str) -> None:
     settings = settings_for("sac", sim, {"actions": "continuous"})
-    assert settings == BOX_SETTINGS[sim]
+    assert settings == BOX_SETTINGS[sim] | BOX_ALGO_SETTINGS["sac"]
+    assert SACConfig(**settings).steps == settings["steps"]
     spec = SIMS.find(SIMS[sim])
     assert spec is not None
     continuous_id = spec.continuous_id
     assert continuous_id is not None
-    assert settings_for("td3", continuous_id, {}) == settings | TD3_SETTINGS
-    assert TD3Config(**settings, **TD3_SETTINGS).steps == settings["steps"]
+    settings = settings_for("td3", continuous_id, {})
+    assert settings == BOX_SETTINGS[sim] | BOX_ALGO_SETTINGS["td3"]
+    assert TD3Config(**settings).steps == settings["steps"]
 
 
 @pytest.mark.parametrize(("sim", "observation"), IMAGE_SETTINGS)

@@ -91,7 +91,7 @@ def test_an_installed_sim_is_loaded_on_first_use(site: Path) -> None:
 import sys
 import mcaprl
 from mcaprl.sims import SIMS, make_sim
-from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.evaluation.evaluate import make_pilot
 assert "boat" in SIMS and list(SIMS)[-1] == "boat" and len(SIMS) == 5
 make_sim("CartPole-v1")
 assert "boats" not in sys.modules

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from mcaprl.errors import PolicyError, UnknownNameError, UsageError
 from mcaprl.sims import SIMS, make_sim
 from mcaprl.sims.drawing.depth import encode_depth
-from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.evaluation.evaluate import make_pilot
 from mcaprl.sims.powerline.course import POINTS_M, point_on_line
 from tests.support.sims import action_of, batched, check_shape, rotated, unwrapped
 
@@ -540,7 +540,7 @@ def test_a_pose_that_ends_the_episode_is_refused(name: str, pose: Any, words: st
 
 def test_importing_the_sims_loads_no_engine() -> None:
     code = (
-        "import sys, mcaprl.sims, mcaprl.sims.evaluation.pilots, mcaprl.sims.drawing.scene\n"
+        "import sys, mcaprl.sims, mcaprl.sims.evaluation.evaluate, mcaprl.sims.drawing.scene\n"
         "heavy = {'numba', 'torch', 'pygame', 'matplotlib', 'stable_baselines3'}\n"
         "assert not heavy & set(sys.modules), heavy & set(sys.modules)"
     )

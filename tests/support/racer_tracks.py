@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from mcaprl.sims.geometry.paths import closed_path
+from mcaprl.sims.geometry import closed_path
 from mcaprl.sims.racer.course import Car, Track, placed
 from mcaprl.sims.racer.rules import ACTION_COMMANDS, drive, outcome_of
 

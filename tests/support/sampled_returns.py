@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.evaluation.statistics import bootstrap_interval, mean_interval
+from mcaprl.sims.evaluation.evaluate import bootstrap_interval, mean_interval
 
 Floats = NDArray[np.float64]
 

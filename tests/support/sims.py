@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.scene import Color, Frame, Shape
-from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.evaluation.evaluate import make_pilot
 
 Image = NDArray[np.uint8]
 

@@ -45,8 +45,7 @@ from mcaprl.recorder.record.layout import (
 )
 from mcaprl.recorder.record.panels import action_parts, bounded_actions
 from mcaprl.recorder.source import open_data
-from mcaprl.recorder.viewer.playback import Track
-from mcaprl.recorder.viewer.scene_reader import SeenFrame, SeenShape, frames_of, shapes_of
+from mcaprl.recorder.viewer.playback import SeenFrame, SeenShape, Track, frames_of, shapes_of
 from mcaprl.texts import encodable
 
 _ALIGNMENT = 8

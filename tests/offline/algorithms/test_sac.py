@@ -12,17 +12,21 @@ from gymnasium import spaces
 from torch import Tensor
 
 from mcaprl.errors import UsageError
+from mcaprl.offline.algorithms.actor_critic import ActorCritic
 from mcaprl.offline.algorithms.config import SACConfig, TD3Config
 from mcaprl.offline.algorithms.heads import SquashedGaussian, bounded_log_std
 from mcaprl.offline.algorithms.losses import (
+    action_change,
     clipped_double_q_target,
     smoothed_actions,
     squashed_normal_log_density,
     temperature_loss,
 )
+from mcaprl.offline.algorithms.rebrac import ReBRAC
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.algorithms.sac import LOG_TEMPERATURE, SAC
 from mcaprl.offline.algorithms.td3 import TD3
+from mcaprl.offline.algorithms.td3_bc import TD3BC
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.recorder.dataset.dataset import Dataset
 
@@ -62,6 +66,20 @@ def test_targets_of_sac_subtract_the_weighted_log_density() -> None:
 def test_targets_of_td3_clip_the_noise_and_the_actions() -> None:
     actions, noise = torch.tensor([[0.0, 0.75]]), torch.tensor([[-2.0, 0.5]])
     assert smoothed_actions(actions, noise, 0.5).tolist() == [[-0.5, 1.0]]
+
+
+def test_the_change_of_actions_is_the_mean_over_their_numbers() -> None:
+    before = torch.tensor([[0.5, -1.0], [0.25, 0.0]], requires_grad=True)
+    after = torch.tensor([[0.0, 1.0], [0.25, -0.5]], requires_grad=True)
+    change = action_change(before, after)
+    # (.5 + 2) / 2, and (0 + .5) / 2.
+    assert change.tolist() == [1.25, 0.25]
+    torch.autograd.backward(change.sum())
+    assert before.grad is not None
+    assert after.grad is not None
+    # Both actions move toward each other.
+    assert before.grad.tolist() == [[0.5, -0.5], [0.0, 0.5]]
+    assert after.grad.tolist() == [[-0.5, 0.5], [0.0, -0.5]]
 
 
 def test_the_temperature_falls_above_the_target_entropy() -> None:
@@ -139,6 +157,30 @@ def test_td3_updates_the_actor_every_second_time() -> None:
     assert "policy_loss" in learner.update()
     twice = weights_of(learner)
     assert all((twice[name] != once[name]).any() for name in once)
+
+
+@pytest.mark.parametrize(
+    "learner_type", [SAC, TD3, TD3BC, ReBRAC], ids=lambda learner_type: learner_type.name
+)
+def test_smoothness_adds_the_weighted_change_to_the_loss(learner_type: type[ActorCritic]) -> None:
+    rough, smooth = (
+        learner_type(
+            learner_type.config_type(**SMALL | {"hidden": (8, 8)}, smoothness=weight), buffer(), [0]
+        )
+        for weight in (0.0, 3.0)
+    )
+    batch = rough.buffer.batch(torch.arange(4))
+    losses = []
+    for learner in (rough, smooth):
+        # The second update of the critics is the first one of the actor of TD3.
+        learner.step = 1
+        losses.append(learner.losses(batch)["loss"])
+    actions = [rough.act(seen) for seen in (batch.observations, batch.next_observations)]
+    torch.testing.assert_close(losses[1] - losses[0], 3 * (actions[0] - actions[1]).abs().mean(1))
+    torch.autograd.backward((losses[1] - losses[0]).sum())
+    assert smooth.models["actor"].weights.grad is not None
+    assert rough.models["q"].weights.grad is not None
+    torch.testing.assert_close(rough.models["q"].weights.grad, -smooth.models["q"].weights.grad)
 
 
 @pytest.mark.parametrize("algo", ["sac", "td3"])

@@ -16,7 +16,7 @@ import mcaprl
 from mcaprl.cli import cli
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.bag import open_bag
-from mcaprl.recorder.bags.definition_files import DefinitionFiles
+from mcaprl.recorder.bags.files import DefinitionFiles
 from tests.support.bags import START_NS, Channel, write_channels
 
 Row = tuple[str, str, Sequence[bytes]]

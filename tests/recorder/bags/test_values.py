@@ -15,8 +15,15 @@ from hypothesis import strategies as st
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.bags.bag import open_bag
-from mcaprl.recorder.bags.path_steps import kind_at, path_text, steps_of
-from mcaprl.recorder.bags.values import ABSENT, Lack, column_of, value_at
+from mcaprl.recorder.bags.values import (
+    ABSENT,
+    Lack,
+    column_of,
+    kind_at,
+    path_text,
+    steps_of,
+    value_at,
+)
 from tests.support.nested_bags import write_json
 
 TIME = {"sec": "integer", "nsec": "integer"}

@@ -25,7 +25,7 @@ from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.schema import stored_dtype
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.viewer.annotate import annotated_copy
-from mcaprl.recorder.viewer.scene_reader import moments_of_episode
+from mcaprl.recorder.viewer.playback import moments_of_episode
 from mcaprl.sims import make_sim
 from tests.conftest import need
 from tests.support.paths import NODE

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import mcaprl
 from mcaprl.errors import SpaceError, UsageError
-from mcaprl.recorder.record.array_types import as_array, as_arrays
+from mcaprl.recorder.record.recordable import as_array, as_arrays
 from mcaprl.recorder.record.vector_wrapper import VectorWrapper
 from tests.recorder.record.test_vector_wrapper import Wanderer, check_against_members, members
 from tests.support.recordings import MIXED_SPACE

@@ -13,7 +13,7 @@ import mcaprl
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.record.scene import motion_transforms
-from mcaprl.recorder.viewer.scene_reader import moments_of_episode
+from mcaprl.recorder.viewer.playback import moments_of_episode
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.scene import Frame
 

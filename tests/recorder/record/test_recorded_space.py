@@ -17,7 +17,7 @@ import mcaprl
 from mcaprl.errors import SpaceError, UnknownNameError, UsageError
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import observation_leaves, space_from_json
-from mcaprl.recorder.record.recorded_space import recorded_like, recorded_space
+from mcaprl.recorder.record.recordable import recorded_like, recorded_space
 from tests.support.recordings import ScriptedEnv
 
 PAIR = spaces.Tuple(

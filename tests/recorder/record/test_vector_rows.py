@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mcaprl.recorder.format.schema import LEARNER_TEXT, TopicRows
-from mcaprl.recorder.record import vector_rows
-from mcaprl.recorder.record.vector_rows import OpenRows
+from mcaprl.recorder.record import step_rows
+from mcaprl.recorder.record.step_rows import OpenRows
 
 ENVIRONMENTS, ROWS, PER_CHUNK = 5, 40, 7
 
@@ -23,7 +23,7 @@ def buffers(chunks: list[NDArray[Any]], fields: list[str]) -> OpenRows[TopicRows
     chunk = TopicRows.of_text(LEARNER_TEXT, 3, PER_CHUNK, write)
     chunk.fields["epsilon"][:], chunk.fields["policy_version"][:] = -1.0, -1
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(vector_rows, "_FIRST_CAPACITY", 4)
+        patch.setattr(step_rows, "_FIRST_CAPACITY", 4)
         return OpenRows(chunk, ENVIRONMENTS, fields)
 
 

@@ -21,8 +21,8 @@ import mcaprl
 from mcaprl.errors import LogError, NoStepsError, SpaceError, UsageError
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.dataset.transitions import Episode
-from mcaprl.recorder.record import vector_rows
-from mcaprl.recorder.record.vector_rows import OpenSteps
+from mcaprl.recorder.record import step_rows
+from mcaprl.recorder.record.step_rows import OpenSteps
 from mcaprl.recorder.record.vector_wrapper import VectorWrapper
 from mcaprl.recorder.repair.check import check_log
 from tests.support.learner_topic import read_learner
@@ -63,7 +63,7 @@ class Wanderer(gym.Env[Any, Any]):
 def small_buffers() -> Iterator[None]:
     """Begin with buffers of four rows, so that they are used several times and must grow."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(vector_rows, "_FIRST_CAPACITY", 4)
+        patch.setattr(step_rows, "_FIRST_CAPACITY", 4)
         yield
 
 

@@ -16,8 +16,7 @@ import pytest
 from gymnasium import spaces
 
 import mcaprl
-from mcaprl.errors import LogError
-from mcaprl.problem import LISTED, Problem, Shortlist
+from mcaprl.errors import LISTED, LogError, Problem, Shortlist
 from mcaprl.recorder.columns import chunks, file_check
 from mcaprl.recorder.columns import reader as mcap_reader
 from mcaprl.recorder.columns.reader import McapReader

@@ -35,7 +35,7 @@ from mcaprl.recorder.record.display import SCENE
 from mcaprl.recorder.viewer.annotate import annotated_copy
 from mcaprl.recorder.viewer.page import server
 from mcaprl.recorder.viewer.page.episode_data import LogPage, pack
-from mcaprl.recorder.viewer.scene_reader import moments_of_episode
+from mcaprl.recorder.viewer.playback import moments_of_episode
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.scene import Frame, Shape, yaw_rotation
 from tests.recorder.viewer.browser import Browser, browsing

@@ -29,8 +29,8 @@ from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.record.layout import layout_of
+from mcaprl.recorder.viewer.annotate import layout_of_log
 from mcaprl.recorder.viewer.live_stream import LiveStep, LiveStream
-from mcaprl.recorder.viewer.log_layout import layout_of_log
 from mcaprl.recorder.viewer.playback import Played, Player, Track
 from mcaprl.recorder.viewer.player_server import prefixed_message, prefixes_of, side_by_side
 from mcaprl.sims import make_sim

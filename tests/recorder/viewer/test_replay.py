@@ -28,10 +28,10 @@ from mcaprl.recorder.record.scene import (
     marker_array,
     motion_transforms,
 )
-from mcaprl.recorder.viewer.scene_reader import moments_of_episode
+from mcaprl.recorder.viewer.playback import moments_of_episode
 from mcaprl.sims import SIMS, make_sim
 from mcaprl.sims.drawing.scene import Frame, Kind, Shape, cut
-from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.evaluation.evaluate import make_pilot
 from tests.support.layouts import check_layout, series_of
 
 EPISODES, STEPS = 2, 12

@@ -15,7 +15,7 @@ import pytest
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.viewer.scene_reader import moments_of_episode
+from mcaprl.recorder.viewer.playback import moments_of_episode
 from mcaprl.recorder.viewer.video import (
     VIDEO_KINDS,
     contact_sheet,
@@ -27,7 +27,7 @@ from mcaprl.recorder.viewer.video import (
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.chase_view import HEIGHT_PX, ChaseView, Dial, chase_eye, poses_of
 from mcaprl.sims.drawing.scene import Frame, Kind, Shape, yaw_rotation
-from mcaprl.sims.geometry.mesh import box_mesh
+from mcaprl.sims.geometry import box_mesh
 from mcaprl.sims.lane.scene import static_shapes
 from tests.conftest import need
 

@@ -21,8 +21,7 @@ from mcaprl.sims.drawing.depth import (
     overlaps,
     shrink,
 )
-from mcaprl.sims.geometry.mesh import box_mesh, ground_mesh
-from mcaprl.sims.geometry.paths import point_at
+from mcaprl.sims.geometry import box_mesh, ground_mesh, point_at
 from mcaprl.sims.lane.camera import IMAGE_SHAPE, LENS, lane_mesh
 from mcaprl.sims.lane.course import COURSE, GROUND_HALF_SIDE_M, buildings, rails
 

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.camera import Lens, level_axes
 from mcaprl.sims.drawing.depth import DepthCamera, encode_depth
-from mcaprl.sims.geometry.paths import point_at
-from mcaprl.sims.geometry.vectors import Quaternion, Vector
+from mcaprl.sims.geometry import Quaternion, Vector, point_at
 from mcaprl.sims.lane.camera import IMAGE_SHAPE, lane_mesh
 from mcaprl.sims.lane.camera import LENS as LANE_LENS
 from mcaprl.sims.lane.course import COURSE

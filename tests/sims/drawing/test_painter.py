@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mcaprl.sims.drawing import painter
-from mcaprl.sims.drawing.painter import Eye, Faces, Painter, joined
+from mcaprl.sims.drawing import chase_view
+from mcaprl.sims.drawing.chase_view import Eye, Faces, Painter, joined
 
 WIDTH, HEIGHT, FOCAL_PX, ABOVE_M = 64, 48, 50.0, 2.0
 AHEAD = np.column_stack([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -55,8 +55,8 @@ def test_the_compiled_and_the_pure_path_draw_equal_images(monkeypatch: pytest.Mo
     some = random_faces(60)
     image = drawn(some)
     for name in (*KERNELS, "_spans"):
-        pure = getattr(painter, name)
-        monkeypatch.setattr(painter, name, getattr(pure, "py_func", pure))
+        pure = getattr(chase_view, name)
+        monkeypatch.setattr(chase_view, name, getattr(pure, "py_func", pure))
     assert (drawn(some) != image).any(axis=2).mean() <= 1e-3
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50, "the image shows the faces"
 
@@ -105,7 +105,7 @@ def test_a_thin_face_remains_visible() -> None:
 
 
 def test_only_the_first_faces_are_left_out_in_the_distance() -> None:
-    board = upright(painter.FAR_M + 1.0, 50.0, (1.0, 0.0, 0.0))
+    board = upright(chase_view.FAR_M + 1.0, 50.0, (1.0, 0.0, 0.0))
     assert (drawn([board], far=1)[..., 0] == 0).all()
     assert (drawn([board], far=0)[..., 0] > 150).any()
     unseen = upright(-5.0, 1.0, (1.0, 0.0, 0.0))
@@ -115,5 +115,5 @@ def test_only_the_first_faces_are_left_out_in_the_distance() -> None:
 def test_a_pixel_is_the_mean_of_its_samples() -> None:
     samples = np.array([[0x10FF04, 0x20FF05], [0x30FF06, 0x44FF07]], np.uint32)
     image = np.empty((1, 1, 3), np.uint8)
-    painter.shrink(samples, image)
+    chase_view.shrink(samples, image)
     assert image.tolist() == [[[0x29, 0xFF, 5]]]

@@ -19,8 +19,8 @@ import mcaprl
 from mcaprl.base_policy import BasePolicy, RandomPolicy
 from mcaprl.errors import UsageError
 from mcaprl.sims import EpsilonGreedy, NoisyPolicy, episode_seed, make_sim
-from mcaprl.sims.evaluation.noise import log_density
-from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.evaluation.evaluate import make_pilot
+from mcaprl.sims.evaluation.rollout import log_density
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(60)
 SEEN = np.zeros((1, 3), np.float32)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from mcaprl.sims.evaluation.statistics import (
+from mcaprl.sims.evaluation.evaluate import (
     bootstrap_interval,
     improvement_interval,
     improvement_probability,

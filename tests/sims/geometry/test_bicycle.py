@@ -10,7 +10,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaprl.sims.geometry.bicycle import moving, roll, slip_of
+from mcaprl.sims.geometry import moving, roll, slip_of
 from mcaprl.sims.lane.rules import (
     ACTION_COMMANDS,
     ACTION_MEANINGS,

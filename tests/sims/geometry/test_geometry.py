@@ -9,8 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from mcaprl.sims.geometry.bicycle import moving, roll, slip_of, steering_of
-from mcaprl.sims.geometry.paths import (
+from mcaprl.sims.geometry import (
     Heading,
     Projection,
     Spot,
@@ -20,10 +19,14 @@ from mcaprl.sims.geometry.paths import (
     heading_of,
     in_body_frame,
     leg_at,
+    moving,
     point_at,
     project,
+    roll,
     sine,
+    slip_of,
     spot_at,
+    steering_of,
     turned,
     wrap_angle,
 )

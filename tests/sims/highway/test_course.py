@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaprl.sims import make_sim
-from mcaprl.sims.highway.course import Course, courses_of
+from mcaprl.sims.highway.scene import Course, courses_of
 
 
 def courses(road: str) -> tuple[Course, ...]:

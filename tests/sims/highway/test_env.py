@@ -19,8 +19,8 @@ from mcaprl.sims.highway.env import (
     OBSERVATION_NAMES,
     ROADS,
     STEERING_RAD,
+    HighwayPilot,
 )
-from mcaprl.sims.highway.pilot import HighwayPilot
 from tests.support.sims import unwrapped
 
 TRACK = "racetrack-v0"

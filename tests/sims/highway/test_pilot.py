@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mcaprl.sims import make_sim
-from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.evaluation.evaluate import make_pilot
 from mcaprl.sims.highway.env import STEERING_RAD
 from tests.support.sims import piloted
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from mcaprl.sims import CarCamera, make_sim
-from mcaprl.sims.geometry.bicycle import moving
-from mcaprl.sims.geometry.paths import point_at
+from mcaprl.sims.geometry import moving, point_at
 from mcaprl.sims.lane.camera import lane_mesh
 from mcaprl.sims.lane.course import BARRIER_HEIGHT_M, COURSE, SECOND_SQUARE_M, barriers
 from mcaprl.sims.lane.env import LaneKeepingEnv

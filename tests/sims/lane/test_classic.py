@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from mcaprl.sims import make_sim
-from mcaprl.sims.evaluation.pilots import make_pilot
-from mcaprl.sims.geometry.bicycle import moving
+from mcaprl.sims.evaluation.evaluate import make_pilot
+from mcaprl.sims.geometry import moving
 from mcaprl.sims.lane.classic import (
     classic_decide,
     classic_distance,

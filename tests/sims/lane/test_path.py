@@ -7,7 +7,7 @@ import math
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from mcaprl.sims.geometry.paths import further, point_of, project, spot_at
+from mcaprl.sims.geometry import further, point_of, project, spot_at
 from mcaprl.sims.lane.course import (
     COURSE,
     LONGEST_LOOK_M,

@@ -9,8 +9,8 @@ import pytest
 
 from mcaprl.errors import UnknownNameError
 from mcaprl.sims import make_sim
-from mcaprl.sims.evaluation.pilots import make_pilot
-from mcaprl.sims.geometry.bicycle import moving
+from mcaprl.sims.evaluation.evaluate import make_pilot
+from mcaprl.sims.geometry import moving
 from mcaprl.sims.lane.pilot import HORIZON, choose, pursue, pursuit_value, steer
 from mcaprl.sims.lane.rules import ACTION_COMMANDS, DRIVING, drive, end_of, located, wheel_angle
 from tests.support.sims import piloted

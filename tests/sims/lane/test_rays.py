@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaprl.sims import make_sim
-from mcaprl.sims.geometry.bicycle import moving
+from mcaprl.sims.geometry import moving
 from mcaprl.sims.lane.course import buildings, rails
 from mcaprl.sims.lane.env import LaneKeepingEnv
 from mcaprl.sims.lane.rays import (

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mcaprl.sims.geometry.bicycle import moving
-from mcaprl.sims.geometry.paths import project
+from mcaprl.sims.geometry import moving, project
 from mcaprl.sims.lane.block import step_cars
 from mcaprl.sims.lane.course import COURSE
 from mcaprl.sims.lane.fleet import start_at_random

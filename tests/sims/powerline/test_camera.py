@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.camera import draw_wires, lengths
 from mcaprl.sims.drawing.depth import DepthCamera, encode_depth
-from mcaprl.sims.geometry.mesh import frustum_mesh
-from mcaprl.sims.geometry.vectors import Quaternion, Vector
+from mcaprl.sims.geometry import Quaternion, Vector, frustum_mesh
 from mcaprl.sims.powerline.camera import (
     CAMERA_AT_M,
     IMAGE_SHAPE,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mcaprl.sims import make_sim
-from mcaprl.sims.geometry.vectors import Vector
+from mcaprl.sims.geometry import Vector
 from mcaprl.sims.powerline.course import LEG_LENGTHS_M, LENGTH_M, POINTS_M, TANGENTS, point_on_line
 from mcaprl.sims.powerline.env import PowerlineEnv
 from mcaprl.sims.powerline.quadrotor import POINT

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mcaprl.sims.geometry.vectors import Vector
+from mcaprl.sims.geometry import Vector
 from mcaprl.sims.powerline.camera import ground_triangles
 from mcaprl.sims.powerline.course import (
     ALONG_M,

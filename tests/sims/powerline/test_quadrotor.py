@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaprl.sims.geometry.vectors import Vector, dot, minus, norm, plus, rotate, times
+from mcaprl.sims.geometry import Vector, dot, minus, norm, plus, rotate, times
 from mcaprl.sims.powerline.quadrotor import (
     DRAG_PER_S,
     DRONE_SIZE,

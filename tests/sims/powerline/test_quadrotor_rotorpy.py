@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.vectors import Quaternion, Vector
+from mcaprl.sims.geometry import Quaternion, Vector
 from mcaprl.sims.powerline.quadrotor import (
     DRAG_PER_S,
     INERTIA_KG_M2,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaprl.sims.geometry.vectors import Vector
+from mcaprl.sims.geometry import Vector
 from mcaprl.sims.powerline.course import (
     ALONG_M,
     LENGTH_M,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mcaprl.sims import make_sim
-from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.evaluation.evaluate import make_pilot
 from mcaprl.sims.racer.course import Track
 from mcaprl.sims.racer.env import RacerEnv
 from mcaprl.sims.racer.rays import BLOCK_SIZE, LENGTH, RAY_NAMES, RAYS, measure

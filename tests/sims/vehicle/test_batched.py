@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.sims import SIMS, make_sim, make_sims
-from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.evaluation.evaluate import make_pilot
 from tests.sims.test_sims import BATCHED, CASES
 from tests.support.sims import action_of
 

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 import pytest
 
-from mcaprl.sims.geometry.paths import heading_of
+from mcaprl.sims.geometry import heading_of
 from mcaprl.sims.powerline.rules import FLIGHT_SIZE, flight_at
 from tests.support.paths import ROOT
 
@@ -26,7 +26,7 @@ class OtherPair(NamedTuple):
     second: float
 
 
-CODE = "from mcaprl.sims.geometry.paths import wrap_angle; print(wrap_angle(4.0))"
+CODE = "from mcaprl.sims.geometry import wrap_angle; print(wrap_angle(4.0))"
 CACHE = Path("sims", "geometry", "__pycache__")
 RESULT = "-2.2831853071795862\n"
 

@@ -1,1 +1,0 @@
-"""Paths, vectors, meshes and kinematics that the sims share."""
