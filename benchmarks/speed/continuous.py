@@ -32,6 +32,8 @@ from mcaprl.offline import BOX_ALGORITHMS, TransitionBuffer
 ROWS, EPISODE, WIDTH, ACTION = 20_000, 1_000, 17, 6
 HIDDEN = (256, 256)
 SIZES = (256, 64, 32)
+COUNTED = 4
+"""Updates whose products are counted: actors learn in every second one."""
 RIVALS = {
     "bc": "BCConfig",
     "td3-bc": "TD3PlusBCConfig",
@@ -91,29 +93,30 @@ def d3rlpys(data: mcaprl.Dataset, algo: str, batch_size: int) -> Update:
     return lambda: learner.update(log.sample_transition_batch(batch_size))
 
 
-def product_flops(update: Update, count: int = 4) -> float:
-    """Return the floating-point operations of the matrix products of an update, on average."""
+def rates_and_limit(update: Update, rival: Update, size: int, turns: Turns) -> list[float]:
+    """Return the updates per CPU second of both sides, and those of ours as products alone."""
     with FlopCounterMode(display=False) as counter:
-        for _ in range(count):
+        for _ in range(COUNTED):
             update()
-    return counter.get_total_flops() / count
+    weights, columns = torch.randn(2, HIDDEN[0], HIDDEN[1]), torch.randn(2, HIDDEN[1], size)
+    product_flops = 2 * weights.numel() * size
+    sides: dict[str, tuple[Update, int]] = {
+        "ours": (update, 1),
+        "rival": (rival, 1),
+        "product": (lambda: torch.bmm(weights, columns), 1),
+    }
+    rates = best_rates(sides, turns)
+    limit = rates["product"] * product_flops * COUNTED / counter.get_total_flops()
+    return [rates["ours"], rates["rival"], limit]
 
 
 def ratios(algo: str, size: int, turns: Turns) -> tuple[float, float, float]:
     """Return our updates per CPU second, their ratio to d3rlpy's, and the limit of the ratio."""
     data = transitions()
-    mine = ours(data, algo, size)
-    weights, columns = torch.randn(2, HIDDEN[0], HIDDEN[1]), torch.randn(2, HIDDEN[1], size)
-    sides: dict[str, tuple[Update, int]] = {
-        "ours": (mine, 1),
-        "d3rlpy": (d3rlpys(data, algo, size), 1),
-        "product": (lambda: torch.bmm(weights, columns), 1),
-    }
-    rates = best_rates(sides, turns)
-    print(algo, size, {name: round(rate, 1) for name, rate in rates.items()}, flush=True)
-    flops_per_s = rates["product"] * 2 * weights.numel() * size
-    limit = flops_per_s / product_flops(mine)
-    return rates["ours"], rates["ours"] / rates["d3rlpy"], limit / rates["d3rlpy"]
+    found = rates_and_limit(ours(data, algo, size), d3rlpys(data, algo, size), size, turns)
+    print(algo, size, [round(rate, 1) for rate in found], flush=True)
+    mine, theirs, limit = found
+    return mine, mine / theirs, limit / theirs
 
 
 def main() -> None:
