@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
-from mcaprl.entry_points import installed
+from mcaprl.lazy import installed
 from mcaprl.offline.batches.packing import Packing
 from mcaprl.settings import Architecture, NetworkSettings
 

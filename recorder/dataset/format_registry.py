@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
-from mcaprl.entry_points import installed, load
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.files import check_plain, replacing, replacing_folder
+from mcaprl.lazy import installed, load
 from mcaprl.recorder.dataset.transitions import Origin
 from mcaprl.recorder.format.behavior import FIELDS, BehaviorField
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
