@@ -48,9 +48,6 @@ def load(entry: EntryPoint, base: type[Any], built_in: Container[str]) -> Any:
         entry: Entry point, which has the `name` of its class.
         base: Class that the class is derived from.
         built_in: Names that an entry point cannot have.
-
-    Raises:
-        UsageError: The class cannot be imported, has another base or name, or the name is taken.
     """
     try:
         found = entry.load()

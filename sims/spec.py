@@ -153,11 +153,7 @@ def _installed() -> dict[str, EntryPoint]:
 
 
 def _load(found: EntryPoint) -> SimSpec:
-    """Load the sim of an entry point.
-
-    Raises:
-        UsageError: The entry point cannot be loaded, or does not return a sim of the same name.
-    """
+    """Load the sim of an entry point."""
     package = f" of package '{found.dist.name}'" if found.dist else ""
     place = f"entry point '{found.name} = {found.value}' in group '{GROUP}'{package}"
     try:

@@ -99,11 +99,7 @@ class McapWriter(OutputFile):
     def add_channel(
         self, topic: str, schema_name: str, schema_text: str, metadata: dict[str, str] | None = None
     ) -> int:
-        """Return the channel id of a topic of `ros2msg` messages; write the channel if it is new.
-
-        Raises:
-            LogError: The topic has messages of another type.
-        """
+        """Return the channel id of a topic of `ros2msg` messages, and write a new channel."""
         schemas, channels = self._summary.schemas, self._summary.channels
         wanted = ("ros2msg", schema_name, schema_text.encode())
         schema_id = next(

@@ -136,10 +136,6 @@ def verify(
             episodes, these are also compared. Default: all episodes.
         on_frame: Function of episode and step. It is called after each observation that matches the
             log, while the environment is in the state of that step.
-
-    Raises:
-        SpaceError: The spaces of the environment and the log differ.
-        LogError: The environment raises an error for a logged action.
     """
     comparison = Comparison(dataset, env, only)
     for episode, step in comparison:
