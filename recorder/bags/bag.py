@@ -167,7 +167,7 @@ class Bag(Protocol):
 
         Args:
             topic: Name of the topic.
-            fields: Paths of fields, see `path_steps`; `publish_time` is the time of publication in
+            fields: Paths of fields, see `bags.values`; `publish_time` is the time of publication in
                 nanoseconds.
             rows: Indices into `times` of the messages to read, in output order; default: all.
         """

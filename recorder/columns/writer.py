@@ -149,7 +149,7 @@ class McapWriter(OutputFile):
     def write_rows(self, rows: NDArray[Any]) -> None:
         """Write messages of one channel and length as one chunk.
 
-        `rows` is an array of `message_rows.record_dtype` with log_time; this function sets its
+        `rows` is an array of `records.record_dtype` with log_time; this function sets its
         sequence numbers and publish times.
         """
         if len(rows) == 0:

@@ -36,7 +36,7 @@ class FieldPath(NamedTuple):
 
     Attributes:
         topic: Name of the topic.
-        field: Path of the field in the message, see `bags.path_steps`; empty for the message as a
+        field: Path of the field in the message, see `bags.values`; empty for the message as a
             whole.
         elements: Index or slice of the field's array; None for the whole field.
     """
