@@ -1,4 +1,4 @@
-"""Foxglove WebSocket server on 127.0.0.1 behind a filter of web pages, and the player of logs.
+"""Foxglove WebSocket server on 127.0.0.1 with a filter of web pages, and the player of logs.
 
 Any web page can open a WebSocket to a local port. The browser sends the page's origin in the header
 `Origin`, which a server must check. foxglove-sdk does not check it. The proxy checks the head of
