@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mcaprl.settings import ENCODERS, Architecture
+from mcaprl.architecture import ENCODERS, Architecture
 from mcaprl.storage.tensor_files import check_widths
 
 _MAX_IMAGES = 10_000
