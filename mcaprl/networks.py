@@ -3,7 +3,7 @@
 image  -> convolutions -> layer -+
 vector -----------------> layer -+-> layers -> outputs
 
-The encoders of images are described in `mcaprl.settings`.
+The encoders of images are described in `mcaprl.architecture`.
 """
 
 from __future__ import annotations
