@@ -19,11 +19,20 @@ import click
 from mcaprl._interrupt import INTERRUPTED, raise_interrupt, repeat_lost_interrupt
 from mcaprl._version import __version__
 from mcaprl.cli.completion import completion
-from mcaprl.cli.convert import convert
-from mcaprl.cli.edit import filter_, merge, slice_, split
 from mcaprl.cli.evaluate import evaluate
 from mcaprl.cli.help import EXIT_CODES, Program
-from mcaprl.cli.logs import annotate, check, info, layout, recover
+from mcaprl.cli.logs import (
+    annotate,
+    check,
+    convert,
+    filter_,
+    info,
+    layout,
+    merge,
+    recover,
+    slice_,
+    split,
+)
 from mcaprl.cli.record import record
 from mcaprl.cli.replay import replay
 from mcaprl.cli.show import echo

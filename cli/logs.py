@@ -1,10 +1,11 @@
-"""`mcaprl info`, `check`, `recover`, `layout` and `annotate`: commands on logs."""
+"""Commands on logs: `info`, `check`, `recover`, `layout`, `annotate`, `convert` and the edits."""
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -24,9 +25,13 @@ from mcaprl.cli.options import (
     trust_option,
 )
 from mcaprl.cli.progress import hint, working
-from mcaprl.cli.show import echo, print_facts, print_json, print_problems, print_table
+from mcaprl.cli.show import echo, print_facts, print_json, print_problems, print_table, print_wide
+from mcaprl.errors import UsageError
 from mcaprl.page import PAGE_NAME
 from mcaprl.texts import counted
+
+if TYPE_CHECKING:
+    from mcaprl.recorder.edit.piece import Edited
 
 
 @click.command(cls=Command)
@@ -173,3 +178,197 @@ def annotate(file: str, out: Path, **request: Any) -> None:
     if found.scene is not None:
         episodes, steps = found.scene.episodes, found.scene.steps
         echo(f"{out}: the scene of {counted(episodes, 'episode')}, {counted(steps, 'step')}")
+
+
+@click.command(cls=Command)
+@click.argument("paths", nargs=-1, required=True, metavar="SRC... [DST]", type=PATH)
+@mapping_options
+@click.option("--from", "source_format", metavar="FORMAT", help="Format of SRC if not detected.")
+@click.option(
+    "--one-episode",
+    is_flag=True,
+    help="All of SRC is one episode if it marks no end of an episode.",
+)
+@click.option(
+    "--dones",
+    type=click.Choice(["terminated", "truncated"]),
+    help="Kind of the ends of episodes in SRC if SRC does not say it.",
+)
+@click.option("--to", metavar="FORMAT", help="Format of DST if not clear from its name.")
+@click.option("--lossy", is_flag=True, help="Convert or omit data that DST or a log cannot store.")
+@click.option("--suggest", is_flag=True, help="Print a draft of a mapping for SRC; takes no DST.")
+@click.option(
+    "--bins",
+    type=click.IntRange(2),
+    metavar="N",
+    help="With --suggest: N bins of each continuous command, each with as many commands.",
+)
+@click.option("--dry-run", is_flag=True, help="Read SRC and write nothing; takes no DST.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
+@click.option("--upload", metavar="URL", help="Copy the finished file to a URL.")
+@json_option
+def convert(
+    paths: tuple[str, ...],
+    suggest: bool,
+    bins: int | None,
+    dry_run: bool,
+    as_json: bool,
+    source_format: str | None,
+    one_episode: bool,
+    dones: str | None,
+    **request: Any,
+) -> None:
+    """Read SRC, and write its transitions to DST.
+
+    SRC is a log or a dataset of another tool. With --mapping, SRC is a bag: an MCAP file of any
+    writer, a rosbag2 folder or database, or a ROS 1 bag. To write a mapping for a bag, begin with
+    `mcaprl convert --suggest BAG > robot.yaml`. DST is a log if it ends with .mcap. Otherwise, DST
+    is a dataset in the format that --to names: lerobot, minari, parquet, npz, d3rlpy or hdf5.
+    """
+    if bins is not None and not suggest:
+        raise UsageError("--bins is for --suggest: set `edges` of the mapping instead")
+    bag = bag_options(request)
+    if suggest:
+        with working("reading the topics"):
+            text = mcaprl.suggest_mapping(paths, bins=bins, definitions=bag["definitions"])
+        click.echo(text, nl=False)
+        return
+    if not dry_run and len(paths) < 2:
+        raise UsageError("convert needs SRC and DST, or --dry-run to write nothing")
+    sources, out = (paths, None) if dry_run else (paths[:-1], paths[-1])
+    source = bag_reader(sources, bag)
+    reading: dict[str, Any] = {"format": source_format, "one_episode": one_episode, "dones": dones}
+    if any(reading.values()):
+        source = partial(mcaprl.open, sources, lossy=request["lossy"], **reading, **bag)
+    with working("converting"):
+        found = mcaprl.convert(source, out, **request)
+    if as_json:
+        print_json(found.to_json())
+        return
+    if found.report is not None:
+        print_facts(", ".join(sources), found.report.rows(), width=100)
+        print_wide("recordings: missing share, median age, largest age", *found.run_table())
+    if dry_run:
+        print_wide("first transitions", *found.first_table(), last=3)
+    if found.report is not None:
+        print_problems(found.report.problems())
+    for sentence in found.lost:
+        echo(f"lost: {sentence}")
+    if found.out is not None:
+        data = found.dataset
+        steps = counted(len(data), "step")
+        echo(f"{found.out}: {counted(len(data.episodes), 'episode')}, {steps}")
+
+
+_overwrite_option = click.option("--overwrite", is_flag=True, help="Replace existing output.")
+
+
+@click.command(cls=Command)
+@click.argument("logs", nargs=-1, required=True, metavar="LOG... OUT", type=PATH)
+@click.option("--shift", is_flag=True, help="Delay each log that overlaps a previous one in time.")
+@_overwrite_option
+@json_option
+def merge(logs: tuple[str, ...], shift: bool, overwrite: bool, as_json: bool) -> None:
+    """Join LOG... into the new log OUT, with all topics, metadata and attachments."""
+    if len(logs) < 2:
+        raise UsageError("merge needs LOG... and OUT")
+    with working("copying"):
+        found = mcaprl.merge(logs[:-1], logs[-1], shift=shift, overwrite=overwrite)
+    _show([found], as_json)
+
+
+@click.command(cls=Command)
+@click.argument("log", type=PATH)
+@click.argument("out", type=PATH)
+@click.option("--episodes", type=int, help="Number of episodes of each part.")
+@click.option("--ratio", metavar="A:B[:C...]", help="Relative sizes of the parts, such as 8:1:1.")
+@click.option("--seed", type=click.IntRange(0), help="Assign episodes at random with this seed.")
+@_overwrite_option
+@json_option
+def split(
+    log: str,
+    out: str,
+    episodes: int | None,
+    ratio: str | None,
+    seed: int | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Copy the episodes of LOG to several logs in the new folder OUT."""
+    shares = None if ratio is None else [_number("ratio", part) for part in ratio.split(":")]
+    with working("copying"):
+        found = mcaprl.split(
+            log, out, episodes=episodes, ratio=shares, seed=seed, overwrite=overwrite
+        )
+    _show(found, as_json)
+
+
+@click.command("filter", cls=Command)
+@click.argument("expression")
+@click.argument("log", type=PATH)
+@click.argument("out", type=PATH)
+@_overwrite_option
+@json_option
+def filter_(expression: str, log: str, out: str, overwrite: bool, as_json: bool) -> None:
+    """Copy the episodes of LOG for which EXPRESSION is true to the new log OUT.
+
+    EXPRESSION is a condition such as "length > 100 and reason == 'crash'" on: episode, length,
+    total_reward, terminated, truncated, reason, policy, epsilon, seed, options, start_s,
+    duration_s.
+    """
+    with working("copying"):
+        found = mcaprl.filter(expression, log, out, overwrite=overwrite)
+    _show([found], as_json)
+
+
+@click.command("slice", cls=Command)
+@click.argument("log", type=PATH)
+@click.argument("out", type=PATH)
+@click.option("--steps", metavar="A:B", help="Transitions from A to B; B is not included.")
+@click.option("--time", metavar="A:B", help="Seconds since the first message of LOG.")
+@_overwrite_option
+@json_option
+def slice_(
+    log: str, out: str, steps: str | None, time: str | None, overwrite: bool, as_json: bool
+) -> None:
+    """Copy the part of LOG between two steps or times to the new log OUT.
+
+    Episodes that contain A or B are shortened. If A or B is empty, the start or end of LOG is used.
+    """
+    bounds = {
+        "steps": None if steps is None else _bounds("steps", steps),
+        "time": None if time is None else _bounds("time", time),
+    }
+    with working("copying"):
+        found = mcaprl.slice(log, out, **bounds, overwrite=overwrite)
+    _show([found], as_json)
+
+
+def _show(results: list[Edited], as_json: bool) -> None:
+    if as_json:
+        print_json({"logs": [vars(found) | {"out": str(found.out)} for found in results]})
+        return
+    for found in results:
+        episodes, steps = counted(found.episodes, "episode"), counted(found.steps, "step")
+        chunks = f"{found.whole_chunks} of {found.whole_chunks + found.rewritten_chunks} chunks"
+        messages = counted(found.messages, "message")
+        echo(f"{found.out}: {episodes}, {steps}, {messages}; {chunks} copied unchanged")
+
+
+def _bounds(option: str, text: str) -> tuple[float | None, float | None]:
+    """Parse A:B; an empty bound is None."""
+    parts = text.split(":")
+    if len(parts) != 2:
+        raise UsageError(f"--{option} is '{text}', expected A:B, such as 100:200")
+    first, last = (None if not part.strip() else _number(option, part) for part in parts)
+    return first, last
+
+
+def _number(option: str, text: str) -> float:
+    try:
+        number = int(text) if option == "steps" else float(text)
+    except ValueError as error:
+        raise UsageError(f"--{option} has '{text}', which is not a number") from error
+    if not (math.isfinite(number) and number >= 0):
+        raise UsageError(f"--{option} has '{text}', expected a number of 0 or more")
+    return number

@@ -24,19 +24,16 @@ if not is_program():
 
 if TYPE_CHECKING:
     from mcaprl import ray, torch
-    from mcaprl.api.annotate import annotate
     from mcaprl.api.behavior import estimate_behavior
-    from mcaprl.api.browse import browse, save_page
-    from mcaprl.api.cluster import ClusterOptions
     from mcaprl.api.convert import convert, suggest_mapping
-    from mcaprl.api.edit import filter, merge, slice, split
+    from mcaprl.api.edit import annotate, filter, merge, slice, split
     from mcaprl.api.estimate import estimate
     from mcaprl.api.evaluate import evaluate
-    from mcaprl.api.layout import layout
     from mcaprl.api.logs import check, info, recover
     from mcaprl.api.policies import Run, export, load_policy
+    from mcaprl.api.ranges import ClusterOptions
     from mcaprl.api.record import record
-    from mcaprl.api.replay import render, replay, verify
+    from mcaprl.api.replay import browse, layout, render, replay, save_page, verify
     from mcaprl.api.sweep import sweep
     from mcaprl.api.train import train, train_online
     from mcaprl.recorder.bags.bag import OpenBag, open_bag
@@ -101,20 +98,16 @@ if not TYPE_CHECKING:
 # These names are imported on first use: their modules take long to import.
 __getattr__ = lazy_attributes(
     __name__,
-    {
-        f"mcaprl.api.{name}": [name]
-        for name in ("annotate", "estimate", "evaluate", "layout", "record", "sweep")
-    }
+    {f"mcaprl.api.{name}": [name] for name in ("estimate", "evaluate", "record", "sweep")}
     | {
         "mcaprl.api.behavior": ["estimate_behavior"],
-        "mcaprl.api.cluster": ["ClusterOptions"],
-        "mcaprl.api.browse": ["browse", "save_page"],
         "mcaprl.api.convert": ["convert", "suggest_mapping"],
         "mcaprl.recorder.source": ["open_data as open"],
-        "mcaprl.api.edit": ["filter", "merge", "slice", "split"],
+        "mcaprl.api.edit": ["annotate", "filter", "merge", "slice", "split"],
         "mcaprl.api.logs": ["check", "info", "recover"],
         "mcaprl.api.policies": ["Run", "export", "load_policy"],
-        "mcaprl.api.replay": ["render", "replay", "verify"],
+        "mcaprl.api.ranges": ["ClusterOptions"],
+        "mcaprl.api.replay": ["browse", "layout", "render", "replay", "save_page", "verify"],
         "mcaprl.api.train": ["train", "train_online"],
         "mcaprl.ray": ["ray"],
         "mcaprl.torch": ["torch"],

@@ -1,11 +1,16 @@
-"""Attributes of a package that are imported on first use."""
+"""Attributes of packages and classes of entry points, which are imported on first use."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from mcaprl.errors import UsageError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 def lazy_attributes(package: str, sources: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
@@ -27,3 +32,39 @@ def lazy_attributes(package: str, sources: Mapping[str, Sequence[str]]) -> Calla
         return value
 
     return get
+
+
+def installed(group: str) -> dict[str, EntryPoint]:
+    """Return the entry points of a group by name."""
+    from importlib.metadata import entry_points
+
+    return {entry.name: entry for entry in entry_points(group=group)}
+
+
+def load(entry: EntryPoint, base: type[Any], built_in: Container[str]) -> Any:
+    """Import the class of an entry point, a subclass of `base`.
+
+    Args:
+        entry: Entry point, which has the `name` of its class.
+        base: Class that the class is derived from.
+        built_in: Names that an entry point cannot have.
+    """
+    try:
+        found = entry.load()
+    except Exception as error:  # Importing a module can raise any exception.
+        raise _broken(entry, f"{type(error).__name__}: {error}") from error
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise _broken(entry, f"it is not a subclass of {base.__name__}")
+    if (name := getattr(found, "name", None)) != entry.name:
+        raise _broken(entry, f"its name is {name!r}")
+    if entry.name in built_in:
+        raise _broken(entry, "the name is built in")
+    return found
+
+
+def _broken(entry: EntryPoint, reason: str) -> UsageError:
+    package = entry.dist.name if entry.dist else "unknown"
+    return UsageError(
+        f"entry point {entry.name!r} ({entry.value}) of package {package} in group"
+        f" {entry.group} is broken: {reason}; fix or uninstall the package"
+    )

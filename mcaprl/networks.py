@@ -3,7 +3,7 @@
 image  -> convolutions -> layer -+
 vector -----------------> layer -+-> layers -> outputs
 
-The encoders of images are described in `mcaprl.settings`.
+The encoders of images are described in `mcaprl.architecture`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mcaprl.settings import ENCODERS, Architecture
+from mcaprl.architecture import ENCODERS, Architecture
 from mcaprl.storage.tensor_files import check_widths
 
 _MAX_IMAGES = 10_000

@@ -94,9 +94,6 @@ class RunIdentity:
         Args:
             found: Identity in the file; it may have further parts.
             where: Path of the file.
-
-        Raises:
-            TrainingError: The identities differ; the message names the first difference.
         """
         mine = self.parts
         theirs: dict[str, Any] = {name: found.get(name) for name in mine}
@@ -130,13 +127,7 @@ class RunIdentity:
 
 @contextmanager
 def locked_run(folder: Path, resume: bool) -> Iterator[None]:
-    """Lock a run folder against other trainings; create the folder of a new run.
-
-    Raises:
-        OutputExistsError: `folder` is a file.
-        TrainingError: Another training is using the folder, or the folder cannot be created, or it
-            contains no run to resume.
-    """
+    """Lock a run folder against other trainings; create the folder of a new run."""
     if resume:
         run_to_resume(folder)
     elif folder.is_file():
@@ -168,10 +159,6 @@ def open_run(
         resume: Whether to continue the run in the folder, even if it has not written a file yet.
         seeds: Seeds of the run.
         **source: Further entries of `config.json`.
-
-    Raises:
-        OutputExistsError: The folder contains other files.
-        TrainingError: The folder belongs to another run, or cannot be written.
     """
     found = run_to_resume(folder) if resume else {}
     leftovers = _leftovers(folder)
@@ -229,10 +216,6 @@ def choose_seeds(folder: Path, seeds: int | None, seed: int | None, resume: bool
         seeds: Number of seeds; None selects that of the resumed run, or else 1.
         seed: First seed; None selects that of the resumed run, or else 0.
         resume: Whether to resume the run in the folder.
-
-    Raises:
-        UsageError: A number is out of range, or the resumed run has other seeds.
-        TrainingError: There is no run to resume.
     """
     if (seeds is not None and seeds < 1) or (seed is not None and seed < 0):
         raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
@@ -286,11 +269,7 @@ class _Config:
 
 
 def run_to_resume(folder: Path) -> dict[str, Any]:
-    """Return the config of a run, or an empty dict if the run ended before writing its config.
-
-    Raises:
-        TrainingError: There is no run in the folder, or its config cannot be read.
-    """
+    """Return the config of a run, or an empty dict if the run ended before writing its config."""
     if (folder / CONFIG_NAME).exists():
         return read_config(folder)
     if not folder.is_dir() or _leftovers(folder) is None:
@@ -302,11 +281,7 @@ def run_to_resume(folder: Path) -> dict[str, Any]:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Read the `config.json` of a run.
-
-    Raises:
-        TrainingError: The file cannot be read, or is not a JSON object.
-    """
+    """Read the `config.json` of a run."""
     path = folder / CONFIG_NAME
     try:
         found: dict[str, Any] = read_json(path, TrainingError)
@@ -324,9 +299,6 @@ def read_updates(folder: Path) -> int | None:
     """Return the number of updates with which an offline run was started or last continued.
 
     The result is None if the run ended before writing its config.
-
-    Raises:
-        TrainingError: There is no run in the folder, or its config cannot be read.
     """
     match run_to_resume(folder):
         case {"config": {"updates": int(updates)}}:
@@ -341,9 +313,6 @@ def check_kind(folder: Path, config: Mapping[str, Any], kind: str) -> None:
         folder: Folder of the run.
         config: Contents of its `config.json`.
         kind: `online` or `offline`.
-
-    Raises:
-        TrainingError: The run is of the other kind.
     """
     other, source = ("offline", "data") if kind == "online" else ("online", "sim")
     if source in config:
@@ -402,11 +371,7 @@ def saved_updates(run: Path, seeds: int) -> int:
 
 
 def read_curve(path: Path) -> Curve:
-    """Read the columns of a `metrics.csv` or `curve.csv`.
-
-    Raises:
-        TrainingError: The file cannot be read, or has no rows.
-    """
+    """Read the columns of a `metrics.csv` or `curve.csv`."""
     try:
         check_regular(path)
         with path.open(newline="") as file:
@@ -417,12 +382,7 @@ def read_curve(path: Path) -> Curve:
 
 
 def read_curves(run: Path, name: str, columns: Iterable[str] = ()) -> list[Curve]:
-    """Read `metrics.csv` or `curve.csv` of each seed that has this file.
-
-    Raises:
-        TrainingError: A file cannot be read, lacks one of `columns`, or has other columns than
-            that of the first seed.
-    """
+    """Read `metrics.csv` or `curve.csv` of each seed that has this file."""
     curves = {path: read_curve(path) for path in sorted(run.glob(f"seed-*/{name}"))}
     for path, curve in curves.items():
         needed = {*columns, *next(iter(curves.values()))}

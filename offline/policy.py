@@ -23,6 +23,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from mcaprl.actions import OBSERVATION_KEY, BoxActions, has_source, joint_actions
+from mcaprl.architecture import architecture_of
 from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
 from mcaprl.files import as_type, parse_json, read_file, write_json
@@ -41,7 +42,6 @@ from mcaprl.recorder.format.spaces import (
     space_to_json,
 )
 from mcaprl.runs import POLICY_NAME
-from mcaprl.settings import architecture_of
 from mcaprl.storage.tensor_files import check_finite, read_tensors, write_tensors
 
 FORMAT_VERSION = 2

@@ -30,8 +30,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from mcaprl.architecture import Architecture, NetworkSettings
 from mcaprl.errors import UnknownNameError
-from mcaprl.settings import Architecture, NetworkSettings
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,11 @@ from stable_baselines3.common.vec_env import VecTransposeImage
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import Tensor, nn
 
+from mcaprl.architecture import Architecture
 from mcaprl.frames import is_image, map_space, parts_of, parts_of_space, stack_axis
 from mcaprl.networks import Convolutions, ImageInput, Trunk, make_head
 from mcaprl.offline.batches.observations import Observations
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE
-from mcaprl.settings import Architecture
 
 
 class NetworkFeatures(BaseFeaturesExtractor):

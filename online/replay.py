@@ -21,11 +21,11 @@ from gymnasium import spaces
 from torch import Tensor
 
 from mcaprl.actions import BoxActions
+from mcaprl.architecture import Architecture
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
 from mcaprl.offline.batches.packing import Packing
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.settings import Architecture
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,6 +35,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from torch import Tensor
 
 from mcaprl.actions import BoxActions
+from mcaprl.architecture import SMALL_EDGE, Architecture
 from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import UsageError
 from mcaprl.frames import (
@@ -76,7 +77,6 @@ from mcaprl.online.zip_file import (
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import BEST_NAME
-from mcaprl.settings import SMALL_EDGE, Architecture
 from mcaprl.sims.evaluation.rollout import episode_seed
 from mcaprl.storage.tensor_files import below
 

@@ -38,6 +38,7 @@ from stable_baselines3.td3 import policies as td3
 from torch import Tensor, nn
 
 from mcaprl.actions import BoxActions, joint_actions
+from mcaprl.architecture import Architecture, architecture_of
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
 from mcaprl.files import as_type, check_regular, parse_json, write_atomically
 from mcaprl.frames import (
@@ -70,7 +71,6 @@ from mcaprl.recorder.format.spaces import (
     space_to_json,
 )
 from mcaprl.runs import BEST_NAME
-from mcaprl.settings import Architecture, architecture_of
 from mcaprl.storage.tensor_files import check_finite, check_widths
 
 FORMAT_VERSION = 1

@@ -2,9 +2,9 @@
 
 Arrows show how data flows through the modules:
 
-    environment  -> wrapper -> step_rows, display   -> log_writer -> writer -> file
-    environments -> vector_wrapper -> vector_rows   -> log_writer -> writer -> file
-    dataset      -> save                            -> log_writer -> writer -> file
+    environment  -> wrapper        -> step_rows, display -> log_writer -> writer -> file
+    environments -> vector_wrapper -> step_rows, display -> log_writer -> writer -> file
+    dataset      -> save                                 -> log_writer -> writer -> file
     file -> reader -> log_reader -> dataset -> statistics, tables
                    -> check
     bag -> bags -> mapping -> dataset                                 (convert)

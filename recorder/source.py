@@ -196,11 +196,7 @@ def read_mapped(
 def changed_mapping(
     mapping: str | Path | Mapping[str, Any] | None, changes: Mapping[str, Any]
 ) -> MappingFile | None:
-    """Return a mapping with other values of some keys.
-
-    Raises:
-        UsageError: There are changes, but no mapping.
-    """
+    """Return a mapping with other values of some keys."""
     if not changes:
         return mapping
     if mapping is None:
@@ -225,10 +221,6 @@ def logs_of(data: Data, *, weighted: bool = False) -> dict[Path, float]:
     """Return the absolute paths and the weights of logs, for processes that read them again.
 
     With `weighted`, a name may end with the weight of its logs, such as `:2`.
-
-    Raises:
-        UsageError: The data are not whole logs.
-        LogError: A file is missing.
     """
     if isinstance(data, Dataset):
         if not data.origin.logs:
@@ -245,11 +237,7 @@ def logs_of(data: Data, *, weighted: bool = False) -> dict[Path, float]:
 
 
 def split_weights(data: Paths) -> tuple[list[str], list[float] | None]:
-    """Split names such as `logs/a.mcap:2` into paths and weights; None if all weights are 1.
-
-    Raises:
-        UsageError: A weight is negative or infinite.
-    """
+    """Split names such as `logs/a.mcap:2` into paths and weights; None if all weights are 1."""
     pairs = [_split_weight(str(name)) for name in _names(data)]
     weights = [weight for _, weight in pairs]
     return [name for name, _ in pairs], None if set(weights) <= {1.0} else weights

@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any, Final
 import gymnasium as gym
 
 from mcaprl.errors import UsageError
+from mcaprl.lazy import installed
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 GROUP: Final = "mcaprl.sims"
 """Entry point group; each entry point is named after its sim."""
+_installed = functools.cache(functools.partial(installed, GROUP))
 
 
 @dataclass(frozen=True)
@@ -144,20 +146,8 @@ class SimCatalog(Mapping[str, str]):
         return self._specs[name]
 
 
-@functools.cache
-def _installed() -> dict[str, EntryPoint]:
-    """Return the entry points of installed packages by name."""
-    from importlib.metadata import entry_points
-
-    return {found.name: found for found in entry_points(group=GROUP)}
-
-
 def _load(found: EntryPoint) -> SimSpec:
-    """Load the sim of an entry point.
-
-    Raises:
-        UsageError: The entry point cannot be loaded, or does not return a sim of the same name.
-    """
+    """Load the sim of an entry point."""
     package = f" of package '{found.dist.name}'" if found.dist else ""
     place = f"entry point '{found.name} = {found.value}' in group '{GROUP}'{package}"
     try:

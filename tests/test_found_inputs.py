@@ -174,8 +174,7 @@ def test_choices_of_other_types(tmp_path: Path) -> None:
 )
 def test_scores_of_a_sweep(tmp_path: Path, content: Any, reason: str) -> None:
     pytest.importorskip("ray")
-    from mcaprl.ray.sweep import _open, _result
-    from mcaprl.ray.sweep_file import read_plan
+    from mcaprl.ray.sweep import _open, _result, read_plan
 
     (trial,) = read_plan({"algos": ["bc"]}).trials
     (tmp_path / "bc-000.scores.json").write_text(json.dumps(content))
@@ -186,8 +185,7 @@ def test_scores_of_a_sweep(tmp_path: Path, content: Any, reason: str) -> None:
 
 def test_scores_without_values(tmp_path: Path) -> None:
     pytest.importorskip("ray")
-    from mcaprl.ray.sweep import _result
-    from mcaprl.ray.sweep_file import read_plan
+    from mcaprl.ray.sweep import _result, read_plan
 
     (trial,) = read_plan({"algos": ["bc"]}).trials
     score = {"updates": 1, "values": [], "estimator": "FQE", "trusted": True}

@@ -13,10 +13,9 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 
-from mcaprl.api.cluster import ClusterOptions
 from mcaprl.api.environments import all_options, check_names, name_of, trained_options
 from mcaprl.api.policies import SCRIPTED, Names, by_name, policies_of, policy_names
-from mcaprl.api.ranges import check_least
+from mcaprl.api.ranges import ClusterOptions, check_least
 from mcaprl.base_policy import Actor, BasePolicy
 from mcaprl.errors import ClusterError, ReportError, UsageError, import_extra
 from mcaprl.files import check_log_name, check_target, check_writable, write_json

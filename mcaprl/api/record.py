@@ -12,10 +12,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from mcaprl.api.cluster import ClusterOptions
 from mcaprl.api.environments import all_options, check_names, name_of, trained_options
 from mcaprl.api.policies import by_name
-from mcaprl.api.ranges import check_fraction, check_least, check_positive
+from mcaprl.api.ranges import ClusterOptions, check_fraction, check_least, check_positive
 from mcaprl.api.record_file import FileRequest, record_file
 from mcaprl.api.shards import record_on_ray, record_shards
 from mcaprl.base_policy import Actor

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
+import webbrowser
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -14,11 +17,11 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.api.environments import check_episode, sim_of
+from mcaprl.api.environments import all_options, check_episode, sim_of
 from mcaprl.api.policies import as_names
 from mcaprl.api.ranges import check_port, check_positive
-from mcaprl.errors import LogError, UsageError
-from mcaprl.files import temporary_folder, write_json
+from mcaprl.errors import LogError, OutputExistsError, ReportError, UnknownNameError, UsageError
+from mcaprl.files import check_target, replacing, temporary_folder, write_json
 from mcaprl.progress import Advance, ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import find_logs
@@ -28,19 +31,21 @@ from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.display import SCENE
 from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.record.panels import bounded_actions
+from mcaprl.recorder.record.scene import DepthSource
+from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.recorder.source import Paths, open_data
-from mcaprl.recorder.viewer.annotate import attached_layout
-from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
-from mcaprl.recorder.viewer.playback import Player, SeenStep, Track, moments_of_episode
-from mcaprl.recorder.viewer.player_server import (
+from mcaprl.recorder.viewer.annotate import Comparison, Verification, attached_layout
+from mcaprl.recorder.viewer.annotate import verify as verify_dataset
+from mcaprl.recorder.viewer.foxglove_server import (
+    DEFAULT_PORT,
     MAX_SPEED,
     MIN_SPEED,
     LiveServer,
     prefixes_of,
     side_by_side,
 )
-from mcaprl.recorder.viewer.verify import Comparison, Verification
-from mcaprl.recorder.viewer.verify import verify as verify_dataset
+from mcaprl.recorder.viewer.page.log_page import LogPage, PageServer, page_html
+from mcaprl.recorder.viewer.playback import Player, SeenStep, Track, moments_of_episode
 from mcaprl.recorder.viewer.video import (
     VIDEO_KINDS,
     check_output,
@@ -50,7 +55,8 @@ from mcaprl.recorder.viewer.video import (
     write_sheet,
     write_video,
 )
-from mcaprl.storage.remote import as_path
+from mcaprl.sims import SIMS, make_sim
+from mcaprl.storage.remote import as_path, is_url
 
 _Images = Iterator[NDArray[np.uint8]]
 _STILLS, _MOST_DIALS, _HEIGHTS_PX = 12, 8, (16, 4320)
@@ -349,3 +355,154 @@ def _counted(images: _Images, advance: Advance) -> _Images:
     for image in images:
         advance(1)
         yield image
+
+
+def layout(
+    source: str | Path,
+    out: str | Path | None = None,
+    *,
+    actions: str | int | None = None,
+    sim_options: Mapping[str, Any] | None = None,
+    keys: Sequence[str] | None = None,
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Return the Foxglove layout of a log, or of the logs of a sim.
+
+    Args:
+        source: Path or URL of a log, short name of a sim, or Gymnasium id.
+        out: JSON file to write; None to write nothing.
+        actions: Actions of the sim, such as `continuous`.
+        sim_options: Other arguments of the environment.
+        keys: Keys of the parts of a Dict or Tuple observation that the logs contain; default: all.
+        overwrite: Whether an existing file is replaced.
+
+    Raises:
+        UsageError: `out` has the suffix of a log, or arguments or keys are given for a log.
+        UnknownNameError: There is no such sim.
+        OutputExistsError: `out` exists.
+        LogError: The log cannot be read.
+        ReportError: `out` cannot be written.
+    """
+    path = None if out is None else Path(out)
+    if path is not None and path.suffix == ".mcap":
+        raise UsageError(f"{path}: a layout is a JSON file and must not replace a log")
+    if path is not None and path.exists() and not overwrite:
+        raise OutputExistsError(f"{path} exists: choose another path, or pass `overwrite=True`")
+    name = str(source)
+    is_file = is_url(name) or Path(name).is_file() or name.endswith(".mcap")
+    is_log = name not in SIMS and is_file
+    options = all_options(None, None, actions, sim_options)
+    if is_log and (options or keys is not None):
+        raise UsageError(
+            f"{name} is a log, but `actions=`, `sim_options=` and `keys=` are for a sim: omit them"
+        )
+    found = attached_layout(McapReader(name)) if is_log else _layout_of_sim(name, options, keys)
+    if path is not None:
+        write_json(path, found, ReportError)
+    return found
+
+
+def _layout_of_sim(sim: str, options: dict[str, Any], keys: Sequence[str] | None) -> dict[str, Any]:
+    """Return the layout of a temporary recording of a sim."""
+    with temporary_folder() as folder:
+        path = folder / "reset.mcap"
+        env = make_sim(sim, **options)
+        camera = isinstance(env.unwrapped, DepthSource)
+        with closing(RecordMcap(env, path, camera=camera, keys=keys)) as log:
+            log.reset(seed=0)
+        return attached_layout(McapReader(path))
+
+
+_KINDS = (".html", ".htm")
+
+
+def browse(
+    data: str | Path,
+    *,
+    episode: int = 0,
+    speed: float = 1.0,
+    loop: bool = False,
+    port: int = 0,
+    show: bool = True,
+    on_open: Callable[[str], None] = lambda url: None,
+    stop: threading.Event | None = None,
+) -> None:
+    """Serve a page with a log's episodes on 127.0.0.1 until `stop` is set or Ctrl-C is pressed.
+
+    Args:
+        data: Path of the log.
+        episode: Index of the episode that the page shows first.
+        speed: Initial playback speed, simulated seconds per second.
+        loop: Whether an episode restarts at its end.
+        port: Port on 127.0.0.1; 0 for any free port.
+        show: Whether to open the page in the browser, if there is a display.
+        on_open: Function called with the URL when the page can be opened.
+        stop: Event that ends the server.
+
+    Raises:
+        UsageError: The log has no such episode, the port is in use, or a number is out of range.
+        LogError: The log cannot be read.
+    """
+    check_positive(speed=speed)
+    check_port(port)
+    page = _page(data, episode)
+    with closing(PageServer(page, port=port, first=episode, speed=speed, loop=loop)) as server:
+        on_open(server.url)
+        if show and _has_display():
+            webbrowser.open(server.url)
+        with suppress(KeyboardInterrupt):
+            server.run(stop or threading.Event())
+
+
+def save_page(
+    data: str | Path,
+    page: str | Path,
+    *,
+    episode: int = 0,
+    speed: float = 1.0,
+    loop: bool = False,
+    overwrite: bool = False,
+) -> int:
+    """Save an episode as one HTML file, which a browser shows without a server or a network.
+
+    Args:
+        data: Path of the log.
+        page: File to write: .html.
+        episode: Index of the episode.
+        speed: Initial playback speed, simulated seconds per second.
+        loop: Whether the episode restarts at its end.
+        overwrite: Whether an existing file is replaced.
+
+    Returns:
+        Size of the page in bytes.
+
+    Raises:
+        UsageError: The log has no such episode, or `speed` is not positive.
+        LogError: The log cannot be read.
+        OutputExistsError: `page` exists.
+        ReportError: `page` cannot be written.
+    """
+    check_positive(speed=speed)
+    out = Path(page)
+    if out.suffix not in _KINDS:
+        raise UnknownNameError("kind of output", out.suffix or out.name, _KINDS)
+    check_target(out, overwrite=overwrite)
+    log = _page(data, episode)
+    index = log.index(only=episode, first=episode, speed=speed, loop=loop)
+    html = page_html(index, log.episode(episode)).encode()
+    with replacing(out, ReportError, overwrite=overwrite) as unfinished:
+        unfinished.write_bytes(html)
+    return len(html)
+
+
+def _page(data: str | Path, episode: int) -> LogPage:
+    path = as_path(data)
+    page = LogPage(path)
+    check_episode(page.dataset, episode, path)
+    return page
+
+
+def _has_display() -> bool:
+    """Return whether a browser can open a window. Otherwise, `webbrowser` runs text browsers."""
+    has_windows = sys.platform in ("win32", "darwin")
+    return has_windows or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))

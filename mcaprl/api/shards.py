@@ -22,8 +22,8 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from mcaprl._interrupt import is_postponed, send_to_main_thread
-from mcaprl.api.cluster import ClusterOptions
 from mcaprl.api.policies import SCRIPTED
+from mcaprl.api.ranges import ClusterOptions
 from mcaprl.api.record_file import FileRequest, record_file, try_request
 from mcaprl.errors import LogError, McaprlError, NoStepsError, OutputExistsError
 from mcaprl.files import check_target, locked_file, locked_folder

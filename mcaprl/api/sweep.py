@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mcaprl.api.cluster import ClusterOptions
+from mcaprl.api.ranges import ClusterOptions
 from mcaprl.errors import MissingExtraError
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.source import Data
@@ -68,8 +68,7 @@ def sweep(
         ClusterError: The Ray cluster cannot be used.
         MissingExtraError: Ray or the packages of the `offline` extra are not installed.
     """
-    from mcaprl.ray.sweep import sweep_on_ray, table_of, write_sweep
-    from mcaprl.ray.sweep_file import read_plan
+    from mcaprl.ray.sweep import read_plan, sweep_on_ray, table_of, write_sweep
 
     on_cluster = ClusterOptions(True, workers, address)
     on_cluster.check()

@@ -7,10 +7,9 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mcaprl.api.cluster import ClusterOptions
 from mcaprl.api.environments import all_options
 from mcaprl.api.policies import Run, as_names, is_policy, load_policies
-from mcaprl.api.ranges import check_least, check_port, check_positive
+from mcaprl.api.ranges import ClusterOptions, check_least, check_port, check_positive
 from mcaprl.api.replay import LiveAddress
 from mcaprl.errors import MissingExtraError, TrainingError, UsageError
 from mcaprl.files import write_json

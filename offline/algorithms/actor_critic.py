@@ -11,13 +11,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from mcaprl.architecture import Architecture
 from mcaprl.offline.algorithms.config import ActorCriticConfig
 from mcaprl.offline.algorithms.heads import BOX_HEADS
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.algorithms.losses import action_change, clipped_double_q_target
 from mcaprl.offline.batches.buffer import Batch
 from mcaprl.offline.batches.observations import Observations
-from mcaprl.settings import Architecture
 
 
 class ActorCritic(Learner):

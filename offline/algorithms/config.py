@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
-from mcaprl.entry_points import installed
+from mcaprl.architecture import Architecture, NetworkSettings
+from mcaprl.lazy import installed
 from mcaprl.offline.batches.packing import Packing
-from mcaprl.settings import Architecture, NetworkSettings
 
 ENTRY_POINT_GROUP: Final = "mcaprl.algorithms"
 HEADS: Final = ("deterministic", "gaussian", "mixture")

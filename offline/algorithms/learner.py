@@ -16,13 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mcaprl.architecture import Architecture
 from mcaprl.networks import Network
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.losses import allowed_only
 from mcaprl.offline.algorithms.models import ALIGNMENT, Model, TargetNetwork, build_model
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
-from mcaprl.settings import Architecture
 
 Terms = dict[str, Tensor]
 _WARM_UPS = 3

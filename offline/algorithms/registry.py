@@ -13,8 +13,8 @@ from typing import Any, Final, NamedTuple
 from gymnasium import spaces
 
 from mcaprl.actions import short_name
-from mcaprl.entry_points import installed, load
 from mcaprl.errors import SpaceError, UnknownNameError, UsageError
+from mcaprl.lazy import installed, load
 from mcaprl.offline.algorithms.bc import BC, BoxBC
 from mcaprl.offline.algorithms.bcq import BCQ
 from mcaprl.offline.algorithms.config import ENTRY_POINT_GROUP, TrainingConfig

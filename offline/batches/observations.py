@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.actions import MASK_KEY, JointActions, allowed_actions, joint_actions
+from mcaprl.architecture import SMALL_EDGE
 from mcaprl.errors import SpaceError
 from mcaprl.networks import ImageInput
 from mcaprl.recorder.dataset.images import Frames, MappedImages
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, observation_leaves
-from mcaprl.settings import SMALL_EDGE
 
 
 @dataclass(frozen=True)

@@ -167,22 +167,13 @@ class Bag(Protocol):
 
         Args:
             topic: Name of the topic.
-            fields: Paths of fields, see `path_steps`; `publish_time` is the time of publication in
+            fields: Paths of fields, see `bags.values`; `publish_time` is the time of publication in
                 nanoseconds.
             rows: Indices into `times` of the messages to read, in output order; default: all.
-
-        Raises:
-            LogError: The file is damaged, or no message of the topic can be decoded; if the bag is
-                strict: a message cannot be decoded.
-            UnknownNameError: There is no such topic or field.
         """
 
     def failures(self, topic: str) -> Iterator[Failure]:
-        """Decode all messages of a topic one by one, and yield those that cannot be decoded.
-
-        Raises:
-            LogError: The file is damaged, or no message of the topic can be decoded.
-        """
+        """Decode all messages of a topic one by one, and yield those that cannot be decoded."""
 
     def close(self) -> None:
         """Close the files."""
@@ -341,11 +332,7 @@ class _Topic:
 
 
 def _decoded(decoder: MessageDecoder, raw: RawMessage) -> Any:
-    """Return a decoded message.
-
-    Raises:
-        LogError: The message is damaged.
-    """
+    """Return a decoded message."""
     if raw.problem:
         raise LogError(raw.problem)
     return decoder.decode(raw.data)

@@ -249,7 +249,7 @@ class OutputFile:
 
         Args:
             records: Records of the chunk.
-            indexes: Entries of `message_rows.INDEX_ENTRY` as bytes, by channel id.
+            indexes: Entries of `records.INDEX_ENTRY` as bytes, by channel id.
             times: Smallest and largest log_time, nanoseconds.
             data: Compressed records.
             compression: Name of the compression in the Chunk record.

@@ -99,11 +99,7 @@ class McapWriter(OutputFile):
     def add_channel(
         self, topic: str, schema_name: str, schema_text: str, metadata: dict[str, str] | None = None
     ) -> int:
-        """Return the channel id of a topic of `ros2msg` messages; write the channel if it is new.
-
-        Raises:
-            LogError: The topic has messages of another type.
-        """
+        """Return the channel id of a topic of `ros2msg` messages, and write a new channel."""
         schemas, channels = self._summary.schemas, self._summary.channels
         wanted = ("ros2msg", schema_name, schema_text.encode())
         schema_id = next(
@@ -153,7 +149,7 @@ class McapWriter(OutputFile):
     def write_rows(self, rows: NDArray[Any]) -> None:
         """Write messages of one channel and length as one chunk.
 
-        `rows` is an array of `message_rows.record_dtype` with log_time; this function sets its
+        `rows` is an array of `records.record_dtype` with log_time; this function sets its
         sequence numbers and publish times.
         """
         if len(rows) == 0:

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
-from mcaprl.entry_points import installed, load
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.files import check_plain, replacing, replacing_folder
+from mcaprl.lazy import installed, load
 from mcaprl.recorder.dataset.transitions import Origin
 from mcaprl.recorder.format.behavior import FIELDS, BehaviorField
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
@@ -264,23 +264,14 @@ FORMATS: dict[str, Format] = {
 
 
 def every_format() -> Iterator[Format]:
-    """Yield the built-in formats, and then those of installed packages.
-
-    Raises:
-        UsageError: An entry point is broken.
-    """
+    """Yield the built-in formats, and then those of installed packages."""
     yield from FORMATS.values()
     for entry in installed(ENTRY_POINT_GROUP).values():
         yield load(entry, Format, FORMATS)()
 
 
 def format_named(name: str) -> Format:
-    """Return a format by its name.
-
-    Raises:
-        UnknownNameError: There is no such format; the message lists all formats.
-        UsageError: The entry point of a package is broken.
-    """
+    """Return a format by its name."""
     found = next((form for form in every_format() if form.name == name), None)
     if found is None:
         raise UnknownNameError("format", name, [form.name for form in every_format()])
@@ -301,13 +292,7 @@ def other_format(name: str | Path) -> Format | None:
 
 
 def target_format(path: str | Path, name: str | None) -> Format:
-    """Return the format to write, given by its name or by the suffix of the path.
-
-    Raises:
-        UnknownNameError: There is no format with this name.
-        UsageError: The path has the suffix of logs, or the name is not given, and no format or more
-            than one format has this suffix.
-    """
+    """Return the format to write, given by its name or by the suffix of the path."""
     if name is not None:
         form = format_named(name)
         if Path(path).suffix == ".mcap":
@@ -338,11 +323,7 @@ def target_path(path: str | Path, form: Format) -> Path:
 
 
 def _given(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of reading that differ from their defaults.
-
-    Raises:
-        UnknownNameError: `dones` is not one of `KINDS`.
-    """
+    """Return the options of reading that differ from their defaults."""
     dones = options.get("dones")
     if dones is not None and dones not in KINDS:
         raise UnknownNameError("kind of ends", str(dones), KINDS)
@@ -356,12 +337,6 @@ def read_format(path: str | Path, form: Format, **options: Any) -> Dataset:
         path: File or folder.
         form: Format of the data.
         options: Options of the format's reader; those that are None or False are ignored.
-
-    Raises:
-        LogError: The file is missing or damaged.
-        SpaceError: The data has a space that a log cannot hold, or impossible values.
-        UsageError: The format does not have an option, or the option contradicts the data.
-        MissingExtraError: The format needs a package that is not installed.
     """
     source, given = target_path(path, form), _given(options)
     for name in given.keys() - form.reading_options():
@@ -403,12 +378,6 @@ def write_format(
 
     Returns:
         One sentence for each thing that was left out or changed.
-
-    Raises:
-        SpaceError: The format cannot hold a space or dtype, and `lossy` is not set.
-        OutputExistsError: `path` exists, and `overwrite` is not set.
-        LogError: The file cannot be written, or the dataset has no episodes.
-        MissingExtraError: The format needs a package that is not installed.
     """
     if not len(dataset.episode_lengths):
         raise LogError(f"nothing to write to {path}: the dataset has no episodes")

@@ -175,11 +175,7 @@ def _selected(
 def _call_each(
     paths: Sequence[Path], function: Callable[[Path], Result]
 ) -> list[tuple[Path, Result]]:
-    """Call a function on each log. If there are several logs, skip those without finished episodes.
-
-    Raises:
-        NoEpisodesError: No log has a finished episode.
-    """
+    """Call a function on each log; of several logs, skip those without finished episodes."""
     results = []
     for path in paths:
         try:

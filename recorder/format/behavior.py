@@ -89,11 +89,7 @@ class BehaviorField:
         return found
 
     def probs(self, values: _Values, instead: str = "behavior_log_probs") -> _Values:
-        """Return values of this column as probabilities, or probabilities as values.
-
-        Raises:
-            SpaceError: The actions have densities; the message names the attribute `instead`.
-        """
+        """Return values of this column as probabilities, or probabilities as values."""
         if self == LOG_DENSITY:
             raise SpaceError(f"actions of floats have densities, not probabilities: use {instead}")
         return values

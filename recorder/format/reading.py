@@ -13,9 +13,9 @@ from mcaprl.recorder.columns.definitions import (
     leaf_kinds,
     parsed_types,
 )
-from mcaprl.recorder.columns.file_check import check_chunk, check_file, check_statistics, place
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import MESSAGE_HEADER, MessageRange, prefetch, release
+from mcaprl.recorder.columns.summary import check_chunk, check_file, check_statistics, place
 from mcaprl.recorder.columns.topic import LOG_TIME, Columns, Decoder, Topic
 
 __all__ = [

@@ -36,7 +36,7 @@ class FieldPath(NamedTuple):
 
     Attributes:
         topic: Name of the topic.
-        field: Path of the field in the message, see `bags.path_steps`; empty for the message as a
+        field: Path of the field in the message, see `bags.values`; empty for the message as a
             whole.
         elements: Index or slice of the field's array; None for the whole field.
     """
@@ -134,11 +134,7 @@ def topic_of(bag: Bag, name: str) -> str:
 
 
 def field_path(bag: Bag, text: str) -> FieldPath:
-    """Resolve the path of a field. Its topic is the longest topic name that the text begins with.
-
-    Raises:
-        UsageError: There is no such topic or field; the message names the nearest ones.
-    """
+    """Resolve the path of a field, whose topic is the longest name that the text begins with."""
     topics = [
         each for each in bag.topics if text == each or text.startswith((f"{each}.", f"{each}["))
     ]

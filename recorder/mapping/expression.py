@@ -103,9 +103,6 @@ class Expression:
         Args:
             columns: (N,) or (N, K) column of each name.
             following: (N,) index of the row after each row, which `next` reads.
-
-        Raises:
-            UsageError: A name is unknown, or a value has the wrong type or shape.
         """
         for name in self.names:
             if name not in columns:

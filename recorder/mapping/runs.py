@@ -303,11 +303,7 @@ class _Resets:
     def _check_others(
         self, names: Sequence[str], first: str, jump: int, jumps: Mapping[str, Sequence[int]]
     ) -> None:
-        """Check that streams without messages before or after a reset belong to one of its sides.
-
-        Raises:
-            UsageError: The messages of a stream were not recorded together with those of `first`.
-        """
+        """Check that a stream with messages on one side of a reset only belongs to this side."""
         back = self._parts[first]
         for name in names:
             part, start = self._parts[name], self._start(name)

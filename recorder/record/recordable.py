@@ -276,11 +276,7 @@ def check_vector(env: Any) -> None:
 
 
 def autoreset_mode(env: gym.vector.VectorEnv[Any, Any, Any]) -> AutoresetMode:
-    """Return the autoreset mode that a vector environment declares.
-
-    Raises:
-        UsageError: It declares none.
-    """
+    """Return the autoreset mode that a vector environment declares."""
     declared = env.metadata.get("autoreset_mode")
     try:
         return AutoresetMode(declared)
@@ -362,13 +358,7 @@ def recorded_space(space: spaces.Space[Any], keys: Sequence[str] | None = None) 
 
 
 def recorded_like(space: spaces.Space[Any], logged: spaces.Space[Any]) -> RecordedSpace:
-    """Return the form in which a log with the space `logged` stores an environment's observations.
-
-    Raises:
-        SpaceError: A log cannot store a part that `logged` has.
-        UnknownNameError: The environment lacks a part.
-        UsageError: Only `logged` has keys.
-    """
+    """Return the form in which a log with the space `logged` stores observations."""
     keys = None
     if isinstance(logged, spaces.Dict):
         keys = ["/".join(leaf.path) for leaf in leaves_of(logged)]

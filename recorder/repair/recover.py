@@ -1,7 +1,7 @@
 """Recovery of the valid part of a log that was cut off or damaged.
 
     valid records -> valid MCAP file with new indexes and CRCs -> whole episodes -> OUT
-    (salvage)        (valid_copy)
+    (salvage)
 
 Metadata, attachments and all topics are kept; only messages of `/rl/` topics that belong to a
 dropped episode are omitted. All omissions are reported.

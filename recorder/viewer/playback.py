@@ -339,11 +339,7 @@ def _frame_at(poses: list[tuple[int, SeenFrame]], time_ns: int) -> SeenFrame:
 
 
 def frames_of(data: bytes) -> list[tuple[int, SeenFrame]]:
-    """Return the coordinate frames in a `tf2_msgs/msg/TFMessage` and their stamps in nanoseconds.
-
-    Raises:
-        CorruptLogError: The message is damaged.
-    """
+    """Return the frames in a `tf2_msgs/msg/TFMessage` and their stamps in nanoseconds."""
     tree = messages.decode(data, "tf2_msgs/msg/TFMessage")
     return [(_stamp_ns(transform), _frame(transform)) for transform in tree.transforms]
 

@@ -19,8 +19,7 @@ from mcaprl.sims.drawing.shapes import car_frame, car_moments
 from mcaprl.sims.drawing.top_view import Body, FollowView
 from mcaprl.sims.highway import scene as highway_scene
 from mcaprl.sims.highway.scene import FLIP, Car, Course, Place, courses_of
-from mcaprl.sims.vehicle.arguments import Pose, check_actions, check_name, pose_from
-from mcaprl.sims.vehicle.controls import KINDS, Controls
+from mcaprl.sims.vehicle.controls import KINDS, Controls, Pose, check_actions, check_name, pose_from
 from mcaprl.sims.vehicle.env import RENDER_MODES, RenderedEnv, RenderMode, ScriptedPilot, before_end
 
 Floats = NDArray[np.float64]

@@ -39,10 +39,8 @@ from mcaprl.sims.lane.rules import (
     observe,
     store_car,
 )
-from mcaprl.sims.vehicle.arguments import check_actions, check_name, pose_from
-from mcaprl.sims.vehicle.controls import KINDS, Controls
-from mcaprl.sims.vehicle.draws import Generators, draw, spread
-from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
+from mcaprl.sims.vehicle.controls import KINDS, Controls, check_actions, check_name, pose_from
+from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet, Generators, draw, spread
 
 OBSERVATIONS = ("state", "depth", "depth-commands", "dashboard", "rays")
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}

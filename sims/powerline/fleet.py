@@ -50,8 +50,14 @@ from mcaprl.sims.powerline.rules import (
     store_bearings,
     store_flight,
 )
-from mcaprl.sims.vehicle.arguments import check_actions, check_name, check_range, read_pose
-from mcaprl.sims.vehicle.controls import KINDS, Controls
+from mcaprl.sims.vehicle.controls import (
+    KINDS,
+    Controls,
+    check_actions,
+    check_name,
+    check_range,
+    read_pose,
+)
 from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
 
 MAX_WIND_M_S = 8.0

@@ -39,10 +39,8 @@ from mcaprl.sims.racer.rules import (
     observe,
     walls_hit,
 )
-from mcaprl.sims.vehicle.arguments import check_actions, check_name, pose_from
-from mcaprl.sims.vehicle.controls import Controls
-from mcaprl.sims.vehicle.draws import Generators, draw, spread
-from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
+from mcaprl.sims.vehicle.controls import Controls, check_actions, check_name, pose_from
+from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet, Generators, draw, spread
 
 _EVERY = tuple(range(len(ACTION_COMMANDS)))
 ACTION_SETS: dict[object, tuple[int, ...]] = {

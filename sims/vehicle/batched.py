@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
-from mcaprl.sims.vehicle.arguments import check_name
+from mcaprl.sims.vehicle.controls import check_name
 from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
 
 Bools = NDArray[np.bool_]

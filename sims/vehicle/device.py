@@ -19,7 +19,7 @@ from gymnasium import spaces
 
 from mcaprl.compiled import compiled
 from mcaprl.errors import UsageError, import_extra
-from mcaprl.sims.vehicle.arguments import check_name
+from mcaprl.sims.vehicle.controls import check_name
 from mcaprl.sims.vehicle.fleet import Fleet
 
 DEVICES = ("cpu", "cuda")

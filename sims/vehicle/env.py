@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mcaprl.actions import joint_actions
 from mcaprl.base_policy import BasePolicy
-from mcaprl.sims.vehicle.arguments import check_name
+from mcaprl.sims.vehicle.controls import check_name
 from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
 
 RenderMode = Literal["human", "rgb_array"]

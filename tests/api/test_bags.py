@@ -10,7 +10,7 @@ import pytest
 from mcap.writer import Writer
 
 import mcaprl
-from mcaprl.api.bags import BagInfo
+from mcaprl.api.logs import BagInfo
 from mcaprl.cli import run
 from mcaprl.errors import LogError, NotMcapError, UsageError
 from tests.support.bags import (

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from stable_baselines3 import A2C, DQN, PPO
 
 from mcaprl.api.policies import load_policy
+from mcaprl.architecture import Architecture
 from mcaprl.errors import PolicyError
 from mcaprl.frames import stacked_space
 from mcaprl.networks import ImageInput
@@ -29,7 +30,6 @@ from mcaprl.online.features import NetworkDQNPolicy, normalize_images, policy_ar
 from mcaprl.online.zip_file import describe_run
 from mcaprl.online.zip_file import save_policy as save_model
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.settings import Architecture
 
 FOLDER = Path(__file__).parent / "policies"
 STEPS, EPISODES = 4, 3

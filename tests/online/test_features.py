@@ -16,6 +16,7 @@ from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.torch_layers import NatureCNN
 
 import mcaprl
+from mcaprl.architecture import Architecture
 from mcaprl.errors import PolicyError, UsageError
 from mcaprl.networks import Convolutions, ImageInput
 from mcaprl.online.agent import CENTERING_STEPS
@@ -31,7 +32,6 @@ from mcaprl.online.sb3 import ModelAgent
 from mcaprl.online.task import Task
 from mcaprl.online.train import make_agent
 from mcaprl.online.zip_file import describe_run, read_policy, save_policy
-from mcaprl.settings import Architecture
 from mcaprl.sims.evaluation.evaluate import Scale
 
 SHORT: dict[str, Any] = {

@@ -11,10 +11,10 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mcaprl.architecture import Architecture
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
 from mcaprl.offline.batches.packing import Packing
 from mcaprl.online.replay import Outcome, ReplayBuffer, averaged, shifted
-from mcaprl.settings import Architecture
 
 AGENTS, ENVS, CAPACITY, GAMMA = 2, 3, 6, 0.5
 WIDTH = AGENTS * ENVS

@@ -22,8 +22,7 @@ from mcaprl.errors import ClusterError, OutputExistsError, TrainingError, UsageE
 from mcaprl.offline.algorithms.config import BCConfig
 from mcaprl.offline.training.train import train
 from mcaprl.ray import sweep, tasks
-from mcaprl.ray.sweep import Score, TrialResult, table_of, write_sweep
-from mcaprl.ray.sweep_file import SweepPlan, Trial, read_plan
+from mcaprl.ray.sweep import Score, SweepPlan, Trial, TrialResult, read_plan, table_of, write_sweep
 from mcaprl.ray.tasks import check_machine
 from mcaprl.recorder.format.metadata import installed_versions
 from tests.ray.processes import open_files

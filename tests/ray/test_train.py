@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 import mcaprl
-from mcaprl.api.cluster import ClusterOptions
+from mcaprl.api.ranges import ClusterOptions
 from mcaprl.cli import run
 from mcaprl.errors import ClusterError, SpaceError, TrainingError, UsageError
 from mcaprl.progress import TrainingProgress

@@ -304,7 +304,7 @@ def _channels_last(values: NDArray[Any]) -> NDArray[Any]:
 
 def _action_space_of(actions: Sequence[NDArray[Any]]) -> spaces.Space[Any]:
     every = np.concatenate(actions)
-    is_discrete = every.dtype.kind in "iu" and every.shape[1:] == (1,)
+    is_discrete = every.dtype.kind in "iu" and every.shape[1:] == (1,) and not (every < 0).any()
     return action_space_of(every[:, 0] if is_discrete else every)
 
 

@@ -579,11 +579,7 @@ def _described(columns: Mapping[str, Any], where: object) -> LogMetadata:
 
 
 def _one_column(name: str, values: Any, where: object) -> Any:
-    """Check that a column of `COLUMNS` is numeric; convert arrays (N, 1) to (N,) if they are flat.
-
-    Raises:
-        SpaceError: The column is not numeric.
-    """
+    """Check that a column of `COLUMNS` is numeric; make flat arrays (N, 1) arrays (N,)."""
     try:
         if isinstance(values, Mapping):
             return {key: _one_column(f"{name}/{key}", values[key], where) for key in values}

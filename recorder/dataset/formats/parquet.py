@@ -365,11 +365,7 @@ class _Table:
         return [name.removeprefix("info.") for name in names if name.startswith("info.")]
 
     def info(self, prefix: str, name: str) -> Masked:
-        """Return the info (N, *shape) in the column `<prefix>.<name>`.
-
-        Raises:
-            LogError: There is no such column, or the metadata of its field is damaged.
-        """
+        """Return the info (N, *shape) in the column `<prefix>.<name>`."""
         column = f"{prefix}.{name}"
         if column not in self._table.column_names:
             raise LogError(f"{self._path} has no column '{column}'")

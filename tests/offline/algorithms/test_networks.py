@@ -11,10 +11,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from mcaprl.architecture import Architecture
 from mcaprl.networks import ImageInput, Network
 from mcaprl.offline.algorithms.models import AnyModel, Model, StackedMLP, build_model
 from mcaprl.offline.batches.observations import Observations
-from mcaprl.settings import Architecture
 
 
 def vectors(rows: int, width: int, seed: int = 0) -> Observations:

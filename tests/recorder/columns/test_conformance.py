@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from mcaprl.recorder.columns.file_check import check_file
 from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.summary import check_file
 from tests.support.conformance import CONTENTS, Content, build, variants
 
 VARIANTS = list(variants())

@@ -131,7 +131,7 @@ def test_an_attachment_that_is_not_a_layout_is_refused(
 
 def test_a_layout_without_panels_can_be_played(log_path: Path, tmp_path: Path) -> None:
     from mcaprl.recorder.viewer.annotate import attached_layout
-    from mcaprl.recorder.viewer.player_server import side_by_side
+    from mcaprl.recorder.viewer.foxglove_server import side_by_side
 
     record(log_path, spaces.Discrete(2), spaces.Discrete(2), [3])
     out = tmp_path / "other.mcap"

@@ -17,7 +17,7 @@ from gymnasium import spaces
 
 import mcaprl
 from mcaprl.errors import LISTED, LogError, Problem, Shortlist
-from mcaprl.recorder.columns import chunks, file_check
+from mcaprl.recorder.columns import chunks, summary
 from mcaprl.recorder.columns import reader as mcap_reader
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import INDEX_ENTRY, MESSAGE_HEADER, contents_of
@@ -262,7 +262,7 @@ def test_array_checks_find_the_same_problems_as_a_scan(
         log_path.write_bytes(spoilt)
         together = check_log(log_path)
         with monkeypatch.context() as patch:
-            patch.setattr(file_check, "_has_only", lambda *_: False)
+            patch.setattr(summary, "_has_only", lambda *_: False)
             assert check_log(log_path) == together
         found |= {problem.what for problem in together}
     assert len(found) > 10, found

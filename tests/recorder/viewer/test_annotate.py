@@ -28,7 +28,7 @@ from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.topic import Topic
 from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.viewer.annotate import annotated_copy, values_topics
-from mcaprl.recorder.viewer.report import moments_of
+from mcaprl.recorder.viewer.surprises import moments_of
 from mcaprl.sims import make_sim
 from tests.support.layouts import check_layout
 

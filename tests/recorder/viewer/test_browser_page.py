@@ -33,8 +33,8 @@ from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.format.schema import COMMAND_VALUES
 from mcaprl.recorder.record.display import SCENE
 from mcaprl.recorder.viewer.annotate import annotated_copy
-from mcaprl.recorder.viewer.page import server
-from mcaprl.recorder.viewer.page.episode_data import LogPage, pack
+from mcaprl.recorder.viewer.page import log_page
+from mcaprl.recorder.viewer.page.log_page import LogPage, pack
 from mcaprl.recorder.viewer.playback import moments_of_episode
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.scene import Frame, Shape, yaw_rotation
@@ -306,7 +306,7 @@ def test_the_scene_is_that_of_the_log(tmp_path: Path, sim: str) -> None:
 
 
 def test_many_images_are_thinned_out(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    name = "mcaprl.recorder.viewer.page.episode_data._MOST_IMAGE_BYTES"
+    name = "mcaprl.recorder.viewer.page.log_page._MOST_IMAGE_BYTES"
     monkeypatch.setattr(name, 2 * 8 * 12 * 3)
     image = unpacked(LogPage(log).episode(0))["images"][0]
     assert image["steps"].tolist() == [0, 3]
@@ -649,16 +649,16 @@ def test_a_client_that_reads_nothing_is_disconnected(
 ) -> None:
     monkeypatch.setattr(limits, "CLIENT_TIMEOUT_S", 0.3)
     monkeypatch.setattr(LogPage, "episode", lambda *_: bytes(2**26))
-    left, finish = threading.Event(), server._Handler.finish
+    left, finish = threading.Event(), log_page._Handler.finish
     ports = list[int]()
 
-    def note(handler: server._Handler) -> None:
+    def note(handler: log_page._Handler) -> None:
         finish(handler)
         # The browser of an earlier test may still have a connection to this port.
         if handler.client_address[1] in ports:
             left.set()
 
-    monkeypatch.setattr(server._Handler, "finish", note)
+    monkeypatch.setattr(log_page._Handler, "finish", note)
     with served(log) as url:
         with socket.create_connection(("127.0.0.1", urlsplit(url).port), timeout=2) as connection:
             ports.append(connection.getsockname()[1])

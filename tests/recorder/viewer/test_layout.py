@@ -17,7 +17,7 @@ from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.layout import layout_of
 from mcaprl.recorder.record.panels import share_of_transitions
 from mcaprl.recorder.viewer.annotate import annotated_copy, layout_of_log
-from mcaprl.recorder.viewer.player_server import side_by_side
+from mcaprl.recorder.viewer.foxglove_server import side_by_side
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.evaluate import make_pilot
 from tests.support.layouts import (

@@ -30,9 +30,9 @@ from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.record.layout import layout_of
 from mcaprl.recorder.viewer.annotate import layout_of_log
+from mcaprl.recorder.viewer.foxglove_server import prefixed_message, prefixes_of, side_by_side
 from mcaprl.recorder.viewer.live_stream import LiveStep, LiveStream
 from mcaprl.recorder.viewer.playback import Played, Player, Track
-from mcaprl.recorder.viewer.player_server import prefixed_message, prefixes_of, side_by_side
 from mcaprl.sims import make_sim
 from tests.conftest import need
 from tests.support.paths import NODE
@@ -334,7 +334,7 @@ def test_a_second_viewer_gets_the_current_messages_and_the_first_one_no_line_twi
     log: Path,
 ) -> None:
     viewer_is_there()
-    from mcaprl.recorder.viewer.player_server import LiveServer
+    from mcaprl.recorder.viewer.foxglove_server import LiveServer
 
     player = Player([Track(McapReader(log))])
     with closing(LiveServer(player, port=0)) as server:
@@ -479,7 +479,7 @@ def bytes_of(seen: list[Any], topic: str) -> bytes:
 
 
 def test_a_port_in_use_is_refused(log: Path) -> None:
-    from mcaprl.recorder.viewer.player_server import LiveServer
+    from mcaprl.recorder.viewer.foxglove_server import LiveServer
 
     player = Player([Track(McapReader(log))])
     with closing(LiveServer(player, port=0)) as server:

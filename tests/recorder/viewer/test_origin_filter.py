@@ -18,9 +18,15 @@ from gymnasium import spaces
 from mcaprl import limits
 from mcaprl.errors import UsageError
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.viewer.foxglove_server import HOST, VIEWER_ORIGINS, _hidden_host, is_allowed
+from mcaprl.recorder.viewer.foxglove_server import (
+    HOST,
+    MAX_SPEED,
+    VIEWER_ORIGINS,
+    LiveServer,
+    _hidden_host,
+    is_allowed,
+)
 from mcaprl.recorder.viewer.playback import Player, Track
-from mcaprl.recorder.viewer.player_server import MAX_SPEED, LiveServer
 from tests.support.recordings import record
 
 KEY = base64.b64encode(b"0123456789abcdef").decode()

@@ -14,7 +14,7 @@ from gymnasium import spaces
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import LogError, SpaceError
-from mcaprl.recorder.viewer.verify import Verification, verify
+from mcaprl.recorder.viewer.annotate import Verification, verify
 from mcaprl.sims import SIMS, make_sim
 from mcaprl.texts import counted
 from tests.support.recordings import MIXED_SPACE, ScriptedEnv

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mcaprl.sims.vehicle.draws import Generators, draw
+from mcaprl.sims.vehicle.fleet import Generators, draw
 
 COUNT = 4
 BIT_GENERATORS = (

@@ -21,7 +21,7 @@ from gymnasium import spaces
 import mcaprl
 from mcaprl.api.evaluate import learning_curves
 from mcaprl.offline.selection.choice import read_choice
-from mcaprl.ray.sweep_file import read_plan
+from mcaprl.ray.sweep import read_plan
 from mcaprl.recorder.dataset.open import LogFile, write_manifest
 from tests.offline.estimate.test_off_policy import log
 from tests.recorder.bags.test_definition_files import write_database

@@ -109,6 +109,22 @@ def test_what_d3rlpy_has_no_place_for_is_said(tmp_path: Path) -> None:
     ]
 
 
+def test_negative_integers_are_a_box(tmp_path: Path) -> None:
+    dataset = Dataset.from_arrays(
+        observations=np.zeros((2, 1), np.float32),
+        next_observations=np.zeros((2, 1), np.float32),
+        actions=np.array([[-128], [5]], np.int8),
+        rewards=np.array([0.0, 1.0]),
+        terminated=np.array([False, True]),
+        truncated=np.array([False, False]),
+        action_space=spaces.Box(-128, 127, (1,), np.int8),
+    )
+    _write(dataset, tmp_path / "out.h5", lossy=True)
+    found = mcaprl.open(tmp_path / "out.h5")
+    assert isinstance(found.action_space, spaces.Box)
+    assert found.actions.tolist() == [[-128], [5]]
+
+
 @settings(max_examples=40)
 @given(transitions())
 def test_all_transitions_come_back(arguments: dict[str, Any]) -> None:

@@ -16,6 +16,7 @@ import mcaprl
 from mcaprl.errors import LogError, McaprlError
 from mcaprl.recorder.dataset.format_registry import FORMATS, write_format
 from mcaprl.recorder.dataset.formats import columns
+from mcaprl.recorder.dataset.formats.parquet import _row_groups
 from tests.support.damage.datasets import dataset, write_all
 
 h5py = pytest.importorskip("h5py", reason="needs the extra interop")
@@ -235,7 +236,7 @@ def test_sizes_in_the_footer_of_parquet_are_those_of_pyarrow(nested_table: Path)
         for group in groups
         for column in (group.column(number) for number in range(group.num_columns))
     ]
-    found = parquet._row_groups(nested_table)
+    found = _row_groups(nested_table)
     assert [rows for rows, _ in found] == [3, 3]
     assert expected == [
         (".".join(each.words), each.values, each.stored_bytes)
