@@ -50,8 +50,8 @@ def _tuned() -> dict[str, dict[str, Any]]:
 @click.option(
     "--algo",
     type=Name(_configs),
-    help="double-dqn or dqn for discrete actions, sac or td3 for those of a Box, ppo or a2c for"
-    " both.  [default: double-dqn or sac]",
+    help="double-dqn or dqn for discrete actions; sac, td3 or tqc for those of a Box; ppo or a2c"
+    " for both.  [default: double-dqn or sac]",
 )
 @click.option(
     "--engine",

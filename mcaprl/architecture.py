@@ -97,6 +97,10 @@ class Architecture:
         channels = self.channels[: len(encoder.kernels)] or encoder.channels
         return replace(encoder, channels=channels)
 
+    def of_encoder(self) -> Architecture:
+        """Return the architecture of an encoder that several networks share."""
+        return Architecture((), self.channels, encoder=self.encoder)
+
     def features(self, image_shape: Sequence[int]) -> int:
         """Return the number of features of the convolutions for an image (height, width, ...)."""
         encoder = self.encoder_of(image_shape)

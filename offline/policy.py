@@ -29,7 +29,7 @@ from mcaprl.errors import PolicyError, SpaceError, TrainingError
 from mcaprl.files import as_type, parse_json, read_file, write_json
 from mcaprl.frames import FrameStack, mapped
 from mcaprl.networks import ImageInput, Network, check_size
-from mcaprl.offline.algorithms.heads import Head, build_head
+from mcaprl.offline.algorithms.heads import ENCODER, Head, build_head
 from mcaprl.offline.algorithms.iql import LOG_STD
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
@@ -240,7 +240,7 @@ def save_policy(
 ) -> None:
     """Write the current policy of a seed into a folder."""
     buffer = learner.buffer
-    networks = {name: copy.deepcopy(learner.network(name, seed)) for name in learner.policy_models}
+    networks = copy.deepcopy(learner.policy_networks(seed))
     if "q" in learner.critics:
         # Training online may continue with both critics.
         networks[TWIN] = copy.deepcopy(learner.network("q", seed, member=1))
@@ -364,11 +364,15 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
     networks: dict[str, Network] = {}
     for name, outputs in description.outputs.items():
         architecture = architecture_of(description.critics.get(name, description.architecture))
-        width = encoder.width * stack
+        width, seen = encoder.width * stack, images
+        if name == ENCODER:
+            width, architecture = 0, architecture.of_encoder()
+        elif ENCODER in description.outputs:
+            width, seen = width + description.outputs[ENCODER][0], []
         if name in description.critics and box is not None:
             width += box.size
-        check_size(architecture, width, images, math.prod(outputs), weights)
-        networks[name] = Network(width, images, tuple(outputs), architecture)
+        check_size(architecture, width, seen, math.prod(outputs), weights)
+        networks[name] = Network(width, seen, tuple(outputs), architecture)
     threshold = description.threshold
     head = build_head(
         description.acts_by, networks, action_space, threshold, box=box, log_std=log_std

@@ -217,7 +217,8 @@ class BoxBehavior(Behavior):
             shape = (len(observations), self._box.size)
             numbers = 2 * torch.rand(shape, generator=self._generator) - 1
             return self._choice(numbers, lambda taken: torch.full((len(taken),), self._uniform))
-        outputs = self._learner.models["actor"](observations)
+        learner = self._learner
+        outputs = learner.models["actor"](learner.inputs(observations))
         numbers = self._drawn(outputs)
         return self._choice(numbers, lambda taken: self._log_density(outputs, taken))
 

@@ -33,6 +33,9 @@ from typing import Any, Final
 from mcaprl.architecture import Architecture, NetworkSettings
 from mcaprl.errors import UnknownNameError
 
+N_QUANTILES: Final = 25
+"""Number of quantiles of each critic of TQC, sb3-contrib's default."""
+
 
 @dataclass(frozen=True)
 class OnlineConfig(NetworkSettings):
@@ -209,7 +212,7 @@ class ActorCriticConfig(ReplayConfig):
     critic_layer_norm: bool = False
     """normalize the hidden layers of the critics; the default with logs is yes"""
     data_fraction: float = 0.5
-    """fraction of each batch that is drawn from the given logs, if there are any"""
+    """fraction of each batch that is drawn from given logs; 0 copies them to the replay buffer"""
     smoothness: float = 0.0
     """weight of the mean change of the actions in [-1, 1] from a state to the next one"""
 
@@ -276,6 +279,24 @@ class TD3Config(ActorCriticConfig):
             "target_policy_noise": self.policy_noise,
             "target_noise_clip": self.noise_clip,
         }
+
+
+@dataclass(frozen=True)
+class TQCConfig(SACConfig):
+    """Settings of TQC: those of SAC, and how optimistic the critics are."""
+
+    dropped_quantiles: int = 2
+    """largest quantiles of each critic, of 25, that targets leave out"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        fits = 0 <= self.dropped_quantiles < N_QUANTILES
+        self._require("dropped_quantiles", fits, f"within 0 to {N_QUANTILES - 1}")
+
+    def arguments(self) -> dict[str, Any]:
+        """Return arguments of SB3's constructor, except learning rate, entropy and networks."""
+        return {**super().arguments(), "top_quantiles_to_drop_per_net": self.dropped_quantiles}
 
 
 @dataclass(frozen=True)
@@ -354,18 +375,19 @@ CONFIGS: Final[dict[str, type[OnlineConfig]]] = {
     "double-dqn": DoubleDQNConfig,
     "sac": SACConfig,
     "td3": TD3Config,
+    "tqc": TQCConfig,
     "ppo": PPOConfig,
     "a2c": A2CConfig,
 }
 """Settings of the algorithms by name."""
 ENGINES: Final[dict[str, tuple[str, ...]]] = {
     "mcaprl": ("double-dqn", "sac", "td3"),
-    "sb3": ("dqn", "sac", "td3", "ppo", "a2c"),
+    "sb3": ("dqn", "sac", "td3", "tqc", "ppo", "a2c"),
 }
-"""Algorithms of this package's learners, and of Stable-Baselines3."""
+"""Algorithms of this package's learners, and of Stable-Baselines3 with sb3-contrib."""
 FINITE_ALGOS: Final = ("double-dqn", "dqn", "ppo", "a2c")
 """Algorithms for finite action spaces, the default first."""
-BOX_ALGOS: Final = ("sac", "td3", "ppo", "a2c")
+BOX_ALGOS: Final = ("sac", "td3", "tqc", "ppo", "a2c")
 """Algorithms for the actions of a Box, the default first."""
 
 
@@ -538,6 +560,23 @@ IMAGE_SETTINGS: Final[dict[tuple[str, str], dict[str, Any]]] = {
     },
 }
 """Settings for learning from images, by the sim's short name and its argument `observation`."""
+_BOX_FROM_IMAGES: Final[dict[str, Any]] = {
+    "learning_rate": 5e-4,
+    "final_learning_rate_fraction": 0.04,
+    "hidden": (256, 256),
+    "batch_size": 64,
+    "buffer_size": 100_000,
+    "learning_starts": 2_000,
+    "steps_per_update": 4,
+    "polyak": 0.01,
+    "image_shift": 2,
+    "eval_interval": 20_000,
+}
+BOX_IMAGE_SETTINGS: Final[dict[tuple[str, str], dict[str, Any]]] = {
+    ("lane", "dashboard"): {**_BOX_FROM_IMAGES, "steps": 200_000, "gamma": 0.97},
+    ("powerline", "depth"): {**_BOX_FROM_IMAGES, "steps": 240_000, "gamma": 0.95, "n_steps": 3},
+}
+"""Settings for continuous actions from images, which were not tuned."""
 
 
 def find_preset(name: str) -> Preset:
@@ -584,4 +623,5 @@ def settings_for(algo: str, sim: str, sim_options: Mapping[str, Any]) -> dict[st
     if observation in ("state", "rays"):
         settings = BOX_SETTINGS.get(name, {}) if is_box else SIM_SETTINGS.get(name, {})
         return {**settings, **(BOX_ALGO_SETTINGS[algo] if is_box and settings else {})}
-    return {} if is_box else dict(IMAGE_SETTINGS.get((name, observation), {}))
+    images = BOX_IMAGE_SETTINGS if is_box else IMAGE_SETTINGS
+    return dict(images.get((name, observation), {}))

@@ -21,13 +21,21 @@ from typing import Any, cast
 import numpy as np
 import torch
 from gymnasium import spaces
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mcaprl.actions import joint_actions
+from mcaprl.actions import BoxActions, joint_actions
 from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError, SpaceError, TrainingError, UsageError
 from mcaprl.frames import mapped
-from mcaprl.offline.algorithms.heads import BoxHead, Deterministic, Gaussian, build_head
+from mcaprl.offline.algorithms.actor_critic import ActorCritic
+from mcaprl.offline.algorithms.heads import (
+    ENCODER,
+    BoxHead,
+    Deterministic,
+    Gaussian,
+    build_head,
+)
 from mcaprl.offline.algorithms.learner import NotFiniteError
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import ObservationEncoder
@@ -36,7 +44,7 @@ from mcaprl.online.agent import Agent, center_images, is_due
 from mcaprl.online.collector import Choice, EpsilonGreedy, VectorEnvironments
 from mcaprl.online.config import ReplayConfig
 from mcaprl.online.engine import Agents
-from mcaprl.online.live import WATCHED
+from mcaprl.online.live import WATCHED, command_values, numbered_values
 from mcaprl.online.replay import Outcome, ReplayBuffer, packed_log, restored_log
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -99,7 +107,7 @@ class LearningAgent(Agent):
     def policy(self) -> Policy:
         """Greedy policy, whose networks share the weights of the learner."""
         learner, seed = self.agents.learner, self._seed
-        networks = {name: learner.network(name, seed) for name in learner.policy_models}
+        networks = learner.policy_networks(seed)
         return Policy(
             name=self._task.algo,
             algo=self._task.algo,
@@ -133,14 +141,15 @@ class LearningAgent(Agent):
                 encoder = policy.encoder
         if data is not None:
             _check_spaces(data, self._encoder.space, self.env.single_action_space)
-        log = None if box is None or data is None else partial(packed_log, data)
+        fills = box is None or not getattr(self.agents.config, "data_fraction", 0)
+        log = None if fills or data is None else partial(packed_log, data)
         if log is not None or encoder is not self._encoder:
             self._create(encoder, log)
         if policy is not None:
             (self._take_values if box is None else self._take_actor_and_critics)(policy)
             self.agents.learner.load_targets()
         if data is not None:
-            if box is None:
+            if fills:
                 fill_buffer(self.agents, data)
             self.agents.learning_starts = 0
         if policy is not None:
@@ -165,6 +174,7 @@ class LearningAgent(Agent):
     def _take_actor_and_critics(self, policy: Policy) -> None:
         """Copy the actor of a policy, and its critics if it has them."""
         learner, head = self.agents.learner, cast(BoxHead, policy.head)
+        self._take_encoder(policy, head)
         _copy_actor(
             policy, head, learner.network("actor", self._seed), self.agents.buffer.n_actions
         )
@@ -179,6 +189,20 @@ class LearningAgent(Agent):
                 f"{policy.name} has an actor of another architecture (for example, normalized"
                 " inputs): the agent's actor produces other actions with the same weights"
             )
+
+    def _take_encoder(self, policy: Policy, head: BoxHead) -> None:
+        """Copy the encoder that the networks of a policy share, if there are images."""
+        ours = self.agents.learner.policy_networks(self._seed).get(ENCODER)
+        if ours is None:
+            return
+        if ENCODER not in head.networks:
+            raise PolicyError(
+                f"{policy.name} ({policy.algo}) has convolutions in each network, but the agent has"
+                " one encoder: from images, start from a policy of sac or td3"
+            )
+        theirs = head.networks[ENCODER]
+        _check_layers(policy, theirs, ours)
+        ours.load_state_dict(theirs.state_dict())
 
     def scalars(self) -> dict[str, float]:
         """Return the scalars of a row of `progress.csv`."""
@@ -264,21 +288,35 @@ class LearningAgent(Agent):
         assert self._choice is not None
         return float(self._choice.behavior()[WATCHED])
 
-    def values(self) -> tuple[Tensor, Tensor, float] | None:
-        """Return Q-values, preferences and the state's value in the watched environment.
+    def values(self, taken: NDArray[Any]) -> dict[str, Any]:
+        """Return the fields of `values_schema` for the action of the watched environment.
 
-        They are those of the forward pass that chose the action, if there was one. The result is
-        None for the actions of a Box.
+        Q-values of numbered actions are those of the forward pass that chose the action, if there
+        was one.
         """
         assert self._choice is not None
         values, behavior = self._choice.values, self.agents.behavior
+        if not isinstance(behavior, EpsilonGreedy):
+            return self._command_values(taken)
         if values is None:
-            if not isinstance(behavior, EpsilonGreedy):
-                return None
             with torch.no_grad():
                 values = behavior.values(self.agents.buffer.now())
         q = values[WATCHED]
-        return q, q.softmax(0), float(q.max())
+        return numbered_values(q, q.softmax(0), float(q.max()), int(taken))
+
+    @torch.no_grad()
+    def _command_values(self, taken: NDArray[Any]) -> dict[str, Any]:
+        """Return the fields of `values_schema` for an action of a Box."""
+        learner = cast(ActorCritic, self.agents.learner)
+        buffer, box = self.agents.buffer, cast(BoxActions, self.agents.buffer.box)
+        seen = learner.inputs(buffer.now().rows(torch.tensor([WATCHED])))
+        best = learner.act(seen)
+        both = torch.cat((torch.from_numpy(box.scaled(taken[None])).clamp(-1, 1), best))
+        twice = seen.rows(torch.zeros(2, dtype=torch.int64))
+        q, value = learner.models["q"](twice.with_actions(both), members=1)[0].tolist()
+        command = box.unscaled(best.numpy())[0]
+        space, log_prob = buffer.action_space, self.probability()
+        return command_values(command, taken, space, log_prob=log_prob, q=q, value=value)
 
     def metrics(self) -> dict[str, float]:
         """Return the metrics of `/rl/training`, without the score."""
@@ -325,7 +363,8 @@ def fill_buffer(agents: Agents, dataset: Dataset) -> int:
             encode(batch.next_observations),
             None,
         )
-        buffer.add(torch.from_numpy(buffer.joint.indexes(batch.actions)), outcome)
+        taken = buffer.joint.indexes(batch.actions) if buffer.box is None else batch.actions
+        buffer.add(torch.from_numpy(taken), outcome)
         if following is not None:
             batch = following
     return rows * envs

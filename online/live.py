@@ -13,11 +13,13 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.frames import rows_of
+from mcaprl.offline.estimate.values import command_columns
 from mcaprl.online.task import Task, check_spaces
 from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
@@ -59,8 +61,8 @@ class Shown(Protocol):
     def probability(self) -> float:
         """Return the probability of the action of the watched environment."""
 
-    def values(self) -> tuple[Tensor, Tensor, float]:
-        """Return the watched environment's Q-values (A,), preferences (A,), and state value."""
+    def values(self, taken: NDArray[Any]) -> dict[str, Any]:
+        """Return the fields of `values_schema` for the action of the watched environment."""
 
     def metrics(self) -> dict[str, float]:
         """Return the metrics of `TRAINING_LABELS` without the score."""
@@ -215,7 +217,7 @@ class WatchedBatch(VectorWrapper):
         shown = self.shown
         assert shown is not None
         is_shown = self._stream.look(self._source(self._last_action), self._return_so_far)
-        values = _values(shown, int(actions[WATCHED])) if is_shown else {}
+        values = shown.values(actions[WATCHED]) if is_shown else {}
         probability = shown.probability()
         self._stream.pause()
         return {
@@ -245,9 +247,15 @@ class WatchedBatch(VectorWrapper):
         self._stream.end_episode(summary)
 
 
-def _values(shown: Shown, taken: int) -> dict[str, Any]:
-    """Return the learner's values for the watched environment, as fields of `values_schema`."""
-    q, preference, value = shown.values()
+def numbered_values(q: Tensor, preference: Tensor, value: float, taken: int) -> dict[str, Any]:
+    """Return the fields of `values_schema` for one of A actions.
+
+    Args:
+        q: (A,) values of the actions; NaN if unknown.
+        preference: (A,) probabilities of the actions; softmax of q if the policy is greedy.
+        value: Value of the state.
+        taken: Number of the action that was taken.
+    """
     best = int(preference.argmax())
     entropy = torch.special.entr(preference).sum() / math.log(max(len(preference), 2))
     return {
@@ -259,4 +267,31 @@ def _values(shown: Shown, taken: int) -> dict[str, Any]:
         "entropy": float(entropy),
         "policy_action": best,
         "agrees": best == taken,
+    }
+
+
+def command_values(
+    command: NDArray[Any],
+    taken: NDArray[Any],
+    space: spaces.Space[Any],
+    *,
+    log_prob: float,
+    q: float = math.nan,
+    value: float = math.nan,
+) -> dict[str, Any]:
+    """Return the fields of `values_schema` for one action of a Box.
+
+    Args:
+        command: Greedy action of the policy.
+        taken: Action that was taken.
+        space: Space of both.
+        log_prob: Log density of the action that was taken.
+        q: Value of the action that was taken.
+        value: Value of the greedy action.
+    """
+    columns = command_columns(command[None], taken[None], space)
+    return {
+        **{name: column[0] for name, column in columns.items()},
+        **{"q": q, "value": value, "advantage": q - value, "log_prob": log_prob},
+        "td_error": math.nan,
     }

@@ -237,7 +237,10 @@ class ReplayBuffer(TransitionBuffer):
 
     def batch(self, rows: Tensor) -> Batch:
         """Return the transitions of rows (R,), with the shift of the last draw."""
-        batch = super().batch(rows)
+        return self._augmented(super().batch(rows))
+
+    def _augmented(self, batch: Batch) -> Batch:
+        """Shift the images of a batch by the shift of the last draw."""
         if not self.image_shift:
             return batch
         here, there = self.counts.shifts
@@ -391,15 +394,17 @@ class MixedBuffer(ReplayBuffer):
     def batch(self, rows: Tensor) -> Batch:
         """Return the transitions of rows (R,), which `draw` returned."""
         own = int((rows < len(self)).sum())
-        parts = super().batch(rows[:own]), self.log.batch(rows[own:] - len(self))
-        first, last = parts
-        return Batch(
-            rows,
-            _joined(first.observations, last.observations),
-            torch.cat((first.actions, last.actions)),
-            torch.cat((first.rewards, last.rewards)),
-            torch.cat((first.discounts, last.discounts)),
-            _joined(first.next_observations, last.next_observations),
+        first = TransitionBuffer.batch(self, rows[:own])
+        last = self.log.batch(rows[own:] - len(self))
+        return self._augmented(
+            Batch(
+                rows,
+                _joined(first.observations, last.observations),
+                torch.cat((first.actions, last.actions)),
+                torch.cat((first.rewards, last.rewards)),
+                torch.cat((first.discounts, last.discounts)),
+                _joined(first.next_observations, last.next_observations),
+            )
         )
 
     def state(self) -> dict[str, Tensor]:

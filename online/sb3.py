@@ -1,5 +1,7 @@
 """Adapter of Stable-Baselines3: its DQN, SAC, TD3, PPO and A2C, trained and saved as SB3 does.
 
+TQC is that of sb3-contrib, an optional package.
+
 SB3's own features extractors are used unless a setting asks for another encoder of images, for
 dueling networks or for layer normalization. The models, their environments with SB3's interface,
 and their checkpoints are all in this file; `online.zip_file` reads and writes SB3's files.
@@ -37,7 +39,7 @@ from torch import Tensor
 from mcaprl.actions import BoxActions
 from mcaprl.architecture import SMALL_EDGE, Architecture
 from mcaprl.base_policy import BasePolicy
-from mcaprl.errors import UsageError
+from mcaprl.errors import UsageError, import_extra
 from mcaprl.frames import (
     FrameStack,
     is_image,
@@ -65,7 +67,7 @@ from mcaprl.online.features import (
     normalize_images,
     policy_arguments,
 )
-from mcaprl.online.live import WATCHED
+from mcaprl.online.live import WATCHED, command_values, numbered_values
 from mcaprl.online.zip_file import (
     ClampedGaussian,
     ModelEncoder,
@@ -87,6 +89,16 @@ MODELS: Final[dict[str, type[BaseAlgorithm]]] = {
     "ppo": PPO,
     "a2c": A2C,
 }
+
+
+def model_type_of(algo: str) -> type[BaseAlgorithm]:
+    """Return the class of an algorithm's models."""
+    if algo == "tqc":
+        found: type[BaseAlgorithm] = import_extra("sb3_contrib", "contrib").TQC
+        return found
+    return MODELS[algo]
+
+
 _COUNTERS = (
     "num_timesteps",
     "_n_updates",
@@ -240,24 +252,27 @@ class ModelAgent(Agent):
         """Return the probability, or log density, of the action of the watched environment."""
         return float(behavior_of(self.model, self._actions)[WATCHED])
 
-    def values(self) -> tuple[Tensor, Tensor, float] | None:
-        """Return Q-values, preferences and the state's value in the watched environment.
+    def values(self, taken: NDArray[Any]) -> dict[str, Any]:
+        """Return the fields of `values_schema` for the action of the watched environment.
 
-        The result is None for the actions of a Box.
+        The values of the actions of a Box are unknown.
         """
         model = self.model
+        observation: Any = rows_of(model._last_obs, slice(WATCHED, WATCHED + 1))
         if isinstance(model.action_space, spaces.Box):
-            return None
-        observation = rows_of(model._last_obs, slice(WATCHED, WATCHED + 1))
+            command = model.predict(observation, deterministic=True)[0][0]
+            log_prob = self.probability()
+            return command_values(command, taken, model.action_space, log_prob=log_prob)
         tensor: Any = model.policy.obs_to_tensor(observation)[0]
         with torch.inference_mode():
             if isinstance(model, DQN):
                 q = model.q_net(tensor)[0]
-                return q, q.softmax(0), float(q.max())
+                return numbered_values(q, q.softmax(0), float(q.max()), int(taken))
             policy = cast(ActorCriticPolicy, model.policy)
             preference = cast(Any, policy.get_distribution(tensor).distribution).probs[0]
             value = float(policy.predict_values(tensor))
-            return torch.full_like(preference, torch.nan), preference, value
+            unknown = torch.full_like(preference, torch.nan)
+            return numbered_values(unknown, preference, value, int(taken))
 
     def metrics(self) -> dict[str, float]:
         """Return the metrics of `/rl/training`, without the score."""
@@ -306,7 +321,7 @@ class _Callbacks(BaseCallback):
 
 def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseAlgorithm:
     """Create a model with new weights, and seed Python, NumPy and torch."""
-    model_type: Any = MODELS[algo]
+    model_type: Any = model_type_of(algo)
     _check(algo, config, env.observation_space)
     architecture = own_architecture(config, env.observation_space)
     policy_kwargs: dict[str, Any] = {"net_arch": list(config.hidden)}
@@ -420,7 +435,7 @@ def behavior_log_densities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArr
     policy: Any = model.policy
     with torch.inference_mode():
         observations = policy.obs_to_tensor(model._last_obs)[0]
-        if isinstance(model, SAC):
+        if hasattr(model, "log_ent_coef"):
             mean, log_std, _ = policy.actor.get_action_dist_params(observations)
             found = ClampedGaussian.log_density(torch.stack((mean, log_std), 1).cpu(), numbers)
             return found.numpy() + box.log_scale
@@ -481,19 +496,17 @@ def _columns(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
 
 def _optimizers(model: BaseAlgorithm) -> dict[str, torch.optim.Optimizer]:
     """Return the optimizers of a model by their names in checkpoints."""
-    if not isinstance(model, SAC | TD3):
+    if not hasattr(model, "critic"):
         return {"optimizer": model.policy.optimizer}
     found = {f"optimizer_{name}": getattr(model, name).optimizer for name in ("actor", "critic")}
-    if isinstance(model, SAC) and model.ent_coef_optimizer is not None:
-        found["optimizer_temperature"] = model.ent_coef_optimizer
-    return found
+    temperature: torch.optim.Optimizer | None = getattr(model, "ent_coef_optimizer", None)
+    return found if temperature is None else {**found, "optimizer_temperature": temperature}
 
 
 def _temperature(model: BaseAlgorithm) -> dict[str, Tensor]:
-    """Return the logarithm of SAC's temperature, which is not among the policy's weights."""
-    if not isinstance(model, SAC) or model.log_ent_coef is None:
-        return {}
-    return {"log_temperature": model.log_ent_coef.detach()}
+    """Return the logarithm of the temperature of SAC and TQC, which is not a policy's weight."""
+    found: Tensor | None = getattr(model, "log_ent_coef", None)
+    return {} if found is None else {"log_temperature": found.detach()}
 
 
 def _optimizer_tensors(model: BaseAlgorithm) -> dict[str, Tensor]:

@@ -12,7 +12,13 @@ from gymnasium import Env, spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from mcaprl.actions import BoxActions, joint_actions, short_name
-from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
+from mcaprl.errors import (
+    SpaceError,
+    TrainingError,
+    UnknownNameError,
+    UsageError,
+    import_extra,
+)
 from mcaprl.frames import parts_of_space
 from mcaprl.online.config import (
     BOX_ALGOS,
@@ -77,7 +83,15 @@ def default_algo(sim: str, sim_options: Mapping[str, Any]) -> str:
 
 
 def choose_engine(algo: str, engine: str | None) -> str:
-    """Return the engine that trains an algorithm; None selects the first one that has it."""
+    """Return the engine that trains an algorithm; None selects the first one that has it.
+
+    Raises:
+        UnknownNameError: There is no such engine.
+        UsageError: The engine does not have the algorithm.
+        MissingExtraError: The package of the algorithm is not installed.
+    """
+    if algo == "tqc":
+        import_extra("sb3_contrib", "contrib")
     if engine is None:
         return next(name for name, algos in ENGINES.items() if algo in algos)
     if engine not in ENGINES:

@@ -34,16 +34,21 @@ from mcaprl.progress import ProgressCallback, terminal_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.runs import (
+    CHECKPOINT_NAME,
+    CONFIG_NAME,
     RunSummary,
     choose_seeds,
     locked_run,
     open_run,
+    run_to_resume,
     seed_folder,
     writing,
 )
 from mcaprl.sims.evaluation.evaluate import Scale, evaluate
 from mcaprl.sims.evaluation.rollout import warn_of_cuts
 
+_SOURCES = "sources"
+"""Key of `config.json`. Seeds without a checkpoint start from these paths when a run is resumed."""
 _SEEDS = 2**32
 """Number of seeds that Stable-Baselines3 accepts."""
 
@@ -75,6 +80,7 @@ def train(
     record: str | Path | None = None,
     data: Dataset | None = None,
     policy: Any = None,
+    sources: Sequence[str] = (),
     resume: bool = False,
     live: LiveTraining | None = None,
     progress: ProgressCallback | None = None,
@@ -93,7 +99,9 @@ def train(
         data: Logged transitions that initialize the replay buffer.
         policy: Trained policy with Q-values whose weights initialize the agents, or a list with one
             policy for each seed.
-        resume: Whether to resume from the checkpoints in `out`. Seeds without one start at step 0.
+        sources: Paths of `data` and `policy`, for `sources_to_resume`.
+        resume: Whether to resume from the checkpoints in `out`. Seeds without one start at step 0,
+            from `data` and `policy`.
         live: Live view of the training; its layout is written into `out`.
         progress: Callback for progress; None shows a bar if stderr is a terminal.
 
@@ -120,7 +128,7 @@ def train(
     config = task.config
     with locked_run(folder, resume), closing(task.evaluation_env()) as env:
         check_spaces(task.algo, env.observation_space, env.action_space)
-        run = _Run(folder, task, env, logs, data, policy, live, numbers)
+        run = _Run(folder, task, env, logs, data, policy, list(sources), live, numbers)
         run.open(resume)
         selection = measure_scale(env, episodes=config.eval_episodes, seed=SELECTION_SEED)
         fresh = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
@@ -131,6 +139,23 @@ def train(
             ]
         run.conclude(summaries, fresh)
     return summaries
+
+
+def sources_to_resume(folder: Path, seeds: range) -> list[str]:
+    """Return the paths of the logs and the policy that a run still needs.
+
+    Seeds with a checkpoint need none, so the list is empty if all have one.
+    """
+    places = (folder / f"seed-{seed}" / CHECKPOINT_NAME for seed in seeds)
+    return [] if all(path.exists() for path in places) else _sources_of(folder)
+
+
+def _sources_of(folder: Path) -> list[str]:
+    """Return the paths of the logs and the policy from which the agents of a run started."""
+    found = run_to_resume(folder).get(_SOURCES, [])
+    if not (isinstance(found, list) and all(isinstance(each, str) for each in found)):
+        raise TrainingError(f"{folder / CONFIG_NAME}: {_SOURCES} is not a list of paths")
+    return found
 
 
 def make_agent(task: Task, *arguments: Any, **options: Any) -> Agent:
@@ -154,12 +179,15 @@ class _Run:
     logs: dict[int, Path]
     data: Dataset | None
     policy: Any
+    sources: list[str]
     live: LiveTraining | None
     seeds: range
 
     def open(self, resume: bool) -> None:
         """Create the run folder, or check that it belongs to this run; create the log folders."""
-        open_run(self.folder, self.task.identity, resume, self.seeds)
+        sources = self.sources or (_sources_of(self.folder) if resume else [])
+        kept = {_SOURCES: sources} if sources else {}
+        open_run(self.folder, self.task.identity, resume, self.seeds, **kept)
         for path in self.logs.values():
             with writing(path.parent):
                 path.parent.mkdir(parents=True, exist_ok=True)

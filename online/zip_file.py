@@ -71,7 +71,7 @@ from mcaprl.recorder.format.spaces import (
     space_to_json,
 )
 from mcaprl.runs import BEST_NAME
-from mcaprl.storage.tensor_files import check_finite, check_widths
+from mcaprl.storage.tensor_files import below, check_finite, check_widths
 
 FORMAT_VERSION = 1
 OWN_NAME = "mcaprl.json"
@@ -170,7 +170,7 @@ def save_policy(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -
         model: Model of SB3.
         description: Description as `describe_run` returns it.
     """
-    kind = _kind_of(model.policy)
+    kind = "tqc" if is_tqc(model.policy) else _kind_of(model.policy)
     own = {
         "format_version": FORMAT_VERSION,
         "network": kind,
@@ -181,8 +181,15 @@ def save_policy(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -
     write_model(path, model, own)
 
 
+def is_tqc(network: BasePolicy) -> bool:
+    """Return whether a policy is of sb3-contrib's TQC, whose actor is that of SAC."""
+    return type(network).__module__.startswith("sb3_contrib.tqc")
+
+
 def _kind_of(network: BasePolicy) -> str:
     """Return the key of `_POLICY_TYPES` of a policy of SB3."""
+    if is_tqc(network):
+        return "sac"
     return next(kind for kind, types in _POLICY_TYPES.items() if isinstance(network, types[0]))
 
 
@@ -264,14 +271,18 @@ def _build(
     else:
         for widths in _layers(observation_space, frames, description.net_arch):
             check_widths(widths, weights)
-        network = _policy_type(kind, shape)(
+        network = _policy_type("sac" if kind == "tqc" else kind, shape)(
             shape,
             action_space,
             lambda _: 0.0,
             net_arch=description.net_arch,
             activation_fn=_ACTIVATIONS[description.activation],
         )
-    network.load_state_dict(weights)
+    if kind == "tqc":
+        # Its critics are another class's; policies act without them.
+        cast(Any, network).actor.load_state_dict(below(weights, "actor"))
+    else:
+        network.load_state_dict(weights)
     folder = path.resolve().parent
     name = f"{folder.parent.name}/{folder.name}" if path.name == BEST_NAME else path.stem
     return _policy(network, description, name, exact=exact)
@@ -421,8 +432,8 @@ class ClampedGaussian(SquashedGaussian):
 class ClippedGaussian(BoxHead):
     """Normal distributions of SB3's PPO and A2C, whose actions are clipped to the Box.
 
-    Outputs (B, 2, n) are means and log deviations, for actions scaled to [-1, 1]. At the bounds,
-    the density is that before the clipping.
+    Outputs (B, 2, n) are means and log deviations, for actions scaled to [-1, 1]. An action with a
+    number at a bound has a probability instead of a density: NaN.
     """
 
     @staticmethod
@@ -440,7 +451,8 @@ class ClippedGaussian(BoxHead):
         """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
         mean, log_std = outputs.unbind(1)
         normal: Any = torch.distributions.Normal(mean, log_std.exp())
-        return cast(Tensor, normal.log_prob(actions).sum(1))
+        found: Tensor = normal.log_prob(actions).sum(1)
+        return found.masked_fill((actions.abs() >= 1).any(1), torch.nan)
 
 
 _BOX_HEADS: Final[dict[str, type[BoxHead]]] = {
@@ -462,7 +474,7 @@ def _inner(network: BasePolicy, box: BoxActions | None) -> tuple[nn.Module, str]
 
 
 class _BoxActor(nn.Module):
-    """Outputs of the actor of SAC or TD3."""
+    """Outputs of the actor of SAC, TQC or TD3."""
 
     def __init__(self, actor: Any) -> None:
         super().__init__()
@@ -470,7 +482,7 @@ class _BoxActor(nn.Module):
 
     def forward(self, inputs: Any) -> Tensor:
         actor = self.actor
-        if isinstance(actor, sac.Actor):
+        if hasattr(actor, "get_action_dist_params"):
             return torch.stack(actor.get_action_dist_params(inputs)[:2], 1)
         features = actor.extract_features(inputs, actor.features_extractor)
         # The last layer is a tanh, which the head applies.
@@ -569,7 +581,9 @@ def describe_sb3(data: Mapping[str, Any], weights: Mapping[str, Any]) -> dict[st
     )
     kind = next(known, None)
     if kind is None:
-        raise PolicyError("the model is not DQN, SAC, TD3, PPO or A2C")
+        raise PolicyError("the model is not DQN, SAC, TQC, TD3, PPO or A2C")
+    if kind == "sac" and "top_quantiles_to_drop_per_net" in data:
+        kind = "tqc"
     default = "Tanh" if kind == "actor-critic" else "ReLU"
     return {
         "algo": "dqn" if kind == "q-network" else kind,

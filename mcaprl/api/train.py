@@ -195,8 +195,9 @@ def train_online(
         sim: Short name of a sim, or a Gymnasium id; None for the sim of the preset or of the
             resumed run.
         out: Run folder to create.
-        algo: `double-dqn` or `dqn` for discrete actions, `sac` or `td3` for those of a Box, `ppo`
-            or `a2c` for both. None selects that of the preset or run, else `double-dqn` or `sac`.
+        algo: `double-dqn` or `dqn` for discrete actions, `sac`, `td3` or `tqc` for those of a Box,
+            `ppo` or `a2c` for both. None selects that of the preset or run, else `double-dqn` or
+            `sac`.
         engine: `mcaprl`, whose learners are those of offline training, or `sb3` for
             Stable-Baselines3. None selects `mcaprl` for `double-dqn`, `sac` and `td3`.
         preset: Name of published settings.
@@ -209,7 +210,8 @@ def train_online(
         upload: URL to which the log of `record` is copied at the end of the training; with several
             seeds, the URL of a folder.
         sources: Logs, and at most one policy whose weights initialize the agents. With discrete
-            actions, the logs fill the replay buffer; else, a part of each batch is drawn from them.
+            actions, the logs fill the replay buffer; else, a part of each batch is drawn from them,
+            unless `data_fraction` is 0.
         resume: Whether training continues from the checkpoints in `out`.
         live: Whether viewers can connect during training, and watch one episode after the other.
         live_speed: Simulated seconds per second in the episodes that are shown.
@@ -244,10 +246,12 @@ def train_online(
         SpaceError: The algorithm does not support the observations or actions.
         PolicyError: The policy in `sources` has another network than the agent.
         TrainingError: `out` cannot be written, or contains a run of another task.
-        MissingExtraError: The packages of the `online` extra are not installed.
+        MissingExtraError: The packages of the `online` extra, or of `contrib` for `tqc`, are not
+            installed.
     """
     from mcaprl.online.live import LiveTraining
     from mcaprl.online.task import choose_task
+    from mcaprl.online.train import sources_to_resume
     from mcaprl.online.train import train as train_agents
 
     check_least(1, seeds=seeds, threads=threads, max_steps=max_steps)
@@ -275,7 +279,10 @@ def train_online(
         numbers = choose_seeds(out, seeds, seed, resume)
         found = _train_on_device(sim, out, device, numbers, threads, options, settings, progress)
         return Run(out, found)
-    data, policy = _experience(as_names(sources))
+    names = _absolute(as_names(sources))
+    if resume and not names:
+        names = sources_to_resume(out, choose_seeds(out, seeds, seed, resume))
+    data, policy = _experience(names)
     task = choose_task(
         sim,
         algo,
@@ -305,6 +312,7 @@ def train_online(
             record=record,
             data=data,
             policy=policy,
+            sources=names,
             resume=resume,
             live=viewers,
             progress=progress,
@@ -342,6 +350,11 @@ def _train_on_device(
         return train_agents(
             task, out, device=device, seeds=len(seeds), seed=seeds.start, progress=progress
         )
+
+
+def _absolute(sources: list[str]) -> list[str]:
+    """Return paths that do not depend on the working directory; URLs stay the same."""
+    return [each if "://" in each else str(Path(each).absolute()) for each in sources]
 
 
 def _experience(sources: list[str]) -> tuple[Dataset | None, list[Policy] | None]:

@@ -2,18 +2,27 @@
 
 The actor maps an observation to the outputs of a head (`heads.BoxHead`). The critics, the twins of
 TD3, are one ensemble of two networks Q(s, a).
+
+Where `shares_encoder` is set, all networks see images through one encoder, which learns from the
+losses of the critics alone, as in "Image Augmentation Is All You Need" and "Improving Sample
+Efficiency in Model-Free Reinforcement Learning from Images" (https://arxiv.org/abs/2004.13649,
+https://arxiv.org/abs/1910.01741). There is no target network of the encoder, as in DrQ-v2
+(https://arxiv.org/abs/2107.09645).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from mcaprl.architecture import Architecture
+from mcaprl.networks import ImageInput, Network
 from mcaprl.offline.algorithms.config import ActorCriticConfig
-from mcaprl.offline.algorithms.heads import BOX_HEADS
+from mcaprl.offline.algorithms.heads import BOX_HEADS, ENCODER, FEATURES, encoded
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.algorithms.losses import action_change, clipped_double_q_target
 from mcaprl.offline.batches.buffer import Batch
@@ -27,20 +36,57 @@ class ActorCritic(Learner):
     policy_models = ("actor", "q")
     continuous = True
     critics = ("q",)
+    shares_encoder: ClassVar[bool] = False
     config: ActorCriticConfig
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shapes of the actor's outputs, and of one value per critic."""
-        return {"actor": BOX_HEADS[self.acts_by].output_shape(self.n_actions), "q": (1,)}
+        encoder = {ENCODER: (FEATURES,)} if self._has_encoder else {}
+        outputs = BOX_HEADS[self.acts_by].output_shape(self.n_actions)
+        return {"actor": outputs, "q": (1,), **encoder}
+
+    @property
+    def _has_encoder(self) -> bool:
+        return self.shares_encoder and bool(self.buffer.image_inputs)
+
+    def inputs_of(self, name: str) -> tuple[int, Sequence[ImageInput]]:
+        """Return the length of the vectors and the images that a model receives."""
+        width, images = super().inputs_of(name)
+        if not self._has_encoder:
+            return width, images
+        return (0, images) if name == ENCODER else (FEATURES + width, ())
+
+    def inputs(self, observations: Observations) -> Observations:
+        """Return the observations with the features of the encoder in place of images."""
+        return encoded(self.models[ENCODER], observations) if self._has_encoder else observations
+
+    def encoded(self, batch: Batch) -> Batch:
+        """Return a batch of the buffer with the `inputs` of the networks, for `losses`.
+
+        Gradients flow to the encoder from the observations, and not from the next ones.
+        """
+        if not self._has_encoder:
+            return batch
+        with torch.no_grad():
+            next_observations = self.inputs(batch.next_observations)
+        observations = self.inputs(batch.observations)
+        return replace(batch, observations=observations, next_observations=next_observations)
+
+    def policy_networks(self, seed: int) -> dict[str, Network]:
+        """Return the networks of one seed that its policy needs, with their current weights."""
+        encoder = {ENCODER: self.network(ENCODER, seed)} if self._has_encoder else {}
+        return {**super().policy_networks(seed), **encoder}
 
     def architecture_of(self, name: str) -> Architecture:
         """Return the architecture of a model; critics may have layer normalization alone."""
+        if name == ENCODER:
+            return self.architecture.of_encoder()
         normed = self.config.critic_layer_norm and name in self.critics
         return replace(self.architecture, layer_norm=self.architecture.layer_norm or normed)
 
     def act(self, observations: Observations) -> Tensor:
-        """Return the actor's actions (R, n), in [-1, 1]."""
-        return BOX_HEADS[self.acts_by].best(self.models["actor"](observations))
+        """Return the actor's actions (R, n), in [-1, 1], without gradients of the encoder."""
+        return BOX_HEADS[self.acts_by].best(self.models["actor"](observations.detached()))
 
     def smoothness_loss(self, batch: Batch, weight: float) -> Tensor | float:
         """Return the weighted change (R,) of the actor's action until the next observation.

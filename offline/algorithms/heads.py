@@ -20,14 +20,15 @@ here and an entry in `HEADS`.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
-from typing import Any, Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final, cast
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
 from mcaprl.actions import BoxActions
 from mcaprl.errors import PolicyError
@@ -181,6 +182,8 @@ class FilteredQ(DiscreteHead):
 class BoxHead(Head):
     """Head for the actions of a Box, from the outputs of the network `actor`.
 
+    If there is a network `encoder`, the others receive its features in place of images.
+
     Attributes:
         box: Scaling of the actions to numbers in [-1, 1].
         log_std: (n,) logarithms of the standard deviations, if they are the same in all states.
@@ -218,14 +221,14 @@ class BoxHead(Head):
 
     def actions(self, observations: Observations) -> Tensor:
         """Return the best actions (B, *shape), in the units and dtype of the space."""
-        numbers = self.best(self.networks["actor"](observations)).double()
+        numbers = self.best(self._outputs(observations)).double()
         values = self._low + (numbers + 1) / 2 * (self._high - self._low)
         dtype = getattr(torch, str(self.box.space.dtype))
         return values.clamp(self._low, self._high).to(dtype).view(-1, *self.box.shape)
 
     def log_prob(self, observations: Observations, actions: NDArray[Any]) -> Tensor:
         """Return the log densities (B,) of actions (B, *shape), in their own units."""
-        outputs = self.networks["actor"](observations)
+        outputs = self._outputs(observations)
         numbers = torch.from_numpy(self.box.scaled(actions)).clamp(-1, 1)
         log_density = self.log_density(outputs, numbers, self.log_std) + self.box.log_scale
         inside = torch.from_numpy(self.box.contain(actions))
@@ -236,8 +239,16 @@ class BoxHead(Head):
         if "q" not in self.networks:
             return None
         numbers = torch.from_numpy(self.box.scaled(actions))
-        found: Tensor = self.networks["q"](observations.with_actions(numbers))
+        found: Tensor = self.networks["q"](self._inputs(observations).with_actions(numbers))
         return found.squeeze(1)
+
+    def _outputs(self, observations: Observations) -> Tensor:
+        return cast(Tensor, self.networks["actor"](self._inputs(observations)))
+
+    def _inputs(self, observations: Observations) -> Observations:
+        if ENCODER not in self.networks:
+            return observations
+        return encoded(self.networks[ENCODER], observations)
 
 
 class Deterministic(BoxHead):
@@ -335,6 +346,19 @@ class Mixture(BoxHead):
         """Return the means and deviations (B, C, 2, n) before they are bounded."""
         size = (outputs.shape[1] // COMPONENTS - 1) // 2
         return outputs[:, COMPONENTS:].reshape(-1, COMPONENTS, 2, size)
+
+
+ENCODER: Final = "encoder"
+"""Name of the network that maps the images of all other networks to features."""
+FEATURES: Final = 64
+"""Number of these features."""
+
+
+def encoded(encoder: Callable[[Observations], Tensor], observations: Observations) -> Observations:
+    """Return observations with the normalized outputs of an encoder in place of images."""
+    outputs = encoder(observations)
+    features = functional.layer_norm(outputs, outputs.shape[1:]).tanh()
+    return Observations(torch.cat((features, observations.vector), 1), (), observations.mask)
 
 
 COMPONENTS: Final = 5

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from mcaprl.architecture import Architecture
-from mcaprl.networks import Network
+from mcaprl.networks import ImageInput, Network
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.losses import allowed_only
 from mcaprl.offline.algorithms.models import ALIGNMENT, Model, TargetNetwork, build_model
@@ -171,6 +171,14 @@ class Learner(ABC):
         `torch.no_grad()`.
         """
 
+    def inputs(self, observations: Observations) -> Observations:
+        """Return what the networks receive; default: the observations themselves."""
+        return observations
+
+    def encoded(self, batch: Batch) -> Batch:
+        """Return a batch of the buffer with the `inputs` of the networks, for `losses`."""
+        return batch
+
     def validate(self, batch: Batch) -> dict[str, Tensor]:
         """Return metrics (R,) of a held-out batch, by name.
 
@@ -233,7 +241,7 @@ class Learner(ABC):
         Returns:
             The terms of `losses`, detached.
         """
-        terms = self.losses(self.buffer.batch(rows))
+        terms = self.losses(self.encoded(self.buffer.batch(rows)))
         self.optimizer.zero_grad()
         # A seed's loss depends only on that seed's weights, so one sum yields all gradients.
         torch.autograd.backward(terms["loss"].sum() / (len(rows) // len(self.seeds)))
@@ -364,6 +372,10 @@ class Learner(ABC):
         model = self.models[name]
         return model.networks[self.seeds.index(seed) * model.members + member]
 
+    def policy_networks(self, seed: int) -> dict[str, Network]:
+        """Return the networks of one seed that its policy needs, with their current weights."""
+        return {name: self.network(name, seed) for name in self.policy_models}
+
     def architecture_of(self, name: str) -> Architecture:
         """Return the architecture of a model's networks; default: the same one for all models."""
         return self.architecture
@@ -442,10 +454,15 @@ class Learner(ABC):
         return N_CRITICS if name in self.critics else 1
 
     def _random_network(self, name: str, shape: tuple[int, ...]) -> Network:
+        width, images = self.inputs_of(name)
+        network = Network(width, images, shape, self.architecture_of(name))
+        return network.to(self.buffer.device)
+
+    def inputs_of(self, name: str) -> tuple[int, Sequence[ImageInput]]:
+        """Return the length of the vectors and the images that a model receives."""
         buffer = self.buffer
-        width = buffer.vector_width + (self.n_actions if name in self.critics else 0)
-        network = Network(width, buffer.image_inputs, shape, self.architecture_of(name))
-        return network.to(buffer.device)
+        actions = self.n_actions if name in self.critics else 0
+        return buffer.vector_width + actions, buffer.image_inputs
 
     def _not_finite(self, seed_means: Sequence[Mapping[str, float]]) -> NotFiniteError:
         """Return an error that names the first term of `losses` that is not finite."""

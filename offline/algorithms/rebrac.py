@@ -24,6 +24,7 @@ class ReBRAC(TD3):
     """TD3 with a penalty on unlike actions in the loss of the actor and in the targets."""
 
     name = "rebrac"
+    shares_encoder = False
     config_type = ReBRACConfig
     config: ReBRACConfig
 

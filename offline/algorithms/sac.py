@@ -41,6 +41,7 @@ class SAC(ActorCritic):
     name = "sac"
     config_type = SACConfig
     acts_by = "squashed_gaussian"
+    shares_encoder = True
     config: SACConfig
 
     def __init__(self, config: SACConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:
@@ -57,9 +58,10 @@ class SAC(ActorCritic):
         target_tm1 = self.targets(batch, alpha, self.noise(1.0))
         q_tm1 = self.models["q"](batch.observations.with_actions(batch.actions))
         td_loss = twin_regression(q_tm1, target_tm1)
-        outputs = self.models["actor"](batch.observations)
+        observations = batch.observations.detached()
+        outputs = self.models["actor"](observations)
         actions, log_pi = SquashedGaussian.sample(outputs, self.noise(1.0))
-        q = self.models["q"](batch.observations.with_actions(actions), frozen=True)
+        q = self.models["q"](observations.with_actions(actions), frozen=True)
         policy_loss = alpha * log_pi - q.amin(0)
         smoothness_loss = self.smoothness_loss(batch, self.config.smoothness)
         entropy_loss = temperature_loss(log_alpha, log_pi.detach(), self._target_entropy)

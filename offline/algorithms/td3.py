@@ -36,6 +36,7 @@ class TD3(ActorCritic):
 
     name = "td3"
     config_type = TD3Config
+    shares_encoder = True
     config: TD3Config
 
     def __init__(self, config: TD3Config, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:
@@ -62,7 +63,7 @@ class TD3(ActorCritic):
 
     def policy_losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return terms to log, among them `policy_loss` (R,), which the actor minimizes."""
-        inputs = batch.observations.with_actions(self.act(batch.observations))
+        inputs = batch.observations.detached().with_actions(self.act(batch.observations))
         return {"policy_loss": -self.models["q"](inputs, frozen=True, members=1).squeeze(0)}
 
     @torch.no_grad()

@@ -26,6 +26,7 @@ class TD3BC(TD3):
     """TD3 with behavior cloning."""
 
     name = "td3-bc"
+    shares_encoder = False
     config_type = TD3BCConfig
     config: TD3BCConfig
 

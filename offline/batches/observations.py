@@ -87,6 +87,10 @@ class Observations:
         """Return the same observations with actions (B, n) after the numbers of their vectors."""
         return replace(self, vector=torch.cat((self.vector, actions), 1))
 
+    def detached(self) -> Observations:
+        """Return the same observations, through which no gradients flow."""
+        return replace(self, vector=self.vector.detach())
+
     def to(self, device: torch.device) -> Observations:
         """Return the same observations on another device."""
         return self.like([part.to(device) for part in self.parts()])

@@ -72,7 +72,6 @@ def _of_commands(
     steps = len(episode)
     command = by_rows(policy.act, observations)
     seen = rows_of(observations, slice(steps))
-    difference = _flat(command[:steps]) - _flat(episode.actions)
     try:
         q = policy.action_values(seen, episode.actions)
         value = policy.action_values(observations, command)
@@ -83,17 +82,24 @@ def _of_commands(
     except PolicyError:
         log_prob = np.full(steps, np.nan)
     ahead = np.where(episode.terminated, 0.0, gamma) * value[1:]
-    parts = np.square(difference / half_ranges(action_space, episode.actions))
     return {
-        "policy_action": _flat(command[:steps]),
-        "difference": difference,
+        **command_columns(command[:steps], episode.actions, action_space),
         "q": q,
         "value": value[:steps],
         "advantage": q - value[:steps],
         "td_error": episode.rewards + np.where(episode.terminated, 0.0, ahead) - q,
-        "distance": np.sqrt(parts.mean(1)),
         "log_prob": log_prob,
     }
+
+
+def command_columns(
+    command: NDArray[Any], taken: NDArray[Any], action_space: spaces.Space[Any]
+) -> Columns:
+    """Return the fields that compare a policy's commands with others, both (T, *shape)."""
+    difference = _flat(command) - _flat(taken)
+    parts = np.square(difference / half_ranges(action_space, taken))
+    distance = np.sqrt(parts.mean(1))
+    return {"policy_action": _flat(command), "difference": difference, "distance": distance}
 
 
 def half_ranges(space: spaces.Space[Any], actions: NDArray[Any]) -> NDArray[np.float64]:

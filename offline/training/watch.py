@@ -54,7 +54,7 @@ class HeldOut:
         rows = self._rows.expand(len(learner.seeds), -1).flatten()
         batch = self._buffer.batch(rows.to(self._buffer.device))
         with torch.no_grad():
-            terms = learner.validate(batch)
+            terms = learner.validate(learner.encoded(batch))
         means = learner.seed_means({f"held_out_{name}": term for name, term in terms.items()})
         has_values = "q" in learner.models and math.isfinite(self.mean_return)
         known = {"held_out_return": self.mean_return} if has_values else {}

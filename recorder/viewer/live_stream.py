@@ -286,7 +286,7 @@ class LiveStream(ViewerServer):
         if isinstance(source, DepthSource):
             self._depth = log.image_rows(DEPTH, source.depth_image_m().shape, "16UC1", 1)
             self._topics[DEPTH] = self._depth.channel_id
-        if isinstance(metadata.action_space, spaces.Discrete):
+        if isinstance(metadata.action_space, spaces.Discrete | spaces.Box):
             self._values = log.values_rows(VALUES_TOPIC, 1)
             self._topics[VALUES_TOPIC] = self._values.channel_id
         self._steps, self._learner = log.step_rows(1), log.learner_rows(1)

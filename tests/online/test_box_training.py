@@ -104,20 +104,25 @@ def test_a_resumed_run_ends_with_the_same_bits(tmp_path: Path, algo: str, head: 
     assert all(action in policy.action_space for action in policy.act(first.observations))
 
 
-@pytest.mark.parametrize("algo", ["sac", "td3", "ppo"])
+@pytest.mark.parametrize("algo", ["sac", "td3", "tqc", "ppo"])
 def test_models_of_sb3_are_recorded_and_loaded(tmp_path: Path, algo: str) -> None:
+    if algo == "tqc":
+        pytest.importorskip("sb3_contrib")
     settings = {**ROLLOUTS, "rollout_steps": 24, "batch_size": 12} if algo == "ppo" else SHORT
     task = choose_task(PENDULUM, algo, {}, settings, engine="sb3")
     train(task, tmp_path / "run", record=tmp_path / "log.mcap", progress=silent)
     data = mcaprl.open(tmp_path / "log.mcap")
     inside = np.abs(data.actions[:, 0]) < 2
     assert np.isfinite(data.behavior_log_probs[inside]).all()
-    if algo == "ppo":
-        assert np.isnan(data.behavior_log_probs[~inside]).all()
     policy = mcaprl.load_policy(tmp_path / "run")
-    from mcaprl.online.sb3 import MODELS
+    if algo == "ppo":
+        for found in (data.behavior_log_probs, policy.log_prob(data.observations, data.actions)):
+            assert np.isnan(found[~inside]).all()
+    from mcaprl.online.sb3 import model_type_of
 
-    model = MODELS[algo].load(tmp_path / "run" / "seed-0" / "best_model.zip", device="cpu")
+    model: Any = model_type_of(algo).load(
+        tmp_path / "run" / "seed-0" / "best_model.zip", device="cpu"
+    )
     expected = model.predict(data.observations, deterministic=True)[0]
     np.testing.assert_allclose(policy.act(data.observations), expected, atol=1e-5)
     # A file of plain SB3 has no description of this package.
@@ -171,6 +176,24 @@ def test_half_of_each_batch_is_from_the_log(tmp_path: Path) -> None:
         agent.close()
 
 
+def test_a_log_fills_the_replay_buffer_if_no_part_is_drawn_from_it(tmp_path: Path) -> None:
+    task = choose_task(PENDULUM, "td3", {}, {**SHORT, "data_fraction": 0.0}, with_logs=True)
+    agent = LearningAgent(task, PENDULUM, tmp_path, 0, Scale(0, 1))
+    try:
+        agent.start_from(logged(), None)
+        buffer = agent.agents.buffer
+        assert not isinstance(buffer, MixedBuffer)
+        assert buffer.stored * buffer.width == 40
+        batch = buffer.batch(buffer.draw(20, ()))
+        rows = (batch.rewards - 100).long().numpy()
+        assert buffer.box is not None
+        expected = buffer.box.scaled(logged().actions)[rows]
+        np.testing.assert_array_equal(batch.actions, expected)
+        np.testing.assert_array_equal(batch.observations.vector, logged().observations[rows])
+    finally:
+        agent.close()
+
+
 def test_a_run_with_a_log_resumes_without_it(tmp_path: Path) -> None:
     task = choose_task(PENDULUM, "td3", {}, SHORT, with_logs=True)
     train(task, tmp_path / "run", data=logged(), progress=silent)
@@ -181,6 +204,29 @@ def test_a_run_with_a_log_resumes_without_it(tmp_path: Path) -> None:
         np.testing.assert_array_equal(buffer.log.returns[0], logged().rewards)
     finally:
         agent.close()
+
+
+def test_seeds_without_a_checkpoint_resume_from_the_same_sources(tmp_path: Path) -> None:
+    log, out, whole = tmp_path / "log.mcap", tmp_path / "run", tmp_path / "whole"
+    logged().save(log)
+    given: dict[str, Any] = {"seeds": 2, "sources": log, **SHORT}
+    mcaprl.train_online(PENDULUM, whole, algo="sac", **given)
+
+    def stop(now: TrainingProgress) -> None:
+        if now.seed == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        mcaprl.train_online(PENDULUM, out, algo="sac", progress=stop, **given)
+    (out / "seed-1" / "checkpoint.safetensors").unlink(missing_ok=True)
+    mcaprl.train_online(None, out, resume=True)
+    for seed in range(2):
+        name = f"seed-{seed}/checkpoint.safetensors"
+        assert (out / name).read_bytes() == (whole / name).read_bytes()
+    # All seeds have checkpoints, which contain the log.
+    log.unlink()
+    mcaprl.train_online(None, out, resume=True)
+    assert json.loads((out / "config.json").read_text())["sources"] == [str(log)]
 
 
 @pytest.mark.parametrize(("offline", "algo"), [("iql", "sac"), ("td3-bc", "sac"), ("iql", "td3")])

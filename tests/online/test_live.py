@@ -7,11 +7,13 @@ import json
 import math
 from collections import Counter
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 import mcaprl
 from mcaprl.cli import run
@@ -220,6 +222,44 @@ def test_other_algorithms_and_environments(
     loss = layout["configById"]["Plot!loss"]["lichtblickPanelTitle"]
     assert loss == TRAINING_LABELS["loss"] == "loss of the last update"
     assert layout["configById"]["Tab!metrics"]["tabs"][0]["title"] == "mean q"
+
+
+@pytest.mark.parametrize(
+    ("sim", "algo", "engine"),
+    [("lane", "sac", ""), ("Pendulum-v1", "td3", ""), ("lane", "sac", "sb3"), ("racer", "ppo", "")],
+)
+def test_the_commands_of_a_box_are_shown(tmp_path: Path, sim: str, algo: str, engine: str) -> None:
+    options = {} if sim == "Pendulum-v1" else {"actions": "continuous"}
+    given = {"rollout_steps": 40, "batch_size": 20} if algo == "ppo" else {"learning_starts": 40}
+    short = {**SHORT, "steps": 80, "eval_interval": 80, "hidden": (8, 8)}
+    del short["learning_starts"]
+    task = replace(Task.for_sim(sim, algo, options, **short, **given), engine=engine)
+    log = tmp_path / "log.mcap"
+    seen = watched(task, tmp_path / "run", record=log)
+    steps, values, data = decoded(seen, "/rl/step"), decoded(seen, "/rl/values"), mcaprl.open(log)
+    assert len(steps) == len(values) == 20
+    places = {row.tobytes(): i for i, row in enumerate(data.observations)}
+    rows = [places[observation.tobytes()] for observation in steps["observation"]]
+    taken, box = data.actions[rows], data.action_space
+    assert isinstance(box, spaces.Box)
+    np.testing.assert_array_equal(steps["action"], taken)
+    np.testing.assert_array_equal(steps["behavior_log_prob"], data.behavior_log_probs[rows])
+    np.testing.assert_array_equal(values["log_prob"], steps["behavior_log_prob"])
+    assert ((values["policy_action"] >= box.low) & (values["policy_action"] <= box.high)).all()
+    difference = values["policy_action"] - taken
+    np.testing.assert_allclose(values["difference"], difference, rtol=1e-4, atol=1e-6)
+    for name in ("q", "value", "advantage"):
+        assert np.isfinite(values[name]).all() == (not task.is_sb3)
+    schemas = {
+        topic: (found["schemaName"], found["schema"]) for topic, found in seen["topics"].items()
+    }
+    layout = json.loads((tmp_path / "run" / "foxglove-layout.json").read_text())
+    check_panels(layout, Topics(schemas))
+    dials = [one for name, one in layout["configById"].items() if name.startswith("Gauge!action")]
+    ends = [(one["minValue"], one["maxValue"]) for one in dials]
+    assert ends == list(zip(box.low.tolist(), box.high.tolist(), strict=True))
+    parts = {"lane": ["pedal", "steering"], "racer": ["acceleration", "turn"]}
+    assert [one["lichtblickPanelTitle"] for one in dials] == parts.get(sim, ["action"])
 
 
 def test_the_command_prints_the_url(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,7 @@ import sys
 import textwrap
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import TrainingError, UsageError
 from mcaprl.frames import mapped
-from mcaprl.online.config import CONFIGS
+from mcaprl.online.config import CONFIGS, FINITE_ALGOS
 from mcaprl.online.learning import LearningAgent
 from mcaprl.online.task import Task
 from mcaprl.online.train import OnlineSummary, make_agent, train
@@ -76,15 +76,24 @@ def stop_at(step: int) -> Callable[[TrainingProgress], None]:
         ("dqn", {}),
         ("dqn", {"n_steps": 3}),
         ("ppo", {"rollout_steps": 400, "batch_size": 50}),
+        ("sac", {"n_steps": 3}),
+        ("td3", {}),
+        ("sac of sb3", {}),
+        ("tqc", {}),
     ],
 )
 def test_a_checkpoint_restores_everything(
     tmp_path: Path, algo: str, settings: dict[str, Any]
 ) -> None:
     """A finished run that is resumed writes the same checkpoint, which has all state."""
+    if algo == "tqc":
+        pytest.importorskip("sb3_contrib")
+    algo, _, engine = algo.partition(" of ")
     known = {field.name for field in fields(CONFIGS[algo])}
     given = {name: value for name, value in {**SHORT, **settings}.items() if name in known}
-    task, path = Task.for_sim("lane", algo, **given), tmp_path / "checkpoint.safetensors"
+    sim_options = {} if algo in FINITE_ALGOS else {"actions": "continuous"}
+    task = replace(Task.for_sim("lane", algo, sim_options, **given), engine=engine)
+    path = tmp_path / "checkpoint.safetensors"
     scale = Scale(0.0, 1.0)
     with closing(make_agent(task, "Lane-v0", tmp_path, 0, scale)) as first:
         first.learn(silent)
