@@ -16,7 +16,7 @@ import pytest
 from gymnasium import spaces
 
 import mcaprl
-from mcaprl.api import record_file
+from mcaprl.api import record_files
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.repair.check import check_log
 from tests.support.recordings import ScriptedEnv
@@ -42,7 +42,7 @@ def recording(folder: Path) -> Iterator[tuple[subprocess.Popen[str], list[int]]]
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         try:
-            while not all(path.exists() and path.stat().st_size > 40_000 for path in shards):
+            while not all(path.exists() and path.stat().st_size > 40_000 for path in record_files):
                 assert process.poll() is None, process.communicate()
                 time.sleep(0.05)
             children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text()
@@ -143,7 +143,7 @@ def test_a_request_that_cannot_be_logged_leaves_old_shards(
     before = (tmp_path / "shard-00.mcap").read_bytes()
     text = spaces.Text(3)
     env = ScriptedEnv(text, spaces.Discrete(2), [])
-    monkeypatch.setattr(record_file, "make_limited", lambda sim, limit: env)
+    monkeypatch.setattr(record_files, "make_limited", lambda sim, limit: env)
     with pytest.raises(SpaceError):
         mcaprl.record("Text-v0", tmp_path, policy="random", episodes=2, envs=2, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["shard-00.mcap"]
