@@ -1,4 +1,4 @@
-"""Recording of a file, or of several into a folder: by processes that end with their parent, or Ray."""
+"""Recording of a file, or of several into a folder: by processes of this one, or by Ray."""
 
 from __future__ import annotations
 

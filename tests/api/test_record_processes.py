@@ -42,7 +42,7 @@ def recording(folder: Path) -> Iterator[tuple[subprocess.Popen[str], list[int]]]
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         try:
-            while not all(path.exists() and path.stat().st_size > 40_000 for path in record_files):
+            while not all(path.exists() and path.stat().st_size > 40_000 for path in shards):
                 assert process.poll() is None, process.communicate()
                 time.sleep(0.05)
             children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text()
