@@ -15,8 +15,7 @@ import numpy as np
 from mcaprl.api.environments import all_options, check_names, name_of, trained_options
 from mcaprl.api.policies import by_name
 from mcaprl.api.ranges import ClusterOptions, check_fraction, check_least, check_positive
-from mcaprl.api.record_file import FileRequest, record_file
-from mcaprl.api.shards import record_on_ray, record_shards
+from mcaprl.api.record_files import FileRequest, record_file, record_on_ray, record_shards
 from mcaprl.base_policy import Actor
 from mcaprl.errors import UsageError
 from mcaprl.files import check_log_name

@@ -16,7 +16,7 @@ import pytest
 from gymnasium import spaces
 
 import mcaprl
-from mcaprl.api import record_file
+from mcaprl.api import record_files
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.repair.check import check_log
 from tests.support.recordings import ScriptedEnv
@@ -143,7 +143,7 @@ def test_a_request_that_cannot_be_logged_leaves_old_shards(
     before = (tmp_path / "shard-00.mcap").read_bytes()
     text = spaces.Text(3)
     env = ScriptedEnv(text, spaces.Discrete(2), [])
-    monkeypatch.setattr(record_file, "make_limited", lambda sim, limit: env)
+    monkeypatch.setattr(record_files, "make_limited", lambda sim, limit: env)
     with pytest.raises(SpaceError):
         mcaprl.record("Text-v0", tmp_path, policy="random", episodes=2, envs=2, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["shard-00.mcap"]

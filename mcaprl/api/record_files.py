@@ -1,8 +1,9 @@
-"""Recording of several files into a folder: by processes that end with their parent, or by Ray."""
+"""Recording of a file, or of several into a folder: by processes of this one, or by Ray."""
 
 from __future__ import annotations
 
 import itertools
+import math
 import multiprocessing
 import os
 import shutil
@@ -10,23 +11,24 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from types import FrameType
 from typing import Any, Literal, TypeVar
 
+import gymnasium as gym
 import numpy as np
 
 from mcaprl._interrupt import is_postponed, send_to_main_thread
-from mcaprl.api.policies import SCRIPTED
+from mcaprl.api.policies import SCRIPTED, policies_of, policy_names
 from mcaprl.api.ranges import ClusterOptions
-from mcaprl.api.record_file import FileRequest, record_file, try_request
+from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import LogError, McaprlError, NoStepsError, OutputExistsError
-from mcaprl.files import check_target, locked_file, locked_folder
+from mcaprl.files import check_target, locked_file, locked_folder, work_folder
 from mcaprl.progress import Advance
 from mcaprl.recorder.dataset.log_reader import LogReader
 from mcaprl.recorder.dataset.open import (
@@ -36,10 +38,132 @@ from mcaprl.recorder.dataset.open import (
     unfinished_folder,
     write_manifest,
 )
+from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.format.messages import INTERRUPTED
+from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.recorder.repair.recover import recover_log
-from mcaprl.sims.evaluation.rollout import EpisodeResult
+from mcaprl.sims.evaluation.rollout import (
+    EpisodeResult,
+    EpsilonGreedy,
+    NoisyPolicy,
+    make_limited,
+    make_or_borrow,
+    noisy_name,
+    rollout,
+)
 from mcaprl.texts import counted
+
+
+@dataclass(frozen=True)
+class FileRequest:
+    """One file to record; its fields are the arguments of `record`.
+
+    Attributes:
+        first_episode: Number of the first episode; an episode's seed depends on its number.
+    """
+
+    sim: str | gym.Env[Any, Any]
+    out: Path
+    policy: str | BasePolicy
+    epsilon: float
+    noise: float
+    noise_per_episode: bool
+    episodes: int | None
+    steps: int | None
+    seed: int
+    sim_options: Mapping[str, Any]
+    scene: bool
+    camera: bool
+    infos: bool | Sequence[str]
+    keys: Sequence[str] | None
+    compression: str
+    overwrite: bool
+    append: bool
+    rotate_mb: float | None
+    max_steps: int | None
+    first_episode: int = 0
+
+    @property
+    def policy_name(self) -> str:
+        """Name of the policy in the log."""
+        given = self.policy
+        name = given.name if isinstance(given, BasePolicy) else policy_names([given])[given]
+        return noisy_name(name, self.noise, per_episode=self.noise_per_episode)
+
+
+def record_file(
+    request: FileRequest, on_episode: Callable[[EpisodeResult], None] | None = None
+) -> list[EpisodeResult]:
+    """Record one file in this process."""
+    with closing(_env(request)) as env:
+        behavior = _behavior(request, env)
+        recorder = _recorder(request, env, behavior)
+
+        name = behavior_field(env.action_space).name
+
+        def set_behavior(value: float) -> None:
+            setattr(recorder, name, value)
+
+        with closing(recorder):
+            return rollout(
+                recorder,
+                behavior,
+                seed=request.seed,
+                episodes=request.episodes,
+                steps=request.steps,
+                # Appended episodes continue the numbering, which determines the seeds.
+                first_episode=request.first_episode + recorder.episodes,
+                on_action=set_behavior,
+                on_episode=on_episode,
+            )
+
+
+def try_request(request: FileRequest) -> None:
+    """Create the file of a request and remove it, to find errors before the first episode.
+
+    Raises:
+        McaprlError: The sim, the policy or another argument is not valid.
+    """
+    with (
+        work_folder(request.out) as trial,
+        closing(_env(request)) as env,
+    ):
+        behavior = _behavior(request, env)
+        _recorder(replace(request, out=trial / "trial.mcap"), env, behavior).close()
+
+
+def _env(request: FileRequest) -> gym.Env[Any, Any]:
+    # A number of steps ends the recording, so it needs no default limit.
+    if request.steps is not None and request.max_steps is None:
+        return make_or_borrow(request.sim, **request.sim_options)
+    return make_limited(request.sim, request.max_steps, **request.sim_options)
+
+
+def _behavior(request: FileRequest, env: gym.Env[Any, Any]) -> EpsilonGreedy:
+    policy, space = policies_of(request.policy, env)[0], env.action_space
+    if request.noise:
+        policy = NoisyPolicy(policy, request.noise, space, per_episode=request.noise_per_episode)
+    return EpsilonGreedy(policy, request.epsilon, space)
+
+
+def _recorder(request: FileRequest, env: gym.Env[Any, Any], behavior: EpsilonGreedy) -> RecordMcap:
+    megabytes = request.rotate_mb
+    return RecordMcap(
+        env,
+        request.out,
+        policy=request.policy_name,
+        epsilon=behavior.epsilon,
+        seed=request.seed,
+        compression=request.compression,
+        overwrite=request.overwrite,
+        append=request.append,
+        max_file_bytes=None if megabytes is None else math.ceil(megabytes * 1e6),
+        scene=request.scene,
+        camera=request.camera,
+        infos=request.infos,
+        keys=request.keys,
+    )
+
 
 if sys.platform != "win32":
     from multiprocessing import resource_tracker
