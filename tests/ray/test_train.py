@@ -145,11 +145,11 @@ def test_a_run_is_resumed_with_and_without_ray(
 def test_weights_of_learners_of_a_box_are_those_of_one_process(tmp_path: Path, algo: str) -> None:
     log, box = tmp_path / "log.mcap", {"pause_s": 0.0, "box": True}
     mcaprl.record(SEEDED, log, policy="random", episodes=8, seed=0, sim_options=box)
-    sizes = {"updates": 40, "batch_size": 16, "hidden": (8, 8), "seeds": 2}
+    sizes: dict[str, Any] = {"updates": 40, "batch_size": 16, "hidden": (8, 8), "seeds": 2}
     if algo != "bc":
         sizes["gamma"] = 0.5
-    for name, workers in (("ray", {"ray": ClusterOptions(workers=2)}), ("local", {})):
-        mcaprl.train(log, tmp_path / name, algo=algo, **workers, **sizes)
+    mcaprl.train(log, tmp_path / "ray", algo=algo, ray=ClusterOptions(workers=2), **sizes)
+    mcaprl.train(log, tmp_path / "local", algo=algo, **sizes)
     for seed in (0, 1):
         for file in ("metrics.csv", "policy.safetensors", "policy.json"):
             mine, theirs = (tmp_path / one / f"seed-{seed}" / file for one in ("ray", "local"))

@@ -186,7 +186,8 @@ def test_new_episodes_of_a_box_are_learned_from(tmp_path: Path, algo: str) -> No
         if now.done == 200:
             recorder.record(2)
 
-    sizes = {"updates": 2 * CHECK_INTERVAL, "hidden": (8,), "batch_size": 8, "log_interval": 100}
+    sizes: dict[str, Any] = {"hidden": (8,), "batch_size": 8, "log_interval": 100}
+    sizes["updates"] = 2 * CHECK_INTERVAL
     with pytest.warns(UserWarning, match="infinite bounds"):
         found = mcaprl.train(data, tmp_path / "run", algo=algo, progress=report, **sizes)
     recorder.env.close()
@@ -196,7 +197,8 @@ def test_new_episodes_of_a_box_are_learned_from(tmp_path: Path, algo: str) -> No
     whole = mcaprl.open(tmp_path / "log.mcap").actions
     assert whole.min() < low
     assert whole.max() > high
-    box = found.policy.head.box
+    head: Any = found.policy.head
+    box = head.box
     np.testing.assert_allclose([box.low[0], box.high[0]], [low, high])
 
 
