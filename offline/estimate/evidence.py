@@ -30,7 +30,7 @@ from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError, UsageError
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.items import returns_to_go
-from mcaprl.offline.estimate.fqe import FQE, FQEConfig
+from mcaprl.offline.estimate.fqe import FQE, BoxFQEConfig, FQEConfig
 from mcaprl.offline.estimate.importance import (
     EpisodeTable,
     Floats,
@@ -84,10 +84,12 @@ class Evidence:
         return {name: one for name, one in vars(self).items() if not isinstance(one, np.ndarray)}
 
 
-def fqe_config(gamma: float, updates: int, hidden: tuple[int, ...] = (64, 64)) -> FQEConfig:
+def fqe_config(
+    gamma: float, updates: int, hidden: tuple[int, ...] = (64, 64), *, is_box: bool = False
+) -> FQEConfig:
     """Return settings of FQE with enough updates of the target network for the discount."""
     interval = max(1, int(updates * (1 - gamma) / _SYNCS_PER_HORIZON))
-    return FQEConfig(
+    return (BoxFQEConfig if is_box else FQEConfig)(
         updates=updates, gamma=gamma, batch_size=128, hidden=hidden, target_interval=interval
     )
 
