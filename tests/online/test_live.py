@@ -259,7 +259,7 @@ def test_the_commands_of_a_box_are_shown(tmp_path: Path, sim: str, algo: str, en
     ends = [(one["minValue"], one["maxValue"]) for one in dials]
     assert ends == list(zip(box.low.tolist(), box.high.tolist(), strict=True))
     parts = {"lane": ["pedal", "steering"], "racer": ["acceleration", "turn"]}
-    assert [one["lichtblickPanelTitle"] for one in dials] == parts.get(sim, ["action"])
+    assert [one["lichtblickPanelTitle"] for one in dials] == parts.get(sim, ["action[0]"])
 
 
 def test_the_command_prints_the_url(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
