@@ -16,6 +16,9 @@ has the command and the scores of four seeds. Important settings are:
   oscillates until the end.
 - `n_steps` is 3 for powerline and racer, whose rewards are sparse or late. Their target networks
   are updated only every 2,000 steps (powerline, `gamma` 0.95) or 4,000 steps (racer, `gamma` 0.98).
+- For continuous actions, `polyak` is 0.02: with 0.005, critics lag behind the policy, and the car
+  of the lane stays slow. `smoothness` makes the commands smooth. The measurements are in
+  docs/decisions/14-continuous-actions.md.
 - Checkpoints are compared on separate episodes and the best one is stored, because scores can still
   drop during training.
 """
@@ -211,7 +214,7 @@ class ActorCriticConfig(ReplayConfig):
     data_fraction: float = 0.5
     """fraction of each batch that is drawn from given logs; 0 copies them to the replay buffer"""
     smoothness: float = 0.0
-    """weight of the mean change of the actor's action until the next state, in [-1, 1]"""
+    """weight of the mean change of the actions in [-1, 1] from a state to the next one"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -512,18 +515,20 @@ _BOX: Final[dict[str, Any]] = {
     "learning_starts": 1_000,
     "eval_interval": 2_000,
     "buffer_size": 100_000,
+    "polyak": 0.02,
     "smoothness": 0.1,
 }
 BOX_SETTINGS: Final[dict[str, dict[str, Any]]] = {
-    "lane": {**_BOX, "steps": 60_000, "gamma": 0.97},
+    "lane": {**_BOX, "steps": 80_000, "gamma": 0.97},
     "racer": {**_BOX, "steps": 40_000, "gamma": 0.98},
-    "powerline": {**_BOX, "steps": 60_000, "gamma": 0.95, "n_steps": 3},
+    "powerline": {**_BOX, "steps": 100_000, "gamma": 0.95, "n_steps": 3, "smoothness": 0.2},
     "highway-lane": {**_BOX, "steps": 40_000, "gamma": 0.97},
 }
 """Settings for continuous actions that differ from the algorithm's defaults, by sim."""
 BOX_ALGO_SETTINGS: Final[dict[str, dict[str, Any]]] = {
     "sac": {"target_entropy": -2.0},
     "td3": {"exploration_noise": 0.2},
+    "tqc": {"target_entropy": -2.0},
 }
 """Settings of each algorithm in addition to those of `BOX_SETTINGS`."""
 
@@ -598,9 +603,17 @@ def warm_settings(algo: str, *, with_logs: bool, with_policy: bool) -> dict[str,
     )
 
 
-def reference_settings(algo: str) -> dict[str, Any]:
+def reference_settings(algo: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that replace the tuned ones of a sim, because SB3 lacks them."""
-    return {"smoothness": 0.0} if issubclass(CONFIGS[algo], ActorCriticConfig) else {}
+    if not issubclass(CONFIGS[algo], ActorCriticConfig):
+        return {}
+    images = {"image_shift": 0, "encoder": "nature", "center_images": False}
+    return {"smoothness": 0.0, **(images if _has_images(sim_options) else {})}
+
+
+def _has_images(sim_options: Mapping[str, Any]) -> bool:
+    """Return whether the observations of one of our sims have images."""
+    return sim_options.get("observation", "state") not in ("state", "rays")
 
 
 def settings_for(algo: str, sim: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
@@ -614,10 +627,10 @@ def settings_for(algo: str, sim: str, sim_options: Mapping[str, Any]) -> dict[st
     from mcaprl.sims import SIMS
 
     spec = SIMS.find(SIMS.get(sim, sim), loads=False)
-    name, observation = spec.name if spec else sim, sim_options.get("observation", "state")
+    name = spec.name if spec else sim
     is_box = issubclass(CONFIGS[algo], ActorCriticConfig)
-    if observation in ("state", "rays"):
+    if not _has_images(sim_options):
         settings = BOX_SETTINGS.get(name, {}) if is_box else SIM_SETTINGS.get(name, {})
         return {**settings, **(BOX_ALGO_SETTINGS[algo] if is_box and settings else {})}
     images = BOX_IMAGE_SETTINGS if is_box else IMAGE_SETTINGS
-    return dict(images.get((name, observation), {}))
+    return dict(images.get((name, sim_options["observation"]), {}))

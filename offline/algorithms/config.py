@@ -281,7 +281,7 @@ class TD3Config(ActorCriticConfig):
     noise_clip: float = 0.5
     """largest noise on target actions, as a fraction of half the Box"""
     smoothness: float = 0.0
-    """weight of the mean change of the actor's action until the next state, in [-1, 1]"""
+    """weight of the mean change of the actions in [-1, 1] from a state to the next one"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -301,7 +301,7 @@ class SACConfig(ActorCriticConfig):
     target_entropy: float = -1.0
     """entropy per number of an action in [-1, 1] to which the temperature is tuned"""
     smoothness: float = 0.0
-    """weight of the mean change of the actor's action until the next state, in [-1, 1]"""
+    """weight of the mean change of the actions in [-1, 1] from a state to the next one"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""

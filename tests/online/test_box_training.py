@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,7 +15,7 @@ import torch
 from gymnasium import spaces
 
 import mcaprl
-from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
+from mcaprl.errors import MissingExtraError, SpaceError, TrainingError, UnknownNameError, UsageError
 from mcaprl.offline.algorithms.heads import Deterministic, SquashedGaussian
 from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.training.train import train as train_offline
@@ -261,6 +262,24 @@ def test_an_agent_continues_an_offline_policy(tmp_path: Path, offline: str, algo
         agent.close()
 
 
+def test_a_missing_package_is_named_before_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "sb3_contrib", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'mcaprl\[contrib\]'"):
+        mcaprl.train_online("lane", tmp_path / "run", algo="tqc", actions="continuous")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_reference_has_settings_that_it_supports() -> None:
+    options = {"observation": "dashboard", "actions": "continuous"}
+    own = choose_task("lane", "td3", options, {}).config.to_json()
+    reference = choose_task("lane", "td3", options, {}, engine="sb3").config.to_json()
+    changed = {name: reference[name] for name in own if own[name] != reference[name]}
+    assert changed == {"image_shift": 0, "encoder": "nature", "center_images": False}
+    assert own["gamma"] == reference["gamma"] == 0.97
+
+
 def test_wrong_combinations_name_those_that_fit(tmp_path: Path) -> None:
     vector, box, buttons = spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,)), spaces.Discrete(5)
     with pytest.raises(SpaceError, match=r"double-dqn needs discrete actions; for Box\(2,\) use s"):
@@ -300,8 +319,8 @@ def test_runs_of_versions_without_a_setting_are_resumed(tmp_path: Path) -> None:
     written = json.loads(path.read_text())
     assert written["config"].pop("smoothness") == 0
     path.write_text(json.dumps(written))
-    train(Task.of_run(tmp_path), tmp_path, resume=True, progress=silent)
-    train(task, tmp_path, resume=True, progress=silent)
     other = Task.for_sim(PENDULUM, "sac", **SHORT, smoothness=1.0)
     with pytest.raises(TrainingError, match=r"has smoothness None, not 1\.0"):
         train(other, tmp_path, resume=True, progress=silent)
+    (summary,) = train(task, tmp_path, resume=True, progress=silent)
+    assert summary.resumed_at == SHORT["steps"]
