@@ -573,8 +573,11 @@ _BOX_FROM_IMAGES: Final[dict[str, Any]] = {
     "image_shift": 2,
     "eval_interval": 20_000,
 }
+_BOX_LANE_IMAGES: Final[dict[str, Any]] = {**_BOX_FROM_IMAGES, "steps": 200_000, "gamma": 0.97}
 BOX_IMAGE_SETTINGS: Final[dict[tuple[str, str], dict[str, Any]]] = {
-    ("lane", "dashboard"): {**_BOX_FROM_IMAGES, "steps": 200_000, "gamma": 0.97},
+    ("lane", "dashboard"): _BOX_LANE_IMAGES,
+    ("lane", "depth"): {**_BOX_LANE_IMAGES, "frame_stack": 4},
+    ("lane", "depth-commands"): {**_BOX_LANE_IMAGES, "frame_stack": 4},
     ("powerline", "depth"): {**_BOX_FROM_IMAGES, "steps": 240_000, "gamma": 0.95, "n_steps": 3},
 }
 """Settings for continuous actions from images, which were not tuned."""
