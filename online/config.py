@@ -610,7 +610,8 @@ def reference_settings(algo: str, sim_options: Mapping[str, Any]) -> dict[str, A
     """Return the settings that replace the tuned ones of a sim, because SB3 lacks them."""
     if not issubclass(CONFIGS[algo], ActorCriticConfig):
         return {}
-    images = {"image_shift": 0, "encoder": "nature", "center_images": False}
+    # Its buffer of Dict observations has no n-step returns.
+    images = {"image_shift": 0, "encoder": "nature", "center_images": False, "n_steps": 1}
     return {"smoothness": 0.0, **(images if _has_images(sim_options) else {})}
 
 

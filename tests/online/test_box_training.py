@@ -278,6 +278,10 @@ def test_a_reference_has_settings_that_it_supports() -> None:
     changed = {name: reference[name] for name in own if own[name] != reference[name]}
     assert changed == {"image_shift": 0, "encoder": "nature", "center_images": False}
     assert own["gamma"] == reference["gamma"] == 0.97
+    options = {"observation": "depth", "actions": "increments"}
+    assert (
+        choose_task("powerline", "sac", options, {}, engine="sb3").config.to_json()["n_steps"] == 1
+    )
 
 
 def test_wrong_combinations_name_those_that_fit(tmp_path: Path) -> None:
