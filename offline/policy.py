@@ -365,6 +365,8 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
     for name, outputs in description.outputs.items():
         architecture = architecture_of(description.critics.get(name, description.architecture))
         width, seen = encoder.width * stack, images
+        if name == ENCODER and not images:
+            raise ValueError("there are no images to encode")
         if name == ENCODER:
             width, architecture = 0, architecture.of_encoder()
         elif ENCODER in description.outputs:

@@ -1,4 +1,4 @@
-"""Online learning with recording: Double DQN, and DQN, PPO and A2C of Stable-Baselines3.
+"""Online learning with recording: Double DQN, SAC, TD3, and algorithms of Stable-Baselines3.
 
 Importing this package does not import torch; the first use of one of its names does.
 

@@ -528,6 +528,7 @@ BOX_SETTINGS: Final[dict[str, dict[str, Any]]] = {
 BOX_ALGO_SETTINGS: Final[dict[str, dict[str, Any]]] = {
     "sac": {"target_entropy": -2.0},
     "td3": {"exploration_noise": 0.2},
+    "tqc": {"target_entropy": -2.0},
 }
 """Settings of each algorithm in addition to those of `BOX_SETTINGS`."""
 
@@ -572,8 +573,11 @@ _BOX_FROM_IMAGES: Final[dict[str, Any]] = {
     "image_shift": 2,
     "eval_interval": 20_000,
 }
+_BOX_LANE_IMAGES: Final[dict[str, Any]] = {**_BOX_FROM_IMAGES, "steps": 200_000, "gamma": 0.97}
 BOX_IMAGE_SETTINGS: Final[dict[tuple[str, str], dict[str, Any]]] = {
-    ("lane", "dashboard"): {**_BOX_FROM_IMAGES, "steps": 200_000, "gamma": 0.97},
+    ("lane", "dashboard"): _BOX_LANE_IMAGES,
+    ("lane", "depth"): {**_BOX_LANE_IMAGES, "frame_stack": 4},
+    ("lane", "depth-commands"): {**_BOX_LANE_IMAGES, "frame_stack": 4},
     ("powerline", "depth"): {**_BOX_FROM_IMAGES, "steps": 240_000, "gamma": 0.95, "n_steps": 3},
 }
 """Settings for continuous actions from images, which were not tuned."""
@@ -602,9 +606,18 @@ def warm_settings(algo: str, *, with_logs: bool, with_policy: bool) -> dict[str,
     )
 
 
-def reference_settings(algo: str) -> dict[str, Any]:
+def reference_settings(algo: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that replace the tuned ones of a sim, because SB3 lacks them."""
-    return {"smoothness": 0.0} if issubclass(CONFIGS[algo], ActorCriticConfig) else {}
+    if not issubclass(CONFIGS[algo], ActorCriticConfig):
+        return {}
+    # Its buffer of Dict observations has no n-step returns.
+    images = {"image_shift": 0, "encoder": "nature", "center_images": False, "n_steps": 1}
+    return {"smoothness": 0.0, **(images if _has_images(sim_options) else {})}
+
+
+def _has_images(sim_options: Mapping[str, Any]) -> bool:
+    """Return whether the observations of one of our sims have images."""
+    return sim_options.get("observation", "state") not in ("state", "rays")
 
 
 def settings_for(algo: str, sim: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
@@ -618,10 +631,10 @@ def settings_for(algo: str, sim: str, sim_options: Mapping[str, Any]) -> dict[st
     from mcaprl.sims import SIMS
 
     spec = SIMS.find(SIMS.get(sim, sim), loads=False)
-    name, observation = spec.name if spec else sim, sim_options.get("observation", "state")
+    name = spec.name if spec else sim
     is_box = issubclass(CONFIGS[algo], ActorCriticConfig)
-    if observation in ("state", "rays"):
+    if not _has_images(sim_options):
         settings = BOX_SETTINGS.get(name, {}) if is_box else SIM_SETTINGS.get(name, {})
         return {**settings, **(BOX_ALGO_SETTINGS[algo] if is_box and settings else {})}
     images = BOX_IMAGE_SETTINGS if is_box else IMAGE_SETTINGS
-    return dict(images.get((name, observation), {}))
+    return dict(images.get((name, sim_options["observation"]), {}))

@@ -412,6 +412,7 @@ class MixedBuffer(ReplayBuffer):
         return super().state() | {f"log.{name}": part for name, part in _log_parts(self.log)}
 
 
+_IMAGES_AT_ONCE = 4_096
 _LOG_PARTS = ("starts", "places", "actions", "returns")
 
 
@@ -432,8 +433,9 @@ def packed_log(dataset: Dataset, buffer: ReplayBuffer) -> TransitionBuffer:
     packed = TransitionBuffer.from_dataset(
         dataset, buffer.packing, encoder=buffer.encoder, reward_scale=1.0, box=buffer.box
     )
-    frames = packed.frames.rows(torch.arange(len(packed.frames)))
-    return replace(packed, frames=_averaged(frames, buffer.pools))
+    blocks = torch.arange(len(packed.frames)).split(_IMAGES_AT_ONCE)
+    frames = [_averaged(packed.frames.rows(rows), buffer.pools) for rows in blocks]
+    return replace(packed, frames=_joined(*frames))
 
 
 def restored_log(tensors: Mapping[str, Tensor], buffer: ReplayBuffer) -> TransitionBuffer:
@@ -455,9 +457,9 @@ def restored_log(tensors: Mapping[str, Tensor], buffer: ReplayBuffer) -> Transit
     )
 
 
-def _joined(first: Observations, last: Observations) -> Observations:
-    parts = zip(first.parts(), last.parts(), strict=True)
-    return first.like([torch.cat(pair) for pair in parts])
+def _joined(*blocks: Observations) -> Observations:
+    parts = zip(*(block.parts() for block in blocks), strict=True)
+    return blocks[0].like([torch.cat(part) for part in parts])
 
 
 def _averaged(observations: Observations, pools: Sequence[int]) -> Observations:

@@ -59,6 +59,7 @@ from mcaprl.online.config import (
     ReplayConfig,
     SACConfig,
     TD3Config,
+    TQCConfig,
 )
 from mcaprl.online.features import (
     NetworkDQNPolicy,
@@ -364,12 +365,13 @@ def _check(algo: str, config: OnlineConfig, space: spaces.Space[Any]) -> None:
     """Refuse settings that SB3's algorithms with a replay buffer do not have."""
     if not isinstance(config, ReplayConfig):
         return
-    lacks = ("image_shift", "exploration_decay", "target_update_episodes")
+    lacks: tuple[str, ...] = ("image_shift", "exploration_decay", "target_update_episodes")
     lacks += ("critic_layer_norm", "smoothness")
     given = [name for name in lacks if getattr(config, name, False)]
     if config.n_steps > 1 and isinstance(space, spaces.Dict):
         given.append("n_steps for Dict observations")
-    own = "use `algo='double-dqn'`" if isinstance(config, DQNConfig) else "omit `engine='sb3'`"
+    others = {DQNConfig: "use `algo='double-dqn'`", TQCConfig: "use `algo='sac'`"}
+    own = others.get(type(config), "omit `engine='sb3'`")
     if given:
         raise UsageError(f"{algo} of Stable-Baselines3 has no {given[0]}: omit it, or {own}")
     if isinstance(config, ActorCriticConfig) and own_architecture(config, space) is not None:

@@ -253,12 +253,11 @@ def choose_task(
     `with_logs` and `with_policy` say what the agents start from.
     """
     is_resumed = resumed is not None and run_to_resume(resumed)
-    is_other = with_logs or with_policy or engine == "sb3"
-    if sim is not None and preset is None and not is_resumed and is_other:
+    if sim is not None and preset is None and not is_resumed:
         algo = algo or default_algo(sim, sim_options)
         find_config(algo)
-        if engine == "sb3":
-            replaced = reference_settings(algo)
+        if choose_engine(algo, engine) == "sb3":
+            replaced = reference_settings(algo, sim_options)
         else:
             replaced = warm_settings(algo, with_logs=with_logs, with_policy=with_policy)
         given = {**replaced, **given}

@@ -6,7 +6,7 @@ LOG has mixed behavior, such as FOLDER/lane/mixed of `benchmarks.studies.box_gri
 `--data`, such a log is recorded. The rows of the table:
 
     nothing            SAC without a log
-    filled buffer      SAC whose replay buffer contains the log at the start
+    filled buffer      SAC whose replay buffer contains the log at the start; new steps replace it
     half of each batch SAC with the log beside the replay buffer (RLPD)
     iql                offline IQL, continued by SAC
     td3-bc, rebrac     offline TD3+BC and ReBRAC, continued by TD3

@@ -85,9 +85,10 @@ def test_the_encoder_learns_from_the_critics_alone(kind: type[ActorCriticConfig]
     assert sorted(weights) == ["actor", "encoder", "q"]
     learner.step = 1  # The actor of TD3 is due.
     terms = learner.losses(learner.encoded(drawn(learner)))
-    given = {"allow_unused": True, "retain_graph": True}
     for term, moved in (("td_loss", ["encoder", "q"]), ("policy_loss", ["actor"])):
-        found = torch.autograd.grad(terms[term].sum(), list(weights.values()), **given)
+        found = torch.autograd.grad(
+            terms[term].sum(), list(weights.values()), allow_unused=True, retain_graph=True
+        )
         gradients = dict(zip(weights, found, strict=True))
         changed = [name for name, one in gradients.items() if one is not None and one.any()]
         assert sorted(changed) == moved, term
@@ -151,8 +152,35 @@ def test_a_run_from_images_is_saved_resumed_and_continued(tmp_path: Path, algo: 
         stack = {name: np.stack([part[:5], part[1:6]], 1) for name, part in data.frames.items()}
         np.testing.assert_allclose(agent.policy.act(stack), policy.act(stack), atol=1e-4)
         taken = data.actions[:5]
-        values = (one.action_values(stack, taken) for one in (agent.policy, policy))
-        np.testing.assert_allclose(*values, rtol=1e-3, atol=1e-3)
+        first, second = (one.action_values(stack, taken) for one in (agent.policy, policy))
+        np.testing.assert_allclose(first, second, rtol=1e-3, atol=1e-3)
+    finally:
+        agent.close()
+
+
+def test_logged_images_are_averaged_as_stored_ones(tmp_path: Path) -> None:
+    log = tmp_path / "log.mcap"
+    mcaprl.record("powerline", log, steps=30, noise=0.1, **DRONE)
+    data = mcaprl.open(log)
+    task = choose_task("powerline", "td3", DRONE, {**SHORT, "image_shift": 0}, with_logs=True)
+    agent = LearningAgent(task, "", tmp_path, 0, Scale(0, 1))
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("mcaprl.online.replay._IMAGES_AT_ONCE", 7)
+            agent.start_from(data, None)
+        agent._begin()
+        agent.agents.step()
+        buffer = agent.agents.buffer
+        batch = buffer.batch(buffer.draw(4, ()))
+        images = data.observations["depth"].reshape(-1, 42, 2, 42, 2).mean((2, 4))
+        found = batch.observations.images[0][2:, :, :, 0].numpy()
+        for image, reward in zip(found, batch.rewards[2:].tolist(), strict=True):
+            # Rewards of three steps identify the row.
+            sums = data.rewards.copy()
+            for step in (1, 2):
+                sums[:-step] += 0.95**step * data.rewards[step:]
+            row = np.abs(sums - reward).argmin()
+            assert np.abs(images[row] - image).max() <= 0.51
     finally:
         agent.close()
 

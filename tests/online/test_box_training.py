@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,7 +15,7 @@ import torch
 from gymnasium import spaces
 
 import mcaprl
-from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
+from mcaprl.errors import MissingExtraError, SpaceError, TrainingError, UnknownNameError, UsageError
 from mcaprl.offline.algorithms.heads import Deterministic, SquashedGaussian
 from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.training.train import train as train_offline
@@ -259,6 +260,28 @@ def test_an_agent_continues_an_offline_policy(tmp_path: Path, offline: str, algo
         assert agent.agents.epsilon == 0
     finally:
         agent.close()
+
+
+def test_a_missing_package_is_named_before_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "sb3_contrib", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'mcaprl\[contrib\]'"):
+        mcaprl.train_online("lane", tmp_path / "run", algo="tqc", actions="continuous")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_reference_has_settings_that_it_supports() -> None:
+    options = {"observation": "dashboard", "actions": "continuous"}
+    own = choose_task("lane", "td3", options, {}).config.to_json()
+    reference = choose_task("lane", "td3", options, {}, engine="sb3").config.to_json()
+    changed = {name: reference[name] for name in own if own[name] != reference[name]}
+    assert changed == {"image_shift": 0, "encoder": "nature", "center_images": False}
+    assert own["gamma"] == reference["gamma"] == 0.97
+    options = {"observation": "depth", "actions": "increments"}
+    assert (
+        choose_task("powerline", "sac", options, {}, engine="sb3").config.to_json()["n_steps"] == 1
+    )
 
 
 def test_wrong_combinations_name_those_that_fit(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import json
 import math
 from collections import Counter
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import UsageError
 from mcaprl.online.live import TRAINING_LABELS, LiveTraining
-from mcaprl.online.task import Task
+from mcaprl.online.task import Task, choose_task
 from mcaprl.online.train import train
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.format import messages
@@ -233,7 +232,7 @@ def test_the_commands_of_a_box_are_shown(tmp_path: Path, sim: str, algo: str, en
     given = {"rollout_steps": 40, "batch_size": 20} if algo == "ppo" else {"learning_starts": 40}
     short = {**SHORT, "steps": 80, "eval_interval": 80, "hidden": (8, 8)}
     del short["learning_starts"]
-    task = replace(Task.for_sim(sim, algo, options, **short, **given), engine=engine)
+    task = choose_task(sim, algo, options, {**short, **given}, engine=engine or None)
     log = tmp_path / "log.mcap"
     seen = watched(task, tmp_path / "run", record=log)
     steps, values, data = decoded(seen, "/rl/step"), decoded(seen, "/rl/values"), mcaprl.open(log)
@@ -259,7 +258,7 @@ def test_the_commands_of_a_box_are_shown(tmp_path: Path, sim: str, algo: str, en
     ends = [(one["minValue"], one["maxValue"]) for one in dials]
     assert ends == list(zip(box.low.tolist(), box.high.tolist(), strict=True))
     parts = {"lane": ["pedal", "steering"], "racer": ["acceleration", "turn"]}
-    assert [one["lichtblickPanelTitle"] for one in dials] == parts.get(sim, ["action"])
+    assert [one["lichtblickPanelTitle"] for one in dials] == parts.get(sim, ["action[0]"])
 
 
 def test_the_command_prints_the_url(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

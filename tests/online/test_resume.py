@@ -12,7 +12,7 @@ import sys
 import textwrap
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from mcaprl.errors import TrainingError, UsageError
 from mcaprl.frames import mapped
 from mcaprl.online.config import CONFIGS, FINITE_ALGOS
 from mcaprl.online.learning import LearningAgent
-from mcaprl.online.task import Task
+from mcaprl.online.task import Task, choose_task
 from mcaprl.online.train import OnlineSummary, make_agent, train
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.open import GrowingLogs
@@ -92,7 +92,7 @@ def test_a_checkpoint_restores_everything(
     known = {field.name for field in fields(CONFIGS[algo])}
     given = {name: value for name, value in {**SHORT, **settings}.items() if name in known}
     sim_options = {} if algo in FINITE_ALGOS else {"actions": "continuous"}
-    task = replace(Task.for_sim("lane", algo, sim_options, **given), engine=engine)
+    task = choose_task("lane", algo, sim_options, given, engine=engine or None)
     path = tmp_path / "checkpoint.safetensors"
     scale = Scale(0.0, 1.0)
     with closing(make_agent(task, "Lane-v0", tmp_path, 0, scale)) as first:
