@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -36,6 +36,8 @@ STOPPED_EARLY: Final = "stopped early"
 """Outcome of a candidate that was not trained with all updates, or cannot be chosen."""
 DETERMINISTIC: Final = 0.05
 """If the entropy of the behavior policy is lower, candidates are rated by agreement with it."""
+ESTIMATE, AGREEMENT, PRIOR, UNTESTED = "estimate", "agreement", "prior order", "untested"
+"""Rules that decide."""
 _FEW_EPISODES: Final = 50
 _LOW_COVERAGE: Final = 0.5
 
@@ -110,6 +112,8 @@ class Tried:
         weighted: Estimate by WPDIS, and the effective number of episodes of this estimate; None
             if the log has no action probabilities.
         outcome: `chosen`, `runner-up`, `stopped early`, or why it was not trained.
+        behavior: Mean estimate of the behavior of the log by the models of the candidate; None for
+            finite action spaces.
     """
 
     updates: int = 0
@@ -118,6 +122,7 @@ class Tried:
     bellman_error: float | None = None
     weighted: tuple[float, float] | None = None
     outcome: str = ""
+    behavior: float | None = None
 
     def row(self, name: str) -> tuple[str, ...]:
         """Return the row of the table of candidates."""
@@ -140,6 +145,58 @@ class Tried:
 
 
 @dataclass(frozen=True)
+class BehaviorCheck:
+    """What the models of the candidates say of the behavior, whose value the log shows.
+
+    Attributes:
+        estimate: Mean estimated discounted return of the logged episodes.
+        logged: Mean discounted return of these episodes.
+        interval: 95 % interval of `logged`.
+    """
+
+    estimate: float
+    logged: float
+    interval: tuple[float, float]
+
+    @property
+    def passed(self) -> bool:
+        """Whether the estimate is within the interval."""
+        return self.interval[0] <= self.estimate <= self.interval[1]
+
+    def __str__(self) -> str:
+        """Return both values in words."""
+        low, high = self.interval
+        return (
+            f"the models estimate {self.estimate:.4g} for the behavior of the log, whose mean"
+            f" discounted return is {self.logged:.4g} ({low:.4g} to {high:.4g})"
+        )
+
+
+def decide(
+    ratings: Mapping[str, Rating], prior: Sequence[str], check: BehaviorCheck | None
+) -> tuple[str, str]:
+    """Choose by the estimates if they can be trusted, else by the prior order.
+
+    The estimates can be trusted if they are right for the behavior, and the interval of the
+    candidate with the largest estimate is above that of the first candidate of the prior order.
+
+    Args:
+        ratings: Ratings by candidate, the best first.
+        prior: All rated candidates in the order in which they are preferred without estimates.
+        check: Estimate of the behavior.
+
+    Returns:
+        The chosen candidate, and the rule that decided.
+    """
+    best, usual = next(iter(ratings)), prior[0]
+    if check is None or not check.passed:
+        return usual, PRIOR
+    if best == usual or ratings[best].interval[0] > ratings[usual].interval[1]:
+        return best, ESTIMATE
+    return usual, PRIOR
+
+
+@dataclass(frozen=True)
 class Choice:
     """Policy that `auto` chose, and the reason.
 
@@ -151,6 +208,8 @@ class Choice:
         complete: Whether all planned training and evaluation was done within the budget.
         traits: Properties of the log.
         tried: What is known of each candidate, by name, from the best to the worst.
+        rule: Rule that decided: `ESTIMATE`, `AGREEMENT`, `PRIOR` or `UNTESTED`.
+        check: What the models say of the behavior; None for finite action spaces.
     """
 
     chosen: str
@@ -160,15 +219,24 @@ class Choice:
     complete: bool
     traits: LogTraits
     tried: dict[str, Tried]
+    rule: str = ""
+    check: BehaviorCheck | None = None
 
     @classmethod
     def of(
-        cls, chosen: str, evaluated: int, traits: LogTraits, tried: dict[str, Tried], complete: bool
+        cls,
+        chosen: str,
+        rule: str,
+        evaluated: int,
+        traits: LogTraits,
+        tried: dict[str, Tried],
+        complete: bool,
+        check: BehaviorCheck | None = None,
     ) -> Choice:
         """Put a choice among this number of evaluated candidates into words."""
-        reason, confidence = _words(chosen, tried[chosen].rating, evaluated, traits)
+        reason, confidence = _words(chosen, rule, tried, evaluated, traits, check)
         advice = _advice(traits, tried, complete)
-        return cls(chosen, reason, confidence, advice, complete, traits, tried)
+        return cls(chosen, reason, confidence, advice, complete, traits, tried, rule, check)
 
     @property
     def rows(self) -> list[tuple[str, ...]]:
@@ -203,24 +271,43 @@ def read_choice(run: Path) -> Choice:
 
 
 def _words(
-    chosen: str, rating: Rating | None, evaluated: int, traits: LogTraits
+    chosen: str,
+    rule: str,
+    tried: Mapping[str, Tried],
+    evaluated: int,
+    traits: LogTraits,
+    check: BehaviorCheck | None,
 ) -> tuple[str, str]:
     """Return why the rule chose a candidate, and the confidence in the choice."""
+    rating = tried[chosen].rating
     if rating is None:
         reason = f"{chosen} is used because the budget ended before any candidate was evaluated."
         return reason, "Unknown, because no candidate was evaluated."
     count = counted(evaluated, "candidate")
-    reason = f"{chosen} has the largest estimated value of {count}: {rating}."
-    if traits.is_deterministic:
+    confidence = (
+        f"In {rating.best_chance:.0%} of the resamplings of episodes, networks and models, {chosen}"
+        f" is the best of {count}. This does not include the bias of the models, which a log does"
+        " not show."
+    )
+    if rule == AGREEMENT:
         reason = (
             f"{chosen} takes the logged action in {rating.agreement:.0%} of the states, most often"
             f" of {count}. The behavior is almost deterministic (entropy {traits.entropy:.2f} of"
             " 1), so the log has no evidence that other actions are better."
         )
+        return reason, confidence
+    if rule == ESTIMATE:
+        reason = f"{chosen} has the largest estimated value of {count}: {rating}."
+        return reason, confidence if check is None else f"{confidence} For comparison, {check}."
+    why = "the intervals of the estimates overlap"
+    if check is not None and not check.passed:
+        why = f"the estimates cannot be trusted: {check}"
+    reason = (
+        f"{chosen} has the best mean score on logs of our sims among {count}, and decides because"
+        f" {why}."
+    )
     return reason, (
-        f"In {rating.best_chance:.0%} of the resamplings of episodes, networks and models, {chosen}"
-        f" is the best of {count}. This does not include the bias of the models, which a log does"
-        " not show."
+        f"As good as its mean over other logs: no estimate of this log decided. {confidence}"
     )
 
 
