@@ -82,11 +82,10 @@ def expected_sarsa_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, pi_t: Te
     return r_t + discount_t * (pi_t * q_t).sum(1)
 
 
-def square_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:
-    """Return half the squared error (B,) of Q(s, a), whose minimum is at the mean target."""
-    _check_actions(q_tm1, a_tm1)
-    _check_shape("target_tm1", target_tm1, (len(q_tm1),))
-    return 0.5 * (chosen(q_tm1, a_tm1) - target_tm1).square()
+def square_regression(v_tm1: Tensor, target_tm1: Tensor) -> Tensor:
+    """Return half the squared error (B,) of values (B,), whose minimum is at the mean target."""
+    _check_shape("target_tm1", target_tm1, v_tm1.shape)
+    return 0.5 * (v_tm1 - target_tm1).square()
 
 
 def temporal_difference_loss(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:

@@ -4,7 +4,8 @@
 
 Q learns the target r + gamma sum_a pi(a|s') Q'(s', a), where pi is the evaluated policy and Q' is
 the target network, which is synced every `target_interval` updates. A truncated episode would have
-continued, so only `terminated` ends the return.
+continued, so only `terminated` ends the return. For the actions of a Box, Q has the action as an
+additional input, and the target is r + gamma Q'(s', a') with one action a' of the policy.
 
 Departures from the paper: gradient steps on random batches between two syncs replace a fit to
 convergence. Targets are clipped to the range of possible returns, because the network's values of
@@ -29,6 +30,7 @@ from mcaprl.offline.batches.packing import Packing
 
 SYNCS_PER_HORIZON = 5.0
 """Minimum number of syncs per effective horizon 1 / (1 - gamma) after which Q can converge."""
+_ROWS_AT_ONCE = 1024
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ class FQEConfig(TrainingConfig):
     """discount per step"""
     target_interval: int = 50
     """updates between two syncs of the target network"""
+    scale_rewards: bool = False
+    """divide rewards by the standard deviation of the discounted returns of the log"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -54,7 +58,12 @@ class FQEConfig(TrainingConfig):
 
         n-step returns are not used, because they depend on the behavior policy.
         """
-        return Packing(gamma=self.gamma)
+        return Packing(
+            normalize=self.normalize,
+            gamma=self.gamma,
+            scale_rewards=self.scale_rewards,
+            clip_actions=self.clip_actions,
+        )
 
     @property
     def enough_syncs(self) -> bool:
@@ -64,6 +73,20 @@ class FQEConfig(TrainingConfig):
         """
         syncs = self.updates / self.target_interval
         return syncs * (1 - self.gamma) >= SYNCS_PER_HORIZON
+
+
+@dataclass(frozen=True)
+class BoxFQEConfig(FQEConfig):
+    """Settings of fitted Q evaluation for the actions of a Box."""
+
+    batch_size: int = 128
+    """transitions in one gradient update, drawn with replacement"""
+    hidden: tuple[int, ...] = (64, 64)
+    """widths of the hidden layers"""
+    normalize: bool = True
+    """normalize the network's inputs to mean 0 and standard deviation 1 over the data"""
+    scale_rewards: bool = True
+    """divide rewards by the standard deviation of the discounted returns of the log"""
 
 
 class FQE(Learner):
@@ -90,13 +113,14 @@ class FQE(Learner):
             buffer: N transitions of the log.
             seeds: Seeds of the weights and batches of each of K policies. Equal seeds give equal
                 initial weights and batches, which reduces the noise of differences.
-            pi_t: Probabilities (K, N, A) of each policy in each next state.
-            fixed_v_t: Fixed values (K, N) of next states; NaN where the value is learned. Default:
-                all values are learned.
+            pi_t: Probabilities (K, N, A) of each policy in each next state; for a Box, its actions
+                (K, N, n), scaled by the buffer's `box`.
+            fixed_v_t: Fixed values (K, N) of next states, in units of the logged rewards; NaN where
+                the value is learned. Default: all values are learned.
         """
         super().__init__(config, buffer, seeds)
         self._pi_t = pi_t.flatten(0, 1)
-        self._fixed_v_t = None if fixed_v_t is None else fixed_v_t.flatten()
+        self._fixed_v_t = None if fixed_v_t is None else fixed_v_t.flatten() / buffer.reward_scale
         networks = torch.arange(len(seeds), device=buffer.device)
         self._offsets = (networks * len(buffer)).repeat_interleave(config.batch_size)
         self.target_network = self.add_target_network("q", config.target_interval)
@@ -110,23 +134,73 @@ class FQE(Learner):
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return half the squared temporal difference."""
-        q_tm1 = self.outputs("q", batch.observations)
-        q_t = self.target_network.outputs(batch).clamp(self.low, self.high)
         rows = batch.rows + self._offsets
-        pi_t = self._pi_t.index_select(0, rows)
-        target_tm1 = expected_sarsa_target(batch.rewards, batch.discounts, q_t, pi_t)
+        target_tm1 = self.targets(batch, self._pi_t.index_select(0, rows))
         if self._fixed_v_t is not None:
             fixed_v_t = self._fixed_v_t.index_select(0, rows)
             fixed_tm1 = batch.rewards + batch.discounts * fixed_v_t
             target_tm1 = torch.where(fixed_v_t.isnan(), target_tm1, fixed_tm1)
-        td_loss = square_regression(q_tm1, batch.actions, target_tm1)
-        return {"mean_q": chosen(q_tm1, batch.actions), "loss": td_loss}
+        q_tm1 = self.logged_values(batch)
+        return {"mean_q": q_tm1, "loss": square_regression(q_tm1, target_tm1)}
+
+    def targets(self, batch: Batch, pi_t: Tensor) -> Tensor:
+        """Return the targets (R,), given rows (R, ...) of `pi_t`."""
+        q_t = self.target_network.outputs(batch).clamp(self.low, self.high)
+        return expected_sarsa_target(batch.rewards, batch.discounts, q_t, pi_t)
+
+    def logged_values(self, batch: Batch) -> Tensor:
+        """Return the values (R,) of the logged actions."""
+        return chosen(self.outputs("q", batch.observations), batch.actions)
 
     def values(self, *, next_states: bool) -> Tensor:
         """Return the values (K, N, A) of the networks, clipped to the possible returns."""
         outputs = outputs_of_buffer(self.models["q"], self.buffer, next_states=next_states)
         values = outputs.view(len(self.seeds), len(self.buffer), -1)
         return values.clamp(self.low, self.high)
+
+
+class BoxFQE(FQE):
+    """Learner of the values Q(s, a) of given policies with the actions of a Box."""
+
+    continuous = True
+    critics = ("q",)
+
+    def output_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return the shape of the value of one action."""
+        return {"q": (1,)}
+
+    def targets(self, batch: Batch, pi_t: Tensor) -> Tensor:
+        """Return the targets (R,), given the next actions (R, n)."""
+        with torch.no_grad():
+            v_t = self.target_network.model(batch.next_observations.with_actions(pi_t)).squeeze(1)
+        return batch.rewards + batch.discounts * v_t.clamp(self.low, self.high)
+
+    def logged_values(self, batch: Batch) -> Tensor:
+        """Return the values (R,) of the logged actions."""
+        return self.models["q"](batch.observations.with_actions(batch.actions)).squeeze(1)
+
+    @torch.no_grad()
+    def values_of(self, actions: Tensor, rows: Tensor | None = None) -> Tensor:
+        """Return the values (K, M) of scaled actions, clipped to the possible returns.
+
+        They are in units of the logged rewards.
+
+        Args:
+            actions: (K, M, n) actions of each network's policy.
+            rows: (M,) transitions in whose states the actions are taken; default: all N.
+        """
+        buffer, networks = self.buffer, len(self.seeds)
+        rows = torch.arange(len(buffer)) if rows is None else rows
+        places, parts = buffer.places[0].index_select(0, rows), []
+        for part in torch.arange(len(rows)).split(_ROWS_AT_ONCE):
+            states = buffer.observe(places[part].repeat(networks))
+            values = self.models["q"](states.with_actions(actions[:, part].flatten(0, 1)))
+            parts.append(values.view(networks, -1))
+        return self.in_reward_units(torch.cat(parts, 1).clamp(self.low, self.high))
+
+    def _members(self, name: str) -> int:
+        # Networks are averaged over seeds, which also draw other batches.
+        return 1
 
 
 def return_bounds(rewards: Tensor, gamma: float) -> tuple[float, float]:

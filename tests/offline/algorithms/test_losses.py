@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mcaprl.offline.algorithms.losses import (
     allowed_only,
+    chosen,
     cross_entropy,
     double_q_learning_target,
     expected_sarsa_target,
@@ -102,7 +103,7 @@ def test_huber_regression_has_a_gradient_only_at_the_action_taken() -> None:
 
 def test_square_regression_by_hand() -> None:
     def loss_of(q_tm1: Tensor) -> Tensor:
-        return square_regression(q_tm1, A_TM1, torch.tensor([1.5, 9.0, 5.0]))
+        return square_regression(chosen(q_tm1, A_TM1), torch.tensor([1.5, 9.0, 5.0]))
 
     torch.testing.assert_close(loss_of(Q_TM1), torch.tensor([0.125, 12.5, 0.0]))
     expected = torch.tensor([[-0.5, 0.0], [0.0, -5.0], [0.0, 0.0]])
@@ -199,7 +200,7 @@ def losses_to_check() -> dict[str, tuple[Callable[[Tensor], Tensor], tuple[int, 
     samples = torch.linspace(-3, 3, 20).double().view(4, 5)
     return {
         "huber": (lambda q: huber_regression(q, a_tm1, target), (4, 3)),
-        "square regression": (lambda q: square_regression(q, a_tm1, target), (4, 3)),
+        "square regression": (lambda q: square_regression(chosen(q, a_tm1), target), (4, 3)),
         "quantiles": (lambda z: quantile_regression(z, a_tm1, samples), (4, 3, 5)),
         "cross entropy": (lambda q: cross_entropy(q, a_tm1), (4, 3)),
         "penalty of quantiles": (lambda z: cross_entropy(mean_values(z), a_tm1), (4, 3, 5)),
