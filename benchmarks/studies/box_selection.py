@@ -197,3 +197,7 @@ def tables(found: dict[str, Result]) -> str:
     rows = regret_rows({name: np.array(each) for name, each in regrets.items()})
     header = "| rule | mean regret | largest | on each log |\n|---|---|---|---|"
     return "\n".join([*lines, "", header, rows])
+
+
+if __name__ == "__main__":
+    main()

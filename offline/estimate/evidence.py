@@ -95,11 +95,11 @@ class Evidence:
 
 
 def fqe_config(
-    gamma: float, updates: int, hidden: tuple[int, ...] = (64, 64), *, box: bool = False
+    gamma: float, updates: int, hidden: tuple[int, ...] = (64, 64), *, is_box: bool = False
 ) -> FQEConfig:
     """Return settings of FQE with enough updates of the target network for the discount."""
     interval = max(1, int(updates * (1 - gamma) / _SYNCS_PER_HORIZON))
-    return (BoxFQEConfig if box else FQEConfig)(
+    return (BoxFQEConfig if is_box else FQEConfig)(
         updates=updates, gamma=gamma, batch_size=128, hidden=hidden, target_interval=interval
     )
 

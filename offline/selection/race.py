@@ -469,9 +469,9 @@ class _Race:
             self._stop_after(ends)
 
         def evaluate(updates: int, member: int) -> list[Evidence]:
-            box = isinstance(self._dataset.action_space, spaces.Box)
-            model = fqe_config(self._config.gamma, updates, box=box)
-            collector = (BoxEvidenceCollector if box else EvidenceCollector)(
+            is_box = isinstance(self._dataset.action_space, spaces.Box)
+            model = fqe_config(self._config.gamma, updates, is_box=is_box)
+            collector = (BoxEvidenceCollector if is_box else EvidenceCollector)(
                 self._dataset, clone, model, seed=member
             )
             return collector.collect([one for each in policies.values() for one in each], check)

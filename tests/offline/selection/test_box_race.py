@@ -134,7 +134,7 @@ def test_an_action_is_likely_above_a_tenth_of_the_largest_density() -> None:
 
 def test_the_values_of_one_step_are_the_rewards(data: Dataset) -> None:
     many = regulator(2_000)
-    model = replace(fqe_config(0.0, 600, box=True), learning_rate=3e-3)
+    model = replace(fqe_config(0.0, 600, is_box=True), learning_rate=3e-3)
     collector = BoxEvidenceCollector(many, Normal(0, 4), model)
     optimal, wild = collector.collect([Normal(riccati()[1], 1), Normal(3, 1)])
     x = many.observations.ravel()
@@ -150,7 +150,7 @@ def test_the_values_of_one_step_are_the_rewards(data: Dataset) -> None:
 
 
 def test_rare_actions_have_the_low_value(data: Dataset) -> None:
-    model = fqe_config(0.5, 5, box=True)
+    model = fqe_config(0.5, 5, is_box=True)
     collector = BoxEvidenceCollector(data, Normal(0, 0.01), model)
     (found,) = collector.collect([Normal(3, 1)])
     rare = np.abs(3 * data.observations.ravel()) > 0.01 * np.sqrt(2 * np.log(10))
