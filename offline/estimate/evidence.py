@@ -63,7 +63,7 @@ class Evidence:
         first_value: FQE's mean value of the first states of the episodes.
         mean_value: FQE's mean value of all states of the log.
         first_values: (E,) FQE's value of the first state of each episode.
-        logged_values: (N,) FQE's value of each logged action.
+        logged_values: (N,) FQE's value of each logged action; empty for a Box.
         next_values: (N,) FQE's largest value in each next state; empty for a Box.
         agrees: (N,) whether the policy's action is the logged one, in each state; for a Box,
             whether the root mean square of the differences is at most `CLOSE`.
@@ -73,8 +73,9 @@ class Evidence:
         bellman_error: Root mean square of r + gamma max_a Q(s', a) - Q(s, a), divided by the
             standard deviation of Q; None if the policy has no Q. For a Box, the next action is that
             of the policy.
-        behavior_value: FQE's mean value of the first states for the behavior of the log, by the
-            same models; None for finite action spaces.
+        behavior: (2, E) value of each episode for the behavior of the log: by FQE, with the same
+            models, and as logged. After a truncated episode, the return continues with the value of
+            its last action. Empty for finite action spaces.
     """
 
     first_value: float
@@ -87,7 +88,7 @@ class Evidence:
     agreement: float
     own_value: float | None
     bellman_error: float | None
-    behavior_value: float | None = None
+    behavior: Floats = field(repr=False, default_factory=lambda: np.empty((2, 0)))
 
     def to_json(self) -> dict[str, Any]:
         """Return the attributes as plain JSON types, without the arrays over episodes or states."""
@@ -289,10 +290,14 @@ class BoxEvidenceCollector(EvidenceCollector):
         fixed = np.full(actions.shape[:2], np.nan, np.float32)
         if self._pessimistic:
             fixed[:-1][~is_likely[:, 1]] = self.low_value
-        values, logged_values = self._values_of_box(actions, next_actions, fixed, on_update)
+        values = self._values_of_box(actions, next_actions, fixed, on_update)
         if self._pessimistic:
             values[:-1][~is_likely[:, 0]] = self.low_value
-        behavior_value = float(values[-1, self._first].mean())
+        rewards = data.rewards.astype(np.float64)
+        cut = (following < 0) & (self._buffer.returns[1].numpy() > 0)
+        rewards[cut] = values[-1, cut]
+        returned = returns_to_go(rewards, data.episode_lengths, self._config.gamma)
+        behavior = np.stack([values[-1], returned])[:, self._first]
         found = []
         for k, policy in enumerate(policies):
             own_value, bellman_error = self._own_values_of_box(policy, *taken[k])
@@ -302,14 +307,14 @@ class BoxEvidenceCollector(EvidenceCollector):
                     first_value=float(values[k, self._first].mean()),
                     mean_value=float(values[k].mean()),
                     first_values=values[k, self._first],
-                    logged_values=logged_values[k],
+                    logged_values=np.empty(0),
                     next_values=np.empty(0),
                     agrees=agrees,
                     support=float(is_likely[k, 0].mean()),
                     agreement=float(agrees.mean()),
                     own_value=own_value,
                     bellman_error=bellman_error,
-                    behavior_value=behavior_value,
+                    behavior=behavior,
                 )
             )
         return found
@@ -320,14 +325,13 @@ class BoxEvidenceCollector(EvidenceCollector):
         next_actions: NDArray[np.float32],
         fixed: NDArray[np.float32],
         on_update: Callable[[], None],
-    ) -> tuple[Floats, Floats]:
-        """Return the values (P, N) by FQE of the actions of P policies, and of the logged ones."""
-        policies = len(actions)
-        values, logged_values = np.zeros((2, *actions.shape[:2]))
+    ) -> Floats:
+        """Return the values (P, N) by FQE of the actions of P policies."""
+        values = np.zeros(actions.shape[:2])
         own, pi_t, fixed_v_t = map(torch.from_numpy, (actions, next_actions, fixed))
         for held_out in range(FOLDS):
             training = self._buffer.with_weights((self._fold != held_out).astype(np.float64))
-            seeds = [self._seed + held_out] * policies
+            seeds = [self._seed + held_out] * len(actions)
             learner = BoxFQE(self._config, training, seeds, pi_t, fixed_v_t)
             for _ in range(self._config.updates):
                 learner.update()
@@ -335,9 +339,7 @@ class BoxEvidenceCollector(EvidenceCollector):
             evaluated = np.flatnonzero(self._fold == held_out)
             rows = torch.from_numpy(evaluated)
             values[:, evaluated] = learner.values_of(own[:, rows], rows).numpy()
-            logged = self._buffer.actions[rows].expand(policies, -1, -1)
-            logged_values[:, evaluated] = learner.values_of(logged, rows).numpy()
-        return values, logged_values
+        return values
 
     def _own_values_of_box(
         self, policy: BasePolicy, actions: NDArray[Any], next_actions: NDArray[Any]

@@ -100,6 +100,34 @@ class Rating:
 
 
 @dataclass(frozen=True)
+class BehaviorCheck:
+    """FQE's value of the behavior policy, beside the returns that this policy had.
+
+    Attributes:
+        predicted: Mean value of the episodes, by models that were trained on others.
+        returned: Mean discounted return of the episodes.
+        interval: 95 % interval of `returned`.
+    """
+
+    predicted: float
+    returned: float
+    interval: tuple[float, float]
+
+    @property
+    def passes(self) -> bool:
+        """Whether the prediction is within the interval."""
+        return self.interval[0] <= self.predicted <= self.interval[1]
+
+    def __str__(self) -> str:
+        """Return both values in words."""
+        low, high = self.interval
+        return (
+            f"the models predict {self.predicted:.4g} for the behavior, whose episodes returned"
+            f" {self.returned:.4g} ({low:.4g} to {high:.4g})"
+        )
+
+
+@dataclass(frozen=True)
 class Tried:
     """Results of one candidate.
 
@@ -112,8 +140,7 @@ class Tried:
         weighted: Estimate by WPDIS, and the effective number of episodes of this estimate; None
             if the log has no action probabilities.
         outcome: `chosen`, `runner-up`, `stopped early`, or why it was not trained.
-        behavior: Mean estimate of the behavior of the log by the models of the candidate; None for
-            finite action spaces.
+        check: What the models predict for the behavior; None for finite action spaces.
     """
 
     updates: int = 0
@@ -122,7 +149,7 @@ class Tried:
     bellman_error: float | None = None
     weighted: tuple[float, float] | None = None
     outcome: str = ""
-    behavior: float | None = None
+    check: BehaviorCheck | None = None
 
     def row(self, name: str) -> tuple[str, ...]:
         """Return the row of the table of candidates."""
@@ -144,34 +171,6 @@ class Tried:
         )
 
 
-@dataclass(frozen=True)
-class BehaviorCheck:
-    """What the models of the candidates say of the behavior, whose value the log shows.
-
-    Attributes:
-        estimate: Mean estimated discounted return of the logged episodes.
-        logged: Mean discounted return of these episodes.
-        interval: 95 % interval of `logged`.
-    """
-
-    estimate: float
-    logged: float
-    interval: tuple[float, float]
-
-    @property
-    def passed(self) -> bool:
-        """Whether the estimate is within the interval."""
-        return self.interval[0] <= self.estimate <= self.interval[1]
-
-    def __str__(self) -> str:
-        """Return both values in words."""
-        low, high = self.interval
-        return (
-            f"the models estimate {self.estimate:.4g} for the behavior of the log, whose mean"
-            f" discounted return is {self.logged:.4g} ({low:.4g} to {high:.4g})"
-        )
-
-
 def decide(
     ratings: Mapping[str, Rating], prior: Sequence[str], check: BehaviorCheck | None
 ) -> tuple[str, str]:
@@ -189,7 +188,7 @@ def decide(
         The chosen candidate, and the rule that decided.
     """
     best, usual = next(iter(ratings)), prior[0]
-    if check is None or not check.passed:
+    if check is None or not check.passes:
         return usual, PRIOR
     if best == usual or ratings[best].interval[0] > ratings[usual].interval[1]:
         return best, ESTIMATE
@@ -209,7 +208,6 @@ class Choice:
         traits: Properties of the log.
         tried: What is known of each candidate, by name, from the best to the worst.
         rule: Rule that decided: `ESTIMATE`, `AGREEMENT`, `PRIOR` or `UNTESTED`.
-        check: What the models say of the behavior; None for finite action spaces.
     """
 
     chosen: str
@@ -220,7 +218,6 @@ class Choice:
     traits: LogTraits
     tried: dict[str, Tried]
     rule: str = ""
-    check: BehaviorCheck | None = None
 
     @classmethod
     def of(
@@ -231,12 +228,11 @@ class Choice:
         traits: LogTraits,
         tried: dict[str, Tried],
         complete: bool,
-        check: BehaviorCheck | None = None,
     ) -> Choice:
         """Put a choice among this number of evaluated candidates into words."""
-        reason, confidence = _words(chosen, rule, tried, evaluated, traits, check)
+        reason, confidence = _words(chosen, rule, tried[chosen], evaluated, traits)
         advice = _advice(traits, tried, complete)
-        return cls(chosen, reason, confidence, advice, complete, traits, tried, rule, check)
+        return cls(chosen, reason, confidence, advice, complete, traits, tried, rule)
 
     @property
     def rows(self) -> list[tuple[str, ...]]:
@@ -271,15 +267,10 @@ def read_choice(run: Path) -> Choice:
 
 
 def _words(
-    chosen: str,
-    rule: str,
-    tried: Mapping[str, Tried],
-    evaluated: int,
-    traits: LogTraits,
-    check: BehaviorCheck | None,
+    chosen: str, rule: str, tried: Tried, evaluated: int, traits: LogTraits
 ) -> tuple[str, str]:
     """Return why the rule chose a candidate, and the confidence in the choice."""
-    rating = tried[chosen].rating
+    rating, check = tried.rating, tried.check
     if rating is None:
         reason = f"{chosen} is used because the budget ended before any candidate was evaluated."
         return reason, "Unknown, because no candidate was evaluated."
@@ -295,20 +286,19 @@ def _words(
             f" of {count}. The behavior is almost deterministic (entropy {traits.entropy:.2f} of"
             " 1), so the log has no evidence that other actions are better."
         )
-        return reason, confidence
-    if rule == ESTIMATE:
+    elif rule == PRIOR:
+        why = "the intervals of the estimates overlap"
+        if check is not None and not check.passes:
+            why = f"the estimates are not calibrated: {check}"
+        reason = (
+            f"{chosen} has the best mean score of {count} on other logs, which decides because"
+            f" {why}."
+        )
+    else:
         reason = f"{chosen} has the largest estimated value of {count}: {rating}."
-        return reason, confidence if check is None else f"{confidence} For comparison, {check}."
-    why = "the intervals of the estimates overlap"
-    if check is not None and not check.passed:
-        why = f"the estimates cannot be trusted: {check}"
-    reason = (
-        f"{chosen} has the best mean score on logs of our sims among {count}, and decides because"
-        f" {why}."
-    )
-    return reason, (
-        f"As good as its mean over other logs: no estimate of this log decided. {confidence}"
-    )
+        if check is not None:
+            confidence += f" For comparison, {check}."
+    return reason, confidence
 
 
 def _advice(traits: LogTraits, tried: Mapping[str, Tried], complete: bool) -> tuple[str, ...]:

@@ -40,7 +40,6 @@ from mcaprl.files import read_json, replacing_folder, subfolder, write_json
 from mcaprl.offline.algorithms.config import BOX_CONFIGS, CONFIGS, TrainingConfig
 from mcaprl.offline.algorithms.heads import BoxHead
 from mcaprl.offline.batches.buffer import discrete_actions
-from mcaprl.offline.batches.items import returns_to_go
 from mcaprl.offline.estimate.evidence import (
     FOLDS,
     BoxEvidenceCollector,
@@ -311,8 +310,7 @@ class _Race:
         second = self._evaluate("full", going, clone, imitate, 1.0, SHARES[3])
         last = second or first
         order = finalists(last or names)
-        check = _check(self._dataset, self._config.gamma, last) if last else None
-        chosen, rule = self._decide(order, last, imitate, check)
+        chosen, rule = self._decide(order, last, imitate)
         order = [chosen, *(name for name in order if name != chosen)]
         tried = {name: Tried(self._updates(name), outcome="not evaluated") for name in names}
         tried |= {name: replace(one, outcome=STOPPED_EARLY) for name, one in first.items()}
@@ -323,7 +321,7 @@ class _Race:
         tried |= {name: Tried(outcome="no checkpoint within the budget") for name in late}
         tried |= {name: Tried(outcome=f"not tried: {why}") for name, why in skipped.items()}
         table = {name: tried[name] for name in dict.fromkeys([*order, *first, *trying, *tried])}
-        choice = Choice.of(chosen, rule, len(last), traits, table, self._in_time, check)
+        choice = Choice.of(chosen, rule, len(last), traits, table, self._in_time)
         self._publish(choice.chosen)
         choice.write(self._out)
         return choice, self._summaries(choice.chosen, trying[choice.chosen].algo)
@@ -340,17 +338,14 @@ class _Race:
         return [*going[:-1], usual] if is_box and usual in order and usual not in going else going
 
     def _decide(
-        self,
-        order: Sequence[str],
-        last: Mapping[str, Tried],
-        imitate: bool,
-        check: BehaviorCheck | None,
+        self, order: Sequence[str], last: Mapping[str, Tried], imitate: bool
     ) -> tuple[str, str]:
-        """Choose among the candidates of the last evaluation, in this order; return the rule."""
+        """Choose among candidates, given the best first; return the choice and the rule."""
         if not last:
             return order[0], UNTESTED
         if imitate:
             return order[0], AGREEMENT
+        check = last[order[0]].check
         if check is None:
             return order[0], ESTIMATE
         ratings = {name: one for name in order if (one := last[name].rating)}
@@ -510,14 +505,13 @@ class _Race:
         errors = [one.bellman_error for one in evidence if one.bellman_error is not None]
         weighted = [weighted_value(self._dataset, one, self._config.gamma) for one in evidence]
         known = [one for one in weighted if one is not None]
-        behavior = [one.behavior_value for one in evidence if one.behavior_value is not None]
         return Tried(
             self._updates(name),
             rating,
             float(np.mean([one.support for one in evidence])),
             float(np.mean(errors)) if errors else None,
             tuple(np.mean(known, axis=0).tolist()) if known else None,
-            behavior=float(np.mean(behavior)) if behavior else None,
+            check=_check(evidence),
         )
 
     def _folder(self, name: str) -> Path:
@@ -607,16 +601,14 @@ def _spread_of_commands(dataset: Dataset, clone: Policy) -> tuple[float, float, 
     return width, float(likely_commands(clone, seen, random).mean()), known
 
 
-def _check(dataset: Dataset, gamma: float, tried: Mapping[str, Tried]) -> BehaviorCheck | None:
-    """Compare what the models estimate for the behavior with its logged returns."""
-    estimates = [one.behavior for one in tried.values() if one.behavior is not None]
-    if not estimates:
+def _check(evidence: Sequence[Evidence]) -> BehaviorCheck | None:
+    """Return what the models predict for the behavior of a log with the actions of a Box."""
+    predicted, returned = np.mean([one.behavior for one in evidence], axis=0)
+    if not len(returned):
         return None
-    lengths = dataset.episode_lengths
-    returns = returns_to_go(dataset.rewards, lengths, gamma)[np.cumsum(lengths) - lengths]
-    counts = _counts(np.random.default_rng(0), len(returns))
-    low, high = np.percentile(counts @ returns, [2.5, 97.5]).tolist()
-    return BehaviorCheck(float(np.mean(estimates)), float(returns.mean()), (low, high))
+    drawn = _counts(np.random.default_rng(0), len(returned)) @ returned
+    low, high = np.percentile(drawn, [2.5, 97.5]).tolist()
+    return BehaviorCheck(float(predicted.mean()), float(returned.mean()), (low, high))
 
 
 def _skipped(traits: LogTraits, candidates: Sequence[Candidate]) -> dict[str, str]:

@@ -142,7 +142,8 @@ def test_the_values_of_one_step_are_the_rewards(data: Dataset) -> None:
         expected = -(x**2) - COST_LQ * (gain * x) ** 2
         assert evidence.first_value == pytest.approx(expected.mean(), abs=0.03)
         assert evidence.first_values.shape == (2_000,)
-    assert optimal.behavior_value == pytest.approx(many.rewards.mean(), abs=0.03)
+    assert optimal.behavior[0].mean() == pytest.approx(many.rewards.mean(), abs=0.03)
+    assert optimal.behavior.shape == (2, 2_000)
     assert optimal.support == 1
     close = np.abs(Normal(3, 1).act(many.observations) - many.actions) / 4 <= CLOSE
     assert wild.agreement == pytest.approx(close.mean())
@@ -179,14 +180,34 @@ def test_the_usual_choice_and_the_best_make_all_updates(finished: Path) -> None:
     assert policy.act(np.zeros((3, 1), np.float32)).shape == (3, 1)
 
 
-def test_the_choice_says_which_rule_decided(data: Dataset, finished: Path) -> None:
+def test_the_choice_says_which_rule_decided(finished: Path) -> None:
     choice = read_choice(finished)
     assert choice.rule in (ESTIMATE, PRIOR)
-    assert choice.check is not None
-    assert choice.check.logged == pytest.approx(data.rewards.mean())
-    assert choice.check.interval[0] < choice.check.logged < choice.check.interval[1]
-    assert str(choice.check) in choice.reason + choice.confidence
+    check = choice.tried[choice.chosen].check
+    assert check is not None
+    assert check.interval[0] < check.returned < check.interval[1]
+    assert str(check) in choice.reason + choice.confidence
     assert all(one.weighted is None for one in choice.tried.values())
+
+
+def test_the_return_of_a_truncated_episode_continues_with_the_value() -> None:
+    """Two episodes of two steps with the rewards 1 and 2: one ends, the other one is cut."""
+    data = Dataset.from_arrays(
+        observations=np.arange(4, dtype=np.float32)[:, None],
+        actions=np.array([[0.5], [-0.5], [0.25], [-0.25]], np.float32),
+        rewards=np.array([1.0, 2.0, 1.0, 2.0]),
+        terminated=np.array([False, True, False, False]),
+        truncated=np.array([False, False, False, True]),
+        next_observations=np.arange(1, 5, dtype=np.float32)[:, None],
+        action_space=BOX_LQ,
+    )
+    collector = BoxEvidenceCollector(data, Normal(0, 4), fqe_config(0.5, 3, is_box=True))
+    (found,) = collector.collect([Normal(0, 4)])
+    _, returned = found.behavior
+    assert returned[0] == 1 + 0.5 * 2
+    assert returned[1] != returned[0]
+    # The value of the last action is within those of rewards from 1 to 2 for ever.
+    assert 1 <= returned[1] <= 1 + 0.5 * 4
 
 
 def test_the_log_of_random_actions_has_the_traits_of_one(finished: Path) -> None:
