@@ -103,7 +103,7 @@ def main() -> None:
         if name not in found:
             found[name] = measure(given.folder, name)
             write_json(path, found)
-            print(name, found[name], flush=True)
+            print(name, found[name]["scores"], found[name]["choice"]["reason"], flush=True)
         write_section("box-selection", tables(found))
 
 
@@ -184,12 +184,12 @@ def score(kind: Kind, policies: dict[str, BasePolicy]) -> dict[str, float]:
 def tables(found: dict[str, Result]) -> str:
     """Return the scores and choices on all logs, and the regrets of the rules, as Markdown."""
     names = list(found[next(iter(found))]["scores"])
-    lines = [f"| log | {' | '.join(names)} | chosen |", "|---|" + "---|" * (len(names) + 1)]
+    lines = [f"| log | {' | '.join(names)} | chosen | by |", "|---|" + "---|" * (len(names) + 2)]
     regrets: dict[str, list[float]] = {}
     for log, result in found.items():
-        scores, chosen = result["scores"], result["choice"]["chosen"]
+        scores, chosen, rule = result["scores"], *(result["choice"][k] for k in ("chosen", "rule"))
         cells = [f"{scores[name]:.2f}" for name in names]
-        lines.append(f"| {log} | {' | '.join(cells)} | {chosen} |")
+        lines.append(f"| {log} | {' | '.join(cells)} | {chosen} | {rule} |")
         best = max(scores.values())
         regrets.setdefault("auto", []).append(best - scores[chosen])
         for name in names:

@@ -432,7 +432,7 @@ def regret_rows(regrets: dict[str, NDArray[np.float64]]) -> str:
         low, high = np.percentile(draws, [2.5, 97.5])
         single = " ".join(f"{regret:.2f}" for regret in each)
         mean = f"{each.mean():.3f} ({low:.2f} to {high:.2f})"
-        rows.append(f"| {name} | {mean} | {each.max():.2f} | {single}")
+        rows.append(f"| {name} | {mean} | {each.max():.2f} | {single} |")
     return "\n".join(rows)
 
 

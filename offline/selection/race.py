@@ -12,6 +12,9 @@ of the finalists are trained with the rest and rated again, and the one with the
 chosen. After the first candidate's short training, RUN/seed-K always has a policy, also if the run
 is interrupted.
 
+For the actions of a Box, the candidates are others, and the estimates decide only if they are right
+for the behavior of the log and clear (`mcaprl.offline.selection.choice.decide`).
+
 The score of a candidate is the mean of its estimated values of the first states of the episodes:
 pessimistic FQE by models that were trained on other episodes (`mcaprl.offline.estimate.evidence`).
 The mean is over the episodes, the networks of the candidate, and the models. If the behavior policy
@@ -466,6 +469,7 @@ class _Race:
         def evaluate(updates: int, member: int) -> list[Evidence]:
             is_box = isinstance(self._dataset.action_space, spaces.Box)
             model = fqe_config(self._config.gamma, updates, is_box=is_box)
+            model = replace(model, clip_actions=self._config.clip_actions)
             collector = (BoxEvidenceCollector if is_box else EvidenceCollector)(
                 self._dataset, clone, model, seed=member
             )
@@ -593,10 +597,10 @@ def _spread_of_commands(dataset: Dataset, clone: Policy) -> tuple[float, float, 
     box, seen, logs = clone.head.box, dataset.observations, dataset.behavior_log_probs
     known = bool(np.isfinite(logs).all())
     if not known:
-        logs = of_both(clone.log_prob, seen, dataset.actions)
+        inside = box.unscaled(box.scaled(dataset.actions).clip(-1, 1))
+        logs = of_both(clone.log_prob, seen, inside)
     nats = -logs.astype(np.float64).mean() + box.log_scale - box.size * np.log(2)
-    numbers = np.random.default_rng(0).uniform(-1, 1, (len(dataset), box.size))
-    random = box.unscaled(numbers)
+    random = box.unscaled(np.random.default_rng(0).uniform(-1, 1, (len(dataset), box.size)))
     width = min(float(np.exp(nats / box.size)), 1.0)
     return width, float(likely_commands(clone, seen, random).mean()), known
 

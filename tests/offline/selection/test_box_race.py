@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import mcaprl
 from mcaprl.base_policy import BasePolicy
-from mcaprl.errors import UnknownNameError
+from mcaprl.errors import SpaceError, UnknownNameError
 from mcaprl.offline.algorithms.config import BoxBCConfig, BoxIQLConfig, ReBRACConfig
 from mcaprl.offline.estimate.evidence import (
     CLOSE,
@@ -267,3 +267,20 @@ def test_the_page_has_the_reason(data: Dataset, tmp_path: Path) -> None:
     page, choice = (report / "index.html").read_text(), read_choice(run)
     for text in (choice.reason, choice.confidence, *choice.tried):
         assert text in page
+
+
+def test_actions_outside_the_box_are_clipped_on_request(tmp_path: Path) -> None:
+    log = regulator(120)
+    actions = np.where(np.arange(120)[:, None] % 10, log.actions, 5.0).astype(np.float32)
+    columns = {name: getattr(log, name) for name in ("observations", "rewards", "terminated")}
+    outside = Dataset.from_arrays(
+        **columns,
+        actions=actions,
+        truncated=log.truncated,
+        next_observations=log.next_observations,
+        action_space=BOX_LQ,
+    )
+    with pytest.raises(SpaceError, match="outside"):
+        select(outside, CONFIG, tmp_path / "refused")
+    choice, _ = select(outside, replace(CONFIG, clip_actions=True), tmp_path / "run")
+    assert 0.5 < choice.traits.entropy <= 1
