@@ -32,6 +32,7 @@ from mcaprl.texts import counted
 if TYPE_CHECKING:
     from mcaprl.api.estimate import LogEstimates
     from mcaprl.api.evaluate import Evaluation
+    from mcaprl.offline.estimate.off_policy import Estimate
 
 _OF_DATA = (
     "gamma",
@@ -80,13 +81,14 @@ _OF_DATA = (
 @click.option(
     "--updates",
     type=click.IntRange(1),
-    help="With --data: number of gradient steps of the model.  [default: 10000]",
+    help="With --data: number of gradient steps of a model.  [default: 10000; for a Box, 3000]",
 )
 @click.option(
     "--estimate-behavior",
     is_flag=True,
     default=None,
-    help="With --data: estimate behavior_prob from the actions, for logs without it.",
+    help="With --data: estimate behavior_prob or behavior_log_prob from the actions, for logs"
+    " without it.",
 )
 @click.option(
     "--threads",
@@ -120,7 +122,8 @@ def evaluate(
     POLICY is pilot, random, or a trained run; each seed of a run is evaluated. Actions are greedy.
     If the sim has a pilot, scores are normalized: the score of random is 0, and the score of pilot
     is 1. With --data, discounted returns are estimated, and a verdict says whether the logs suffice
-    for the estimate.
+    for the estimate. For the actions of a Box, policies are ordered by FQE, which is refused if it
+    is wrong about the behavior of the logs.
     """
     given = {name: value for name, value in others.items() if value}
     if data is not None and sim is None:
@@ -210,33 +213,55 @@ def _score_rows(found: Evaluation) -> list[dict[str, str | None]]:
 
 
 def _print_estimates(found: LogEstimates) -> None:
-    rows = [
-        [
-            one.policy,
-            one.estimator,
-            "" if one.value is None else f"{one.value:.3f}",
-            "" if one.interval is None else _interval(one.interval, 3),
-            f"{one.effective_sample_size:.1f}",
-            one.verdict,
-        ]
-        for one in found.estimates
-    ]
-    print_table(
+    title = (
         f"{found.data}: {counted(found.episodes, 'episode')}, mean return discounted by"
-        f" {found.gamma}: {found.behavior_return:.3f} ({_interval(found.behavior_interval, 3)})",
-        ["policy", "estimator", "value", "95 % interval", "effective episodes", "verdict"],
-        rows,
+        f" {found.gamma}: {found.behavior_return:.3f} ({_interval(found.behavior_interval, 3)})"
     )
-    coverage = ", ".join(f"{share:.0%} by {name}" for name, share in found.coverage.items())
-    echo(f"logged actions that the policies would take: {coverage}")
-    if found.behavior_estimate is not None:
-        echo(f"estimated behavior_prob: {found.behavior_estimate}")
+    if found.behavior_check is None:
+        _print_rows(title, found.estimates)
+    else:
+        by_model = [one for one in found.estimates if one.estimator == "FQE"]
+        _print_rows(title, sorted(by_model, key=lambda one: -(one.value or 0.0)))
+        echo(f"{found.behavior_check}")
+        weighted = [one for one in found.estimates if one.estimator != "FQE"]
+        _print_rows("importance sampling, of actions drawn from the densities", weighted)
+    if found.coverage:
+        coverage = ", ".join(f"{share:.0%} by {name}" for name, share in found.coverage.items())
+        echo(f"logged actions that the policies would take: {coverage}")
+    if found.support:
+        support = ", ".join(f"{share:.0%} of {name}" for name, share in found.support.items())
+        echo(f"actions as near to logged ones as 95 % of the log's own: {support}")
+    if (estimated := found.behavior_estimate) is not None:
+        echo(f"estimated {estimated.dataset.behavior_field.name}: {estimated}")
     if found.behavior_calibration is not None:
         echo(f"behavior_prob of the logs implies {found.behavior_calibration}")
     if (order := found.ranking) is not None:
         echo(f"best first, by {order['estimator']}: {', '.join(order['policies'])}")
+        if order["close"]:
+            echo(f"not told apart from the first by FQE's seeds: {', '.join(order['close'])}")
         if not order["trusted"]:
             echo("no estimator is trusted for all policies: do not rely on this order")
+
+
+def _print_rows(title: str, estimates: Sequence[Estimate]) -> None:
+    """Print the estimates, without the columns that none of them has."""
+    rows = [
+        {
+            "policy": one.policy,
+            "estimator": one.estimator,
+            "value": "" if one.value is None else f"{one.value:.3f}",
+            "spread": "" if one.spread is None else f"{one.spread:.3f}",
+            "95 % interval": "" if one.interval is None else _interval(one.interval, 3),
+            "effective episodes": ""
+            if one.effective_sample_size is None
+            else f"{one.effective_sample_size:.1f}",
+            "verdict": one.verdict,
+        }
+        for one in estimates
+    ]
+    missing = [name for name in ("spread", "effective episodes") if not any(r[name] for r in rows)]
+    columns = [name for name in rows[0] if name not in missing]
+    print_table(title, columns, [[row[name] for name in columns] for row in rows])
 
 
 def _interval(interval: Sequence[float], digits: int = 2) -> str:

@@ -27,10 +27,11 @@ def estimate_behavior(
     Most robots do not log these probabilities, but estimators with importance weights need them.
     The episodes are split into folds. For each fold, a classifier is trained on most episodes of
     the other folds and calibrated on the rest of them. The classifier then predicts the actions of
-    the fold.
+    the fold. For the actions of a Box, a mixture of normal distributions takes its place, and the
+    estimates are densities.
 
     Args:
-        data: Dataset, file, folder or glob of logs, or several of them; actions are discrete.
+        data: Dataset, file, folder or glob of logs, or several of them.
         folds: Number of folds of the episodes; the actions of each fold are predicted by a
             classifier trained on the other folds.
         updates: Number of gradient steps for each fold.
@@ -42,7 +43,7 @@ def estimate_behavior(
         The dataset with the estimates, which are marked as estimates, and their calibration.
 
     Raises:
-        SpaceError: The actions are not discrete.
+        SpaceError: The actions are neither discrete nor floats of a Box.
         UsageError: There are too few episodes.
         LogError: The logs cannot be read.
     """
@@ -51,7 +52,7 @@ def estimate_behavior(
     check_least(1, updates=updates, threads=threads)
     check_least(2, folds=folds)
     dataset = opened(data, threads=threads)
-    text = f"estimating behavior_prob in {folds} folds"
+    text = f"estimating {dataset.behavior_field.name} in {folds} folds"
     with torch_threads(threads), progress(text, folds * updates) as advance:
         return behavior.estimate_behavior(
             dataset, folds=folds, updates=updates, seed=seed, on_update=lambda: advance(1)

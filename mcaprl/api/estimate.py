@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
+
+from gymnasium import spaces
 
 from mcaprl.api.behavior import estimate_behavior as estimate_of_behavior
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
@@ -16,8 +19,12 @@ from mcaprl.recorder.dataset.statistics import Calibration, calibration
 from mcaprl.recorder.source import Data, named, opened
 from mcaprl.texts import counted
 
+UPDATES: Final = 10_000
+BOX_UPDATES: Final = 3_000
+
 if TYPE_CHECKING:
     from mcaprl.offline.estimate.behavior import BehaviorEstimate
+    from mcaprl.offline.estimate.box import BehaviorCheck
     from mcaprl.offline.estimate.off_policy import Estimate, PolicyEstimates
     from mcaprl.recorder.dataset.dataset import Dataset
 
@@ -37,9 +44,13 @@ class LogEstimates:
             1 / `behavior_prob`, and the number of actions in the action space. None if unknown.
         behavior_estimate: Quality of the estimated `behavior_prob`; None if it was not estimated
             for this evaluation.
-        coverage: Mean probability of the logged actions under each policy.
+        coverage: Mean probability of the logged actions under each policy; empty for a Box.
         estimates: Estimate of each policy by each estimator.
         ranking: Order of the policies, best first; None for one policy.
+        behavior_check: FQE's value of the behavior beside the logged returns, for a Box. If it is
+            off, the estimates by FQE are refused. None for discrete actions.
+        support: Fraction of each policy's actions that are as near to logged ones as 95 % of the
+            log's own; empty for discrete actions, and if all observations are images.
     """
 
     data: str
@@ -53,16 +64,20 @@ class LogEstimates:
     coverage: dict[str, float]
     estimates: tuple[Estimate, ...]
     ranking: dict[str, Any] | None
+    behavior_check: BehaviorCheck | None = None
+    support: dict[str, float] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return what `evaluate --data --json` prints."""
         calibrated, estimated = self.behavior_calibration, self.behavior_estimate
+        checked = self.behavior_check
         return {
             **vars(self),
             "behavior_interval": list(self.behavior_interval),
             "behavior_calibration": calibrated
             and {**calibrated.to_json(), "text": str(calibrated)},
             "behavior_estimate": estimated and {**estimated.to_json(), "text": str(estimated)},
+            "behavior_check": checked and {**checked.to_json(), "text": str(checked)},
             "estimates": [estimate.to_json() for estimate in self.estimates],
         }
 
@@ -73,7 +88,7 @@ def estimate(
     *,
     gamma: float = 0.97,
     epsilon: float = 0.0,
-    updates: int = 10_000,
+    updates: int | None = None,
     estimate_behavior: bool = False,
     seed: int = 1_000_000,
     threads: int = 1,
@@ -81,34 +96,42 @@ def estimate(
 ) -> LogEstimates:
     """Estimate the discounted returns of policies from logs, with each estimator.
 
+    For the actions of a Box, these are FQE, which evaluates the actions of `act`, and estimators
+    with importance weights, which evaluate actions that are drawn from the policy's densities.
+
     Args:
         policies: `random`, the path of a trained run, or a list of these. Each seed of a run is
             one policy.
         data: Dataset, file, folder or glob of logs, or several of them.
         gamma: Discount of the returns.
-        epsilon: Probability of a random action instead of the policy's.
-        updates: Number of gradient steps of the model that FQE, DR and WDR use. The classifier
-            that estimates the behavior probabilities is trained with at most 2,000 steps.
+        epsilon: Probability of a random action instead of the policy's; 0 for a Box.
+        updates: Number of gradient steps of the model that FQE, DR and WDR use; by default 10,000,
+            and 3,000 for a Box, where there are four models instead of one. The model that
+            estimates the behavior is trained with at most 2,000 steps.
         estimate_behavior: Whether `mcaprl.estimate_behavior` estimates the behavior probabilities
-            from the actions. Otherwise, the logged probabilities are used.
+            or densities from the actions. Otherwise, the logged ones are used.
         seed: Seed of the model and of the resampling.
         threads: Number of threads of PyTorch and of the reader.
         progress: Function that opens a progress bar.
 
     Raises:
-        UsageError: A policy has no action probabilities, or a number is out of range.
+        UsageError: A number is out of range.
         UnknownNameError: There is no such policy.
         PolicyError: A policy was trained on other spaces than those of the logs.
         LogError: The logs cannot be read.
     """
+    from mcaprl.offline.estimate.box import SEEDS, BoxEvaluator
+    from mcaprl.offline.estimate.evidence import fqe_config
     from mcaprl.offline.estimate.fqe import FQEConfig
     from mcaprl.offline.estimate.off_policy import FOLDS, OffPolicyEvaluator, ranking
 
     check_fraction(gamma=gamma, epsilon=epsilon)
-    check_least(1, updates=updates, threads=threads)
     check_least(0, seed=seed)
+    check_least(1, threads=threads, **({} if updates is None else {"updates": updates}))
     dataset = opened(data, threads=threads)
-    found = _policies(as_names(policies), dataset)
+    is_box = isinstance(dataset.action_space, spaces.Box)
+    updates = updates or (BOX_UPDATES if is_box else UPDATES)
+    found = _policies(as_names(policies), dataset, seed)
     behavior = None
     if estimate_behavior:
         steps = min(updates, 2_000)
@@ -116,13 +139,18 @@ def estimate(
             dataset, updates=steps, seed=seed, threads=threads, progress=progress
         )
         dataset = behavior.dataset
-    config = replace(FQEConfig(), gamma=gamma, updates=updates)
-    evaluator = OffPolicyEvaluator(dataset, config, seed)
+    evaluator: OffPolicyEvaluator
+    if is_box:
+        evaluator = BoxEvaluator(dataset, fqe_config(gamma, updates, is_box=True), seed)
+    else:
+        config = replace(FQEConfig(), gamma=gamma, updates=updates)
+        evaluator = OffPolicyEvaluator(dataset, config, seed)
     results: list[PolicyEstimates] = []
-    fits = counted(len(found) * FOLDS, "network")
-    text = f"fitting {fits} with {counted(updates, 'update')} each"
-    total = len(found) * evaluator.updates_of_model
-    with torch_threads(threads), progress(text, total) as advance:
+    # FQE evaluates the behavior of a log with the actions of a Box, too.
+    models = len(found) + is_box
+    networks = models * FOLDS * (SEEDS if is_box else 1)
+    text = f"fitting {counted(networks, 'network')} with {counted(updates, 'update')} each"
+    with torch_threads(threads), progress(text, models * evaluator.updates_of_model) as advance:
         for name, policy in found.items():
             results.append(
                 evaluator.evaluate(policy, name, epsilon=epsilon, on_update=lambda: advance(1))
@@ -137,19 +165,23 @@ def estimate(
         evaluator.behavior_interval,
         calibration(dataset.behavior, dataset.action_space),
         behavior,
-        {result.policy: result.coverage for result in results},
+        {one.policy: one.coverage for one in results if one.coverage is not None},
         tuple(estimates),
         ranking(estimates) if len(found) > 1 else None,
+        evaluator.check_behavior() if isinstance(evaluator, BoxEvaluator) else None,
+        {one.policy: one.support for one in results if one.support is not None},
     )
 
 
-def _policies(names: Sequence[str], dataset: Dataset) -> dict[str, BasePolicy]:
-    """Load the policies, and return them by their names in tables."""
+def _policies(names: Sequence[str], dataset: Dataset, seed: int) -> dict[str, BasePolicy]:
+    """Load the policies, and return them by their names in tables; `random` draws by the seed."""
     shown = policy_names(names)
     found: dict[str, BasePolicy] = {}
     for name in dict.fromkeys(names):
         if name == "random":
-            found[name] = RandomPolicy(dataset.action_space)
+            space = copy.deepcopy(dataset.action_space)
+            space.seed(seed)
+            found[name] = RandomPolicy(space)
             continue
         loaded = trained_policies(name, dataset)
         for policy in loaded:

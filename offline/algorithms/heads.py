@@ -37,6 +37,7 @@ from mcaprl.offline.algorithms.losses import (
     mean_values,
     squashed_normal_log_density,
     truncated_normal_log_density,
+    truncated_normal_probability,
 )
 from mcaprl.offline.batches.buffer import discrete_actions
 from mcaprl.offline.batches.observations import Observations
@@ -329,6 +330,24 @@ class Mixture(BoxHead):
         )
         log_weights = outputs[:, :COMPONENTS].log_softmax(1)
         return (log_weights + log_densities.sum(-1)).logsumexp(1)
+
+    @staticmethod
+    def pit(outputs: Tensor, actions: Tensor) -> Tensor:
+        """Return the probability (B, n) of a smaller number than that of actions (B, n).
+
+        The probability of each number is given those before it, so that the results of actions of
+        this distribution are independent and uniform. See Rosenblatt, "Remarks on a multivariate
+        transformation", 1952.
+        """
+        mean, raw = Mixture._components(outputs).unbind(2)
+        mean, log_std = mean.tanh(), bounded_log_std(raw)
+        numbers = actions.unsqueeze(1)
+        below = truncated_normal_probability(numbers, mean, log_std)
+        log_densities = truncated_normal_log_density(numbers, mean, log_std)
+        # The weights of the components, given the numbers before each number.
+        earlier = log_densities.cumsum(2) - log_densities
+        log_weights = outputs[:, :COMPONENTS].log_softmax(1).unsqueeze(2)
+        return ((log_weights + earlier).softmax(1) * below).sum(1)
 
     @staticmethod
     def _components(outputs: Tensor) -> Tensor:

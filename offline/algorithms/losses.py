@@ -202,6 +202,13 @@ def truncated_normal_log_density(actions: Tensor, mean: Tensor, log_std: Tensor)
     return -0.5 * scaled.square() - log_std - _LOG_SQRT_TAU - inside.log()
 
 
+def truncated_normal_probability(actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
+    """Return the probability of a smaller action, of `truncated_normal_log_density`."""
+    width = (-log_std).exp() * math.sqrt(0.5)
+    low = torch.erf((-1 - mean) * width)
+    return (torch.erf((actions - mean) * width) - low) / (torch.erf((1 - mean) * width) - low)
+
+
 def squashed_normal_log_density(pre: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """Return the log densities of actions tanh(pre), where `pre` is normal.
 

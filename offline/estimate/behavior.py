@@ -1,11 +1,19 @@
 """Estimation of the probabilities of a log's actions under the unknown policy that chose them.
 
+For the actions of a Box, these are densities, of a mixture of normal distributions.
+
 A classifier of the actions (behavior cloning) is trained on a part of the episodes and predicts the
 actions of the other episodes. Thus no episode's probabilities come from a network that was trained
 on this episode (cross-fitting). The predictions are calibrated by a temperature, on episodes that
 the network was not trained on: Guo et al., "On Calibration of Modern Neural Networks",
 https://arxiv.org/abs/1706.04599. A share of the uniform distribution is added, because many
 behavior policies choose some actions at random.
+
+Densities have no temperature. Whether they are right is shown by the probability integral transform
+(PIT): the probability of a smaller action than the logged one, for each part of an action given the
+parts before it. If the densities are those of the behavior, these numbers are uniform in [0, 1].
+
+    Rosenblatt, "Remarks on a multivariate transformation", 1952
 """
 
 from __future__ import annotations
@@ -17,11 +25,13 @@ from typing import Any, Final
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
-from mcaprl.offline.algorithms.bc import BC
-from mcaprl.offline.algorithms.config import BCConfig
+from mcaprl.offline.algorithms.bc import BC, BoxBC
+from mcaprl.offline.algorithms.config import BCConfig, BoxBCConfig
+from mcaprl.offline.algorithms.heads import Mixture
 from mcaprl.offline.algorithms.models import outputs_of_buffer
 from mcaprl.offline.batches.buffer import TransitionBuffer, discrete_actions
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -33,6 +43,9 @@ FOLDS: Final = 5
 UPDATES: Final = 2_000
 _VALIDATED: Final = 0.15
 """Share of a fold's training episodes on which the predictions are calibrated."""
+PIT_RANGES: Final = 10
+LARGEST_PIT_ERROR: Final = 0.05
+"""Difference of the PIT's shares from equal ones, above which densities are called wrong."""
 _CHECKS = 20
 """Number of times that the network is scored during its training. The best weights are used."""
 _TEMPERATURES = np.geomspace(0.25, 4.0, 17)
@@ -48,9 +61,10 @@ class FoldScore:
         episodes: Number of episodes that were predicted.
         log_likelihood: Mean log probability of the actions taken.
         marginal: Value of `log_likelihood` if every prediction is equal to the action frequencies
-            of the training episodes.
-        uniform: `log_likelihood` of equal probabilities for all allowed actions.
-        temperature: Divisor of the network's logits.
+            of the training episodes; for densities, to their normal distribution.
+        uniform: `log_likelihood` of equal probabilities for all allowed actions; of the uniform
+            density.
+        temperature: Divisor of the network's logits; 1 for densities.
         uniform_share: Share of the uniform distribution in the prediction.
     """
 
@@ -85,12 +99,15 @@ class BehaviorEstimate:
     """Estimated behavior probabilities, with their quality.
 
     Attributes:
-        dataset: The dataset with the estimates in `behavior_probs`, marked as estimated.
+        dataset: The dataset with the estimates in `behavior`, marked as estimated.
         folds: Quality for each fold.
-        reliability: Predicted and observed frequencies, by range of the predicted probability.
+        reliability: Predicted and observed frequencies, by range of the predicted probability;
+            empty for densities.
         calibration_error: Mean absolute difference between predicted and observed frequency,
-            weighted by the number of predictions.
-        log_likelihood: Mean log probability of the actions taken.
+            weighted by the number of predictions. For densities, half the sum of the absolute
+            differences between `pit` and equal shares.
+        log_likelihood: Mean log probability, or log density, of the actions taken.
+        pit: Shares of the PIT in ten equal ranges; empty for probabilities.
     """
 
     dataset: Dataset = field(repr=False)
@@ -98,6 +115,7 @@ class BehaviorEstimate:
     reliability: tuple[ReliabilityRange, ...]
     calibration_error: float
     log_likelihood: float
+    pit: tuple[float, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return everything but the dataset, as JSON types."""
@@ -106,17 +124,22 @@ class BehaviorEstimate:
             "reliability": [vars(one) for one in self.reliability],
             "calibration_error": self.calibration_error,
             "log_likelihood": self.log_likelihood,
+            "pit": list(self.pit),
         }
 
     def __str__(self) -> str:
         """Return a one-line summary."""
         uniform = float(np.mean([fold.uniform for fold in self.folds]))
         marginal = float(np.mean([fold.marginal for fold in self.folds]))
-        return (
-            f"mean log probability {self.log_likelihood:.3f} (frequencies {marginal:.3f}, uniform"
-            f" {uniform:.3f}), calibration error {self.calibration_error:.3f}, {len(self.folds)}"
-            " folds"
+        what, other, error = "log probability", "frequencies", "calibration error"
+        if self.pit:
+            what, other, error = "log density", "normal", "PIT differs from uniform by"
+        text = (
+            f"mean {what} {self.log_likelihood:.3f} ({other} {marginal:.3f}, uniform"
+            f" {uniform:.3f}), {error} {self.calibration_error:.3f}, {len(self.folds)} folds"
         )
+        is_wrong = self.pit and self.calibration_error > LARGEST_PIT_ERROR
+        return f"{text}: the densities are wrong" if is_wrong else text
 
 
 def estimate_behavior(
@@ -127,21 +150,23 @@ def estimate_behavior(
     seed: int = 0,
     on_update: Callable[[], None] = lambda: None,
 ) -> BehaviorEstimate:
-    """Estimate the probability of each action under the policy that took it.
+    """Estimate the probability, or density, of each action under the policy that took it.
 
     Args:
-        dataset: Dataset with discrete actions; its `behavior_probs` are ignored.
+        dataset: Dataset with discrete actions or those of a Box; its `behavior` is ignored.
         folds: Number of parts of the episodes; each part is predicted from the others.
         updates: Number of gradient steps for each fold.
         seed: Seed of the folds and of the networks.
         on_update: Callback for each gradient step.
 
     Raises:
-        SpaceError: The actions are not discrete.
+        SpaceError: The actions are neither discrete nor floats of a Box.
         TrainingError: There are no transitions, or a number is not finite.
         UsageError: There are fewer than two folds, or too few episodes for them.
     """
-    discrete_actions(dataset.action_space, "estimating behavior_prob")
+    is_box = isinstance(dataset.action_space, spaces.Box)
+    if not is_box:
+        discrete_actions(dataset.action_space, "estimating behavior_prob")
     count = len(dataset.episode_lengths)
     if folds < 2 or updates < 1:
         raise UsageError(
@@ -149,25 +174,34 @@ def estimate_behavior(
         )
     if count < max(folds, 3):
         raise UsageError(
-            f"estimating behavior_prob in {folds} folds needs {max(folds, 3)} episodes or more;"
-            f" there are {count}"
+            f"estimating {dataset.behavior_field.name} in {folds} folds needs"
+            f" {max(folds, 3)} episodes or more; there are {count}"
         )
-    config = BCConfig(updates=updates, normalize=True)
+    config: BCConfig = BCConfig(updates=updates, normalize=True)
+    if is_box:
+        config = BoxBCConfig(updates=updates, head="mixture")
     buffer = TransitionBuffer.from_dataset(dataset, config.packing)
-    allowed = _allowed(buffer)
     random = np.random.default_rng(seed)
     fold_of = random.permutation(count) % folds
-    predicted = np.empty((len(buffer), buffer.joint.count))
+    # Columns are the probabilities of all actions, or the density and the PIT of the logged one.
+    predicted = np.empty((len(buffer), 1 + buffer.n_actions if is_box else buffer.n_actions))
     scores = []
     for fold in range(folds):
         held_out = fold_of == fold
         validated = _validation(~held_out, random)
         mine = np.repeat(held_out, dataset.episode_lengths)
         checked = np.repeat(validated, dataset.episode_lengths)
-        learner = BC(config, buffer.with_weights((~mine & ~checked).astype(float)), [seed + fold])
-        found, score = _fitted(learner, allowed, mine, checked, on_update)
+        training = buffer.with_weights((~mine & ~checked).astype(float))
+        if isinstance(config, BoxBCConfig):
+            learner = BoxBC(config, training, [seed + fold])
+            found, score = _fitted_densities(learner, mine, checked, on_update)
+        else:
+            classifier = BC(config, training, [seed + fold])
+            found, score = _fitted(classifier, _allowed(buffer), mine, checked, on_update)
         predicted[mine] = found[mine]
         scores.append(dataclasses.replace(score, episodes=int(held_out.sum())))
+    if is_box:
+        return _of_densities(dataset, predicted, tuple(scores))
     actions = buffer.actions.numpy()
     taken = predicted[np.arange(len(actions)), actions].astype(np.float32)
     ranges = reliability(predicted, actions)
@@ -180,6 +214,28 @@ def estimate_behavior(
         calibration_error=float(error),
         log_likelihood=float(np.log(taken).mean()),
     )
+
+
+def _of_densities(
+    dataset: Dataset, predicted: Floats, folds: tuple[FoldScore, ...]
+) -> BehaviorEstimate:
+    """Return the result for rows (N, 1 + n) of log densities and PITs."""
+    shares = pit_shares(predicted[:, 1:])
+    return BehaviorEstimate(
+        dataset=dataset.with_behavior_log_probs(predicted[:, 0], estimated=True),
+        folds=folds,
+        reliability=(),
+        calibration_error=float(np.abs(shares - 1 / PIT_RANGES).sum() / 2),
+        log_likelihood=float(predicted[:, 0].mean()),
+        pit=tuple(shares.tolist()),
+    )
+
+
+def pit_shares(pit: Floats) -> Floats:
+    """Return the shares of numbers within [0, 1] in `PIT_RANGES` equal ranges."""
+    counts, _ = np.histogram(pit, PIT_RANGES, (0.0, 1.0))
+    shares: Floats = counts / counts.sum()
+    return shares
 
 
 def reliability(predicted: Floats, actions: NDArray[np.int64]) -> tuple[ReliabilityRange, ...]:
@@ -253,6 +309,56 @@ def _fitted(
         temperature=best_fit[0],
         uniform_share=best_fit[1],
     )
+
+
+def _fitted_densities(
+    learner: BoxBC,
+    held_out: NDArray[np.bool_],
+    validated: NDArray[np.bool_],
+    on_update: Callable[[], None],
+) -> tuple[Floats, FoldScore]:
+    """Train a network; return its best log densities and PITs (N, 1 + n), and their score.
+
+    The densities are in the units of the space.
+    """
+    buffer, updates = learner.buffer, learner.config.updates
+    box, actions = buffer.box, buffer.actions
+    assert box is not None
+    uniform = -box.size * float(np.log(2))
+    checks = set(np.linspace(0, updates, _CHECKS + 1).round().astype(int).tolist())
+    best_score, best_share, best = -np.inf, 0.0, torch.empty(0)
+    for number in range(1, updates + 1):
+        learner.update()
+        on_update()
+        if number in checks:
+            outputs = outputs_of_buffer(learner.models["actor"], buffer, next_states=False)
+            own = Mixture.log_density(outputs, actions).double().numpy()
+            means = [_mixed(own[validated], uniform, share).mean() for share in _UNIFORM_SHARES]
+            share = int(np.argmax(means))
+            if means[share] > best_score:
+                best_score, best_share = float(means[share]), float(_UNIFORM_SHARES[share])
+                best = outputs
+    log_densities = _mixed(Mixture.log_density(best, actions).double().numpy(), uniform, best_share)
+    pit = (1 - best_share) * Mixture.pit(best, actions).double() + best_share * (actions + 1) / 2
+    found = np.hstack([log_densities[:, None] + box.log_scale, pit.numpy().clip(0, 1)])
+    others = actions.numpy()[~held_out].astype(np.float64)
+    scaled = (actions.numpy()[held_out] - others.mean(0)) / others.std(0)
+    normal = -0.5 * np.square(scaled) - np.log(others.std(0)) - 0.5 * np.log(2 * np.pi)
+    return found, FoldScore(
+        episodes=0,
+        log_likelihood=float(found[held_out, 0].mean()),
+        marginal=float(normal.sum(1).mean()) + box.log_scale,
+        uniform=uniform + box.log_scale,
+        temperature=1.0,
+        uniform_share=best_share,
+    )
+
+
+def _mixed(log_densities: Floats, uniform: float, share: float) -> Floats:
+    """Return log densities that are mixed with the uniform distribution."""
+    with np.errstate(divide="ignore"):
+        mixed: Floats = np.logaddexp(np.log1p(-share) + log_densities, np.log(share) + uniform)
+    return mixed
 
 
 def _calibrated(logits: Floats, actions: NDArray[np.int64]) -> tuple[float, float, float]:

@@ -79,10 +79,6 @@ class FQEConfig(TrainingConfig):
 class BoxFQEConfig(FQEConfig):
     """Settings of fitted Q evaluation for the actions of a Box."""
 
-    batch_size: int = 128
-    """transitions in one gradient update, drawn with replacement"""
-    hidden: tuple[int, ...] = (64, 64)
-    """widths of the hidden layers"""
     normalize: bool = True
     """normalize the network's inputs to mean 0 and standard deviation 1 over the data"""
     scale_rewards: bool = True
@@ -192,7 +188,7 @@ class BoxFQE(FQE):
         buffer, networks = self.buffer, len(self.seeds)
         rows = torch.arange(len(buffer)) if rows is None else rows
         places, parts = buffer.places[0].index_select(0, rows), []
-        for part in torch.arange(len(rows)).split(_ROWS_AT_ONCE):
+        for part in torch.split(torch.arange(len(rows)), _ROWS_AT_ONCE):
             states = buffer.observe(places[part].repeat(networks))
             values = self.models["q"](states.with_actions(actions[:, part].flatten(0, 1)))
             parts.append(values.view(networks, -1))

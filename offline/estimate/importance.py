@@ -292,6 +292,21 @@ def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
     return size
 
 
+def usable_steps(episodes: EpisodeTable, lengths: NDArray[np.int64], least: float) -> int:
+    """Return the number of first steps whose effective sample sizes are all at least `least`.
+
+    The result is at most the length of the longest episode. An episode that has ended keeps the
+    weight of its last step, because its rewards of 0 count as well.
+
+    Args:
+        episodes: E episodes.
+        lengths: (E,) number of steps of each episode.
+        least: Smallest sufficient effective number of episodes.
+    """
+    few = effective_sample_sizes(episodes)[: int(lengths.max())] < least
+    return int(few.argmax()) if few.any() else len(few)
+
+
 def mean_weight(estimator: str, episodes: EpisodeTable) -> RatioEstimate | None:
     """Return the mean importance weight of an unbiased estimator.
 

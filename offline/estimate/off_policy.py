@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.base_policy import BasePolicy, RandomPolicy
@@ -20,15 +21,17 @@ from mcaprl.offline.batches.buffer import TransitionBuffer, discrete_actions
 from mcaprl.offline.estimate.fqe import FQE, FQEConfig
 from mcaprl.offline.estimate.importance import (
     ESTIMATORS,
+    WHOLE_EPISODE,
     EpisodeTable,
     Floats,
     RatioEstimate,
     effective_sample_size,
     mean_weight,
+    usable_steps,
 )
 from mcaprl.offline.estimate.values import by_rows, policy_inputs
 from mcaprl.recorder.dataset.statistics import calibration
-from mcaprl.recorder.format.behavior import PROBABILITY
+from mcaprl.recorder.format.behavior import BehaviorField
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -58,17 +61,22 @@ class Estimate:
         value: Discounted return; None if it cannot be computed.
         interval: 95 % bootstrap-t interval over episodes; None for FQE or if `value` is None.
         effective_sample_size: Number of episodes that would give an equally precise estimate if the
-            policy itself were recorded.
+            policy itself were recorded; None for FQE of the actions of a Box.
         verdict: `ok`, or `refused: ` or `no interval: ` with a reason. FQE is never `ok`.
             A verdict based on estimated behavior probabilities ends with `BY_ESTIMATES`.
+        spread: Standard deviation of FQE's values over its seeds; None if there is one seed.
+        usable_steps: Number of first steps of the episodes whose weights have an effective sample
+            size that suffices; None for estimators without weights, and for TIS and WIS.
     """
 
     policy: str
     estimator: str
     value: float | None
     interval: tuple[float, float] | None
-    effective_sample_size: float
+    effective_sample_size: float | None
     verdict: str
+    spread: float | None = None
+    usable_steps: int | None = None
 
     @property
     def trusted(self) -> bool:
@@ -87,23 +95,30 @@ class PolicyEstimates:
     Attributes:
         policy: Name of the policy.
         coverage: Mean probability of the logged actions under the policy. If it is low, the
-            estimates depend on few steps or on the model's values of unseen actions.
+            estimates depend on few steps or on the model's values of unseen actions. None for the
+            actions of a Box.
         estimates: One estimate per estimator.
+        support: Fraction of the policy's actions, in the states of the log, that are as near to
+            logged ones as 95 % of the log's own actions are; see `estimate.support`. None for
+            discrete actions, and if all observations are images.
     """
 
     policy: str
-    coverage: float
+    coverage: float | None
     estimates: tuple[Estimate, ...]
+    support: float | None = None
 
 
 class OffPolicyEvaluator:
-    """Evaluator of policies on one log.
+    """Evaluator of policies with discrete actions on one log.
 
     Attributes:
         gamma: Discount per step.
         behavior_return: Mean discounted return of the logged episodes.
         behavior_interval: 95 % bootstrap-t interval of that mean.
     """
+
+    config_type: ClassVar[type[FQEConfig]] = FQEConfig
 
     def __init__(self, dataset: Dataset, config: FQEConfig | None = None, seed: int = 0) -> None:
         """Prepare the evaluation on a log.
@@ -118,8 +133,8 @@ class OffPolicyEvaluator:
             TrainingError: There are no transitions, or a number is not finite.
             UsageError: There are too few episodes for cross-fitting.
         """
-        discrete_actions(dataset.action_space, "evaluation from the log alone")
-        self._config = config or FQEConfig()
+        self._check_space(dataset.action_space)
+        self._config = config or self.config_type()
         self._seed = seed
         self._dataset = dataset
         self._buffer = TransitionBuffer.from_dataset(dataset, self._config.packing)
@@ -138,6 +153,9 @@ class OffPolicyEvaluator:
         returns = rewards @ self.gamma ** np.arange(rewards.shape[1], dtype=np.float64)
         self.behavior_return = float(returns.mean())
         self.behavior_interval = RatioEstimate.mean(returns).interval(self._counts)
+
+    def _check_space(self, space: spaces.Space[Any]) -> None:
+        discrete_actions(space, "evaluation from the log alone")
 
     def evaluate(
         self,
@@ -163,20 +181,35 @@ class OffPolicyEvaluator:
         pi, pi_next = self._probabilities(policy, epsilon)
         q, v, v_last = self._model(pi, pi_next, on_update)
         own = pi[np.arange(len(pi)), self._buffer.actions.numpy()]
-        behavior = self._dataset.behavior_probs.astype(np.float64)
-        weights, refused = own, _unusable(behavior)
+        behavior = self._dataset.behavior.astype(np.float64)
+        weights, refused = own, unusable(behavior, self._dataset.behavior_field)
         if refused is None:
             weights = own / behavior
-            table = self._table(weights, q, v, v_last)
-            refused = _overflow(table.rho)
-        if refused is None:
-            found = [self._estimate(name, each, table) for each in ESTIMATORS]
-        else:
-            found = [Estimate(name, each, None, None, 0.0, refused) for each in ESTIMATORS]
-        every = (self._fqe_estimate(name, v, weights), *found)
-        if self._dataset.has_estimated_probs:
-            every = tuple(replace(one, verdict=f"{one.verdict}{BY_ESTIMATES}") for one in every)
+        found = self._importance(name, tuple(ESTIMATORS), refused, weights, q, v, v_last)
+        every = self._marked((self._fqe_estimate(name, v, weights), *found))
         return PolicyEstimates(name, float(own.mean()), every)
+
+    def _importance(
+        self,
+        name: str,
+        estimators: Sequence[str],
+        refused: str | None,
+        weights: Floats,
+        *model: Floats,
+    ) -> list[Estimate]:
+        """Return the estimates with importance weights (N,), or the reason of their refusal."""
+        if refused is None:
+            table = self._table(weights, *model)
+            refused = _overflow(table.rho)
+        if refused is not None:
+            return [Estimate(name, each, None, None, 0.0, refused) for each in estimators]
+        return [self._estimate(name, each, table) for each in estimators]
+
+    def _marked(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
+        """Mark the verdicts that are based on estimated behavior probabilities."""
+        if not self._dataset.has_estimated_probs:
+            return estimates
+        return tuple(replace(one, verdict=f"{one.verdict}{BY_ESTIMATES}") for one in estimates)
 
     @property
     def updates_of_model(self) -> int:
@@ -188,19 +221,10 @@ class OffPolicyEvaluator:
 
         With probability `epsilon`, the policy takes a random action.
         """
-        both = (self._dataset.observations, self._dataset.next_observations)
         random = RandomPolicy(self._dataset.action_space)
-        pi, pi_next = map(random.action_probabilities, both)
+        pi, pi_next = self._in_states(random, random.action_probabilities)
         policy = policy or random
-        if policy.frame_stack == 1:
-            own, own_next = (by_rows(policy.action_probabilities, part) for part in both)
-        else:
-            each = [
-                by_rows(policy.action_probabilities, policy_inputs(policy, episode))
-                for episode in self._dataset.episodes
-            ]
-            own = np.concatenate([one[:-1] for one in each])
-            own_next = np.concatenate([one[1:] for one in each])
+        own, own_next = self._in_states(policy, policy.action_probabilities)
         if own.shape != pi.shape:
             raise SpaceError(
                 f"the policy has {own.shape[1]} actions, but the log has {pi.shape[1]}"
@@ -209,6 +233,19 @@ class OffPolicyEvaluator:
             (1 - epsilon) * own.astype(np.float64) + epsilon * pi,
             (1 - epsilon) * own_next.astype(np.float64) + epsilon * pi_next,
         )
+
+    def _in_states(
+        self, policy: BasePolicy, function: Callable[[Any], NDArray[Any]]
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Apply a function of a policy to the observations, and to the next observations."""
+        if policy.frame_stack == 1:
+            both = (self._dataset.observations, self._dataset.next_observations)
+            here, there = (by_rows(function, part) for part in both)
+            return here, there
+        each = [
+            by_rows(function, policy_inputs(policy, episode)) for episode in self._dataset.episodes
+        ]
+        return np.concatenate([one[:-1] for one in each]), np.concatenate([one[1:] for one in each])
 
     def _model(
         self, pi: Floats, pi_next: Floats, on_update: Callable[[], None]
@@ -265,6 +302,9 @@ class OffPolicyEvaluator:
             estimate.interval(self._counts),
             size,
             self._verdict_on_weights(estimator, table, size),
+            usable_steps=usable_steps(table, self._lengths, LEAST_SAMPLE_SIZE)
+            if estimator not in WHOLE_EPISODE
+            else None,
         )
 
     def _verdict_on_weights(self, estimator: str, table: EpisodeTable, size: float) -> str:
@@ -293,14 +333,18 @@ class OffPolicyEvaluator:
         steps = weights.sum() ** 2 / max((weights**2).sum(), 1e-300)
         size = float(steps / self._lengths.mean())
         verdict = _verdict(size)
-        if verdict == TRUSTED and not self._config.enough_syncs:
-            verdict = (
-                f"refused: {self._config.updates // self._config.target_interval} target syncs"
-                f" are too few for gamma {self.gamma}; increase the updates"
-            )
         if verdict == TRUSTED:
-            verdict = "no interval: the error of the model cannot be estimated from the log"
+            verdict = self._verdict_on_model()
         return Estimate(name, "FQE", float(first.mean()), None, size, verdict)
+
+    def _verdict_on_model(self) -> str:
+        """Return the verdict on an estimate by the model alone, which is never `TRUSTED`."""
+        if self._config.enough_syncs:
+            return "no interval: the error of the model cannot be estimated from the log"
+        return (
+            f"refused: {self._config.updates // self._config.target_interval} target syncs"
+            f" are too few for gamma {self.gamma}; increase the updates"
+        )
 
     def _padded(self, column: NDArray[Any], fill: float) -> Floats:
         """Split the values of all steps into rows (E, T), one per episode, padded with `fill`."""
@@ -314,28 +358,45 @@ def ranking(estimates: Sequence[Estimate]) -> dict[str, Any]:
     """Rank policies by the first estimator of `PREFERENCE` that is trusted for all policies.
 
     Returns:
-        `estimator`; `policies`, best first; and `trusted`. If no estimator is trusted for all
-        policies, `trusted` is false and FQE ranks them.
+        `estimator`; `policies`, best first; `trusted`; and `close`, the other policies whose values
+        differ from the best one by less than two standard deviations over seeds. If no estimator is
+        trusted for all policies, `trusted` is false and FQE ranks them.
     """
     by_estimator = {
         name: [estimate for estimate in estimates if estimate.estimator == name]
         for name in (*PREFERENCE, "FQE")
     }
-    trusted = [name for name in PREFERENCE if all(one.trusted for one in by_estimator[name])]
+    trusted = [
+        name
+        for name, each in by_estimator.items()
+        if each and name in PREFERENCE and all(one.trusted for one in each)
+    ]
     chosen = trusted[0] if trusted else "FQE"
     ordered = sorted(by_estimator[chosen], key=lambda estimate: -(estimate.value or 0.0))
-    policies = [estimate.policy for estimate in ordered]
-    return {"estimator": chosen, "policies": policies, "trusted": bool(trusted)}
+    return {
+        "estimator": chosen,
+        "policies": [estimate.policy for estimate in ordered],
+        "trusted": bool(trusted),
+        "close": [one.policy for one in ordered[1:] if _is_close(ordered[0], one)],
+    }
 
 
-def _unusable(behavior: Floats) -> str | None:
-    """Return a refusal if logged probabilities are missing or impossible, else None."""
+def _is_close(best: Estimate, other: Estimate) -> bool:
+    """Return whether the difference of two values by FQE is within the noise of its seeds."""
+    if best.spread is None or other.spread is None:
+        return False
+    difference = (best.value or 0.0) - (other.value or 0.0)
+    return difference < 2 * float(np.hypot(best.spread, other.spread))
+
+
+def unusable(behavior: Floats, field: BehaviorField) -> str | None:
+    """Return a refusal if logged probabilities or densities are missing or impossible."""
     for wrong, what in (
-        (PROBABILITY.is_impossible(behavior), "not in (0, 1]"),
+        (field.is_impossible(behavior), f"not {field.expected}"),
         (np.isnan(behavior), "unknown; `estimate_behavior=True` estimates it"),
     ):
         if wrong.any():
-            return f"refused: behavior_prob of {wrong.sum()} of {len(wrong)} steps is {what}"
+            return f"refused: {field.name} of {wrong.sum()} of {len(wrong)} steps is {what}"
     return None
 
 

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from mcaprl.errors import TrainingError
 from mcaprl.files import read_json, write_json
+from mcaprl.offline.estimate.box import BehaviorCheck
 from mcaprl.offline.estimate.off_policy import LEAST_SAMPLE_SIZE
 from mcaprl.page import Section, Table, write_page
 from mcaprl.texts import counted
@@ -97,34 +98,6 @@ class Rating:
         """Return the value with its interval."""
         low, high = self.interval
         return f"{self.value:.4g} ({low:.4g} to {high:.4g})"
-
-
-@dataclass(frozen=True)
-class BehaviorCheck:
-    """FQE's value of the behavior policy, beside the returns that this policy had.
-
-    Attributes:
-        predicted: Mean value of the episodes, by models that were trained on others.
-        returned: Mean discounted return of the episodes.
-        interval: 95 % interval of `returned`.
-    """
-
-    predicted: float
-    returned: float
-    interval: tuple[float, float]
-
-    @property
-    def passes(self) -> bool:
-        """Whether the prediction is within the interval."""
-        return self.interval[0] <= self.predicted <= self.interval[1]
-
-    def __str__(self) -> str:
-        """Return both values in words."""
-        low, high = self.interval
-        return (
-            f"the models predict {self.predicted:.4g} for the behavior, whose episodes returned"
-            f" {self.returned:.4g} ({low:.4g} to {high:.4g})"
-        )
 
 
 @dataclass(frozen=True)

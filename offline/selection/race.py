@@ -43,6 +43,7 @@ from mcaprl.files import read_json, replacing_folder, subfolder, write_json
 from mcaprl.offline.algorithms.config import BOX_CONFIGS, CONFIGS, TrainingConfig
 from mcaprl.offline.algorithms.heads import BoxHead
 from mcaprl.offline.batches.buffer import discrete_actions
+from mcaprl.offline.estimate.box import BehaviorCheck
 from mcaprl.offline.estimate.evidence import (
     FOLDS,
     BoxEvidenceCollector,
@@ -61,7 +62,6 @@ from mcaprl.offline.selection.choice import (
     ESTIMATE,
     STOPPED_EARLY,
     UNTESTED,
-    BehaviorCheck,
     Choice,
     LogTraits,
     Rating,
@@ -607,12 +607,15 @@ def _spread_of_commands(dataset: Dataset, clone: Policy) -> tuple[float, float, 
 
 def _check(evidence: Sequence[Evidence]) -> BehaviorCheck | None:
     """Return what the models predict for the behavior of a log with the actions of a Box."""
-    predicted, returned = np.mean([one.behavior for one in evidence], axis=0)
+    predicted = np.array([one.behavior[0] for one in evidence])
+    returned = np.mean([one.behavior[1] for one in evidence], axis=0)
     if not len(returned):
         return None
+    models = predicted.mean(1)
     drawn = _counts(np.random.default_rng(0), len(returned)) @ returned
     low, high = np.percentile(drawn, [2.5, 97.5]).tolist()
-    return BehaviorCheck(float(predicted.mean()), float(returned.mean()), (low, high))
+    means = float(models.mean()), float(models.std()), float(returned.mean())
+    return BehaviorCheck(*means, (low, high))
 
 
 def _skipped(traits: LogTraits, candidates: Sequence[Candidate]) -> dict[str, str]:

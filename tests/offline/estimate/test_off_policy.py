@@ -210,7 +210,7 @@ def test_impossible_probabilities_are_refused(prob: float) -> None:
     for name in ESTIMATORS:
         assert (found[name].value, found[name].interval) == (None, None)
         assert found[name].verdict == (
-            f"refused: behavior_prob of 2 of {len(data)} steps is not in (0, 1]"
+            f"refused: behavior_prob of 2 of {len(data)} steps is not a number in (0, 1]"
         )
 
 

@@ -15,6 +15,7 @@ import mcaprl
 from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import SpaceError, UnknownNameError
 from mcaprl.offline.algorithms.config import BoxBCConfig, BoxIQLConfig, ReBRACConfig
+from mcaprl.offline.estimate.box import BehaviorCheck
 from mcaprl.offline.estimate.evidence import (
     CLOSE,
     BoxEvidenceCollector,
@@ -26,7 +27,6 @@ from mcaprl.offline.selection.choice import (
     AGREEMENT,
     ESTIMATE,
     PRIOR,
-    BehaviorCheck,
     Rating,
     decide,
     read_choice,
@@ -114,14 +114,14 @@ def test_the_rule_by_hand(
     estimate: float, best: tuple[float, float], chosen: str, rule: str
 ) -> None:
     ratings = {"bc": rating(*best), "iql": rating(2.0, 4.0)}
-    check = BehaviorCheck(estimate, 2.0, (1.5, 2.5))
+    check = BehaviorCheck(estimate, 0.1, 2.0, (1.5, 2.5))
     assert decide(ratings, ["iql", "bc"], check) == (chosen, rule)
     assert decide(ratings, ["iql", "bc"], None) == ("iql", PRIOR)
 
 
 def test_without_a_doubt_the_estimates_confirm_the_usual_choice() -> None:
     ratings = {"iql": rating(2.0, 4.0), "bc": rating(1.9, 4.0)}
-    check = BehaviorCheck(2.0, 2.0, (1.5, 2.5))
+    check = BehaviorCheck(2.0, 0.1, 2.0, (1.5, 2.5))
     assert decide(ratings, ["iql", "bc"], check) == ("iql", ESTIMATE)
 
 
