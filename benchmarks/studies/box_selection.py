@@ -31,9 +31,8 @@ from benchmarks.studies.pendulum_data import PILOT, RANDOM, pendulum, returns_of
 from benchmarks.studies.selection import regret_rows
 from benchmarks.studies.sim_grid import normalize_mean, run
 from mcaprl.api import load_policies
-from mcaprl.base_policy import BasePolicy
 from mcaprl.files import write_json
-from mcaprl.sims import make_pilot, make_sim
+from mcaprl.sims import Policy, make_pilot, make_sim
 
 Result = dict[str, Any]
 SHARED: Final[dict[str, Any]] = {
@@ -117,7 +116,7 @@ def measure(folder: Path, name: str) -> Result:
     return {"scores": scores, "choice": choice}
 
 
-def choose(data: mcaprl.Dataset, out: Path, settings: dict[str, Any]) -> dict[str, BasePolicy]:
+def choose(data: mcaprl.Dataset, out: Path, settings: dict[str, Any]) -> dict[str, Policy]:
     """Let `auto` train its portfolio and choose; return the policies of all candidates."""
     if not (out / "choice.json").exists():
         mcaprl.train(
@@ -154,7 +153,7 @@ def make_log(folder: Path, kind: Kind, seed: int) -> mcaprl.Dataset:
     return mcaprl.open(log)
 
 
-def medium(folder: Path, kind: Kind) -> BasePolicy:
+def medium(folder: Path, kind: Kind) -> Policy:
     """Return an early checkpoint of a clone of the noisy pilot."""
     log, out = folder / "noisy.mcap", folder / "medium"
     shutil.rmtree(out, ignore_errors=True)
@@ -162,10 +161,11 @@ def medium(folder: Path, kind: Kind) -> BasePolicy:
         kind.sim, log, noise=0.1, steps=5_000, actions=kind.actions, scene=False, overwrite=True
     )
     mcaprl.train(log, out, algo="bc", updates=MEDIUM_UPDATES)
-    return load_policies(out)[0]
+    policy: Policy = load_policies(out)[0]
+    return policy
 
 
-def score(kind: Kind, policies: dict[str, BasePolicy]) -> dict[str, float]:
+def score(kind: Kind, policies: dict[str, Policy]) -> dict[str, float]:
     """Return the normalized score of each policy."""
     if kind.sim == PENDULUM:
         means = {name: float(np.mean(returns_of(one))) for name, one in policies.items()}

@@ -91,8 +91,8 @@ def test_a_candidate_has_its_own_defaults_unless_auto_is_given_others() -> None:
     assert found["iql"] == BoxIQLConfig(gamma=0.5, checkpoint_interval=500)
     assert found["rebrac"] == ReBRACConfig(gamma=0.5, checkpoint_interval=500)
     assert found["bc-top-0.1"] == BoxBCConfig(top=0.1, checkpoint_interval=500)
-    assert BOX_PORTFOLIO[0].config(AutoConfig(target_interval=7)).hidden == (128, 128)
-    assert BOX_PORTFOLIO[0].config(AutoConfig(target_interval=7)).target_interval == 7
+    given = BOX_PORTFOLIO[0].config(AutoConfig(target_interval=7))
+    assert given == BoxIQLConfig(target_interval=7, checkpoint_interval=500)
 
 
 def rating(low: float, high: float) -> Rating:
