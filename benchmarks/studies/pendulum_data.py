@@ -1,7 +1,6 @@
 """Logs of Pendulum-v1 by a scripted pilot: energy control below, and a PD controller at the top.
 
-The rewards are the negative squares of angle, speed and torque. A mean return of the pilot is about
--170, that of random torques -1,230.
+The rewards are the negative squares of angle, speed and torque.
 """
 
 from __future__ import annotations
@@ -16,6 +15,8 @@ import mcaprl
 
 STEPS = 200
 TORQUE = 2.0
+PILOT, RANDOM = -170.0, -1_230.0
+"""Mean returns of the pilot, and of random torques."""
 BLENDS = {"expert": (0.0, 0.0), "noisy": (0.3, 0.3), "random": (1.0, 0.0), "mixed": (-1.0, 0.3)}
 """Probability of a random torque, and deviation of the noise on others, by the kind of a log.
 
@@ -33,9 +34,11 @@ def pilot(observation: NDArray[Any]) -> float:
     return TORQUE if energy * speed <= 0 else -TORQUE
 
 
-def pendulum(kind: str = "mixed", episodes: int = 100, seed: int = 0) -> mcaprl.Dataset:
-    """Record episodes of 200 steps; `kind` is a key of `BLENDS`."""
-    chance, deviation = BLENDS[kind]
+def pendulum(
+    kind: str | tuple[float, float] = "mixed", episodes: int = 100, seed: int = 0
+) -> mcaprl.Dataset:
+    """Record episodes of 200 steps; `kind` is a key of `BLENDS`, or a value such as those."""
+    chance, deviation = BLENDS[kind] if isinstance(kind, str) else kind
     env, random = gym.make("Pendulum-v1"), np.random.default_rng(seed)
     rows: list[tuple[Any, ...]] = []
     for episode in range(episodes):

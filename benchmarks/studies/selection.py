@@ -415,26 +415,25 @@ def show(logs: list[Log]) -> None:
             best = min(regrets, key=lambda name: regrets[name][~mine].mean())
             fair[mine] = regrets[best][mine]
             print(f"the best rule on the other sims than {sim}: {best}")
-    _print({**regrets, "the best rule on other sims": fair})
+    print(regret_rows({**regrets, "the best rule on other sims": fair}))
     print(f"checkpoints of one training, after {SHORT} updates and the last:")
-    _print(
-        {
-            name: np.array([log.checkpoint_regret(rule) for log in logs])
-            for name, rule in CHECKPOINT_RULES.items()
-        }
-    )
+    checkpoints = {
+        name: np.array([log.checkpoint_regret(rule) for log in logs])
+        for name, rule in CHECKPOINT_RULES.items()
+    }
+    print(regret_rows(checkpoints))
 
 
-def _print(regrets: dict[str, NDArray[np.float64]]) -> None:
-    """Print a row for each rule: mean regret with interval, largest regret, and single regrets."""
-    random = np.random.default_rng(0)
+def regret_rows(regrets: dict[str, NDArray[np.float64]]) -> str:
+    """Return a row for each rule: mean regret with interval, largest regret, single regrets."""
+    random, rows = np.random.default_rng(0), []
     for name, each in regrets.items():
         draws = random.choice(each, (1_000, len(each))).mean(1)
         low, high = np.percentile(draws, [2.5, 97.5])
         single = " ".join(f"{regret:.2f}" for regret in each)
-        print(
-            f"| {name} | {each.mean():.3f} ({low:.2f} to {high:.2f}) | {each.max():.2f} | {single}"
-        )
+        mean = f"{each.mean():.3f} ({low:.2f} to {high:.2f})"
+        rows.append(f"| {name} | {mean} | {each.max():.2f} | {single} |")
+    return "\n".join(rows)
 
 
 def main() -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from mcaprl.errors import TrainingError
 from mcaprl.files import read_json, write_json
+from mcaprl.offline.estimate.box import BehaviorCheck
 from mcaprl.offline.estimate.off_policy import LEAST_SAMPLE_SIZE
 from mcaprl.page import Section, Table, write_page
 from mcaprl.texts import counted
@@ -36,6 +37,8 @@ STOPPED_EARLY: Final = "stopped early"
 """Outcome of a candidate that was not trained with all updates, or cannot be chosen."""
 DETERMINISTIC: Final = 0.05
 """If the entropy of the behavior policy is lower, candidates are rated by agreement with it."""
+ESTIMATE, AGREEMENT, PRIOR, UNTESTED = "estimate", "agreement", "prior order", "untested"
+"""Rules that decide."""
 _FEW_EPISODES: Final = 50
 _LOW_COVERAGE: Final = 0.5
 
@@ -110,6 +113,7 @@ class Tried:
         weighted: Estimate by WPDIS, and the effective number of episodes of this estimate; None
             if the log has no action probabilities.
         outcome: `chosen`, `runner-up`, `stopped early`, or why it was not trained.
+        check: What the models predict for the behavior; None for finite action spaces.
     """
 
     updates: int = 0
@@ -118,6 +122,7 @@ class Tried:
     bellman_error: float | None = None
     weighted: tuple[float, float] | None = None
     outcome: str = ""
+    check: BehaviorCheck | None = None
 
     def row(self, name: str) -> tuple[str, ...]:
         """Return the row of the table of candidates."""
@@ -139,6 +144,30 @@ class Tried:
         )
 
 
+def decide(
+    ratings: Mapping[str, Rating], prior: Sequence[str], check: BehaviorCheck | None
+) -> tuple[str, str]:
+    """Choose by the estimates if they can be trusted, else by the prior order.
+
+    The estimates can be trusted if they are right for the behavior, and the interval of the
+    candidate with the largest estimate is above that of the first candidate of the prior order.
+
+    Args:
+        ratings: Ratings by candidate, the best first.
+        prior: All rated candidates in the order in which they are preferred without estimates.
+        check: Estimate of the behavior.
+
+    Returns:
+        The chosen candidate, and the rule that decided.
+    """
+    best, usual = next(iter(ratings)), prior[0]
+    if check is None or not check.passes:
+        return usual, PRIOR
+    if best == usual or ratings[best].interval[0] > ratings[usual].interval[1]:
+        return best, ESTIMATE
+    return usual, PRIOR
+
+
 @dataclass(frozen=True)
 class Choice:
     """Policy that `auto` chose, and the reason.
@@ -151,6 +180,7 @@ class Choice:
         complete: Whether all planned training and evaluation was done within the budget.
         traits: Properties of the log.
         tried: What is known of each candidate, by name, from the best to the worst.
+        rule: Rule that decided: `ESTIMATE`, `AGREEMENT`, `PRIOR` or `UNTESTED`.
     """
 
     chosen: str
@@ -160,15 +190,22 @@ class Choice:
     complete: bool
     traits: LogTraits
     tried: dict[str, Tried]
+    rule: str = ""
 
     @classmethod
     def of(
-        cls, chosen: str, evaluated: int, traits: LogTraits, tried: dict[str, Tried], complete: bool
+        cls,
+        chosen: str,
+        rule: str,
+        evaluated: int,
+        traits: LogTraits,
+        tried: dict[str, Tried],
+        complete: bool,
     ) -> Choice:
         """Put a choice among this number of evaluated candidates into words."""
-        reason, confidence = _words(chosen, tried[chosen].rating, evaluated, traits)
+        reason, confidence = _words(chosen, rule, tried[chosen], evaluated, traits)
         advice = _advice(traits, tried, complete)
-        return cls(chosen, reason, confidence, advice, complete, traits, tried)
+        return cls(chosen, reason, confidence, advice, complete, traits, tried, rule)
 
     @property
     def rows(self) -> list[tuple[str, ...]]:
@@ -203,25 +240,38 @@ def read_choice(run: Path) -> Choice:
 
 
 def _words(
-    chosen: str, rating: Rating | None, evaluated: int, traits: LogTraits
+    chosen: str, rule: str, tried: Tried, evaluated: int, traits: LogTraits
 ) -> tuple[str, str]:
     """Return why the rule chose a candidate, and the confidence in the choice."""
+    rating, check = tried.rating, tried.check
     if rating is None:
         reason = f"{chosen} is used because the budget ended before any candidate was evaluated."
         return reason, "Unknown, because no candidate was evaluated."
     count = counted(evaluated, "candidate")
-    reason = f"{chosen} has the largest estimated value of {count}: {rating}."
-    if traits.is_deterministic:
+    confidence = (
+        f"In {rating.best_chance:.0%} of the resamplings of episodes, networks and models, {chosen}"
+        f" is the best of {count}. This does not include the bias of the models, which a log does"
+        " not show."
+    )
+    if rule == AGREEMENT:
         reason = (
             f"{chosen} takes the logged action in {rating.agreement:.0%} of the states, most often"
             f" of {count}. The behavior is almost deterministic (entropy {traits.entropy:.2f} of"
             " 1), so the log has no evidence that other actions are better."
         )
-    return reason, (
-        f"In {rating.best_chance:.0%} of the resamplings of episodes, networks and models, {chosen}"
-        f" is the best of {count}. This does not include the bias of the models, which a log does"
-        " not show."
-    )
+    elif rule == PRIOR:
+        why = "the intervals of the estimates overlap"
+        if check is not None and not check.passes:
+            why = f"the estimates are not calibrated: {check}"
+        reason = (
+            f"{chosen} has the best mean score of {count} on other logs, which decides because"
+            f" {why}."
+        )
+    else:
+        reason = f"{chosen} has the largest estimated value of {count}: {rating}."
+        if check is not None:
+            confidence += f" For comparison, {check}."
+    return reason, confidence
 
 
 def _advice(traits: LogTraits, tried: Mapping[str, Tried], complete: bool) -> tuple[str, ...]:

@@ -22,7 +22,8 @@ class AutoConfig(BootstrapConfig):
     target_interval: int = 150
     """updates between two updates of the target network"""
     finalists: str = "iql,cql-alpha-0.1"
-    """candidates among which the choice is made, separated by commas; `all` for all of them"""
+    """candidates among which the choice is made, separated by commas; `all` for all of them, which
+    is the default for a Box"""
     survivors: int = 4
     """maximum number of finalists that are trained with all updates"""
     short_fraction: float = 0.25

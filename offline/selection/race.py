@@ -12,6 +12,9 @@ of the finalists are trained with the rest and rated again, and the one with the
 chosen. After the first candidate's short training, RUN/seed-K always has a policy, also if the run
 is interrupted.
 
+For the actions of a Box, the candidates are others, and the estimates decide only if they are right
+for the behavior of the log and clear (`mcaprl.offline.selection.choice.decide`).
+
 The score of a candidate is the mean of its estimated values of the first states of the episodes:
 pessimistic FQE by models that were trained on other episodes (`mcaprl.offline.estimate.evidence`).
 The mean is over the episodes, the networks of the candidate, and the models. If the behavior policy
@@ -32,25 +35,39 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import TrainingError, UnknownNameError, UsageError, import_extra
 from mcaprl.files import read_json, replacing_folder, subfolder, write_json
-from mcaprl.offline.algorithms.config import TrainingConfig
-from mcaprl.offline.algorithms.registry import choose_algorithm
+from mcaprl.offline.algorithms.config import BOX_CONFIGS, CONFIGS, TrainingConfig
+from mcaprl.offline.algorithms.heads import BoxHead
 from mcaprl.offline.batches.buffer import discrete_actions
+from mcaprl.offline.estimate.box import BehaviorCheck
 from mcaprl.offline.estimate.evidence import (
     FOLDS,
+    BoxEvidenceCollector,
     Evidence,
     EvidenceCollector,
     fqe_config,
     likely,
+    likely_commands,
+    of_both,
     weighted_value,
 )
 from mcaprl.offline.estimate.values import by_rows
 from mcaprl.offline.policy import Policy, read_policy
-from mcaprl.offline.selection.choice import STOPPED_EARLY, Choice, LogTraits, Rating, Tried
+from mcaprl.offline.selection.choice import (
+    AGREEMENT,
+    ESTIMATE,
+    STOPPED_EARLY,
+    UNTESTED,
+    Choice,
+    LogTraits,
+    Rating,
+    Tried,
+    decide,
+)
 from mcaprl.offline.selection.config import ALL, AUTO, AutoConfig
 from mcaprl.offline.training.metrics import OfflineSummary
 from mcaprl.offline.training.train import train, with_source
@@ -98,20 +115,28 @@ class Candidate:
         name: Name in tables and of the folder of its run.
         algo: Name of the algorithm.
         special: Settings that differ from the shared ones.
+        is_box: Whether the algorithm is that for the actions of a Box.
     """
 
     name: str
     algo: str
     special: Mapping[str, Any]
+    is_box: bool = False
 
     def config(self, shared: AutoConfig) -> TrainingConfig:
-        """Return the settings of the algorithm. Its special settings override the shared ones."""
-        _, defaults = choose_algorithm(self.algo)
+        """Return the settings of the algorithm. Its special settings override the shared ones.
+
+        For a Box, the shared settings are those that differ from the defaults of `auto`.
+        """
+        defaults = (BOX_CONFIGS if self.is_box else CONFIGS)[self.algo]()
         names = {field.name for field in fields(defaults)}.difference(_OWN)
         given = {
-            each.name: getattr(shared, each.name) for each in fields(shared) if each.name in names
+            each.name: getattr(shared, each.name)
+            for each in fields(shared)
+            if each.name in names
+            and not (self.is_box and getattr(shared, each.name) == each.default)
         }
-        if self.algo == "iql":
+        if self.algo == "iql" and not self.is_box:
             given["target_interval"] = min(_IQL_INTERVAL, shared.target_interval)
         given["checkpoint_interval"] = shared.candidate_interval
         return replace(defaults, **{**given, **self.special})
@@ -127,6 +152,26 @@ PORTFOLIO: Final = (
     Candidate("double-dqn", "double-dqn", {}),
 )
 """All candidates, in the order of their training; the first is used if none can be evaluated."""
+BOX_PORTFOLIO: Final = (
+    Candidate("iql", "iql", {}, is_box=True),
+    Candidate("rebrac", "rebrac", {}, is_box=True),
+    Candidate("td3-bc", "td3-bc", {}, is_box=True),
+    Candidate("bc", "bc", {}, is_box=True),
+    Candidate("bc-top-0.1", "bc", {"top": 0.1}, is_box=True),
+)
+"""The same for the actions of a Box."""
+
+
+def portfolio(space: spaces.Space[Any]) -> tuple[Candidate, ...]:
+    """Return the candidates for an action space.
+
+    Raises:
+        SpaceError: No candidate learns the actions of this space.
+    """
+    if isinstance(space, spaces.Box):
+        return BOX_PORTFOLIO
+    discrete_actions(space, AUTO)
+    return PORTFOLIO
 
 
 def eligible(config: AutoConfig, trying: Sequence[Candidate]) -> frozenset[str]:
@@ -189,13 +234,13 @@ def select(
 
     The arguments are those of `mcaprl.offline.train` and `mcaprl.train`.
     """
-    discrete_actions(dataset.action_space, AUTO)
     if config.report:
         import_extra("jinja2", "report")
-    known = [one.name for one in PORTFOLIO]
-    for name in config.finalists.split(","):
-        if name not in (*known, ALL):
-            raise UnknownNameError("candidate", name, known)
+    known = [one.name for one in portfolio(dataset.action_space)]
+    if config.finalists != AutoConfig.finalists:
+        for name in config.finalists.split(","):
+            if name not in (*known, ALL):
+                raise UnknownNameError("candidate", name, known)
     if dataset.origin.grow is not None:
         raise UsageError(f"`follow=True` is not for `algo={AUTO!r}`: omit it")
     dataset = with_source(dataset, config.mask_from)
@@ -242,8 +287,9 @@ class _Race:
         """Run both stages. Return the choice, and a summary for each seed."""
         clone = self._clone()
         traits = _traits(self._dataset, clone)
-        skipped = _skipped(traits)
-        trying = {one.name: one for one in PORTFOLIO if one.name not in skipped}
+        candidates = portfolio(self._dataset.action_space)
+        skipped = _skipped(traits, candidates)
+        trying = {one.name: one for one in candidates if one.name not in skipped}
         among = eligible(self._config, list(trying.values()))
 
         def finalists(names: Iterable[str]) -> list[str]:
@@ -261,12 +307,14 @@ class _Race:
         first = self._evaluate("short", names, clone, imitate, 0.5, SHARES[1])
         going = finalists(names)
         if first:
-            going = finalists(first)[: self._config.survivors]
+            going = self._going(finalists(first))
             self._publish(going[0])
         self._train([trying[name] for name in going], full, SHARES[2])
         second = self._evaluate("full", going, clone, imitate, 1.0, SHARES[3])
         last = second or first
         order = finalists(last or names)
+        chosen, rule = self._decide(order, last, imitate)
+        order = [chosen, *(name for name in order if name != chosen)]
         tried = {name: Tried(self._updates(name), outcome="not evaluated") for name in names}
         tried |= {name: replace(one, outcome=STOPPED_EARLY) for name, one in first.items()}
         tried |= second
@@ -276,10 +324,36 @@ class _Race:
         tried |= {name: Tried(outcome="no checkpoint within the budget") for name in late}
         tried |= {name: Tried(outcome=f"not tried: {why}") for name, why in skipped.items()}
         table = {name: tried[name] for name in dict.fromkeys([*order, *first, *trying, *tried])}
-        choice = Choice.of(order[0], len(last), traits, table, self._in_time)
+        choice = Choice.of(chosen, rule, len(last), traits, table, self._in_time)
         self._publish(choice.chosen)
         choice.write(self._out)
         return choice, self._summaries(choice.chosen, trying[choice.chosen].algo)
+
+    def _going(self, order: list[str]) -> list[str]:
+        """Return the candidates that are trained with all updates, given the best first.
+
+        For a Box, the first one of the portfolio is among them, because it is chosen if the
+        estimates do not decide.
+        """
+        going = order[: self._config.survivors]
+        usual = BOX_PORTFOLIO[0].name
+        is_box = isinstance(self._dataset.action_space, spaces.Box)
+        return [*going[:-1], usual] if is_box and usual in order and usual not in going else going
+
+    def _decide(
+        self, order: Sequence[str], last: Mapping[str, Tried], imitate: bool
+    ) -> tuple[str, str]:
+        """Choose among candidates, given the best first; return the choice and the rule."""
+        if not last:
+            return order[0], UNTESTED
+        if imitate:
+            return order[0], AGREEMENT
+        check = last[order[0]].check
+        if check is None:
+            return order[0], ESTIMATE
+        ratings = {name: one for name in order if (one := last[name].rating)}
+        prior = [one.name for one in BOX_PORTFOLIO if one.name in ratings]
+        return decide(ratings, prior, check)
 
     def _left_s(self, share: float) -> float:
         """Return the seconds until a fraction of the budget is used; 0 if it has been used."""
@@ -295,11 +369,13 @@ class _Race:
         """Clone the behavior policy."""
         updates = min(self._config.updates, CLONE_UPDATES)
         config = replace(self._config, updates=updates, held_out=0.0)
+        is_box = isinstance(self._dataset.action_space, spaces.Box)
+        clone = Candidate("clone", "bc", {"head": "gaussian"} if is_box else {}, is_box)
         ends = time.perf_counter() + self._left_s(SHARES[0] / 2)
         folder = self._out / "clone"
         self._train_into(
             folder,
-            Candidate("clone", "bc", {}).config(config),
+            clone.config(config),
             range(1),
             lambda now: self._stop_after(ends),
         )
@@ -391,8 +467,12 @@ class _Race:
             self._stop_after(ends)
 
         def evaluate(updates: int, member: int) -> list[Evidence]:
-            model = fqe_config(self._config.gamma, updates)
-            collector = EvidenceCollector(self._dataset, clone, model, seed=member)
+            is_box = isinstance(self._dataset.action_space, spaces.Box)
+            model = fqe_config(self._config.gamma, updates, is_box=is_box)
+            model = replace(model, clip_actions=self._config.clip_actions)
+            collector = (BoxEvidenceCollector if is_box else EvidenceCollector)(
+                self._dataset, clone, model, seed=member
+            )
             return collector.collect([one for each in policies.values() for one in each], check)
 
         evidence: dict[str, list[Evidence]] = {}
@@ -435,6 +515,7 @@ class _Race:
             float(np.mean([one.support for one in evidence])),
             float(np.mean(errors)) if errors else None,
             tuple(np.mean(known, axis=0).tolist()) if known else None,
+            check=_check(evidence),
         )
 
     def _folder(self, name: str) -> Path:
@@ -481,13 +562,10 @@ class _Race:
         return stages
 
 
-def _traits(dataset: Dataset, clone: BasePolicy) -> LogTraits:
+def _traits(dataset: Dataset, clone: Policy) -> LogTraits:
     """Return the properties of a log. The clone imitates its behavior policy."""
-    chances = by_rows(clone.action_probabilities, dataset.observations).astype(np.float64)
-    behavior = dataset.behavior_probs.astype(np.float64)
-    known = not bool((np.isnan(behavior) | PROBABILITY.is_impossible(behavior)).any())
-    logs = np.log(np.where(chances > 0, chances, 1.0))
-    nats = -np.log(behavior).mean() if known else -(chances * logs).sum(1).mean()
+    is_box = isinstance(dataset.action_space, spaces.Box)
+    entropy, coverage, known = (_spread_of_commands if is_box else _spread)(dataset, clone)
     returns = dataset.statistics.returns
     return LogTraits(
         episodes=len(dataset.episodes),
@@ -495,24 +573,62 @@ def _traits(dataset: Dataset, clone: BasePolicy) -> LogTraits:
         mean_return=float(returns.mean()),
         return_spread=float(returns.std()),
         terminated=float(dataset.terminated.sum() / len(dataset.episodes)),
-        entropy=float(nats / np.log(max(chances.shape[1], 2))),
-        coverage=float(likely(chances).mean()),
+        entropy=entropy,
+        coverage=coverage,
         probabilities=known,
         problems=tuple(one.what for one in lint(dataset) if one.severity == "problem"),
     )
 
 
-def _skipped(traits: LogTraits) -> dict[str, str]:
+def _spread(dataset: Dataset, clone: Policy) -> tuple[float, float, bool]:
+    """Return the entropy and coverage of a log, and whether its probabilities are known."""
+    chances = by_rows(clone.action_probabilities, dataset.observations).astype(np.float64)
+    behavior = dataset.behavior_probs.astype(np.float64)
+    known = not bool((np.isnan(behavior) | PROBABILITY.is_impossible(behavior)).any())
+    logs = np.log(np.where(chances > 0, chances, 1.0))
+    nats = -np.log(behavior).mean() if known else -(chances * logs).sum(1).mean()
+    entropy = float(nats / np.log(max(chances.shape[1], 2)))
+    return entropy, float(likely(chances).mean()), known
+
+
+def _spread_of_commands(dataset: Dataset, clone: Policy) -> tuple[float, float, bool]:
+    """Return the same for the actions of a Box."""
+    assert isinstance(clone.head, BoxHead)
+    box, seen, logs = clone.head.box, dataset.observations, dataset.behavior_log_probs
+    known = bool(np.isfinite(logs).all())
+    if not known:
+        inside = box.unscaled(box.scaled(dataset.actions).clip(-1, 1))
+        logs = of_both(clone.log_prob, seen, inside)
+    nats = -logs.astype(np.float64).mean() + box.log_scale - box.size * np.log(2)
+    random = box.unscaled(np.random.default_rng(0).uniform(-1, 1, (len(dataset), box.size)))
+    width = min(float(np.exp(nats / box.size)), 1.0)
+    return width, float(likely_commands(clone, seen, random).mean()), known
+
+
+def _check(evidence: Sequence[Evidence]) -> BehaviorCheck | None:
+    """Return what the models predict for the behavior of a log with the actions of a Box."""
+    predicted = np.array([one.behavior[0] for one in evidence])
+    returned = np.mean([one.behavior[1] for one in evidence], axis=0)
+    if not len(returned):
+        return None
+    models = predicted.mean(1)
+    drawn = _counts(np.random.default_rng(0), len(returned)) @ returned
+    low, high = np.percentile(drawn, [2.5, 97.5]).tolist()
+    means = float(models.mean()), float(models.std()), float(returned.mean())
+    return BehaviorCheck(*means, (low, high))
+
+
+def _skipped(traits: LogTraits, candidates: Sequence[Candidate]) -> dict[str, str]:
     """Return a dict from the name of each candidate that is not tried on a log to the reason."""
     skipped = {}
-    if traits.coverage <= LEAST_COVERAGE:
+    if traits.coverage <= LEAST_COVERAGE and candidates is PORTFOLIO:
         skipped["double-dqn"] = (
             f"only {traits.coverage:.0%} of the actions are likely in the log, and it overestimates"
             " the others"
         )
     if traits.return_spread == 0 and traits.terminated == 0:
         alike = "all episodes have the same return, so there is nothing to prefer"
-        skipped |= {one.name: alike for one in PORTFOLIO if one.algo not in ("bc", "bcq", "cql")}
+        skipped |= {one.name: alike for one in candidates if one.algo not in ("bc", "bcq", "cql")}
     return skipped
 
 
