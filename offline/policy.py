@@ -357,24 +357,10 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
     stack = description.frame_stack
     check_elements(stack * sum(leaf.size for leaf in observation_leaves(observation_space)))
     encoder = _encoder(observation_space, joint.count if joint else 0, weights)
-    images = [image.stacked(stack) for image in encoder.image_inputs]
     log_std = weights.pop(LOG_STD, None)
     if log_std is not None and (box is None or log_std.shape != (box.size,)):
         raise ValueError(f"{LOG_STD} has shape {tuple(log_std.shape)}")
-    networks: dict[str, Network] = {}
-    for name, outputs in description.outputs.items():
-        architecture = architecture_of(description.critics.get(name, description.architecture))
-        width, seen = encoder.width * stack, images
-        if name == ENCODER and not images:
-            raise ValueError("there are no images to encode")
-        if name == ENCODER:
-            width, architecture = 0, architecture.of_encoder()
-        elif ENCODER in description.outputs:
-            width, seen = width + description.outputs[ENCODER][0], []
-        if name in description.critics and box is not None:
-            width += box.size
-        check_size(architecture, width, seen, math.prod(outputs), weights)
-        networks[name] = Network(width, seen, tuple(outputs), architecture)
+    networks = _networks(description, encoder, 0 if box is None else box.size, weights)
     threshold = description.threshold
     head = build_head(
         description.acts_by, networks, action_space, threshold, box=box, log_std=log_std
@@ -397,6 +383,29 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
         else ActionCommands.from_json(commands, joint.count),
         mask_from=mask_from,
     )
+
+
+def _networks(
+    description: _Description, encoder: ObservationEncoder, size: int, weights: dict[str, Tensor]
+) -> dict[str, Network]:
+    """Create the networks of a file, for actions of a Box with `size` numbers."""
+    networks: dict[str, Network] = {}
+    stack, outputs = description.frame_stack, description.outputs
+    images = [image.stacked(stack) for image in encoder.image_inputs]
+    if ENCODER in outputs and not images:
+        raise ValueError("there are no images to encode")
+    for name, shape in outputs.items():
+        architecture = architecture_of(description.critics.get(name, description.architecture))
+        width, seen = encoder.width * stack, images
+        if name == ENCODER:
+            width, architecture = 0, architecture.of_encoder()
+        elif ENCODER in outputs:
+            width, seen = width + outputs[ENCODER][0], []
+        if name in description.critics:
+            width += size
+        check_size(architecture, width, seen, math.prod(shape), weights)
+        networks[name] = Network(width, seen, tuple(shape), architecture)
+    return networks
 
 
 def _encoder(

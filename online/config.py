@@ -16,8 +16,8 @@ has the command and the scores of four seeds. Important settings are:
   oscillates until the end.
 - `n_steps` is 3 for powerline and racer, whose rewards are sparse or late. Their target networks
   are updated only every 2,000 steps (powerline, `gamma` 0.95) or 4,000 steps (racer, `gamma` 0.98).
-- For continuous actions, `polyak` is 0.02: with 0.005, critics lag behind the policy, and the car
-  of the lane stays slow. `smoothness` makes the commands smooth. The measurements are in
+- For continuous actions, `polyak` is 0.02: with 0.005, critics follow the policy too slowly, and
+  the car of the lane stays slow. `smoothness` makes the commands smooth. The measurements are in
   docs/decisions/14-continuous-actions.md.
 - Checkpoints are compared on separate episodes and the best one is stored, because scores can still
   drop during training.

@@ -433,7 +433,7 @@ def packed_log(dataset: Dataset, buffer: ReplayBuffer) -> TransitionBuffer:
     packed = TransitionBuffer.from_dataset(
         dataset, buffer.packing, encoder=buffer.encoder, reward_scale=1.0, box=buffer.box
     )
-    blocks = torch.arange(len(packed.frames)).split(_IMAGES_AT_ONCE)
+    blocks = torch.split(torch.arange(len(packed.frames)), _IMAGES_AT_ONCE)
     frames = [_averaged(packed.frames.rows(rows), buffer.pools) for rows in blocks]
     return replace(packed, frames=_joined(*frames))
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,7 @@ from benchmarks.page import write_section
 from benchmarks.studies.box_grid import SETTINGS
 from benchmarks.studies.pendulum_data import PILOT, RANDOM, pendulum, returns_of
 from benchmarks.studies.selection import regret_rows
-from benchmarks.studies.sim_grid import normalize_mean, run
+from benchmarks.studies.sim_grid import run
 from mcaprl.api import load_policies
 from mcaprl.files import write_json
 from mcaprl.sims import Policy, make_pilot, make_sim
@@ -111,9 +112,13 @@ def measure(folder: Path, name: str) -> Result:
     kind = LOGS[name]
     here = folder / name.replace(", ", "-").replace(" ", "-")
     data = make_log(here, kind, seed=1_000 + list(LOGS).index(name))
-    scores = score(kind, choose(data, here / "run", SETTINGS.get(kind.sim, {"gamma": 0.98})))
+    policies = choose(data, here / "run", SETTINGS.get(kind.sim, {"gamma": 0.98}))
     choice = json.loads((here / "run" / "choice.json").read_text())
-    return {"scores": scores, "choice": choice}
+    low, high = references(kind)
+    means = [data.statistics.mean_return, *mean_returns(kind, list(policies.values()))]
+    behavior, *scores = ((mean - low) / (high - low) for mean in means)
+    found = dict(zip(policies, scores, strict=True))
+    return {"behavior": behavior, "scores": found, "choice": choice}
 
 
 def choose(data: mcaprl.Dataset, out: Path, settings: dict[str, Any]) -> dict[str, Policy]:
@@ -165,31 +170,37 @@ def medium(folder: Path, kind: Kind) -> Policy:
     return policy
 
 
-def score(kind: Kind, policies: dict[str, Policy]) -> dict[str, float]:
-    """Return the normalized score of each policy."""
+def mean_returns(kind: Kind, policies: Sequence[Policy | None]) -> list[float]:
+    """Return the mean return of each policy; None is the random policy of a sim."""
     if kind.sim == PENDULUM:
-        means = {name: float(np.mean(returns_of(one))) for name, one in policies.items()}
-        return {name: (mean - RANDOM) / (PILOT - RANDOM) for name, mean in means.items()}
-    options = {"actions": kind.actions}
-    with closing(make_sim(kind.sim, **options)) as env:
-        random = run(kind.sim, [None], **options)
-        best = run(kind.sim, [make_pilot(env)], env, **options)
-    returns = run(kind.sim, list(policies.values()), **options).returns
-    return {
-        name: normalize_mean(float(mine.mean()), random, best)
-        for name, mine in zip(policies, returns, strict=True)
-    }
+        return [float(np.mean(returns_of(policy))) for policy in policies]
+    found = run(kind.sim, policies, actions=kind.actions).returns
+    return [float(mine.mean()) for mine in found]
+
+
+def references(kind: Kind) -> tuple[float, float]:
+    """Return the mean returns of the random policy and of the pilot, whose scores are 0 and 1."""
+    if kind.sim == PENDULUM:
+        return RANDOM, PILOT
+    with closing(make_sim(kind.sim, actions=kind.actions)) as env:
+        pilot = run(kind.sim, [make_pilot(env)], env, actions=kind.actions)
+    return mean_returns(kind, [None])[0], pilot.mean_return
 
 
 def tables(found: dict[str, Result]) -> str:
     """Return the scores and choices on all logs, and the regrets of the rules, as Markdown."""
     names = list(found[next(iter(found))]["scores"])
-    lines = [f"| log | {' | '.join(names)} | chosen | by |", "|---|" + "---|" * (len(names) + 2)]
+    lines = [
+        f"| log (behavior) | {' | '.join(names)} | chosen | by |",
+        "|---|" + "---|" * (len(names) + 2),
+    ]
     regrets: dict[str, list[float]] = {}
     for log, result in found.items():
         scores, chosen, rule = result["scores"], *(result["choice"][k] for k in ("chosen", "rule"))
         cells = [f"{scores[name]:.2f}" for name in names]
-        lines.append(f"| {log} | {' | '.join(cells)} | {chosen} | {rule} |")
+        lines.append(
+            f"| {log} ({result['behavior']:.2f}) | {' | '.join(cells)} | {chosen} | {rule} |"
+        )
         best = max(scores.values())
         regrets.setdefault("auto", []).append(best - scores[chosen])
         for name in names:
