@@ -79,5 +79,5 @@ def _scaled(logged: NDArray[np.floating[Any]], values: NDArray[np.floating[Any]]
     """
     deviations = np.asarray(logged, np.float64).std(0)
     scale = np.where(deviations > 0, deviations, 1.0) * np.sqrt(logged.shape[1])
-    scaled: Floats = np.asarray(values, np.float64) / scale
-    return scaled
+    found: Floats = np.asarray(values, np.float64) / scale
+    return found
