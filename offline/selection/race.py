@@ -38,6 +38,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.actions import BoxActions
 from mcaprl.errors import TrainingError, UnknownNameError, UsageError, import_extra
 from mcaprl.files import read_json, replacing_folder, subfolder, write_json
 from mcaprl.offline.algorithms.config import BOX_CONFIGS, CONFIGS, TrainingConfig
@@ -237,6 +238,9 @@ def select(
     if config.report:
         import_extra("jinja2", "report")
     known = [one.name for one in portfolio(dataset.action_space)]
+    if isinstance(dataset.action_space, spaces.Box):
+        # Actions that cannot be learned are refused before the run folder is created.
+        BoxActions.of(dataset.action_space, dataset.actions)
     if config.finalists != AutoConfig.finalists:
         for name in config.finalists.split(","):
             if name not in (*known, ALL):

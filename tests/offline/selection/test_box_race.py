@@ -284,3 +284,19 @@ def test_actions_outside_the_box_are_clipped_on_request(tmp_path: Path) -> None:
         select(outside, CONFIG, tmp_path / "refused")
     choice, _ = select(outside, replace(CONFIG, clip_actions=True), tmp_path / "run")
     assert 0.5 < choice.traits.entropy <= 1
+
+
+def test_a_box_of_integers_is_refused_before_the_run_exists(tmp_path: Path) -> None:
+    log = regulator(20)
+    whole = Dataset.from_arrays(
+        observations=log.observations,
+        actions=np.round(log.actions).astype(np.int32),
+        rewards=log.rewards,
+        terminated=log.terminated,
+        truncated=log.truncated,
+        next_observations=log.next_observations,
+        action_space=spaces.Box(-4, 4, (1,), np.int32),
+    )
+    with pytest.raises(SpaceError, match="has integers"):
+        mcaprl.train(whole, tmp_path / "run", algo="auto")
+    assert not (tmp_path / "run").exists()
