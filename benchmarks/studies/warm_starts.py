@@ -32,6 +32,7 @@ import torch
 
 import mcaprl
 from benchmarks.studies.box_grid import BOX, SETTINGS, make_log
+from mcaprl.errors import TrainingError
 from mcaprl.files import read_json
 from mcaprl.runs import read_curves
 
@@ -115,7 +116,7 @@ def rows(
 def row(name: str, out: Path, *, is_continued: bool) -> str:
     """Return a row of the table."""
     curves = np.array([curve["score"] for curve in read_curves(out, "curve.csv")])
-    seeds = read_json(out / "scores.json")["seeds"].values()
+    seeds = read_json(out / "scores.json", TrainingError)["seeds"].values()
     best = np.mean([each["score"] for each in seeds])
     lowest, last = curves.min(1), curves[:, -3:].mean()
     first, kept = "-", "-"

@@ -201,7 +201,7 @@ def test_files_that_are_not_zip_are_refused(tmp_path: Path) -> None:
 def test_other_algorithms_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zip_file, "_FIRST_WEIGHTS", {"q-network": "q_net.q_net."})
     SAC("MlpPolicy", gym.make("Pendulum-v1"), buffer_size=10, **small()).save(tmp_path / "sac.zip")
-    with pytest.raises(PolicyError, match="not DQN, SAC, TD3, PPO or A2C"):
+    with pytest.raises(PolicyError, match="not DQN, SAC, TQC, TD3, PPO or A2C"):
         read_policy(tmp_path / "sac.zip")
 
 
