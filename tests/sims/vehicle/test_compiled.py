@@ -27,7 +27,7 @@ class OtherPair(NamedTuple):
 
 
 CODE = "from mcaprl.sims.geometry import wrap_angle; print(wrap_angle(4.0))"
-CACHE = Path("sims", "geometry", "__pycache__")
+CACHE = Path("sims", "__pycache__")
 RESULT = "-2.2831853071795862\n"
 
 
@@ -36,7 +36,8 @@ def package(tmp_path: Path) -> Path:
     """Return a copy of the sims that was never compiled."""
     package = tmp_path / "fresh" / "mcaprl"
     shutil.copytree(ROOT / "sims", package / "sims", ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(ROOT / "mcaprl" / "errors.py", package)
+    for name in ("errors.py", "lazy.py"):
+        shutil.copy(ROOT / "mcaprl" / name, package)
     (package / "__init__.py").touch()
     return package
 
@@ -58,15 +59,15 @@ def run(package: Path, user_cache: Path) -> list[str]:
 
 
 def test_compilation_is_announced_once_and_cached(package: Path, tmp_path: Path) -> None:
-    assert run(package, tmp_path) == ["compiling geometry.paths for this machine, once"]
+    assert run(package, tmp_path) == ["compiling geometry for this machine, once"]
     assert run(package, tmp_path) == []
-    assert list((package / CACHE).glob("paths.wrap_angle*.nbi"))
+    assert list((package / CACHE).glob("geometry.wrap_angle*.nbi"))
 
 
 def test_without_a_writable_package_the_users_cache_is_used(package: Path, tmp_path: Path) -> None:
     # With a file in place of the folder, even root cannot write there.
     (package / CACHE).touch()
-    assert run(package, tmp_path) == ["compiling geometry.paths for this machine, once"]
+    assert run(package, tmp_path) == ["compiling geometry for this machine, once"]
     assert run(package, tmp_path) == []
 
 
@@ -77,7 +78,7 @@ def test_without_a_writable_cache_each_process_compiles(package: Path, tmp_path:
     for _ in range(2):
         (line,) = run(package, nowhere)
         assert line == (
-            "compiling geometry.paths for this machine, again in each process:"
+            "compiling geometry for this machine, again in each process:"
             " no cache folder is writable; set NUMBA_CACHE_DIR"
         )
 
