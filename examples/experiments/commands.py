@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import mcaprl
-from mcaprl.figures import COLORS, new_figure, save_png
+from mcaprl.page import COLORS, new_figure, save_png
 
 STEPS, STEP_S = 120, 0.25
 FULL_STEERING = 2.0

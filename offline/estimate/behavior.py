@@ -204,14 +204,23 @@ def estimate_behavior(
         scores.append(dataclasses.replace(score, episodes=int(held_out.sum())))
     if is_box:
         return _of_densities(dataset, predicted, tuple(scores))
-    actions = buffer.actions.numpy()
+    return _of_probabilities(dataset, predicted, buffer.actions.numpy(), tuple(scores))
+
+
+def _of_probabilities(
+    dataset: Dataset,
+    predicted: Floats,
+    actions: NDArray[np.int64],
+    folds: tuple[FoldScore, ...],
+) -> BehaviorEstimate:
+    """Return the result for rows (N, A) of the probabilities of all actions."""
     taken = predicted[np.arange(len(actions)), actions].astype(np.float32)
     ranges = reliability(predicted, actions)
     pairs = sum(one.predictions for one in ranges)
     error = sum(one.predictions * abs(one.predicted - one.observed) for one in ranges) / pairs
     return BehaviorEstimate(
         dataset=dataset.with_behavior_probs(taken, estimated=True),
-        folds=tuple(scores),
+        folds=folds,
         reliability=ranges,
         calibration_error=float(error),
         log_likelihood=float(np.log(taken).mean()),

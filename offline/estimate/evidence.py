@@ -298,26 +298,37 @@ class BoxEvidenceCollector(EvidenceCollector):
         rewards[cut] = values[-1, cut]
         returned = returns_to_go(rewards, data.episode_lengths, self._config.gamma)
         behavior = np.stack([values[-1], returned])[:, self._first]
-        found = []
-        for k, policy in enumerate(policies):
-            own_value, bellman_error = self._own_values_of_box(policy, *taken[k])
-            agrees = np.sqrt(np.square(actions[k] - logged).mean(1)) <= CLOSE
-            found.append(
-                Evidence(
-                    first_value=float(values[k, self._first].mean()),
-                    mean_value=float(values[k].mean()),
-                    first_values=values[k, self._first],
-                    logged_values=np.empty(0),
-                    next_values=np.empty(0),
-                    agrees=agrees,
-                    support=float(is_likely[k, 0].mean()),
-                    agreement=float(agrees.mean()),
-                    own_value=own_value,
-                    bellman_error=bellman_error,
-                    behavior=behavior,
-                )
-            )
-        return found
+        likely = is_likely[:, 0]
+        return [
+            self._evidence_of_box(policy, taken[k], actions[k], values[k], likely[k], behavior)
+            for k, policy in enumerate(policies)
+        ]
+
+    def _evidence_of_box(
+        self,
+        policy: BasePolicy,
+        taken: Sequence[NDArray[Any]],
+        actions: NDArray[np.float32],
+        values: Floats,
+        is_likely: NDArray[np.bool_],
+        behavior: Floats,
+    ) -> Evidence:
+        """Return the evidence for one policy, of what `collect` found for all of them."""
+        own_value, bellman_error = self._own_values_of_box(policy, *taken)
+        agrees = np.sqrt(np.square(actions - self._buffer.actions.numpy()).mean(1)) <= CLOSE
+        return Evidence(
+            first_value=float(values[self._first].mean()),
+            mean_value=float(values.mean()),
+            first_values=values[self._first],
+            logged_values=np.empty(0),
+            next_values=np.empty(0),
+            agrees=agrees,
+            support=float(is_likely.mean()),
+            agreement=float(agrees.mean()),
+            own_value=own_value,
+            bellman_error=bellman_error,
+            behavior=behavior,
+        )
 
     def _values_of_box(
         self,
