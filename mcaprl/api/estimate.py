@@ -124,9 +124,7 @@ def estimate(
         LogError: The logs cannot be read.
     """
     from mcaprl.offline.estimate.box import SEEDS, BoxEvaluator
-    from mcaprl.offline.estimate.evidence import fqe_config
-    from mcaprl.offline.estimate.fqe import FQEConfig
-    from mcaprl.offline.estimate.off_policy import FOLDS, OffPolicyEvaluator, ranking
+    from mcaprl.offline.estimate.off_policy import FOLDS, ranking
 
     check_fraction(gamma=gamma, epsilon=epsilon)
     check_least(0, seed=seed)
@@ -147,13 +145,7 @@ def estimate(
             progress=progress,
         )
         dataset = behavior.dataset
-    evaluator: OffPolicyEvaluator
-    if is_box:
-        model = replace(fqe_config(gamma, updates, is_box=True), clip_actions=clip_actions)
-        evaluator = BoxEvaluator(dataset, model, seed)
-    else:
-        config = replace(FQEConfig(), gamma=gamma, updates=updates)
-        evaluator = OffPolicyEvaluator(dataset, config, seed)
+    evaluator = _evaluator(dataset, gamma, updates, seed, clip_actions=clip_actions)
     results: list[PolicyEstimates] = []
     # FQE evaluates the behavior of a log with the actions of a Box, too.
     models = len(found) + is_box
@@ -180,6 +172,22 @@ def estimate(
         evaluator.check_behavior() if isinstance(evaluator, BoxEvaluator) else None,
         {one.policy: one.support for one in results if one.support is not None},
     )
+
+
+def _evaluator(
+    dataset: Dataset, gamma: float, updates: int, seed: int, *, clip_actions: bool
+) -> OffPolicyEvaluator:
+    """Return the evaluator for the actions of a dataset."""
+    from mcaprl.offline.estimate.box import BoxEvaluator
+    from mcaprl.offline.estimate.evidence import fqe_config
+    from mcaprl.offline.estimate.fqe import FQEConfig
+    from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
+
+    if isinstance(dataset.action_space, spaces.Box):
+        model = replace(fqe_config(gamma, updates, is_box=True), clip_actions=clip_actions)
+        return BoxEvaluator(dataset, model, seed)
+    config = replace(FQEConfig(), gamma=gamma, updates=updates)
+    return OffPolicyEvaluator(dataset, config, seed)
 
 
 def _policies(names: Sequence[str], dataset: Dataset, seed: int) -> dict[str, BasePolicy]:
