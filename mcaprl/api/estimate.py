@@ -25,7 +25,7 @@ BOX_UPDATES: Final = 3_000
 if TYPE_CHECKING:
     from mcaprl.offline.estimate.behavior import BehaviorEstimate
     from mcaprl.offline.estimate.box import BehaviorCheck
-    from mcaprl.offline.estimate.off_policy import Estimate, PolicyEstimates
+    from mcaprl.offline.estimate.off_policy import Estimate, OffPolicyEvaluator, PolicyEstimates
     from mcaprl.recorder.dataset.dataset import Dataset
 
 
