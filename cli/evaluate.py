@@ -39,6 +39,7 @@ _OF_DATA = (
     "epsilon",
     "updates",
     "estimate_behavior",
+    "clip_actions",
     "threads",
     "mapping",
     "trust_code",
@@ -89,6 +90,13 @@ _OF_DATA = (
     default=None,
     help="With --data: estimate behavior_prob or behavior_log_prob from the actions, for logs"
     " without it.",
+)
+@click.option(
+    "--clip-actions",
+    is_flag=True,
+    default=None,
+    help="With --data: clip logged actions outside a Box to its bounds; otherwise, they are an"
+    " error.",
 )
 @click.option(
     "--threads",
@@ -238,7 +246,7 @@ def _print_estimates(found: LogEstimates) -> None:
     if (order := found.ranking) is not None:
         echo(f"best first, by {order['estimator']}: {', '.join(order['policies'])}")
         if order["close"]:
-            echo(f"not told apart from the first by FQE's seeds: {', '.join(order['close'])}")
+            echo(f"within the noise of FQE's seeds of the first: {', '.join(order['close'])}")
         if not order["trusted"]:
             echo("no estimator is trusted for all policies: do not rely on this order")
 

@@ -141,6 +141,7 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
             "epsilon",
             "updates",
             "estimate_behavior",
+            "clip_actions",
             "threads",
         ),
         "Output with --sim": ("record", "keys", "report", "overwrite"),

@@ -19,6 +19,7 @@ def estimate_behavior(
     folds: int = 5,
     updates: int = 2_000,
     seed: int = 0,
+    clip_actions: bool = False,
     threads: int = 1,
     progress: ProgressBar = no_progress,
 ) -> BehaviorEstimate:
@@ -36,6 +37,8 @@ def estimate_behavior(
             classifier trained on the other folds.
         updates: Number of gradient steps for each fold.
         seed: Seed of the folds and of the networks.
+        clip_actions: Whether logged actions outside a Box are clipped to its bounds instead of
+            being an error.
         threads: Number of threads of PyTorch and of the reader.
         progress: Function that opens a progress bar.
 
@@ -55,5 +58,10 @@ def estimate_behavior(
     text = f"estimating {dataset.behavior_field.name} in {folds} folds"
     with torch_threads(threads), progress(text, folds * updates) as advance:
         return behavior.estimate_behavior(
-            dataset, folds=folds, updates=updates, seed=seed, on_update=lambda: advance(1)
+            dataset,
+            folds=folds,
+            updates=updates,
+            seed=seed,
+            clip_actions=clip_actions,
+            on_update=lambda: advance(1),
         )

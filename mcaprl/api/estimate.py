@@ -90,6 +90,7 @@ def estimate(
     epsilon: float = 0.0,
     updates: int | None = None,
     estimate_behavior: bool = False,
+    clip_actions: bool = False,
     seed: int = 1_000_000,
     threads: int = 1,
     progress: ProgressBar = no_progress,
@@ -110,6 +111,8 @@ def estimate(
             estimates the behavior is trained with at most 2,000 steps.
         estimate_behavior: Whether `mcaprl.estimate_behavior` estimates the behavior probabilities
             or densities from the actions. Otherwise, the logged ones are used.
+        clip_actions: Whether logged actions outside a Box are clipped to its bounds instead of
+            being an error.
         seed: Seed of the model and of the resampling.
         threads: Number of threads of PyTorch and of the reader.
         progress: Function that opens a progress bar.
@@ -136,12 +139,18 @@ def estimate(
     if estimate_behavior:
         steps = min(updates, 2_000)
         behavior = estimate_of_behavior(
-            dataset, updates=steps, seed=seed, threads=threads, progress=progress
+            dataset,
+            updates=steps,
+            seed=seed,
+            clip_actions=clip_actions,
+            threads=threads,
+            progress=progress,
         )
         dataset = behavior.dataset
     evaluator: OffPolicyEvaluator
     if is_box:
-        evaluator = BoxEvaluator(dataset, fqe_config(gamma, updates, is_box=True), seed)
+        model = replace(fqe_config(gamma, updates, is_box=True), clip_actions=clip_actions)
+        evaluator = BoxEvaluator(dataset, model, seed)
     else:
         config = replace(FQEConfig(), gamma=gamma, updates=updates)
         evaluator = OffPolicyEvaluator(dataset, config, seed)

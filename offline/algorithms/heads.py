@@ -19,6 +19,7 @@ here and an entry in `HEADS`.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, Final
@@ -28,6 +29,7 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
 from mcaprl.actions import BoxActions
 from mcaprl.errors import PolicyError
@@ -332,21 +334,26 @@ class Mixture(BoxHead):
         return (log_weights + log_densities.sum(-1)).logsumexp(1)
 
     @staticmethod
-    def pit(outputs: Tensor, actions: Tensor) -> Tensor:
+    def pit(outputs: Tensor, actions: Tensor, uniform_share: float = 0.0) -> Tensor:
         """Return the probability (B, n) of a smaller number than that of actions (B, n).
 
         The probability of each number is given those before it, so that the results of actions of
         this distribution are independent and uniform. See Rosenblatt, "Remarks on a multivariate
-        transformation", 1952.
+        transformation", 1952. With a share, the uniform distribution is one more component.
         """
         mean, raw = Mixture._components(outputs).unbind(2)
         mean, log_std = mean.tanh(), bounded_log_std(raw)
         numbers = actions.unsqueeze(1)
         below = truncated_normal_probability(numbers, mean, log_std)
         log_densities = truncated_normal_log_density(numbers, mean, log_std)
+        below = torch.cat([below, (numbers + 1) / 2], 1)
+        uniform = torch.full_like(log_densities[:, :1], -math.log(2))
+        log_densities = torch.cat([log_densities, uniform], 1)
         # The weights of the components, given the numbers before each number.
         earlier = log_densities.cumsum(2) - log_densities
-        log_weights = outputs[:, :COMPONENTS].log_softmax(1).unsqueeze(2)
+        shares = outputs.new_tensor([1 - uniform_share] * COMPONENTS + [uniform_share]).log()
+        own = functional.pad(outputs[:, :COMPONENTS].log_softmax(1), (0, 1))
+        log_weights = (own + shares).unsqueeze(2)
         return ((log_weights + earlier).softmax(1) * below).sum(1)
 
     @staticmethod

@@ -148,6 +148,7 @@ def estimate_behavior(
     folds: int = FOLDS,
     updates: int = UPDATES,
     seed: int = 0,
+    clip_actions: bool = False,
     on_update: Callable[[], None] = lambda: None,
 ) -> BehaviorEstimate:
     """Estimate the probability, or density, of each action under the policy that took it.
@@ -157,6 +158,7 @@ def estimate_behavior(
         folds: Number of parts of the episodes; each part is predicted from the others.
         updates: Number of gradient steps for each fold.
         seed: Seed of the folds and of the networks.
+        clip_actions: Whether actions outside a Box are clipped to its bounds.
         on_update: Callback for each gradient step.
 
     Raises:
@@ -179,7 +181,7 @@ def estimate_behavior(
         )
     config: BCConfig = BCConfig(updates=updates, normalize=True)
     if is_box:
-        config = BoxBCConfig(updates=updates, head="mixture")
+        config = BoxBCConfig(updates=updates, head="mixture", clip_actions=clip_actions)
     buffer = TransitionBuffer.from_dataset(dataset, config.packing)
     random = np.random.default_rng(seed)
     fold_of = random.permutation(count) % folds
@@ -339,8 +341,8 @@ def _fitted_densities(
                 best_score, best_share = float(means[share]), float(_UNIFORM_SHARES[share])
                 best = outputs
     log_densities = _mixed(Mixture.log_density(best, actions).double().numpy(), uniform, best_share)
-    pit = (1 - best_share) * Mixture.pit(best, actions).double() + best_share * (actions + 1) / 2
-    found = np.hstack([log_densities[:, None] + box.log_scale, pit.numpy().clip(0, 1)])
+    pit = Mixture.pit(best, actions, best_share).double().numpy()
+    found = np.hstack([log_densities[:, None] + box.log_scale, pit.clip(0, 1)])
     others = actions.numpy()[~held_out].astype(np.float64)
     scaled = (actions.numpy()[held_out] - others.mean(0)) / others.std(0)
     normal = -0.5 * np.square(scaled) - np.log(others.std(0)) - 0.5 * np.log(2 * np.pi)

@@ -100,7 +100,7 @@ class BoxEvaluator(OffPolicyEvaluator):
 
     config_type: ClassVar[type[FQEConfig]] = BoxFQEConfig
 
-    def __init__(self, dataset: Dataset, config: BoxFQEConfig | None = None, seed: int = 0) -> None:
+    def __init__(self, dataset: Dataset, config: FQEConfig | None = None, seed: int = 0) -> None:
         """Prepare the evaluation on a log.
 
         Args:

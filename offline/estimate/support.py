@@ -79,4 +79,5 @@ def _scaled(logged: NDArray[np.floating[Any]], values: NDArray[np.floating[Any]]
     """
     deviations = np.asarray(logged, np.float64).std(0)
     scale = np.where(deviations > 0, deviations, 1.0) * np.sqrt(logged.shape[1])
-    return np.asarray(values, np.float64) / scale
+    found: Floats = np.asarray(values, np.float64) / scale
+    return found

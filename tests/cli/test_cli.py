@@ -113,6 +113,8 @@ def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixtu
             "interval",
             "effective_sample_size",
             "verdict",
+            "spread",
+            "usable_steps",
         }
         # Four episodes are too few for a verdict.
         assert estimate["verdict"].startswith("refused: ")

@@ -42,7 +42,8 @@ class Linear(BasePolicy):
 
     def act(self, observations: Any) -> NDArray[np.float32]:
         newest = observations if self.frame_stack == 1 else observations[:, -1]
-        return np.clip(-self._gain * newest, -4, 4).astype(np.float32)
+        actions: NDArray[np.float32] = np.clip(-self._gain * newest, -4, 4).astype(np.float32)
+        return actions
 
     def log_prob(self, observations: Any, actions: NDArray[Any]) -> NDArray[np.float64]:
         if self._std is None:

@@ -77,6 +77,17 @@ def test_the_pit_is_the_integral_of_the_density() -> None:
         assert found == pytest.approx(area[row], abs=1e-4)
 
 
+def test_the_pit_with_a_uniform_share_by_hand() -> None:
+    # One component at 0, and half the actions uniform. A first number of .9 is out of the reach of
+    # the component, so that the second number is uniform: its PIT is (.2 + 1) / 2.
+    outputs = outputs_of([9.0] + [-99.0] * 4, [[0.0, 0.0]] * 5)
+    found = Mixture.pit(outputs, torch.tensor([[0.9, 0.2]]), 0.5)[0]
+    torch.testing.assert_close(found, torch.tensor([0.5 + 0.5 * 0.95, 0.6]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        Mixture.pit(outputs, torch.tensor([[0.9, 0.9]])), torch.ones(1, 2), atol=1e-4, rtol=0
+    )
+
+
 def test_shares_of_the_pit_by_hand() -> None:
     shares = pit_shares(np.array([[0.0, 1.0], [0.05, 0.95], [0.55, 0.5], [0.31, 0.39]]))
     expected = np.array([2, 0, 0, 2, 0, 2, 0, 0, 0, 2]) / 8
@@ -124,6 +135,26 @@ def test_densities_of_actions_at_the_stops_are_called_wrong() -> None:
     )
     found = mcaprl.estimate_behavior(bang, folds=2, updates=60)
     assert str(found).endswith("the densities are wrong")
+
+
+def test_actions_outside_the_box_are_clipped_if_wanted() -> None:
+    data = episodes(6, 4)
+    actions = data.actions.copy()
+    actions[0] = 5.0
+    outside = mcaprl.Dataset.from_arrays(
+        observations=data.observations,
+        actions=actions,
+        rewards=data.rewards,
+        terminated=data.terminated,
+        truncated=data.truncated,
+        next_observations=data.next_observations,
+        action_space=BOX_LQ,
+    )
+    with pytest.raises(SpaceError, match="`clip_actions=True`"):
+        mcaprl.estimate("random", outside, updates=2)
+    found = mcaprl.estimate("random", outside, updates=2, clip_actions=True, estimate_behavior=True)
+    assert found.behavior_estimate is not None
+    assert [one.estimator for one in found.estimates] == ["FQE", "PDIS", "WPDIS"]
 
 
 def test_integers_and_few_episodes_are_refused() -> None:
