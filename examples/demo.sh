@@ -56,8 +56,5 @@ Done. $out/ contains
   runs/                  the policies, their checkpoints and curves.png
   report/index.html      the comparison, with 95 % intervals: open it in a browser
   replay.mcap            three drives of the IQL policy, with scene and camera
-  foxglove-layout.json   the layout for Foxglove and Lichtblick
-
-To watch a drive: in app.foxglove.dev or Lichtblick, choose "Open local file",
-open $out/replay.mcap, and import $out/foxglove-layout.json from the layout menu.
+  foxglove-layout.json   the layout; in Foxglove or Lichtblick, open replay.mcap and import it
 TXT

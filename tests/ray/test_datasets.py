@@ -89,7 +89,7 @@ def test_blocks_have_whole_episodes_of_one_log(folder: Path) -> None:
 def test_selected_columns_and_episodes_alone_are_read(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mcaprl.ray import datasets
+    from mcaprl.ray import blocks
 
     data = mcaprl.open(folder)
     rows = mcaprl.ray.read(folder, columns=["reward", "step", "episode"], episodes=[6, 1, -1])
@@ -103,9 +103,9 @@ def test_selected_columns_and_episodes_alone_are_read(
         seen.append(given)
         return Selection(**given)
 
-    monkeypatch.setattr(datasets, "Selection", select)
-    datasets._reader.cache_clear()
-    every = datasets.LogSource([folder / "a.mcap"])
+    monkeypatch.setattr(blocks, "Selection", select)
+    blocks._reader.cache_clear()
+    every = blocks.LogSource([folder / "a.mcap"])
     for names in (["action"], ["next_observation_x", "step"]):
         (task,) = every.apply_projection({name: name for name in names}).get_read_tasks(1)
         (block,) = task()
@@ -120,7 +120,7 @@ def test_columns_selected_later_are_pushed_down(folder: Path) -> None:
 
 
 def test_sizes_come_from_the_summaries(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mcaprl.ray.datasets import LogSource
+    from mcaprl.ray.blocks import LogSource
 
     data = mcaprl.open(folder)
     monkeypatch.setattr("mcaprl.recorder.dataset.log_reader.LogReader.read", None)
@@ -139,7 +139,7 @@ def test_sizes_come_from_the_summaries(folder: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_only_blocks_of_one_episode_exceed_the_maximum(folder: Path) -> None:
-    from mcaprl.ray.datasets import LogSource
+    from mcaprl.ray.blocks import LogSource
 
     # The episodes of the log have 5, 12, 19, 26 and 33 transitions of 198 bytes.
     source = LogSource([folder / "a.mcap"], most_bytes=198 * 32)

@@ -298,8 +298,10 @@ def test_a_log_of_commands_is_continued(tmp_path: Path) -> None:
 
 def test_estimates_say_what_they_need(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the extra offline")
-    data = Dataset.concatenate([made()] * 6)
-    with pytest.raises(SpaceError, match=r"from the log alone needs discrete actions, got Box"):
-        mcaprl.estimate("random", data)
-    with pytest.raises(SpaceError, match=r"estimating behavior_prob needs discrete actions, got"):
-        mcaprl.estimate("random", data, estimate_behavior=True)
+    whole = made(
+        spaces.Box(0, 3, (2,), np.int32), actions=np.arange(6, dtype=np.int32).reshape(3, 2) % 4
+    )
+    data = Dataset.concatenate([whole] * 6)
+    for options in ({}, {"estimate_behavior": True}):
+        with pytest.raises(SpaceError, match=r"Box\(.*int32\)"):
+            mcaprl.estimate("random", data, **options)
