@@ -2,6 +2,7 @@
 
     python -m benchmarks.speed.continuous [--rounds 5] [--turn-s 2.0] [--size 256] [--algo iql]
     python -m benchmarks.speed.continuous --whole [--algo iql]
+    python -m benchmarks.speed.continuous --parts [--size 256] [--algo iql]
 
 Both libraries take turns in one process, on the same random transitions (17 numbers, actions of 6)
 and with networks of 256x256; otherwise, settings are the defaults. The measure is CPU time on one
@@ -11,7 +12,7 @@ and written to benchmarks/speed/continuous.json, and the table to docs/results.m
 --algo, they are only printed.
 
 --whole prints the CPU minutes of 100,000 updates of `mcaprl.train` with default settings on 200,000
-rows, without d3rlpy.
+rows, without d3rlpy. --parts prints the time of the parts of an update, by PyTorch's profiler.
 """
 
 from __future__ import annotations
@@ -46,6 +47,13 @@ RIVALS = {
     "iql": "IQLConfig",
     "rebrac": "ReBRACConfig",
 }
+OPERATIONS = {
+    "products": ("bmm", "aten::mm", "addmm"),
+    "optimizer": ("_fused_adamw_", "lerp_", "Optimizer"),
+    "ReLU": ("relu", "threshold", "clamp_min"),
+    "copies": ("cat", "copy_", "clone", "contiguous", "fill_", "zero_", "pad", "index"),
+}
+"""Parts of the names of PyTorch's operations, by the part of an update."""
 GOALS = {("td3-bc", 256): 2.0, ("iql", 256): 2.0}
 GOAL = 3.0
 RESULTS = Path(__file__).with_name("continuous.json")
@@ -125,6 +133,23 @@ def ratios(algo: str, size: int, turns: Turns) -> tuple[float, float, float]:
     return mine, mine / theirs, limit / theirs
 
 
+def parts(algo: str, size: int, updates: int = 100) -> None:
+    """Print the milliseconds of an update, and of its parts."""
+    update = ours(transitions(), algo, size)
+    for _ in range(updates):
+        update()
+    rate = best_rates({"ours": (update, 1)}, Turns(5, 0.5))["ours"]
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as found:
+        for _ in range(updates):
+            update()
+    spent = dict.fromkeys((*OPERATIONS, "other"), 0.0)
+    for event in found.key_averages():
+        named = (part for part, names in OPERATIONS.items() if any(n in event.key for n in names))
+        spent[next(named, "other")] += event.self_cpu_time_total / updates / 1e3
+    columns = " | ".join(f"{time_ms:.2f}" for time_ms in spent.values())
+    print(f"| {algo}, batch {size} | {1e3 / rate:.2f} | {columns} |", flush=True)
+
+
 def whole(algo: str, rows: int = 200_000, updates: int = 100_000) -> None:
     """Print the CPU minutes of a whole training."""
     data = transitions(rows)
@@ -143,19 +168,20 @@ def main() -> None:
     parser.add_argument("--size", type=int, choices=SIZES)
     parser.add_argument("--algo", choices=RIVALS)
     parser.add_argument("--whole", action="store_true")
+    parser.add_argument("--parts", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
     algos = [given.algo] if given.algo else list(RIVALS)
-    if given.whole:
+    sizes = [given.size] if given.size else list(SIZES)
+    if given.whole or given.parts:
         for algo in algos:
-            whole(algo)
+            if given.whole:
+                whole(algo)
+            for size in sizes if given.parts else ():
+                parts(algo, size)
         return
     turns = Turns(given.rounds, given.turn_s)
-    found = {
-        f"{algo}, batch {size}": ratios(algo, size, turns)
-        for size in ([given.size] if given.size else SIZES)
-        for algo in algos
-    }
+    found = {f"{algo}, batch {size}": ratios(algo, size, turns) for size in sizes for algo in algos}
     print(table := as_table(found))
     if not (given.size or given.algo):
         write_json(RESULTS, json.loads(json.dumps(found)))

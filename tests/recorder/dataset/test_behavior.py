@@ -302,6 +302,6 @@ def test_estimates_say_what_they_need(tmp_path: Path) -> None:
         spaces.Box(0, 3, (2,), np.int32), actions=np.arange(6, dtype=np.int32).reshape(3, 2) % 4
     )
     data = Dataset.concatenate([whole] * 6)
-    for options in ({}, {"estimate_behavior": True}):
+    for estimated in (False, True):
         with pytest.raises(SpaceError, match=r"Box\(.*int32\)"):
-            mcaprl.estimate("random", data, **options)
+            mcaprl.estimate("random", data, estimate_behavior=estimated)
