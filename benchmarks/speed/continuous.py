@@ -155,7 +155,7 @@ def whole(algo: str, rows: int = 200_000, updates: int = 100_000) -> None:
     data = transitions(rows)
     with tempfile.TemporaryDirectory() as folder:
         start = time.process_time()
-        mcaprl.train(data, folder, algo=algo, updates=updates, overwrite=True)
+        mcaprl.train(data, Path(folder, "run"), algo=algo, updates=updates)
         minutes = (time.process_time() - start) / 60
     print(f"| {algo}, {updates:,} updates on {rows:,} rows | {minutes:.1f} min |", flush=True)
 
