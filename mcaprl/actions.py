@@ -165,9 +165,7 @@ class BoxActions:
                 )
             low, high = np.where(np.isinf(low), least, low), np.where(np.isinf(high), most, high)
         elif not np.isfinite([low, high]).all():
-            raise SpaceError(
-                f"{space} has infinite bounds: without logged actions, there is no scale"
-            )
+            raise SpaceError(f"{space} has infinite bounds: its scale needs logged actions")
         empty = low >= high
         if empty.any():
             part = int(empty.argmax())

@@ -26,8 +26,8 @@ from mcaprl.offline.batches.observations import Observations
 ALIGNMENT = 16
 """Number of floats in a vector register.
 
-Rows of weights are padded to a multiple of this number, so that the results of a seed do not depend
-on the number of seeds K.
+Rows of weights, and the batches of stacked networks, are padded to a multiple of this number, so
+that the results of a seed do not depend on the number of seeds K.
 """
 _ROWS_AT_ONCE = 1024
 _NORM_EPSILON = 1e-5

@@ -1,10 +1,10 @@
 """Off-policy evaluation of policies with the actions of a Box.
 
-For a deterministic policy, the density of a logged action is no information, and a product of
-ratios of densities over many steps has an effective sample size of one. So the first answer is that
-of FQE over several seeds, as an order of policies. FQE of the behavior itself, whose returns are in
-the log, shows whether its values can be believed: see `BehaviorCheck`. Importance sampling needs a
-policy with densities, and is per decision only: its first steps may be usable.
+A deterministic policy has no density of a logged action, and the product of density ratios over
+many steps has an effective sample size of about one. Therefore, FQE over several seeds comes first,
+and ranks the policies. FQE also evaluates the behavior, whose returns are in the log: if this value
+is wrong, the others are not trusted, see `BehaviorCheck`. Importance sampling needs a policy with
+densities, and is computed per decision; often only its first steps are usable.
 
 FQE evaluates the actions of `act`, which for most policies are the modes of their distributions.
 Importance sampling evaluates actions that are drawn from the densities.
