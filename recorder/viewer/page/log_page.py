@@ -58,7 +58,7 @@ from mcaprl.recorder.record.layout import (
     VALUES_TOPIC,
     is_values_topic,
 )
-from mcaprl.recorder.record.panels import action_parts, bounded_actions
+from mcaprl.recorder.record.panels import action_parts, bounded_actions, telemetry_groups
 from mcaprl.recorder.source import open_data
 from mcaprl.recorder.viewer.foxglove_server import is_loopback
 from mcaprl.recorder.viewer.playback import SeenFrame, SeenShape, Track, frames_of, shapes_of
@@ -312,8 +312,8 @@ class LogPage:
                 yield _plot("/".join(("observation", *leaf.path)), names, values)
         telemetry = self._at_steps(TELEMETRY, episode.log_time_ns)
         telemetry.pop(RETURN_SO_FAR, None)
-        if telemetry:
-            yield _plot("telemetry", list(telemetry), np.column_stack(list(telemetry.values())))
+        for title, group in telemetry_groups(list(telemetry)).items():
+            yield _plot(title, list(group), np.column_stack([telemetry[name] for name in group]))
         infos = {
             name: np.ma.filled(info.astype(np.float64), np.nan)
             for name, info in episode.infos.items()

@@ -252,8 +252,10 @@ def test_an_episode_has_the_values_of_the_log(log: Path) -> None:
     plots = {plot["title"]: plot for plot in found["plots"]}
     place = plots["observation/place"]
     assert place["values"].tolist() == [[0, 1, 2, 3, 4, 5], [0, -1, -2, -3, -4, -5]]
-    assert plots["telemetry"]["names"] == ["speed_m_s", "x_m"]
-    assert plots["telemetry"]["values"].tolist() == [[20] * 6, [0, 10, 20, 30, 40, 50]]
+    # Numbers of one unit share a plot.
+    assert (plots["speeds"]["names"], plots["positions"]["names"]) == (["speed_m_s"], ["x_m"])
+    assert plots["speeds"]["values"].tolist() == [[20] * 6]
+    assert plots["positions"]["values"].tolist() == [[0, 10, 20, 30, 40, 50]]
     cql, iql = found["policies"]
     assert (cql["name"], iql["name"]) == ("cql", "iql")
     assert cql["q"][:, :STEPS].tolist() == [
@@ -393,6 +395,49 @@ def test_the_browser_shows_an_episode(browser: Browser, log: Path) -> None:
         assert cells == ["2", "12", "22"] * 2
         assert browser.run("document.querySelectorAll('.taken').length") == 2
         assert browser.run("getComputedStyle(document.querySelector('.best')).width") != "0px"
+        title = "values-log.mcap, episode 1: return 7.5, goal word, 5 steps"
+        assert browser.run("[document.title, get('name').innerText]") == [title, title]
+        # The bars of a step range from its worst action to its best.
+        widths = browser.run("[...document.querySelectorAll('.bar')].map((e) => e.style.width)")
+        assert widths == ["0%", "50%", "100%"] * 2
+        # The last reward has a width: it lasts until the end of the episode.
+        assert browser.run("[...plots[0].plot.data[1]]") == [0.5, 1, 1.5, 2, 2.5, 2.5]
+
+
+def test_the_page_lists_steps_to_look_at(browser: Browser, log: Path) -> None:
+    with served(log) as url:
+        browser.show(url)
+        wait_for_episode(browser)
+        # Each policy prefers action 7, by 20 over action 5 and by 10 over action 6. All TD errors
+        # are 0, and no reward is below the one before.
+        lines = browser.run("get('places').innerText.trim().split(String.fromCharCode(10))")
+        assert lines == [
+            f"step {step} disagreement: {policy}: would take right word"
+            for policy in ("cql", "iql")
+            for step in (0, 3, 1, 4)
+        ]
+        browser.run("get('places').querySelectorAll('button')[3].click()")
+        assert browser.run("state.step") == 4
+        assert browser.problems == []
+
+
+def test_the_world_is_seen_from_above(browser: Browser, log: Path) -> None:
+    pressed = "['follow', 'above'].map((id) => get(id).getAttribute('aria-pressed'))"
+    with served(log) as url:
+        browser.show(url)
+        wait_for_episode(browser)
+        browser.press("a")
+        assert browser.run(pressed) == ["false", "true"]
+        for time_s in (0.0, 2.0):
+            browser.run(f"seek({time_s})")
+            vehicle = browser.run("scene.marker.visible && scene.marker.position.x")
+            assert vehicle == pytest.approx(20 * time_s)
+        assert browser.run("scene.camera.position.z") > browser.run("scene.camera.position.y") + 50
+        browser.press("f")
+        assert browser.run(pressed) == ["true", "false"]
+        assert browser.run("scene.marker.visible") is False
+        assert is_red(center_color(browser))
+        assert browser.problems == []
 
 
 def test_the_camera_follows_the_vehicle(browser: Browser, log: Path) -> None:

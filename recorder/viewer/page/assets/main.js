@@ -2,7 +2,7 @@
 // The page: a list of episodes, the panels of one episode, and the timeline.
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8, 16];
-const MOST_LISTED = 500, MOST_BARS = 24;
+const MOST_LISTED = 500, MOST_BARS = 24, MOST_PLACES = 5;
 const get = (id) => document.getElementById(id);
 const state = { time: 0, step: -1, playing: false, speed: 1 };
 let log, episode, scene, plots = [], images = [], bars = [];
@@ -10,8 +10,6 @@ let log, episode, scene, plots = [], images = [], bars = [];
 /** Read the log's description, and show its first episode. */
 async function start() {
   log = await unpack(embedded("log-data"));
-  document.title = log.name;
-  get("name").textContent = log.name;
   get("about").textContent = [log.environment, ...log.policies.slice(0, 5)].filter(Boolean).join(" \u00b7 ");
   state.speed = log.speed;
   get("loop").checked = log.loop;
@@ -53,13 +51,17 @@ function report(text) {
 function show(data) {
   report("");
   episode = data;
+  get("name").textContent = document.title = `${log.name}, ${summary(state.index)}`;
   plots.forEach((plot) => plot.destroy());
-  for (const id of ["images", "plots", "policies", "lines"]) get(id).replaceChildren();
+  for (const id of ["images", "plots", "policies", "lines", "places"]) get(id).replaceChildren();
   get("view").hidden = !data.scene;
   images = data.images.map((image) => new ImageView(get("images"), image));
   plots = plotsOf(data);
   bars = [...dialsOf(data), ...data.policies.filter(({ preference }) => preference).flatMap(barsOf)];
   get("log").hidden = !data.lines.texts.length;
+  const places = placesOf(data);
+  get("look").hidden = !places.length;
+  get("places").append(...places.map(placeLine));
   get("lines").append(...data.lines.texts.map((text, k) => lineOf(data.lines, text, k)));
   get("time").max = duration();
   if (data.scene) showScene(data.scene);
@@ -67,77 +69,24 @@ function show(data) {
   seek(0);
 }
 
+/** Return the number, return, end and length of the episode at an index. */
+function summary(index) {
+  const end = log.reasons[log.reason[index]];
+  const parts = [`return ${short(log.returns[index])}`, end, `${log.lengths[index]} steps`];
+  return `episode ${log.numbers[index]}: ${parts.filter(Boolean).join(", ")}`;
+}
+
 function showScene(data) {
   try {
     scene ??= new SceneView(get("scene"), log);
     scene.resize();
     scene.load(data);
+    follow(true);
   } catch (error) {
     scene = undefined;
     get("view").hidden = true;
-    report(`the 3D view does not work in this browser: ${error.message}`);
+    report("The 3D view needs WebGL, which this browser does not offer; all other panels work.");
   }
-}
-
-function plotsOf(data) {
-  const { times, rewards } = data;
-  const sums = [0];
-  for (const reward of rewards) sums.push(sums.at(-1) + reward);
-  const plot = (series, options) => {
-    return new TimePlot(get("plots"), times, series, options, seek);
-  };
-  const rows = (values, names) => Array.from({ length: values.shape[0] }, (_, k) =>
-    ({ name: names[k] ?? String(k), values: row(values, k) }));
-  const named = data.is_discrete && log.actions.length && log.actions.length <= MOST_BARS;
-  const index = (values) => (named ? values.map((value) => value - log.first_action) : values);
-  data.sums = sums;
-  return [
-    plot([{ name: "reward", values: rewards }], { title: "Reward" }),
-    plot([{ name: "return", values: sums }], { title: "Return so far" }),
-    data.is_discrete
-      ? plot([
-        { name: "log", values: index(row(data.actions, 0)) },
-        ...data.policies.map(({ name, policy_action: chosen }) =>
-          ({ name: name || "policy", values: index(chosen), dash: [3, 3] })),
-      ], { title: "Action", names: named ? log.actions : undefined })
-      : undefined,
-    ...(data.is_discrete ? [] : commandPlots(data, plot, rows)),
-    ...data.policies.flatMap((policy) => {
-      if (!policy.preference) return valuePlots(policy, plot);
-      const hasValues = policy.q.some(Number.isFinite);
-      const errors = [{ name: "TD error", values: policy.td_error }, { name: "advantage", values: policy.advantage }];
-      return [
-        plot(rows(hasValues ? policy.q : policy.preference, log.actions), {
-          title: titled(hasValues ? "Q-values" : "Probabilities of the actions", policy), shown: 8,
-        }),
-        ...(hasValues ? [plot(errors, { title: titled("TD error and advantage", policy) })] : []),
-      ];
-    }),
-    ...data.plots.map(({ title, names, values }) =>
-      plot(rows(values, names), { title: title[0].toUpperCase() + title.slice(1) })),
-  ].filter(Boolean);
-}
-
-/** Return the plots of a Box action: each element beside the policies' commands, if there are any. */
-function commandPlots({ actions, policies }, plot, rows) {
-  const own = policies.filter((policy) => !policy.preference);
-  if (!own.length) return [plot(rows(actions, log.parts), { title: "Action" })];
-  return log.parts.map((part, k) => plot([
-    { name: "log", values: row(actions, k) },
-    ...own.map(({ name, policy_action: command }) =>
-      ({ name: name || "policy", values: row(command, k), dash: [3, 3] })),
-  ], { title: `Action: ${part}` }));
-}
-
-/** Return the plots of a policy's values of the logged commands and of the policy's. */
-function valuePlots(policy, plot) {
-  if (!policy.q.some(Number.isFinite)) return [];
-  const values = [{ name: "log", values: policy.q }, { name: "policy", values: policy.value, dash: [3, 3] }];
-  const errors = [{ name: "TD error", values: policy.td_error }, { name: "advantage", values: policy.advantage }];
-  return [
-    plot(values, { title: titled("Q-values of both commands", policy) }),
-    plot(errors, { title: titled("TD error and advantage", policy) }),
-  ];
 }
 
 /** Create a dial for each element of a Box action, with marks for the log and each policy. */
@@ -189,9 +138,6 @@ function barsOf(policy) {
   const count = policy.q.shape[0];
   if (count > MOST_BARS) return [];
   const hasValues = policy.q.some(Number.isFinite), values = hasValues ? policy.q : policy.preference;
-  const finite = values.filter(Number.isFinite);
-  const low = hasValues ? finite.reduce((a, b) => Math.min(a, b), Infinity) : 0;
-  const high = finite.reduce((a, b) => Math.max(a, b), -Infinity);
   const box = element("div", { className: "bars" },
     element("h2", { textContent: titled(hasValues ? "Q-values" : "Probabilities", policy) }));
   const cells = Array.from({ length: count }, (_, k) => {
@@ -204,16 +150,61 @@ function barsOf(policy) {
     box.append(...made);
     return made;
   });
-  box.append(element("p", { className: "key", textContent: "bold: taken; blue: policy's action" }));
+  const scale = hasValues ? "; from the worst to the best of this step" : "";
+  box.append(element("p", { className: "key", textContent: `bold: taken; blue: policy's action${scale}` }));
   get("policies").append(box);
-  return [(step) => cells.forEach(([name, bar, number], k) => {
-    const value = step < values.shape[1] ? row(values, k)[step] : NaN;
-    const share = (value - low) / (high - low || 1);
+  return [(step) => {
+    const now = cells.map((_, k) => (step < values.shape[1] ? row(values, k)[step] : NaN));
+    const [low, high] = hasValues ? ends([now]) : [0, 1];
+    cells.forEach((cell, k) => draw(cell, k, now[k], (now[k] - low) / (high - low || 1), step));
+  }];
+
+  function draw([name, bar, number], k, value, share, step) {
     bar.firstChild.style.width = `${Number.isFinite(share) ? 100 * share : 0}%`;
     number.textContent = short(value);
     name.classList.toggle("taken", row(episode.actions, 0)[step] === k + log.first_action);
     bar.firstChild.classList.toggle("best", policy.policy_action[step] === k + log.first_action);
-  })];
+  }
+}
+
+/** Return the steps that are worth a look: the kind, the step and the text of each. */
+function placesOf({ rewards, actions, policies, times }) {
+  const places = [];
+  const add = (kind, values, text) => {
+    const found = Array.from(values, (value, step) => ({ kind, step, value })).filter(({ value }) => value > 0);
+    found.sort((a, b) => b.value - a.value);
+    places.push(...found.slice(0, MOST_PLACES).map((place) => ({ ...place, text: text(place.step) })));
+  };
+  for (const policy of policies) {
+    const sizes = Array.from(policy.td_error, Math.abs);
+    add(titled("TD error", policy), sizes, (step) => short(policy.td_error[step]));
+    if (policy.preference) {
+      const name = (action) => log.actions[action - log.first_action] ?? String(action);
+      const gaps = Array.from(rewards, (_, step) => gapOf(policy, step, row(actions, 0)[step]));
+      add(titled("disagreement", policy), gaps, (step) => `would take ${name(policy.policy_action[step])}`);
+    } else {
+      const change = (step) => log.parts.map((_, k) => row(policy.policy_action, k)[step] - row(actions, k)[step]);
+      const distance = (step) => Math.hypot(...change(step));
+      add(titled("disagreement", policy), Array.from(rewards, (_, step) => distance(step)),
+        (step) => `commands differ by ${short(distance(step))}`);
+    }
+  }
+  const drops = Array.from(rewards, (reward, step) => (step ? rewards[step - 1] - reward : 0));
+  add("drop of the reward", drops, (step) => `${short(rewards[step - 1])} to ${short(rewards[step])}`);
+  return places.map((place) => ({ ...place, time: times[place.step] }));
+}
+
+/** Return how much more a policy prefers its own action than the logged one. */
+function gapOf({ q, preference, policy_action: chosen }, step, action) {
+  const values = q.some(Number.isFinite) ? q : preference;
+  return row(values, chosen[step] - log.first_action)[step] - row(values, action - log.first_action)[step];
+}
+
+function placeLine({ kind, step, text, time }) {
+  const button = element("button", {
+    textContent: `step ${step}  ${kind}: ${text}`, onclick: () => { play(false); seek(time); },
+  });
+  return element("li", {}, button);
 }
 
 function lineOf({ times, levels }, text, k) {
@@ -319,7 +310,16 @@ function turn(count) {
 
 function follow(following) {
   get("follow").setAttribute("aria-pressed", following);
+  get("above").setAttribute("aria-pressed", false);
+  scene?.fromAbove(false);
   scene?.follow(following);
+}
+
+function above(isAbove) {
+  if (!isAbove) return follow(true);
+  get("follow").setAttribute("aria-pressed", false);
+  get("above").setAttribute("aria-pressed", true);
+  scene?.fromAbove(true);
 }
 
 const KEYS = {
@@ -331,16 +331,19 @@ const KEYS = {
   PageUp: () => turn(-1),
   PageDown: () => turn(1),
   f: () => follow(get("follow").getAttribute("aria-pressed") !== "true"),
+  a: () => above(get("above").getAttribute("aria-pressed") !== "true"),
 };
 
 function listen() {
   get("play").onclick = () => play(!state.playing);
   get("back").onclick = () => stepBy(-1);
   get("forth").onclick = () => stepBy(1);
-  get("speed").onchange = ({ target }) => { state.speed = Number(target.value); };
+  get("speed").onchange = ({ target }) => { state.speed = Number(target.value); target.blur(); };
   get("time").oninput = ({ target }) => seek(Number(target.value));
   get("follow").onclick = () => KEYS.f();
-  get("order").onchange = list;
+  get("above").onclick = () => KEYS.a();
+  // The keys work again without a click elsewhere.
+  get("order").onchange = ({ target }) => { list(); target.blur(); };
   get("number").onchange = ({ target }) => {
     const index = log.numbers.indexOf(Number(target.value));
     if (index >= 0) choose(index);

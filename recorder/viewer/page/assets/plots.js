@@ -64,8 +64,11 @@ class TimePlot {
         values: () => labels,
       }
       : { size: 52, values: (_, splits) => splits.map((split) => (split === null ? "" : short(split))) };
-    const columns = this.series.map(({ values }) =>
-      Array.from(this.times, (_, k) => (Number.isFinite(values[k]) ? values[k] : null)));
+    // The last value of a series with one number per step lasts until the end of the episode.
+    const columns = this.series.map(({ values }) => Array.from(this.times, (_, k) => {
+      const value = values[Math.min(k, values.length - 1)];
+      return Number.isFinite(value) ? value : null;
+    }));
     this.plot = new libraries.uPlot({
       ...this.size(),
       padding: [8, 16, 0, 0],
@@ -113,4 +116,66 @@ class TimePlot {
 
 function cut(text, most) {
   return text.length > most ? `${text.slice(0, most - 1)}\u2026` : text;
+}
+
+/** Create the plots of an episode. */
+function plotsOf(data) {
+  const { times, rewards } = data;
+  const sums = [0];
+  for (const reward of rewards) sums.push(sums.at(-1) + reward);
+  const plot = (series, options) => {
+    return new TimePlot(get("plots"), times, series, options, seek);
+  };
+  const rows = (values, names) => Array.from({ length: values.shape[0] }, (_, k) =>
+    ({ name: names[k] ?? String(k), values: row(values, k) }));
+  const named = data.is_discrete && log.actions.length && log.actions.length <= MOST_BARS;
+  const index = (values) => (named ? values.map((value) => value - log.first_action) : values);
+  data.sums = sums;
+  return [
+    plot([{ name: "reward", values: rewards }], { title: "Reward" }),
+    plot([{ name: "return", values: sums }], { title: "Return so far" }),
+    data.is_discrete
+      ? plot([
+        { name: "log", values: index(row(data.actions, 0)) },
+        ...data.policies.map(({ name, policy_action: chosen }) =>
+          ({ name: name || "policy", values: index(chosen), dash: [3, 3] })),
+      ], { title: "Action", names: named ? log.actions : undefined })
+      : undefined,
+    ...(data.is_discrete ? [] : commandPlots(data, plot, rows)),
+    ...data.policies.flatMap((policy) => {
+      if (!policy.preference) return valuePlots(policy, plot);
+      const hasValues = policy.q.some(Number.isFinite);
+      const errors = [{ name: "TD error", values: policy.td_error }, { name: "advantage", values: policy.advantage }];
+      return [
+        plot(rows(hasValues ? policy.q : policy.preference, log.actions), {
+          title: titled(hasValues ? "Q-values" : "Probabilities of the actions", policy), shown: 8,
+        }),
+        ...(hasValues ? [plot(errors, { title: titled("TD error and advantage", policy) })] : []),
+      ];
+    }),
+    ...data.plots.map(({ title, names, values }) =>
+      plot(rows(values, names), { title: title[0].toUpperCase() + title.slice(1) })),
+  ].filter(Boolean);
+}
+
+/** Return the plots of a Box action: each element beside the policies' commands, if there are any. */
+function commandPlots({ actions, policies }, plot, rows) {
+  const own = policies.filter((policy) => !policy.preference);
+  if (!own.length) return [plot(rows(actions, log.parts), { title: "Action" })];
+  return log.parts.map((part, k) => plot([
+    { name: "log", values: row(actions, k) },
+    ...own.map(({ name, policy_action: command }) =>
+      ({ name: name || "policy", values: row(command, k), dash: [3, 3] })),
+  ], { title: `Action: ${part}` }));
+}
+
+/** Return the plots of a policy's values of the logged commands and of the policy's. */
+function valuePlots(policy, plot) {
+  if (!policy.q.some(Number.isFinite)) return [];
+  const values = [{ name: "log", values: policy.q }, { name: "policy", values: policy.value, dash: [3, 3] }];
+  const errors = [{ name: "TD error", values: policy.td_error }, { name: "advantage", values: policy.advantage }];
+  return [
+    plot(values, { title: titled("Q-values of both commands", policy) }),
+    plot(errors, { title: titled("TD error and advantage", policy) }),
+  ];
 }

@@ -7,8 +7,10 @@ const UNIT = {
   cylinder: new libraries.CylinderGeometry(0.5, 0.5, 1, 20).rotateX(Math.PI / 2),
   cone: new libraries.ConeGeometry(0.5, 1, 20).rotateX(Math.PI / 2),
   dot: new libraries.SphereGeometry(0.5, 8, 6),
+  pointer: new libraries.ConeGeometry(0.5, 1, 4),
 };
-// Lines thinner than this are drawn with a constant width on the screen, so that they stay visible.
+const MARKER = "#e3242b", MARKER_SHARE = 0.03;
+// Lines thinner than this are drawn with a least width on the screen, so that they stay visible.
 const THIN_M = 0.25, THIN_PX = 1.5;
 
 class SceneView {
@@ -41,6 +43,8 @@ class SceneView {
     this.objects?.forEach(dispose);
     if (this.root) this.scene.remove(this.root);
     this.root = new libraries.Group();
+    this.marker = mesh(UNIT.pointer, { color: new libraries.Color(MARKER), opacity: 1 });
+    this.isAbove = false;
     this.scene.add(this.root);
     this.data = data;
     this.groups = new Map();
@@ -48,6 +52,7 @@ class SceneView {
     this.moment = undefined;
     for (const frame of data.frames) this.attach(this.group(frame.name), this.group(frame.parent));
     this.show([...data.static]);
+    this.root.add(this.marker);
     this.anchor = null;
     this.draw(0);
     this.placeCamera();
@@ -89,6 +94,7 @@ class SceneView {
   /** Show the scene at a time in seconds. */
   draw(time) {
     const { moments, frames } = this.data;
+    this.time = time;
     const moment = Math.max(0, indexAt(moments.times, time));
     if (moment !== this.moment) {
       this.moment = moment;
@@ -97,7 +103,13 @@ class SceneView {
     }
     for (const frame of frames) setPose(this.groups.get(frame.name), frame, time);
     this.root.updateMatrixWorld(true);
-    if (this.following) this.moveCamera();
+    this.marker.visible = this.isAbove && Boolean(this.vehicle());
+    if (this.marker.visible) {
+      const { position, heading } = this.vehicle();
+      this.marker.position.copy(position);
+      this.marker.rotation.z = heading - Math.PI / 2;
+    }
+    if (this.following && !this.isAbove) this.moveCamera();
     this.render();
   }
 
@@ -149,6 +161,25 @@ class SceneView {
   follow(following) {
     this.following = following;
     if (following) this.placeCamera();
+  }
+
+  /** Show the world and a marker of the vehicle from above, or the view behind the vehicle. */
+  fromAbove(isAbove) {
+    this.isAbove = isAbove;
+    if (isAbove) {
+      const { camera, controls } = this, box = new libraries.Box3().setFromObject(this.root);
+      const size = box.getSize(new libraries.Vector3());
+      box.getCenter(controls.target);
+      const height = Math.max(size.y, size.x / camera.aspect, 1);
+      const distance = height / (2 * Math.tan(camera.fov * Math.PI / 360)) + size.z / 2;
+      // A camera exactly above its target has no direction of up.
+      camera.position.copy(controls.target).add(new libraries.Vector3(0, -1e-3 * distance, distance));
+      camera.lookAt(controls.target);
+      this.marker.scale.setScalar(MARKER_SHARE * height);
+    } else {
+      this.placeCamera();
+    }
+    this.draw(this.time);
   }
 
   resize() {
@@ -222,11 +253,11 @@ function linesObject(kind, points, look, width) {
     ends = [];
     for (let k = 3; k < points.length; k += 3) ends.push(...points.subarray(k - 3, k + 3));
   }
-  const isThin = width < THIN_M;
-  return new libraries.LineSegments2(
-    new libraries.LineSegmentsGeometry().setPositions(ends),
-    new libraries.LineMaterial({ ...look, worldUnits: !isThin, linewidth: isThin ? THIN_PX : width }),
-  );
+  const geometry = new libraries.LineSegmentsGeometry().setPositions(ends);
+  const lines = (options) => new libraries.LineSegments2(geometry, new libraries.LineMaterial({ ...look, ...options }));
+  const wide = lines({ worldUnits: true, linewidth: width });
+  if (width >= THIN_M) return wide;
+  return new libraries.Group().add(wide, lines({ worldUnits: false, linewidth: THIN_PX }));
 }
 
 function dotsObject(points, look, size) {
