@@ -8,7 +8,7 @@ that it fits into a window of 1280 x 720 pixels.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,8 +20,6 @@ from mcaprl.recorder.format.schema import (
     EPISODE_TOPIC,
     IMAGE_FRAME,
     LOG_TOPIC,
-    PHASE_TOPIC,
-    RUNNING,
     STEP_TOPIC,
 )
 from mcaprl.recorder.format.spaces import observation_leaves
@@ -49,10 +47,13 @@ _REASONS = (
     *("off_lane", "off_line", "collision", "crash", "stall", "no_gate", "slow", "low_reward"),
     *("terminated", "time_limit"),
 )
-_LAST_S = 20
+_LAST_STEPS = 80
 _MAX_EPISODE = 100
-_FIRST_METRICS = ("mean_return", "score")
+_MEAN_RETURN = "mean_return"
+_FIRST_METRICS = (_MEAN_RETURN, "score")
 _NEXT_METRICS = ("loss", "epsilon")
+# Share of the range of the depth below the nearest one, in which the colors are almost black.
+_DARK = 0.1
 
 
 def layout_of(
@@ -61,9 +62,24 @@ def layout_of(
     telemetry_names: Sequence[str] = (),
     follow_frame: str = "",
     training: Mapping[str, str] | None = None,
+    without_q: Collection[str] = (),
+    episodes: int = 0,
 ) -> dict[str, Any]:
-    """Return the layout for a log with these topics."""
-    screens = _Screens(metadata, topics, telemetry_names, follow_frame, training or {})
+    """Return the layout for a log with these topics.
+
+    Args:
+        metadata: Description of the log.
+        topics: Names of the topics.
+        telemetry_names: Fields of the telemetry.
+        follow_frame: Frame that the 3D view follows; empty for none.
+        training: Titles of the metrics of a training that is shown live, by field.
+        without_q: Topics of policies without Q-values.
+        episodes: Number of episodes; 0 if it is unknown.
+    """
+    # A policy with Q-values is shown first.
+    ordered = sorted(topics, key=lambda topic: (is_values_topic(topic), topic in without_q))
+    found = (metadata, ordered, telemetry_names, follow_frame, training or {}, without_q, episodes)
+    screens = _Screens(*found)
     nodes = {"Drive": screens.drive(), "Learning": screens.learning(), "Data": screens.data()}
     return {
         "configById": {"Tab!screens": panels.tabs(nodes), **screens.found},
@@ -93,6 +109,8 @@ class _Screens:
     telemetry: Sequence[str]
     follow_frame: str
     training: Mapping[str, str]
+    without_q: Collection[str]
+    episodes: int
     found: dict[str, Panel] = field(default_factory=dict)
 
     def drive(self) -> Node:
@@ -214,8 +232,10 @@ class _Screens:
             low = self.metadata.view.get("depth_min_m", DEPTH_M[0])
             high = self.metadata.view.get("depth_max_m", DEPTH_M[1])
             colors = {"colorMode": "colormap", "colorMap": "turbo"}
-            limits_mm = {"minValue": 1000 * low, "maxValue": 1000 * high}
-            title = f"depth, {low:g} to {high:g} m; black: nothing in range"
+            # The lowest colors are almost black, like pixels without a depth.
+            nearest = max(0.0, low - _DARK * (high - low))
+            limits_mm = {"minValue": 1000 * nearest, "maxValue": 1000 * high}
+            title = f"depth {low:g}-{high:g} m, black: none"
             panel = panels.image(title, _DEPTH, **colors, **limits_mm)
             names.append(self._put("Image!depth", panel))
         for leaf in observation_leaves(self.metadata.observation_space):
@@ -230,6 +250,9 @@ class _Screens:
         returns = {"return of each episode": f"{EPISODE_TOPIC}.total_reward"}
         if RETURN_SO_FAR in self.telemetry:
             returns = {"return so far": f"/telemetry.{RETURN_SO_FAR}"}
+        if _MEAN_RETURN in self.training:
+            # Viewers keep live data of the panels on the screen alone.
+            returns = {self.training[_MEAN_RETURN]: f"{TRAINING_TOPIC}.{_MEAN_RETURN}"}
         plots: list[Node] = [
             self._plot("reward", "reward", {"reward": f"{panels.STEPS}.reward"}),
             self._plot("return", next(iter(returns)), returns),
@@ -253,34 +276,41 @@ class _Screens:
         return [self._put("Gauge!speed", panel)]
 
     def _indicator(self) -> list[Node]:
-        """Add the state of the episode. If the success reasons are known, failures are red."""
-        if PHASE_TOPIC not in self.topics:
-            return []
+        """Add how the last episode ended, which stays until the next end.
+
+        If the success reasons are known, failures are red.
+        """
         successes = self.metadata.success_reasons
-        other = (panels.BAD, "failed") if successes else (panels.NEUTRAL, "ended")
         colors = {
-            **dict.fromkeys((RUNNING, INTERRUPTED), panels.NEUTRAL),
-            **dict.fromkeys(_REASONS, other[0]),
+            INTERRUPTED: panels.NEUTRAL,
+            **dict.fromkeys(_REASONS, panels.BAD if successes else panels.NEUTRAL),
             **dict.fromkeys(successes, panels.GOOD),
         }
-        panel = panels.indicator("state of the episode", f"{PHASE_TOPIC}.data", colors, other)
+        # Viewers show the same before the first end and for texts without a color.
+        other = (panels.NEUTRAL, "none yet, or another reason")
+        path = f"{EPISODE_TOPIC}.reason"
+        panel = panels.indicator("how the last episode ended", path, colors, other)
         return [self._put("Indicator!state", panel)]
 
     def _actions(self) -> tuple[Node, float]:
         """Add a panel of recent logged and policy actions; return its node and relative height."""
-        title = f"actions of the last {_LAST_S} s"
+        last_s = round(_LAST_STEPS * self.metadata.step_duration_ns / 1e9, 3)
+        title = f"the last {last_s:g} s"
         if not self.metadata.action_names():
-            return self._commands(title)
-        rows = {"action": f"{panels.STEPS}.action"}
+            return self._commands(last_s)
+        rows = {
+            "episode": f"{panels.STEPS}.episode",
+            "step": f"{panels.STEPS}.step",
+            "action": f"{panels.STEPS}.action",
+        }
         for topic in self._values_topics():
             name = topic.removeprefix(VALUES_TOPIC).removeprefix("/")
             rows[f"{name} would take".strip()] = f"{topic}.policy_action"
-            rows[f"{name} agrees".strip()] = f"{topic}.agrees"
-        panel = panels.state_transitions(title, rows, _LAST_S)
+        panel = panels.state_transitions(title, rows, last_s)
         share = panels.share_of_transitions(len(rows))
         return self._put("StateTransitions!actions", panel), share
 
-    def _commands(self, title: str) -> tuple[Node, float]:
+    def _commands(self, last_s: float) -> tuple[Node, float]:
         """Add a plot of logged and policy commands, and dials of a Box action's elements."""
         logged = panels.action_series(self.metadata)
         paths = dict(logged)
@@ -291,7 +321,12 @@ class _Screens:
             for name, suffix in panels.action_parts(self.metadata).items():
                 paths[f"{name}, {policy}"] = f"{topic}.policy_action{suffix or '[0]'}"
         shown = dict(list(paths.items())[: panels.MAX_SERIES])
-        panel = panels.plot(title, shown, isSynced=False, followingViewWidth=_LAST_S)
+        # Viewers move a plot of limited width only while data arrive, and not over a file.
+        title, options = "actions", dict[str, Any]()
+        if self.training:
+            title = f"actions of the last {last_s:g} s"
+            options = {"isSynced": False, "followingViewWidth": last_s}
+        panel = panels.plot(title, shown, **options)
         plot: Node = self._put("Plot!action", panel)
         if not bounded:
             return plot, 0.25
@@ -310,8 +345,7 @@ class _Screens:
         """Add the return of each episode, and an overview of the episodes."""
         paths = {"return": f"{EPISODE_TOPIC}.total_reward"}
         rows: dict[str, str] = {"episode": f"{panels.STEPS}.episode"}
-        if PHASE_TOPIC in self.topics:
-            rows["state"] = f"{PHASE_TOPIC}.data"
+        rows["how the episode before ended"] = f"{EPISODE_TOPIC}.reason"
         overview = panels.state_transitions("episodes", rows)
         share = panels.share_of_transitions(len(rows))
         return [
@@ -323,9 +357,14 @@ class _Screens:
         """Add the metrics of training, the most important first."""
         paths = {name: f"{TRAINING_TOPIC}.{name}" for name in self.training}
         rows: list[tuple[Node, float]] = []
-        first = {self.training[name]: paths.pop(name) for name in _FIRST_METRICS if name in paths}
+        # Scores are between 0 and 1, and returns often far from that.
+        first: list[Node] = [
+            self._plot(f"training {name}", self.training[name], {name: paths.pop(name)})
+            for name in _FIRST_METRICS
+            if name in paths
+        ]
         if first:
-            rows.append((self._plot("training", "mean return and score", first), 0.3))
+            rows.append((panels.stack(first, "row"), 0.3))
         plots: dict[str, Node] = {
             name.replace("_", " "): self._plot(name, self.training[name], {name: path})
             for name, path in paths.items()
@@ -344,17 +383,23 @@ class _Screens:
             return self._policy_commands(topic, title)
         names = list(self.metadata.action_names().values())[: panels.MAX_SERIES]
         over_time: dict[str, Node] = {}
-        for label, array in (("Q-values", "q"), ("probabilities", "preference")):
+        has_q = topic not in self.without_q
+        kinds = {**({"Q-values": "q"} if has_q else {}), "probabilities": "preference"}
+        for label, array in kinds.items():
             paths = {name: f"{topic}.{array}[{index}]" for index, name in enumerate(names)}
             panel = panels.plot(f"{title}: {label} over time", paths, values=True)
             over_time[label] = self._put(f"Plot!{title} {array}", panel)
-        legend = ", ".join(f"{index} {name}" for index, name in enumerate(names))
-        now = panels.points_by_index(f"{title}: Q now ({legend})", {"Q": f"{topic}.q[:]"})
-        fields = ("td_error", "advantage", "entropy")
+        shown = ("Q", "q") if has_q else ("probability", "preference")
+        # The plot beside it has the names of the actions.
+        now = panels.points_by_index(
+            f"{title}: {shown[0]} of each action now", {shown[0]: f"{topic}.{shown[1]}[:]"}
+        )
+        fields = ("td_error", "advantage", "entropy") if has_q else ("entropy",)
         errors = {name: f"{topic}.{name}" for name in fields}
+        label = "TD error, advantage, entropy" if has_q else "entropy"
         pair: list[Node] = [
             self._put(f"Plot!{title} now", now),
-            self._plot(f"{title} errors", f"{title}: TD error, advantage, entropy", errors),
+            self._plot(f"{title} errors", f"{title}: {label}", errors),
         ]
         agreement = panels.state_transitions(
             f"{title}: agreement with the actions of the log", {"agrees": f"{topic}.agrees"}
@@ -390,6 +435,7 @@ class _Screens:
 
     def _chosen_episode(self) -> Node:
         chosen, title = panels.EPISODE_VARIABLE, "reward of the chosen episode"
-        knob = panels.slider("episode to plot", chosen, _MAX_EPISODE)
+        last = self.episodes - 1 if self.episodes else _MAX_EPISODE
+        knob = panels.slider("episode to plot", chosen, max(last, 1))
         plot = self._plot("episode", title, {"reward": panels.CHOSEN_REWARD})
         return panels.split(self._put("GlobalVariableSliderPanel!episode", knob), plot, "row", 30)

@@ -127,7 +127,7 @@ FIELD_OF_VIEW_DEG = 45
 NEUTRAL, GOOD, BAD = "#4e98e2", "#31b57b", "#d64545"
 _COLORS = ("#4e98e2", "#f5774d", "#31b57b", "#a395e2", "#e8c547", "#d65f8a", "#7fd1d8", "#9c755f")
 # Width in pixels of a legend with labels, and of a legend with labels and current values.
-_LEGEND_PX, _LEGEND_WITH_VALUES_PX = 160, 220
+_LEGEND_PX, _LEGEND_WITH_VALUES_PX = 200, 260
 # Height in pixels of each row of state transitions, and of the title and time axis together.
 _TRANSITIONS_ROW_PX, _TRANSITIONS_REST_PX = 64, 60
 # Height of a screen in the smallest window, 1280 x 720 pixels.

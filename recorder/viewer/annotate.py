@@ -11,7 +11,7 @@ continues the random state of the previous episode, so it is replayed directly a
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Collection, Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,10 +34,16 @@ from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.log_writer import LogWriter
 from mcaprl.recorder.format.messages import INTERRUPTED
 from mcaprl.recorder.format.reading import McapReader, Topic
-from mcaprl.recorder.format.schema import LOG_TOPIC
+from mcaprl.recorder.format.schema import EPISODE_TOPIC, LOG_TOPIC
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 from mcaprl.recorder.record.display import SCENE, TELEMETRY, TF, Display, ShownTopics
-from mcaprl.recorder.record.layout import LAYOUT_NAME, VALUES_TOPIC, layout_bytes, layout_of
+from mcaprl.recorder.record.layout import (
+    LAYOUT_NAME,
+    VALUES_TOPIC,
+    is_values_topic,
+    layout_bytes,
+    layout_of,
+)
 from mcaprl.recorder.record.recordable import recorded_like, value_at
 from mcaprl.recorder.record.step_rows import as_declared
 from mcaprl.texts import counted
@@ -331,15 +337,34 @@ def _checked_paths(dataset: Dataset, env: gym.Env[Any, Any]) -> Paths:
 
 
 def layout_of_log(
-    reader: McapReader, topics: Sequence[str] | None = None, shown: ShownTopics | None = None
+    reader: McapReader,
+    topics: Sequence[str] | None = None,
+    shown: ShownTopics | None = None,
+    without_q: Collection[str] = (),
 ) -> dict[str, Any]:
     """Return a layout that shows the topics of a log and plots its series."""
-    if topics is None:
-        topics = sorted({channel.topic for channel in reader.channels.values()})
-    if shown is not None:
-        return layout_of(describe(reader), topics, shown.telemetry_names, shown.follow_frame)
-    telemetry = [name for name in Topic(reader, TELEMETRY).fields if name != "encapsulation"]
-    return layout_of(describe(reader), topics, telemetry, _first_frame(reader))
+    own = sorted({channel.topic for channel in reader.channels.values()})
+    if shown is None:
+        telemetry = [name for name in Topic(reader, TELEMETRY).fields if name != "encapsulation"]
+        names, frame = telemetry, _first_frame(reader)
+    else:
+        names, frame = list(shown.telemetry_names), shown.follow_frame
+    empty = [topic for topic in own if is_values_topic(topic) and not _has_q(reader, topic)]
+    return layout_of(
+        describe(reader),
+        own if topics is None else topics,
+        names,
+        frame,
+        without_q={*without_q, *empty},
+        episodes=len(Topic(reader, EPISODE_TOPIC).times),
+    )
+
+
+def _has_q(reader: McapReader, topic: str) -> bool:
+    """Return whether the first message of a policy's topic has Q-values."""
+    values = Topic(reader, topic)
+    found = values.read(("q",), np.arange(min(1, len(values.times))))["q"]
+    return bool(np.isfinite(found.astype(np.float64)).any())
 
 
 def attached_layout(reader: McapReader) -> dict[str, Any]:
@@ -389,6 +414,7 @@ class AnnotatedCopy:
         self._log, self._source = log, source
         self._topics = {channel.topic for channel in source.channels.values()}
         self._display: Display | None = None
+        self._without_q: set[str] = set()
 
     def add_values(self, topic: str, episodes: Sequence[tuple[Episode, Mapping[str, Any]]]) -> None:
         """Write a topic with schema `schema.values_schema` and one message per step.
@@ -399,6 +425,8 @@ class AnnotatedCopy:
         """
         self._refuse(topic)
         rows = self._log.values_rows(topic)
+        if not any(np.isfinite(columns["q"]).any() for _, columns in episodes):
+            self._without_q.add(topic)
         for episode, columns in episodes:
             rows.write_columns(episode.log_time_ns[:-1], columns)
 
@@ -441,7 +469,7 @@ class AnnotatedCopy:
         mcap = self._log.mcap
         topics = sorted({channel.topic for channel in mcap.channels.values()})
         shown = None if self._display is None else self._display.shown
-        layout = layout_of_log(self._source, topics, shown)
+        layout = layout_of_log(self._source, topics, shown, self._without_q)
         data, time_ns = layout_bytes(layout), mcap.end_time_ns
         mcap.announce(Attachment(time_ns, time_ns, LAYOUT_NAME, "application/json", data))
 

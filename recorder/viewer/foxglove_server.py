@@ -355,6 +355,8 @@ def _prefixed_layout(layout: dict[str, Any], prefix: str) -> dict[str, Any]:
     # Strings that begin with a slash are topics. Names of panels have the form `Kind!title`.
     text = re.sub(r'"(/[a-z])', rf'"/{prefix}\1', text)
     text = re.sub(r'"(\w+)!', rf'"\1!{prefix} ', text)
+    # Titles of screens are not prefixed.
+    text = re.sub(r'("(?:foxglove|lichtblick)PanelTitle": ")', rf"\g<1>{prefix}: ", text)
     text = re.sub(r'("followTf": "|"frame:)(?!map")', rf"\g<1>{prefix}/", text)
     text = re.sub(r'(\{\w+==\$|"globalVariableName": ")', rf"\g<1>{prefix}_", text)
     found: dict[str, Any] = json.loads(text)

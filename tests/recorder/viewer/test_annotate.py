@@ -384,4 +384,4 @@ def test_layouts_of_annotated_logs_refer_to_paths_in_the_log(tmp_path: Path) -> 
     tabs = layout["configById"]["Tab!policies"]["tabs"]
     assert [tab["title"] for tab in tabs] == ["values/a", "values/b"]
     title = layout["configById"]["Plot!values/a now"]["foxglovePanelTitle"]
-    assert title.startswith("values/a: Q now (0 brake, 1 straight, ")
+    assert title == "values/a: Q of each action now"

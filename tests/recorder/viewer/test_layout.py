@@ -12,6 +12,7 @@ import pytest
 from gymnasium import spaces
 
 import mcaprl
+from mcaprl.recorder.dataset.log_reader import describe
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.layout import layout_of
@@ -94,8 +95,8 @@ def test_paths_are_in_annotated_logs(sim: str, names: list[str], tmp_path: Path)
     panels = check_layout(path)["configById"]
     rows = [row["label"] for row in panels["StateTransitions!actions"]["paths"]]
     expected = {
-        1: ["action", "would take", "agrees"],
-        2: ["action", "a would take", "a agrees", "b would take", "b agrees"],
+        1: ["episode", "step", "action", "would take"],
+        2: ["episode", "step", "action", "a would take", "b would take"],
     }
     assert rows == expected[len(names)]
     if sim == "lane":
@@ -121,6 +122,7 @@ def test_paths_are_in_several_logs(prefixes: list[str], tmp_path: Path) -> None:
     assert paths_of(panels[f"Plot!{b} episode"]) == [chosen]
     hidden = panels[f"3D!{a} above"]["transforms"]
     assert hidden.keys() == {"frame:map", f"frame:{a}/camera"}
+    assert panels[f"3D!{a} scene"]["lichtblickPanelTitle"] == f"{a}: scene"
     screens = panels["Tab!screens"]["tabs"]
     assert [tab["title"] for tab in screens] == ["Drive", "Learning", "Data"]
     assert all(tab["layout"]["direction"] == "row" for tab in screens)
@@ -237,7 +239,44 @@ def test_failures_are_unknown_without_reasons_of_success(tmp_path: Path) -> None
     panels = check_layout(recorded(tmp_path / "log.mcap", "CartPole-v1"))["configById"]
     light = panels["Indicator!state"]
     assert {rule["color"] for rule in light["rules"]} == {light["fallbackColor"]} == {"#4e98e2"}
-    assert light["fallbackLabel"] == "ended"
+    assert light["path"] == "/rl/episode.reason", "it stays until the next end"
+    assert light["fallbackLabel"] == "none yet, or another reason"
+
+
+def test_the_window_of_actions_has_80_steps(tmp_path: Path) -> None:
+    for sim, last_s in (("lane", 20.0), ("racer", 8.0), ("CartPole-v1", 1.6)):
+        panels = check_layout(recorded(tmp_path / f"{sim}.mcap", sim))["configById"]
+        actions = panels["StateTransitions!actions"]
+        assert (actions["xAxisRange"], actions["isSynced"]) == (last_s, False)
+        assert actions["foxglovePanelTitle"] == f"the last {last_s:g} s"
+
+
+def test_policies_with_values_are_first(tmp_path: Path) -> None:
+    names = ["/rl/values/a", "/rl/values/b"]
+    path = annotated(recorded(tmp_path / "log.mcap", "lane"), tmp_path / "annotated.mcap", names)
+    reader = McapReader(path)
+    metadata, topics = describe(reader), ["/rl/values/a", "/rl/values/b"]
+    layout = layout_of(metadata, topics, without_q=["/rl/values/a"], episodes=7)
+    panels = layout["configById"]
+    shown = [tab["title"] for tab in panels["Tab!policies"]["tabs"]]
+    assert shown == ["values/b", "values/a"]
+    # The policy without values has plots of its probabilities alone.
+    tabs = {each: panels[f"Tab!values/{each} over time"]["tabs"] for each in "ab"}
+    assert [tab["title"] for tab in tabs["a"]] == ["probabilities"]
+    assert [tab["title"] for tab in tabs["b"]] == ["Q-values", "probabilities"]
+    assert paths_of(panels["Plot!values/a errors"]) == ["/rl/values/a.entropy"]
+    assert panels["GlobalVariableSliderPanel!episode"]["sliderProps"]["max"] == 6
+
+
+def test_a_live_training_shows_the_mean_return_on_drive() -> None:
+    metadata = LogMetadata(spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (1,), np.float32))
+    training = {"mean_return": "mean return", "score": "score", "loss": "loss"}
+    panels = layout_of(metadata, ["/rl/training"], training=training)["configById"]
+    assert paths_of(panels["Plot!return"]) == ["/rl/training.mean_return"]
+    # A score of at most 1 would be a flat line beside returns.
+    assert paths_of(panels["Plot!training mean_return"]) == ["/rl/training.mean_return"]
+    assert paths_of(panels["Plot!training score"]) == ["/rl/training.score"]
+    assert panels["Plot!action"]["followingViewWidth"] == 80 * metadata.step_duration_ns / 1e9
 
 
 def test_steering_is_in_the_first_plot_of_highway_lane(tmp_path: Path) -> None:
@@ -251,7 +290,9 @@ def test_steering_is_in_the_first_plot_of_highway_lane(tmp_path: Path) -> None:
 def test_continuous_actions_are_plotted(tmp_path: Path) -> None:
     panels = check_layout(recorded(tmp_path / "log.mcap", "Pendulum-v1"))["configById"]
     assert paths_of(panels["Plot!action"]) == ["/rl/step{final==false}.action[0]"]
-    assert panels["Plot!action"]["followingViewWidth"] == 20
+    # A plot of limited width would not move with the time of a file.
+    assert "followingViewWidth" not in panels["Plot!action"]
+    assert panels["Plot!action"]["isSynced"] is True
     assert "StateTransitions!actions" not in panels
 
 

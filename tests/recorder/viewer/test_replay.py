@@ -248,7 +248,7 @@ def test_layout_is_attached_and_classic(log: Path) -> None:
     assert views[1]["cameraState"]["perspective"] is False
     assert "/scene/tracks" in views[1]["topics"]
     rules = {rule["rawValue"]: rule["color"] for rule in _panel(layout, "Indicator")["rules"]}
-    assert rules["running"] == rules["interrupted"] == "#4e98e2"
+    assert rules["interrupted"] == "#4e98e2"
     assert rules["time_limit"] == "#31b57b", "that is success in this sim"
     assert rules["off_lane"] == rules["crash"] == "#d64545"
     actions = _panel(layout, "StateTransitions")
@@ -288,8 +288,11 @@ def test_each_sim_has_its_own_camera_and_ranges(tmp_path: Path) -> None:
         "racer": 15,
     }
     depth = layouts["lane"]["configById"]["Image!depth"]
-    assert (depth["imageMode"]["minValue"], depth["imageMode"]["maxValue"]) == (3000, 56_000)
-    assert depth["foxglovePanelTitle"] == "depth, 3 to 56 m; black: nothing in range"
+    # The lowest tenth of the colors is almost black: only missing depths are black.
+    assert (depth["imageMode"]["minValue"], depth["imageMode"]["maxValue"]) == (0, 56_000)
+    drone = layouts["powerline"]["configById"]["Image!depth"]["imageMode"]
+    assert (drone["minValue"], drone["maxValue"]) == (1000 * (8 - 0.1 * 48), 56_000)
+    assert depth["foxglovePanelTitle"] == "depth 3-56 m, black: none"
 
 
 @pytest.mark.parametrize("sim", [*SIMS, "CartPole-v1", "Pendulum-v1"])
