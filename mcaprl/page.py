@@ -9,13 +9,17 @@ from __future__ import annotations
 
 import io
 import re
+import shlex
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from importlib.resources import files
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from mcaprl._version import __version__
 from mcaprl.errors import ReportError, import_extra
 from mcaprl.files import replacing, write_atomically
 from mcaprl.texts import encodable, printable, shortened
@@ -209,10 +213,18 @@ def _kind(cells: Sequence[str]) -> str:
     return "short" if max(map(len, cells), default=0) <= _MAX_SHORT else "text"
 
 
+def _origin() -> str:
+    """Return the version, the date, and the command if there is one."""
+    program, *arguments = sys.argv or [""]
+    command = shlex.join(["mcaprl", *arguments]) if Path(program).stem == "mcaprl" else ""
+    today = datetime.now(UTC).date().isoformat()
+    return ", ".join(filter(None, (f"mcaprl {__version__}", today, command)))
+
+
 def write_page(path: Path, title: str, lead: str, sections: Sequence[Section]) -> None:
     """Write a page; create the folder if needed."""
     jinja2 = import_extra("jinja2", "report")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(files("mcaprl").joinpath("page.html").read_text())
-    text = template.render(title=title, lead=lead, sections=sections)
+    text = template.render(title=title, lead=lead, sections=sections, origin=_origin())
     write_atomically(path, encodable(text).encode(), ReportError)

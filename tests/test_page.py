@@ -118,7 +118,7 @@ def test_the_page_fits_phones_and_color_schemes(
 
 
 def test_the_replay_command_names_the_episodes_file(tmp_path: Path) -> None:
-    for name, count in (("a", 2), ("b", 1)):
+    for name, count in (("a", 2), ("b", 2)):
         recorder = RecordMcap(gym.make("CartPole-v1"), tmp_path / f"{name}.mcap")
         for seed in range(count):
             recorder.reset(seed=seed)
@@ -129,7 +129,13 @@ def test_the_replay_command_names_the_episodes_file(tmp_path: Path) -> None:
     dataset_page(tmp_path / "all.html", data, "", [], [])
     page = (tmp_path / "all.html").read_text()
     found = re.findall(r"mcaprl replay \S+/(\w)\.mcap --episode (\d)", page)
-    assert sorted(found) == [("a", "0"), ("a", "1"), ("b", "0")]
+    assert sorted(found) == [("a", "0"), ("a", "1"), ("b", "0"), ("b", "1")]
+    assert [page.count(f"<strong>{kind}: ") for kind in ("best", "worst")] == [2, 2]
+    # Of three episodes, the one in the middle is neither.
+    three_of = data.filter(lambda episode: episode.index < 3)
+    dataset_page(tmp_path / "three.html", three_of, "", [], [])
+    three = (tmp_path / "three.html").read_text()
+    assert [three.count(f"<strong>{kind}: ") for kind in ("best", "worst")] == [1, 1]
     # The episode numbers of a filtered dataset are unknown.
     some = data.filter(lambda episode: episode.index > 0)
     dataset_page(tmp_path / "some.html", some, "", [], [])
@@ -177,6 +183,17 @@ def test_the_colors_of_an_evaluation_figure_fit_both_color_schemes() -> None:
     drawn = to_svg(comparison_figure(scores, "", (5.0, 4.0, 6.0)))
     of_page = {"currentColor", "var(--pale)", "var(--card)"}
     assert set(re.findall(r'(?:fill|stroke): ([^;"]+)', drawn)) == {"none", *COLORS[:2], *of_page}
+
+
+def test_an_interval_is_drawn_within_the_returns() -> None:
+    """Intervals of few returns can be far beyond all of them."""
+    episodes = tuple((EpisodeResult(k, 3.0 + k, 1, "", np.empty((0, 2))),) for k in range(2))
+    for interval, line, has_arrows in (((3.2, 3.9), [3.2, 3.9], False), ((-9, 20), [3, 4], True)):
+        score = PolicyScore("cql", episodes, 3.5, interval)
+        axes = comparison_figure([score], "", None).axes[0]
+        drawn = [each.get_xdata().tolist() for each in axes.lines if len(each.get_xdata()) == 2]
+        assert line in drawn
+        assert ("arrow" in axes.get_xlabel()) is has_arrows
 
 
 def test_text_is_escaped(tmp_path: Path) -> None:

@@ -60,6 +60,8 @@ from mcaprl.storage.remote import as_path, is_url
 
 _Images = Iterator[NDArray[np.uint8]]
 _STILLS, _MOST_DIALS, _HEIGHTS_PX = 12, 8, (16, 4320)
+_HOLD_S = 1.0
+"""Seconds for which a video shows the last image, which says how the episode ended."""
 
 
 @dataclass(frozen=True)
@@ -270,7 +272,8 @@ def render(
         parts = parts_of_step(images_per_s) if has_scene else 1
         images = draw(shown, parts) if has_scene else draw(shown)
         with progress(f"drawing {movie}", (len(shown) - 1) * parts + 1) as advance:
-            frames = write_video(movie, _counted(images, advance), images_per_s * parts)
+            fps = images_per_s * parts
+            frames = write_video(movie, _counted(images, advance), fps, _HOLD_S)
     if sheet is not None:
         stills = evenly_spaced(one.length, _STILLS)
         write_sheet(sheet, list(draw(stills)))

@@ -11,7 +11,7 @@ continues the random state of the previous episode, so it is replayed directly a
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path

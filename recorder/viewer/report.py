@@ -107,8 +107,9 @@ def _panels(dataset: Dataset, tracks: Sequence[Positions]) -> list[Panel]:
     statistics = dataset.statistics
 
     def by_episode(axes: Any) -> None:
-        axes.plot(statistics.returns, ".", color=COLORS[0], ms=4)
+        axes.plot(statistics.returns, ".", color=COLORS[0], ms=7)
         axes.set_xlabel("episode")
+        axes.xaxis.get_major_locator().set_params(integer=True)
 
     found = [
         Panel(
@@ -144,8 +145,9 @@ def _coverage(axes: Any, places: Positions) -> None:
 
 def _cards(dataset: Dataset, tracks: Sequence[Positions]) -> list[Card]:
     order = np.argsort([-episode.total_reward for episode in dataset.episodes], kind="stable")
-    best = order[:_SHOWN_EPISODES]
-    worst = order[len(best) :][-_SHOWN_EPISODES:][::-1]
+    # No episode is among both the best and the worst.
+    most = min(_SHOWN_EPISODES, max(len(order) // 2, 1))
+    best, worst = order[:most], order[most:][-most:][::-1]
     shown = [("best", int(k)) for k in best] + [("worst", int(k)) for k in worst]
     places, commands = np.concatenate([np.empty((0, 2)), *tracks]), _commands(dataset)
     return [_card(kind, dataset.episodes[k], tracks[k], places, commands[k]) for kind, k in shown]
@@ -237,6 +239,8 @@ def _commands_taken(axes: Any, values: NDArray[Any], ends: tuple[float, float] |
 
 def _histogram(axes: Any, values: NDArray[Any]) -> None:
     axes.hist(values[np.isfinite(values)], bins=_BINS, color=COLORS[0])
+    if values.dtype.kind in "iu":
+        axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_ylabel("episodes")
     axes.yaxis.get_major_locator().set_params(integer=True)
 

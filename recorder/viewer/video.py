@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
 from io import BytesIO
-from itertools import chain
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, Final
 
@@ -48,17 +48,29 @@ def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
         raise OutputExistsError(f"{path} exists: choose another path, or pass `overwrite=True`")
 
 
-def write_video(path: Path, images: Iterable[Image], fps: float) -> int:
+def write_video(path: Path, images: Iterable[Image], fps: float, hold_s: float = 0.0) -> int:
     """Write a video frame by frame: an H.264 encoded `.mp4`, or a `.gif` or `.webp` that loops.
 
+    The last image is shown for `hold_s` seconds more, so that the end can be read.
+
     Returns:
-        Number of frames.
+        Number of frames, with those that repeat the last image.
     """
     with replacing(path, ReportError) as unfinished:
-        count = _encode(unfinished, path.suffix, _of_one_size(images), fps)
+        shown = _held(_of_one_size(images), round(hold_s * fps))
+        count = _encode(unfinished, path.suffix, shown, fps)
         if count == 0:
             raise UsageError(f"{path}: the video has no frames")
     return count
+
+
+def _held(images: Iterable[Image], count: int) -> Iterator[Image]:
+    """Yield images, and the last one `count` times more."""
+    last = None
+    for last in images:
+        yield last
+    if last is not None:
+        yield from repeat(last, count)
 
 
 def _of_one_size(images: Iterable[Image]) -> Iterator[Image]:

@@ -66,10 +66,9 @@ def comparison_figure(
         axes.axvspan(low, high, color=PALE, alpha=0.45, lw=0)
         axes.axvline(mean, color=INK, lw=1, ls="--", label=f"behavior in the log {mean:.0f}")
     for row, score in enumerate(scores):
-        low, high = score.interval
         color = COLORS[row % len(COLORS)]
         axes.barh(row, score.mean_return, color=color, alpha=0.85, height=0.62)
-        axes.plot([low, high], [row, row], color=INK, lw=2, solid_capstyle="butt")
+        low, high = _draw_interval(axes, row, score)
         means = score.returns.mean(axis=1)
         if len(means) > 1:
             axes.plot(means, np.full(len(means), row), "o", color=BACKGROUND, mec=INK, ms=4.5)
@@ -84,11 +83,34 @@ def comparison_figure(
     axes.set_yticks(range(len(scores)), tick_labels(score.policy for score in scores))
     axes.invert_yaxis()
     axes.set_xlim(right=axes.get_xlim()[1] * 1.28)
-    axes.set_xlabel("mean return; line: 95 % interval; dots: training seeds")
+    label = "mean return; line: 95 % interval; dots: training seeds"
+    if any(_exceeds_returns(score) for score in scores):
+        label += "\narrow: the interval goes beyond all returns; evaluate more episodes"
+    axes.set_xlabel(label)
     axes.set_title(title)
     if behavior is not None:
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)
     return figure
+
+
+def _exceeds_returns(score: PolicyScore) -> bool:
+    """Return whether an interval contains means that no sample of the returns could have."""
+    low, high = score.interval
+    return bool(low < score.returns.min() or high > score.returns.max())
+
+
+def _draw_interval(axes: Any, row: int, score: PolicyScore) -> tuple[float, float]:
+    """Draw an interval up to the extreme returns; return the limits of the line.
+
+    The interval of few, skewed returns can be many times as wide as the returns.
+    """
+    limits = (float(score.returns.min()), float(score.returns.max()))
+    low, high = np.clip(score.interval, *limits)
+    axes.plot([low, high], [row, row], color=INK, lw=2, solid_capstyle="butt")
+    for end, wanted, marker in zip((low, high), score.interval, "<>", strict=True):
+        if end != wanted:
+            axes.plot([end], [row], marker, color=INK, ms=7)
+    return float(low), float(high)
 
 
 def _trajectories(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> list[Panel]:
