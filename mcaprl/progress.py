@@ -26,6 +26,8 @@ LINE_INTERVAL_S: Final = 10.0
 """Shortest time between two lines of progress if stderr is not a terminal."""
 LINE_INTERVAL_SHARE: Final = 0.1
 """Shortest time between two such lines as a share of the elapsed time."""
+LEAST_SHARE: Final = 0.02
+"""Share of the work from which on the remaining time is estimated before `FIRST_LINE_S`."""
 
 
 @contextmanager
@@ -96,15 +98,18 @@ class _ProgressLines:
     def __init__(self, description: str, total: int | None) -> None:
         self._description, self._total = description, total
         self._lines, self._done = _LineTimes(), 0
+        # Time and progress after the first unit, which may include a compilation.
+        self._first: tuple[float, int] | None = None
 
     def advance(self, amount: int) -> None:
         self._done += amount
+        if self._first is None:
+            self._first = (time.monotonic(), self._done)
         if not self._lines.is_due():
             return
         text = f"{self._description}: {self._done}"
         if self._total is not None:
-            left_s = _time_left(self._lines.elapsed_s, self._done, self._total)
-            text += f" of {self._total}, about {left_s:.0f} s left"
+            text += f" of {self._total}{_text_of_time_left(*self._first, self._done, self._total)}"
         print(text, file=sys.stderr, flush=True)
 
 
@@ -125,8 +130,13 @@ class _LineTimes:
         return True
 
 
-def _time_left(elapsed_s: float, done: int, total: int) -> float:
-    return max(elapsed_s * (total / max(done, 1) - 1), 0.0)
+def _text_of_time_left(began_s: float, first: int, done: int, total: int) -> str:
+    """Return the time left at the speed since the first report; empty if it is too early for it."""
+    elapsed_s = time.monotonic() - began_s
+    measured = done - first
+    if measured <= 0 or (elapsed_s < FIRST_LINE_S and measured < LEAST_SHARE * total):
+        return ""
+    return f", about {max(elapsed_s * (total - done) / measured, 0.0):.0f} s left"
 
 
 @dataclass(frozen=True)
@@ -200,9 +210,7 @@ def _training_lines(unit: str, terms: Sequence[str]) -> ProgressCallback:
         text = f"seed {now.seed}: {now.done} of {now.total} {unit}"
         if shown := _shown_term(now, terms):
             text += f", {shown}"
-        if now.done > first:
-            left_s = _time_left(time.monotonic() - began, now.done - first, now.total - first)
-            text += f", about {left_s:.0f} s left"
+        text += _text_of_time_left(began, first, now.done, now.total)
         print(text, file=sys.stderr, flush=True)
 
     return show

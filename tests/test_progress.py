@@ -44,6 +44,20 @@ def test_long_work_prints_lines_at_intervals(
     ]
 
 
+def test_the_first_unit_does_not_count_for_the_time_left(
+    clock: Clock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first of 1,000 units compiles for a minute; each other one takes 0.1 s."""
+    with terminal_bar("drawing", 1_000) as advance:
+        clock.now_s += 60
+        advance(1)
+        for _ in range(999):
+            clock.now_s += 0.1
+            advance(1)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == ["drawing: 1 of 1000", "drawing: 102 of 1000, about 90 s left"]
+
+
 def test_work_without_a_total_prints_what_is_done(
     clock: Clock, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -295,7 +295,10 @@ class LogPage:
                     "actions": _rows(episode.actions).T.astype(np.float32),
                     "is_discrete": isinstance(dataset.action_space, spaces.Discrete),
                     "plots": list(self._plots(dataset, episode)),
-                    "policies": list(self._policies(episode)),
+                    # Policies without Q-values are last.
+                    "policies": sorted(
+                        self._policies(episode), key=lambda one: bool(np.isnan(one["q"]).all())
+                    ),
                     "images": [*_observed_images(dataset), *self._depth_images(episode)],
                     "lines": self._lines(start_ns, end_ns),
                     "scene": scene,
