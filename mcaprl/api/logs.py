@@ -251,7 +251,11 @@ def _logs(dataset: Dataset) -> tuple[Path, ...]:
 
 
 def _counts(counts: dict[str, int]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in counts.items())
+    """Return counts by name; a name that is a number comes first: `0: 428`."""
+    return ", ".join(
+        f"{name}: {count}" if name.isdecimal() else f"{count} {name}"
+        for name, count in counts.items()
+    )
 
 
 def _short(text: str) -> str:

@@ -323,5 +323,8 @@ def _check_shape(leaf: Leaf, observations: Any) -> None:
     if len(got) == 0 or got[1:] != leaf.shape:
         wanted = ", ".join(map(str, ("B", *leaf.shape)))
         where = f" of {'.'.join(leaf.path)}" if leaf.path else ""
-        hint = "; add an axis to a single one: observation[None]" if got == leaf.shape else ""
+        added = "observation[None]"
+        if leaf.path:
+            added = "{name: np.asarray(part)[None] for name, part in observation.items()}"
+        hint = f"; add an axis to a single one: {added}" if got == leaf.shape else ""
         raise SpaceError(f"expects observations ({wanted}){where}, got {got}{hint}")

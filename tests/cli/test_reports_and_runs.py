@@ -7,10 +7,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from gymnasium import spaces
 
 import mcaprl
 from mcaprl import cli
-from mcaprl.errors import PolicyError
+from mcaprl.errors import PolicyError, SpaceError
+from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.recorder.dataset.dataset import Dataset
 from tests.support.offline_tasks import corridor
 
@@ -88,3 +90,12 @@ def test_one_observation_without_an_axis_is_refused_with_a_hint(data: Path) -> N
     with pytest.raises(PolicyError, match=r"got \(5,\); add an axis .* observation\[None\]"):
         policy.act(one)
     assert policy.act(one[None]).shape == (1,)
+
+
+def test_the_parts_of_one_dict_are_named_in_the_hint() -> None:
+    space = spaces.Dict({"place": spaces.Box(-1, 1, (2,)), "speed": spaces.Box(0, 1, (1,))})
+    one = space.sample()
+    encoder = ObservationEncoder(space, 2)
+    with pytest.raises(SpaceError, match=r"of place, got \(2,\); add .*\[None\] for name, part in"):
+        encoder.encode(one)
+    assert len(encoder.encode({name: part[None] for name, part in one.items()})) == 1
