@@ -519,18 +519,20 @@ _BOX: Final[dict[str, Any]] = {
     "smoothness": 0.1,
 }
 BOX_SETTINGS: Final[dict[str, dict[str, Any]]] = {
-    "lane": {**_BOX, "steps": 80_000, "gamma": 0.97},
+    "lane": {**_BOX, "steps": 120_000, "gamma": 0.97, "batch_size": 256},
     "racer": {**_BOX, "steps": 40_000, "gamma": 0.98},
-    "powerline": {**_BOX, "steps": 100_000, "gamma": 0.95, "n_steps": 3, "smoothness": 0.2},
+    "powerline": {**_BOX, "steps": 150_000, "gamma": 0.95, "n_steps": 3, "batch_size": 256},
     "highway-lane": {**_BOX, "steps": 40_000, "gamma": 0.97},
 }
 """Settings for continuous actions that differ from the algorithm's defaults, by sim."""
-BOX_ALGO_SETTINGS: Final[dict[str, dict[str, Any]]] = {
-    "sac": {"target_entropy": -2.0},
-    "td3": {"exploration_noise": 0.2},
-    "tqc": {"target_entropy": -2.0},
+_ENTROPIES: Final = {"lane": -4.0, "racer": -2.0, "powerline": -4.0, "highway-lane": -2.0}
+_WITH_ENTROPY: Final = {sim: {"target_entropy": target} for sim, target in _ENTROPIES.items()}
+BOX_ALGO_SETTINGS: Final[dict[str, dict[str, dict[str, Any]]]] = {
+    "sac": _WITH_ENTROPY,
+    "td3": dict.fromkeys(_ENTROPIES, {"exploration_noise": 0.2}),
+    "tqc": _WITH_ENTROPY,
 }
-"""Settings of each algorithm in addition to those of `BOX_SETTINGS`."""
+"""Settings of each algorithm in addition to those of `BOX_SETTINGS`, by sim."""
 
 
 _FROM_IMAGES: Final[dict[str, Any]] = {
@@ -635,6 +637,6 @@ def settings_for(algo: str, sim: str, sim_options: Mapping[str, Any]) -> dict[st
     is_box = issubclass(CONFIGS[algo], ActorCriticConfig)
     if not _has_images(sim_options):
         settings = BOX_SETTINGS.get(name, {}) if is_box else SIM_SETTINGS.get(name, {})
-        return {**settings, **(BOX_ALGO_SETTINGS[algo] if is_box and settings else {})}
+        return {**settings, **(BOX_ALGO_SETTINGS[algo].get(name, {}) if is_box else {})}
     images = BOX_IMAGE_SETTINGS if is_box else IMAGE_SETTINGS
     return dict(images.get((name, sim_options["observation"]), {}))

@@ -74,8 +74,11 @@ def test_defaults_that_differ_between_algorithms_and_sims_are_all_shown() -> Non
     )
     assert "[default: 500; iql: 50; td3-bc, rebrac: 2; iql (Box): 1; auto: 150]" in offline
     assert "[default: 10.0; ppo, a2c: 0.5]" in online
-    assert "[default: 32; sac, td3, tqc: 256; ppo: 64; lane, racer, powerline," in online
-    assert "highway-lane (continuous): 128]" in online.replace("- ", "-")
+    sizes = (
+        "[default: 32; sac, td3, tqc, lane (continuous), powerline (continuous): 256; ppo: 64; lane,"
+        " racer, powerline, highway-lane, racer (continuous), highway-lane (continuous): 128]"
+    )
+    assert sizes in online.replace("highway- lane", "highway-lane")
     switch = SettingsCommand(
         "switch", configs=lambda: {"one": BCConfig(), "two": BCConfig(normalize=True)}
     )

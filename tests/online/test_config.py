@@ -110,14 +110,14 @@ def test_every_sim_has_settings_that_are_fields(sim: str) -> None:
 @pytest.mark.parametrize("sim", SIMS)
 def test_every_sim_has_settings_for_continuous_actions(sim: str) -> None:
     settings = settings_for("sac", sim, {"actions": "continuous"})
-    assert settings == BOX_SETTINGS[sim] | BOX_ALGO_SETTINGS["sac"]
+    assert settings == BOX_SETTINGS[sim] | BOX_ALGO_SETTINGS["sac"][sim]
     assert SACConfig(**settings).steps == settings["steps"]
     spec = SIMS.find(SIMS[sim])
     assert spec is not None
     continuous_id = spec.continuous_id
     assert continuous_id is not None
     settings = settings_for("td3", continuous_id, {})
-    assert settings == BOX_SETTINGS[sim] | BOX_ALGO_SETTINGS["td3"]
+    assert settings == BOX_SETTINGS[sim] | BOX_ALGO_SETTINGS["td3"][sim]
     assert TD3Config(**settings).steps == settings["steps"]
 
 
