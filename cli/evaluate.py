@@ -103,6 +103,12 @@ _OF_DATA = (
     type=click.IntRange(1),
     help="With --data: number of threads of PyTorch and of the reader.  [default: 1]",
 )
+@click.option(
+    "--all",
+    "shows_all",
+    is_flag=True,
+    help="With --data: print the table of all estimators, with their verdicts.",
+)
 @mapping_options
 @click.option("--behavior", metavar="DATA", help="Logs whose returns are shown for comparison.")
 @click.option("--record", type=click.Path(path_type=Path), help="Log to write.")
@@ -122,6 +128,7 @@ def evaluate(
     sim: str | None,
     data: str | None,
     seed: int,
+    shows_all: bool,
     as_json: bool,
     **others: Any,
 ) -> None:
@@ -129,9 +136,10 @@ def evaluate(
 
     POLICY is pilot, random, or a trained run; each seed of a run is evaluated. Actions are greedy.
     If the sim has a pilot, scores are normalized: the score of random is 0, and the score of pilot
-    is 1. With --data, discounted returns are estimated, and a verdict says whether the logs suffice
-    for the estimate. For the actions of a Box, policies are ordered by FQE, which is refused if it
-    is wrong about the behavior of the logs.
+    is 1. With --data, discounted returns are estimated: one line for each policy says what it is
+    worth beside the log, how sure that is, and what to do next. --all shows all estimators, with
+    verdicts whether the logs suffice. For the actions of a Box, policies are ordered by FQE, which
+    is refused if it is wrong about the behavior of the logs.
     """
     given = {name: value for name, value in others.items() if value}
     if data is not None and sim is None:
@@ -142,7 +150,12 @@ def evaluate(
         with working("reading data") as bar:
             source = data if bag["mapping"] is None else mcaprl.open(data, **bag)
             estimates = mcaprl.estimate(policies, source, seed=seed, progress=bar, **given)
-        print_json(estimates.to_json()) if as_json else _print_estimates(estimates)
+        if as_json:
+            print_json(estimates.to_json())
+        else:
+            _print_answers(estimates)
+            if shows_all:
+                _print_estimates(estimates)
     elif sim is not None and data is None:
         _refuse_unused(given, _OF_DATA, "data")
         kept = nullcontext() if others["record"] is None else keeping("finished episodes are kept")
@@ -220,11 +233,22 @@ def _score_rows(found: Evaluation) -> list[dict[str, str | None]]:
     return rows
 
 
-def _print_estimates(found: LogEstimates) -> None:
-    title = (
+def _print_answers(found: LogEstimates) -> None:
+    """Print what each policy is worth, and their order if the log supports one."""
+    echo(
         f"{found.data}: {counted(found.episodes, 'episode')}, mean return discounted by"
         f" {found.gamma}: {found.behavior_return:.3f} ({_interval(found.behavior_interval, 3)})"
     )
+    for policy, answer in found.answers().items():
+        echo(f"{policy}: {answer}")
+    if (order := found.ranking) is not None and found.is_ranked:
+        echo(f"best first, by {order['estimator']}: {', '.join(order['policies'])}")
+        if order["close"]:
+            echo(f"within the noise of FQE's seeds of the first: {', '.join(order['close'])}")
+
+
+def _print_estimates(found: LogEstimates) -> None:
+    title = "all estimators"
     if found.behavior_check is None:
         _print_rows(title, found.estimates)
     else:
@@ -243,12 +267,6 @@ def _print_estimates(found: LogEstimates) -> None:
         echo(f"estimated {estimated.dataset.behavior_field.name}: {estimated}")
     if found.behavior_calibration is not None:
         echo(f"behavior_prob of the logs implies {found.behavior_calibration}")
-    if (order := found.ranking) is not None:
-        echo(f"best first, by {order['estimator']}: {', '.join(order['policies'])}")
-        if order["close"]:
-            echo(f"within the noise of FQE's seeds of the first: {', '.join(order['close'])}")
-        if not order["trusted"]:
-            echo("no estimator is trusted for all policies: do not rely on this order")
 
 
 def _print_rows(title: str, estimates: Sequence[Estimate]) -> None:

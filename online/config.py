@@ -529,7 +529,7 @@ _ENTROPIES: Final = {"lane": -4.0, "racer": -2.0, "powerline": -4.0, "highway-la
 _WITH_ENTROPY: Final = {sim: {"target_entropy": target} for sim, target in _ENTROPIES.items()}
 BOX_ALGO_SETTINGS: Final[dict[str, dict[str, dict[str, Any]]]] = {
     "sac": _WITH_ENTROPY,
-    "td3": dict.fromkeys(_ENTROPIES, {"exploration_noise": 0.2}),
+    "td3": {sim: {"exploration_noise": 0.2} for sim in _ENTROPIES},
     "tqc": _WITH_ENTROPY,
 }
 """Settings of each algorithm in addition to those of `BOX_SETTINGS`, by sim."""

@@ -67,6 +67,46 @@ class LogEstimates:
     behavior_check: BehaviorCheck | None = None
     support: dict[str, float] = field(default_factory=dict)
 
+    @property
+    def is_ranked(self) -> bool:
+        """Whether the log supports an order of the policies, for a Box that of FQE."""
+        if self.ranking is None:
+            return False
+        return bool(self.behavior_check.passes if self.behavior_check else self.ranking["trusted"])
+
+    def answers(self) -> dict[str, str]:
+        """Return for each policy in one line: its value, beside the log's, how sure, what next."""
+        policies = dict.fromkeys(each.policy for each in self.estimates)
+        return {policy: self._answer(policy) for policy in policies}
+
+    def _answer(self, policy: str) -> str:
+        from mcaprl.offline.estimate.off_policy import PREFERENCE
+
+        found = {one.estimator: one for one in self.estimates if one.policy == policy}
+        log = f"the log's {self.behavior_return:.3f}"
+        usable = [found[name] for name in PREFERENCE if name in found and found[name].trusted]
+        if usable and (value := usable[0].value) is not None and usable[0].interval is not None:
+            low, high = usable[0].interval
+            text = f"{value:.3f} ({low:.3f} to {high:.3f}) by {usable[0].estimator}"
+            if low > self.behavior_interval[1]:
+                return f"{text}: better than {log}; try it, and record that"
+            if high < self.behavior_interval[0]:
+                return f"{text}: worse than {log}; train on, or with another algorithm"
+            return f"{text}: cannot be told from {log}; record more episodes, or try it in a sim"
+        model = found.get("FQE")
+        is_right = self.behavior_check is not None and self.behavior_check.passes
+        if is_right and model is not None and model.value is not None and not model.is_refused:
+            spread = "" if model.spread is None else f" +- {model.spread:.3f} over its seeds"
+            return (
+                f"{model.value:.3f}{spread} by FQE, beside {log}: good for an order, without an"
+                " interval; try the best, and record that"
+            )
+        effective = [one.effective_sample_size or 0.0 for one in found.values()]
+        return (
+            f"unknown, beside {log}: the log supports no estimate (at best {max(effective):.1f}"
+            " effective episodes); try it in a sim, or record actions more like its own"
+        )
+
     def to_json(self) -> dict[str, Any]:
         """Return what `evaluate --data --json` prints."""
         calibrated, estimated = self.behavior_calibration, self.behavior_estimate
@@ -79,6 +119,7 @@ class LogEstimates:
             "behavior_estimate": estimated and {**estimated.to_json(), "text": str(estimated)},
             "behavior_check": checked and {**checked.to_json(), "text": str(checked)},
             "estimates": [estimate.to_json() for estimate in self.estimates],
+            "answers": self.answers(),
         }
 
 

@@ -83,6 +83,11 @@ class Estimate:
         """Whether the estimate may be used to choose a policy."""
         return self.verdict.removesuffix(BY_ESTIMATES) == TRUSTED
 
+    @property
+    def is_refused(self) -> bool:
+        """Whether the value must not be used at all."""
+        return self.verdict.startswith("refused")
+
     def to_json(self) -> dict[str, Any]:
         """Return the attributes, as `mcaprl evaluate --data --json` prints them."""
         return asdict(self)

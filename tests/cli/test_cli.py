@@ -123,8 +123,14 @@ def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixtu
     assert result["behavior_calibration"]["text"] == "2.00 +- 0.00 actions; the action space has 2"
     assert result["coverage"]["random"] == pytest.approx(0.5)
     assert result["ranking"]["trusted"] is False
+    assert set(result["answers"]) == {"random", "bc/seed-0", "bc/seed-1"}
     assert run(ask) == 0
-    assert "do not rely on this order" in capsys.readouterr().out
+    short = capsys.readouterr().out
+    assert "bc/seed-0: unknown, beside the log's" in short
+    assert "best first" not in short, "no estimator is trusted for all policies"
+    assert "verdict" not in short
+    assert run([*ask, "--all"]) == 0
+    assert "effective episodes, 10 needed" in capsys.readouterr().out
     line = fails_after(capsys, 2, "evaluate", "pilot", "--data", str(cartpole))
     assert "pilot has no network to evaluate on a log" in line
 

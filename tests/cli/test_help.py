@@ -75,8 +75,8 @@ def test_defaults_that_differ_between_algorithms_and_sims_are_all_shown() -> Non
     assert "[default: 500; iql: 50; td3-bc, rebrac: 2; iql (Box): 1; auto: 150]" in offline
     assert "[default: 10.0; ppo, a2c: 0.5]" in online
     sizes = (
-        "[default: 32; sac, td3, tqc, lane (continuous), powerline (continuous): 256; ppo: 64; lane,"
-        " racer, powerline, highway-lane, racer (continuous), highway-lane (continuous): 128]"
+        "[default: 32; sac, td3, tqc, lane (continuous), powerline (continuous): 256; ppo: 64;"
+        " lane, racer, powerline, highway-lane, racer (continuous), highway-lane (continuous): 128]"
     )
     assert sizes in online.replace("highway- lane", "highway-lane")
     switch = SettingsCommand(
