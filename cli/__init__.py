@@ -30,6 +30,7 @@ from mcaprl.cli.logs import (
     layout,
     merge,
     recover,
+    relabel,
     slice_,
     split,
 )
@@ -65,6 +66,7 @@ _COMMANDS = (
     split,
     filter_,
     slice_,
+    relabel,
     info,
     check,
     recover,

@@ -41,7 +41,7 @@ SECTIONS: Final[dict[str, tuple[str, ...]]] = {
     "Record and learn": ("record", "train-online", "train-offline", "evaluate", "export"),
     "Look at logs": ("info", "replay", "layout", "annotate"),
     "Check and repair logs": ("check", "recover"),
-    "Convert and edit logs": ("convert", "merge", "split", "filter", "slice"),
+    "Convert and edit logs": ("convert", "merge", "split", "filter", "slice", "relabel"),
     "Set up the shell": ("completion",),
 }
 """Commands in the order of the program's help."""
@@ -92,6 +92,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     "split": ("mcaprl split all.mcap parts --ratio 8:1:1 --seed 0",),
     "filter": ("mcaprl filter 'total_reward > 100' data/pilot.mcap good.mcap",),
     "slice": ("mcaprl slice data/pilot.mcap part.mcap --steps 0:1000",),
+    "relabel": ("mcaprl relabel data/pilot.mcap faster.mcap --reward 'reward + 0.1 * speed'",),
     "completion": (
         "mcaprl completion bash >> ~/.bashrc",
         "mcaprl completion fish > ~/.config/fish/completions/mcaprl.fish",

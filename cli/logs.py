@@ -321,6 +321,32 @@ def filter_(expression: str, log: str, out: str, overwrite: bool, as_json: bool)
     _show([found], as_json)
 
 
+@click.command(cls=Command)
+@click.argument("log", type=PATH)
+@click.argument("out", type=PATH)
+@click.option(
+    "--reward",
+    required=True,
+    metavar="EXPRESSION",
+    help="Reward of a transition, such as 'next(speed) - 0.1 * abs(action[0])'.",
+)
+@_overwrite_option
+def relabel(log: str, out: str, reward: str, overwrite: bool) -> None:
+    """Write the transitions of LOG with another reward to the new log OUT.
+
+    The expression can use: action, reward (the logged one), terminated, truncated, the names of the
+    observation's elements, observation[K], the parts of a Dict observation, and numeric infos;
+    next(...) is a value after the transition.
+    """
+    with working("relabeling"):
+        found = mcaprl.relabel(log, out, reward=reward, overwrite=overwrite)
+    statistics = found.statistics
+    echo(
+        f"{out}: {counted(statistics.episodes, 'episode')},"
+        f" {counted(statistics.steps, 'step')}, mean return {statistics.mean_return:.4g}"
+    )
+
+
 @click.command("slice", cls=Command)
 @click.argument("log", type=PATH)
 @click.argument("out", type=PATH)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from mcaprl import ray, torch
     from mcaprl.api.behavior import estimate_behavior
     from mcaprl.api.convert import convert, suggest_mapping
-    from mcaprl.api.edit import annotate, filter, merge, slice, split
+    from mcaprl.api.edit import annotate, filter, merge, relabel, slice, split
     from mcaprl.api.estimate import estimate
     from mcaprl.api.evaluate import evaluate
     from mcaprl.api.logs import check, info, recover
@@ -78,6 +78,7 @@ __all__ = [
     "ray",
     "record",
     "recover",
+    "relabel",
     "render",
     "replay",
     "save_page",
@@ -103,7 +104,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.api.behavior": ["estimate_behavior"],
         "mcaprl.api.convert": ["convert", "suggest_mapping"],
         "mcaprl.recorder.source": ["open_data as open"],
-        "mcaprl.api.edit": ["annotate", "filter", "merge", "slice", "split"],
+        "mcaprl.api.edit": ["annotate", "filter", "merge", "relabel", "slice", "split"],
         "mcaprl.api.logs": ["check", "info", "recover"],
         "mcaprl.api.policies": ["Run", "export", "load_policy"],
         "mcaprl.api.ranges": ["ClusterOptions"],

@@ -17,6 +17,7 @@ from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.edit.join import merge_logs
 from mcaprl.recorder.edit.piece import Bounds, Edited, filter_log, slice_log, split_log
+from mcaprl.recorder.edit.relabel import relabeled
 from mcaprl.recorder.source import Paths, open_data
 from mcaprl.recorder.viewer.annotate import Verification, annotated_copy, values_topics
 from mcaprl.storage.remote import as_path
@@ -135,6 +136,38 @@ def slice(
         LogError: The log cannot be read, or is not finished.
     """
     return slice_log(data, check_log_name(out), steps=steps, time=time, overwrite=overwrite)
+
+
+def relabel(
+    data: Paths | Dataset, out: str | Path, *, reward: str, overwrite: bool = False
+) -> Dataset:
+    """Write the transitions of a log with another reward.
+
+    The reward is an expression of numbers, operators and functions, as in a mapping file, such as
+    `"next(speed) - 0.1 * abs(action)"`. Per transition, it can use: `action` (an element of a Box
+    action as `action[0]`), `reward` (the logged one), `terminated`, `truncated`, the names of the
+    observation's elements, `observation` or the parts of a Dict observation (`observation[2]`), and
+    numeric infos. `next(...)` is a value with the observation that the transition leads to.
+
+    Args:
+        data: Dataset, or path of the logs.
+        out: Path of the new log. It has the transitions; the scene and other topics are not copied.
+        reward: Expression.
+        overwrite: Whether an existing file is replaced.
+
+    Returns:
+        The dataset with the new rewards.
+
+    Raises:
+        UsageError: The expression is not valid, or a reward is not finite.
+        UnknownNameError: The expression has an unknown name.
+        OutputExistsError: `out` exists.
+        LogError: A log cannot be read.
+    """
+    path = check_log_name(out)
+    dataset = relabeled(data if isinstance(data, Dataset) else open_data(data), reward)
+    dataset.save(path, overwrite=overwrite)
+    return dataset
 
 
 @dataclass(frozen=True)
