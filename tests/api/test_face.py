@@ -58,6 +58,7 @@ ONLY_OPTIONS = {
     "replay --save": "it selects the function save_page",
     "replay --verify": "it selects the function verify",
     "record --no-scene": "scene=False",
+    "evaluate --all": "the function returns all estimates",
     "train-offline --sweep": "it selects the function sweep",
     "train-online --from": "`from` is a keyword of Python: sources",
 }

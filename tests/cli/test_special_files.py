@@ -66,6 +66,7 @@ COMMANDS = {
     "recover": ["recover", "{}", "out.mcap"],
     "merge": ["merge", "{}", "{}", "out.mcap"],
     "slice": ["slice", "{}", "out.mcap", "--steps", "0:1"],
+    "relabel": ["relabel", "{}", "out.mcap", "--reward", "reward"],
     "train-offline": ["train-offline", "{}", "--out", "run"],
     "evaluate": ["evaluate", "random", "--data", "{}"],
     "layout": ["layout", "{}", "--out", "layout.json"],
