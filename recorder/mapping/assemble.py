@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import itertools
+import math
 import warnings
 from typing import Any, NamedTuple, cast
 
@@ -27,6 +28,7 @@ from mcaprl.recorder.format.spaces import leaves_of
 from mcaprl.recorder.mapping.align import NS_PER_S, as_numbers
 from mcaprl.recorder.mapping.config import Action, Limits, Quantity
 from mcaprl.recorder.mapping.plan import Plan
+from mcaprl.recorder.mapping.robot import Robot
 from mcaprl.recorder.mapping.runs import Segment
 from mcaprl.recorder.mapping.steps import Steps
 
@@ -191,6 +193,7 @@ def assembled(
         action_units=runs[0].actions.units if any(runs[0].actions.units) else (),
         step_duration_ns=_step_ns(plan, times),
         policy=plan.mapping.meta.policy,
+        robot=_robot(plan, runs, observed, commands, space),
     )
     transitions = Transitions(
         frames=tuple(observed.frames[leaf.path] for leaf in leaves_of(observed.space)),
@@ -203,6 +206,40 @@ def assembled(
         episodes=tuple(summaries),
     )
     return Dataset(transitions, metadata, origin=Origin(plan.bag.paths))
+
+
+def _robot(
+    plan: Plan,
+    runs: list[Steps],
+    observed: _Observations,
+    commands: ActionCommands | None,
+    space: spaces.Space[Any],
+) -> dict[str, Any]:
+    """Return the robot with a mapping that has all that was found in the data."""
+    tree = plan.mapping.model_dump(mode="json", by_alias=True)
+    if commands is not None and None not in commands.commands:
+        tree["action"]["representatives"] = commands.to_json()["commands"]
+    if isinstance(space, spaces.Box):
+        found = {"low": space.low.tolist(), "high": space.high.tolist()}
+        given = {name: each for name, each in tree["action"]["box"].items() if each is not None}
+        tree["action"]["box"] = {**found, **given}
+    shapes = dict[str, tuple[int, ...]]()
+    for name in plan.quantities:
+        if name in plan.images:
+            *size, channels = observed.frames[(name,) if len(observed.frames) > 1 else ()].shape[1:]
+            shapes[name] = (*size, channels // plan.mapping.stack)
+        else:
+            shapes[name] = max(run.quantities[name].values.shape[1:] for run in runs)
+    return Robot.of_plan(plan, shapes).to_json(_json_of(tree))
+
+
+def _json_of(tree: Any) -> Any:
+    """Return keys and values with infinite numbers as texts, because JSON lacks them."""
+    if isinstance(tree, dict):
+        return {key: _json_of(each) for key, each in tree.items()}
+    if isinstance(tree, list):
+        return [_json_of(each) for each in tree]
+    return str(tree) if isinstance(tree, float) and math.isinf(tree) else tree
 
 
 def _shift(run: Steps, episodes: list[Segment], times: list[NDArray[np.int64]]) -> int:
