@@ -63,7 +63,8 @@ class Commands:
 
     def reset(self) -> None:
         """Assume that the robot is stopped."""
-        self._last, self._last_ns = self._stop, None
+        self._last = self._stop
+        self._last_ns: int | None = None
 
     def stopped(self, time_ns: int) -> dict[str, Message]:
         """Return the stop command."""

@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
 from gymnasium import spaces
 
 from mcaprl.base_policy import BasePolicy
 from mcaprl.drive.commands import Commands
+from mcaprl.drive.record import DriveLog
 from mcaprl.errors import LogError, PolicyError, UsageError
 from mcaprl.files import read_json
 from mcaprl.recorder.bags.bag import open_bag
@@ -37,6 +38,7 @@ from mcaprl.recorder.mapping.robot import Robot
 from mcaprl.recorder.mapping.runs import TIME_LIMIT
 from mcaprl.runs import ROBOT_NAME
 
+_STEP_NS = 100_000_000
 _LEARNED = ("time", "clock", "observation", "stack", "action")
 """Keys of a mapping that a policy was trained with."""
 
@@ -119,6 +121,7 @@ class Driver:
         rate_hz, self.clock_topic = robot.mapping.clock.rate_hz, robot.mapping.clock.topic
         self.period_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
         self.stop = self._commands.stop
+        self._robot, self._log = robot, cast("DriveLog | None", None)
         self.begin()
 
     def begin(self) -> None:
@@ -126,8 +129,46 @@ class Driver:
         self._live.reset()
         self._episodes.reset()
         self.policy.begin()
-        self._is_over, self._last_ns = False, None
+        self._is_over = False
+        self._last_ns: int | None = None
         self._commands.reset()
+
+    def record(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Record from now on: a log of this package, with the robot's topics beside it.
+
+        Args:
+            path: MCAP file to write.
+            overwrite: Whether an existing file is replaced.
+
+        Raises:
+            UsageError: The command that stops the robot is no action of the mapping.
+            OutputExistsError: The file exists.
+        """
+        self.close()
+        is_late = self._episodes.is_late
+        self._log = DriveLog(
+            path,
+            self._plan,
+            self._robot,
+            self.policy,
+            self._commands,
+            is_late=is_late,
+            overwrite=overwrite,
+        )
+
+    def close(self) -> None:
+        """End the open episode of the log, and finish the log; closing twice is harmless."""
+        log, self._log = self._log, None
+        if log is not None:
+            log.close(self._live.last_ns)
+
+    def __enter__(self) -> Self:
+        """Return the driver."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Finish the log."""
+        self.close()
 
     def push(self, topic: str, message: Any, stamp_ns: int, publish_ns: int | None = None) -> None:
         """Use a message of one of the `inputs`, in the order in which they come.
@@ -145,6 +186,7 @@ class Driver:
         if topic not in self.inputs:
             raise UsageError(f"{topic} is not needed; topics: {', '.join(self.inputs)}")
         decoder = self._topics.decoders[topic]
+        given = message
         if isinstance(message, bytes):
             try:
                 message = decoder.decode(message)
@@ -154,6 +196,8 @@ class Driver:
         if isinstance(decoder, ProtobufDecoder) and hasattr(message, "DESCRIPTOR"):
             message = decoder.wrapped(message)
         self._live.push(topic, message, stamp_ns, publish_ns)
+        if self._log is not None:
+            self._log.add(topic, given, stamp_ns)
 
     def command(self, now_ns: int, *, enabled: bool = True) -> Command:
         """Return what to publish at a step.
@@ -165,16 +209,25 @@ class Driver:
             now_ns: Time in nanoseconds, on the clock of the stamps.
             enabled: Whether the policy may drive; if not, the stop command is returned.
         """
-        time_ns = now_ns
-        if self.clock_topic is not None:
-            if self._live.clock_ns is None:
-                return self._stopped(now_ns, f"no message of {self.clock_topic} yet")
-            time_ns = self._live.clock_ns
+        time_ns = now_ns if self.clock_topic is None else self._live.clock_ns
+        if time_ns is None:
+            return self._stopped(now_ns, f"no message of {self.clock_topic} yet")
+        step, state = None, None
         try:
             step = self._live.step(time_ns)
-            return self._driven(step, enabled)
+            state = self._episodes.see(step, acts=enabled and not self._is_over)
+            found = self._driven(step, state, enabled)
         except (UsageError, LogError, PolicyError) as error:
-            return self._stopped(time_ns, str(error), is_fatal=True)
+            found = self._stopped(time_ns, str(error), is_fatal=True)
+        self._last_ns = time_ns
+        if self._log is not None and step is not None and state is not None:
+            # A command that is aligned with the steps must not come before its step.
+            at_ns = max(now_ns, time_ns + (self.mapping.action.align == "during"))
+            for topic, message in found.messages.items():
+                self._log.add(topic, message, at_ns)
+            behavior = np.exp(found.log_prob)
+            self._log.see(step, state, self._commands.action_of(), float(behavior))
+        return found
 
     @property
     def next_step_ns(self) -> int | None:
@@ -189,9 +242,7 @@ class Driver:
             k += 1
         return first_ns + round(k * period_ns)
 
-    def _driven(self, step: LiveStep, enabled: bool) -> Command:
-        self._last_ns = step.time_ns
-        state = self._episodes.see(step, acts=enabled and not self._is_over)
+    def _driven(self, step: LiveStep, state: EpisodeState, enabled: bool) -> Command:
         if state.began:
             self.policy.begin()
         observation = state.observation
@@ -324,7 +375,7 @@ def _robot_of(run: Any, folder: Path | None, mapping: Any, bag: Any) -> tuple[Ro
         if bag is None:
             raise UsageError(f"{run} does not contain the types of the topics: pass `bag=`")
         with open_bag(bag, definitions=given.definitions) as opened:
-            robot = Robot.of_plan(Plan(opened, given, place, trust_code=True), {})
+            robot = Robot.of_plan(Plan(opened, given, place, trust_code=True), {}, _STEP_NS)
     return robot, place
 
 

@@ -545,7 +545,9 @@ _BYTES = {"string": 4, "wstring": 4} | {
 
 
 def _built(store: Typestore, name: str, values: Any) -> Any:
-    """Return a message of rosbags with the values of a dict or of another library's message."""
+    """Return a message of rosbags with the values of a dict, or of a message of another library."""
+    if getattr(values, "__msgtype__", None) == name:
+        return values
     found = {}
     for field, description in store.fielddefs[name][1]:
         value = values.get(field) if isinstance(values, Mapping) else getattr(values, field, None)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -250,8 +250,8 @@ class _NamedValue(_Value):
         assert quantity.names, "elements are selected by names"
         if isinstance(raw[0], Lack) or isinstance(raw[1], Lack):
             return
-        columns = (without_lacks([part]) for part in raw)
-        found = by_names(path, *columns, quantity.names, is_whole=False)
+        column, texts = (without_lacks([part]) for part in raw)
+        found = by_names(path, column, texts, quantity.names, is_whole=False)
         assert found.present is not None
         values, present = found.values.reshape(-1), found.present.reshape(-1)
         for k in np.flatnonzero(present).tolist():
@@ -364,6 +364,7 @@ class _Waiting:
 
     Attributes:
         newest_ns: Time of the newest message; None before the first.
+        first_ns: Time of the oldest message so far; None before the first.
         last_ns: Time of the last message up to the last step; None before the first.
         gap_ns: Times of the messages before and after a gap that ended since the step before; None
             if no gap did.
@@ -377,6 +378,7 @@ class _Waiting:
         """Drop all messages."""
         self._pending: list[tuple[int, Any]] = []
         self.newest_ns: int | None = None
+        self.first_ns: int | None = None
         self.last_ns: int | None = None
         self.gap_ns: tuple[int, int] | None = None
 
@@ -387,6 +389,7 @@ class _Waiting:
         else:
             bisect.insort(self._pending, (time_ns, content), key=_first)
         self.newest_ns = max(time_ns, self.newest_ns or time_ns)
+        self.first_ns = min(time_ns, self.first_ns or time_ns)
         if len(self._pending) > self._most:
             self._take(*self._pending.pop(0))
 
@@ -419,8 +422,9 @@ class _Frames(Transforms):
         parents: dict[str, list[str]] = getattr(self, "_parents", {})
         self._parents = {child: parents[child] for child in self._edges}
 
-    def put(self, topic: str, message: Any, time_ns: int) -> None:
-        """Add the transforms of a message."""
+    def put(self, topic: str, message: Any, time_ns: int) -> list[int]:
+        """Add the transforms of a message; return the times of those that are not static."""
+        times_ns = []
         for each in transforms_in(message, topic, self._time, time_ns):
             parents = self._parents.setdefault(each.child, [])
             if each.parent not in parents:
@@ -438,6 +442,8 @@ class _Frames(Transforms):
             if each.child not in self.waiting:
                 self.waiting[each.child] = _Waiting(self._taker(each.child))
             self.waiting[each.child].put(each.time_ns, now)
+            times_ns.append(each.time_ns)
+        return times_ns
 
     def moving(self, frame: str, fixed: str) -> list[_Waiting]:
         """Return the moving transforms between two frames."""
@@ -492,8 +498,6 @@ class LiveSteps:
     Attributes:
         topics: Topics whose messages are used.
         clock_ns: Time of the last message of the clock's topic; None before the first.
-        anchor_ns: Time of the first step at a fixed rate, which is that of the first message, or
-            of the one that ended the last gap; None before the first message.
         fields: Paths of the fields of each topic.
     """
 
@@ -518,8 +522,9 @@ class LiveSteps:
                 self._values[name] = _value_of(wanted, kinds, reader, (shapes or {}).get(name))
                 self._members[wanted.stream].append(self._values[name])
         self._streams: dict[str, _Waiting] = {}
+        self._any = _Waiting(lambda *_: None)
         self._of_topic: dict[str, list[str]] = {}
-        used = {wanted.stream for wanted in plan.quantities.values()} | {plan.clock}
+        used = {wanted.stream for wanted in plan.quantities.values()} | {plan.clock or ""}
         # The messages of the clock come first, because they shift those of the other streams.
         for name in sorted(used & plan.streams.keys(), key=lambda each: each != plan.clock):
             members = self._members[name]
@@ -534,7 +539,11 @@ class LiveSteps:
             topic: sorted({path for name in names for path in plan.streams[name].fields})
             for topic, names in self._of_topic.items()
         }
-        self._clear_clock()
+        self.clock_ns: int | None = None
+        self._raw_ns: int | None = None
+        self._anchor_ns: int | None = None
+        self._last_ns: int | None = None
+        self._nth, self._problem = 0, ""
 
     def push(
         self, topic: str, message: Any, log_time_ns: int, publish_time_ns: int | None = None
@@ -552,8 +561,8 @@ class LiveSteps:
             self._put(name, time_ns, [value.raw(message) for value in self._members[name]])
         for frames in self._frames.values():
             if topic in (frames.topic, frames.topic + STATIC):
-                frames.put(topic, message, log_time_ns)
-                self.anchor_ns = log_time_ns if self.anchor_ns is None else self.anchor_ns
+                for time_ns in frames.put(topic, message, log_time_ns):
+                    self._any.put(time_ns, None)
 
     def _put(self, name: str, time_ns: int, content: Any) -> None:
         stream = self._streams[name]
@@ -562,7 +571,7 @@ class LiveSteps:
             self._problem = f"the clock of {name} went back by {back_s:.3g} s"
             return
         stream.put(time_ns, content)
-        self.anchor_ns = time_ns if self.anchor_ns is None else self.anchor_ns
+        self._any.put(time_ns, None)
 
     def _tick(self, time_ns: int) -> int:
         """Return the time of a message of the clock; of equal times, each one is 1 ns later."""
@@ -574,18 +583,27 @@ class LiveSteps:
         self.clock_ns = tick_ns
         return tick_ns
 
-    def _clear_clock(self) -> None:
-        self.clock_ns: int | None = None
-        self.anchor_ns: int | None = None
-        self._raw_ns: int | None = None
-        self._last_ns: int | None = None
-        self._nth, self._problem = 0, ""
+    @property
+    def anchor_ns(self) -> int | None:
+        """Time of the first step at a fixed rate; None before the first message.
+
+        It is that of the first message, or of the one that ended the last gap.
+        """
+        return self._any.first_ns if self._anchor_ns is None else self._anchor_ns
+
+    @property
+    def last_ns(self) -> int | None:
+        """Time of the last message of an observed topic up to the last step; None if unknown."""
+        found = [each.last_ns for each in self._streams_of(self._plan.mapping.observation)]
+        return max((each for each in found if each is not None), default=None)
 
     def reset(self) -> None:
         """Drop all values, as at the start of a recording."""
-        for part in (*self._values.values(), *self._streams.values(), *self._frames.values()):
+        parts: list[_Value | _Waiting | _Frames] = [*self._values.values(), *self._frames.values()]
+        for part in [*parts, *self._streams.values(), self._any]:
             part.drop()
-        self._clear_clock()
+        self.clock_ns = self._raw_ns = self._anchor_ns = self._last_ns = None
+        self._nth, self._problem = 0, ""
 
     def step(self, time_ns: int) -> LiveStep:
         """Return the quantities and the observation at a time after that of the last step.
@@ -610,15 +628,25 @@ class LiveSteps:
         reason, is_fatal = self._why_not(quantities, time_ns)
         images = self._plan.images
         columns = {name: each.values for name, each in quantities.items() if name not in images}
-        required = self._required_streams()
+        # If no quantity is required, a gap is one of all streams.
+        self._any.pass_on(time_ns, self._gap_ns)
+        required = self._streams_of(self._plan.required) or [self._any]
         ended = [each.gap_ns for each in required if each.gap_ns is not None]
         silent = [
             each.last_ns
             for each in required
             if each.last_ns is not None and time_ns - each.last_ns > self._gap_ns
         ]
-        for each in ended:
-            self.anchor_ns = max(each[1], self.anchor_ns or each[1])
+        first_ns = self._any.first_ns
+        late = [
+            each.first_ns
+            for each in required
+            if None not in (each.first_ns, first_ns) and each.first_ns - first_ns > self._gap_ns
+        ]
+        starts = [*late, *(high_ns for _, high_ns in ended)]
+        self._anchor_ns = max(
+            [*starts, *([self._anchor_ns] if self._anchor_ns else [])], default=None
+        )
         is_late = before_ns is not None and time_ns - before_ns > self._gap_ns
         return LiveStep(
             time_ns,
@@ -631,12 +659,10 @@ class LiveSteps:
             min([*(low for low, _ in ended), *silent], default=None),
         )
 
-    def _required_streams(self) -> list[_Waiting]:
-        """Return the streams without whose messages there is no step; all if it needs none."""
-        if not self._plan.required:
-            return list(self._streams.values())
+    def _streams_of(self, names: Iterable[str]) -> list[_Waiting]:
+        """Return the streams of quantities."""
         found = []
-        for name in self._plan.required:
+        for name in names:
             wanted = self._plan.quantities[name]
             if wanted.quantity.transform is None:
                 found.append(self._streams[wanted.stream])

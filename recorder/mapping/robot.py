@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -21,14 +22,16 @@ class Robot(NamedTuple):
         mapping: Mapping of the bag.
         topics: Definition of the type of each topic that the mapping uses.
         shapes: Shape of each quantity at a step: `()`, `(K,)`, or that of an image (H, W, C).
+        step_ns: Typical time between two steps.
     """
 
     mapping: RobotMapping
     topics: Mapping[str, Definition]
     shapes: Mapping[str, tuple[int, ...]]
+    step_ns: int
 
     @classmethod
-    def of_plan(cls, plan: Plan, shapes: Mapping[str, tuple[int, ...]]) -> Robot:
+    def of_plan(cls, plan: Plan, shapes: Mapping[str, tuple[int, ...]], step_ns: int) -> Robot:
         """Return the robot of a plan."""
         behavior = [] if plan.behavior is None else [plan.behavior]
         used = {
@@ -39,14 +42,15 @@ class Robot(NamedTuple):
             base = topic.removesuffix(STATIC)
             used |= {base, base + STATIC} & plan.bag.topics.keys()
         topics = {topic: plan.bag.definition(topic) for topic in sorted(used)}
-        return cls(plan.mapping, topics, shapes)
+        return cls(plan.mapping, topics, shapes, step_ns)
 
-    def to_json(self, mapping: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the robot as JSON types; `mapping` is the mapping as JSON types."""
+    def to_json(self) -> dict[str, Any]:
+        """Return the robot as JSON types."""
         return {
-            "mapping": dict(mapping),
+            "mapping": _plain(self.mapping.model_dump(mode="json", by_alias=True)),
             "topics": {name: _to_json(each) for name, each in self.topics.items()},
             "shapes": {name: list(shape) for name, shape in self.shapes.items()},
+            "step_ns": self.step_ns,
         }
 
     @classmethod
@@ -55,9 +59,19 @@ class Robot(NamedTuple):
         try:
             topics = {str(name): _from_json(each) for name, each in found["topics"].items()}
             shapes = {str(name): tuple(map(int, shape)) for name, shape in found["shapes"].items()}
-            return cls(parse_mapping(found["mapping"], Place(where)), topics, shapes)
+            mapping = parse_mapping(found["mapping"], Place(where))
+            return cls(mapping, topics, shapes, int(found["step_ns"]))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise LogError(f"{where} does not describe a robot: {error!r}") from error
+            raise LogError(f"{where} does not describe a robot ({error!r}): train again") from error
+
+
+def _plain(tree: Any) -> Any:
+    """Return keys and values with infinite numbers as texts, because JSON lacks them."""
+    if isinstance(tree, dict):
+        return {key: _plain(each) for key, each in tree.items()}
+    if isinstance(tree, list):
+        return [_plain(each) for each in tree]
+    return str(tree) if isinstance(tree, float) and math.isinf(tree) else tree
 
 
 def _to_json(definition: Definition) -> dict[str, str]:
