@@ -95,7 +95,7 @@ class Driver:
         Args:
             run: Run folder, or folder of one seed, that was trained from a bag; or a policy.
             mapping: Mapping file that replaces that of the run. It may change what is not learned,
-                such as `drive`; None for that of the run.
+                such as `drive`; None for that of the run. For a policy, this is `Dataset.robot`.
             bag: Bag that has the topics, for a run that does not contain their types.
             trust_code: Whether the mapping may name a Python function.
 
@@ -355,6 +355,8 @@ def _loaded(run: Any) -> tuple[BasePolicy, Path | None]:
 
 def _robot_of(run: Any, folder: Path | None, mapping: Any, bag: Any) -> tuple[Robot, Place]:
     """Return mapping, topics and shapes of a run, or of other files."""
+    if isinstance(mapping, Mapping) and "topics" in mapping:
+        return Robot.from_json(mapping, "mapping"), Place()
     places = [] if folder is None else [folder / ROBOT_NAME, folder.parent / ROBOT_NAME]
     path = next((each for each in places if each.exists()), None)
     robot = None if path is None else Robot.from_json(read_json(path, PolicyError), str(path))

@@ -419,10 +419,14 @@ class LogMetadata:
 def _common_robot(found: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
     """Return the robot of several logs, with the commands of the first; empty if others differ."""
 
-    def without_commands(robot: Mapping[str, Any]) -> Any:
-        mapping = dict(robot.get("mapping", {}))
-        action = {**mapping.get("action", {}), "representatives": []}
-        return {**robot, "mapping": {**mapping, "action": action}}
+    def without_commands(robot: Any) -> Any:
+        try:
+            mapping = robot["mapping"]
+            action = {**mapping["action"], "representatives": []}
+            return {**robot, "mapping": {**mapping, "action": action}}
+        # It is empty, or forged.
+        except (KeyError, TypeError):
+            return robot
 
     first = without_commands(found[0])
     return found[0] if all(without_commands(each) == first for each in found) else {}

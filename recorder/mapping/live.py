@@ -637,16 +637,12 @@ class LiveSteps:
             for each in required
             if each.last_ns is not None and time_ns - each.last_ns > self._gap_ns
         ]
-        first_ns = self._any.first_ns
-        late = [
-            each.first_ns
-            for each in required
-            if None not in (each.first_ns, first_ns) and each.first_ns - first_ns > self._gap_ns
-        ]
-        starts = [*late, *(high_ns for _, high_ns in ended)]
-        self._anchor_ns = max(
-            [*starts, *([self._anchor_ns] if self._anchor_ns else [])], default=None
-        )
+        first_ns = self._any.first_ns or 0
+        began = [each.first_ns for each in required if each.first_ns is not None]
+        starts = [each for each in began if each - first_ns > self._gap_ns]
+        starts += [high_ns for _, high_ns in ended]
+        if starts:
+            self._anchor_ns = max(*starts, self._anchor_ns or 0)
         is_late = before_ns is not None and time_ns - before_ns > self._gap_ns
         return LiveStep(
             time_ns,

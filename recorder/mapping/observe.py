@@ -214,6 +214,9 @@ def check_order(path: FieldPath, column: NDArray[Any], texts: NDArray[Any]) -> N
     orders: dict[tuple[str, ...], int] = {}
     length = column.shape[1] if column.ndim > 1 else None
     last: Any = None
+    if texts.dtype.kind != "O":
+        # All messages have empty arrays of names.
+        return
     for row, names in enumerate(texts):
         count = _length(column[row]) if length is None else length
         # Nearly always, the names are those of the message before.
