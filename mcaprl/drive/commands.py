@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.base_policy import BasePolicy
+from mcaprl.drive.core import CommandField, CommandMessages, Message
 from mcaprl.errors import PolicyError, UsageError
 from mcaprl.recorder.bags.bag import TopicInfo
-from mcaprl.recorder.bags.values import NUMBERS, Step, general_path, steps_of
+from mcaprl.recorder.bags.values import NUMBERS, general_path, path_text
 from mcaprl.recorder.format.metadata import Command
 from mcaprl.recorder.mapping.actions import Actions, CommandPart, actions_of
-from mcaprl.recorder.mapping.align import NS_PER_S
 from mcaprl.recorder.mapping.observe import Values
 from mcaprl.recorder.mapping.plan import Plan, Wanted
 from mcaprl.recorder.mapping.steps import command_part
 
-Message = dict[str, Any]
-_LONGEST_S = 1.0
-"""Longest time for which a command may change at the limit, after a pause."""
 
-
-class Commands:
+class Commands(CommandMessages):
     """Messages of actions.
 
     Attributes:
@@ -53,30 +48,31 @@ class Commands:
             _Field(wanted, plan.bag.topics[wanted.source.topic], size)
             for wanted, size in zip(plan.commands, sizes, strict=True)
         ]
-        self._kinds = [field.kind for field in self._fields for _ in range(field.size)]
-        self.topics = tuple(dict.fromkeys(field.topic for field in self._fields))
-        self._commands = self._known_commands(policy)
+        infos = plan.bag.topics
+        topics = dict.fromkeys(field.topic for field in self._fields)
+        super().__init__(
+            [field.described for field in self._fields],
+            {topic: _zeros(infos[topic].fields) for topic in topics},
+        )
+        self._table = self._known_commands(policy)
         self._low, self._high, self._most = map(self._limit, ("low", "high", "max_change"))
         self._stop = self._stop_values()
-        self.stop = self._built(self._stop, 0)
+        self.is_finite = self._table is not None
         self.reset()
 
-    def reset(self) -> None:
-        """Assume that the robot is stopped."""
-        self._last = self._stop
-        self._last_ns: int | None = None
-
-    def stopped(self, time_ns: int) -> dict[str, Message]:
-        """Return the stop command."""
-        self._last, self._last_ns = self._stop, time_ns
-        return self._built(self._stop, time_ns)
-
-    def messages(self, action: Any, time_ns: int) -> tuple[dict[str, Message], bool]:
-        """Return the messages of an action, and whether they are another action's as well."""
-        wanted = self._command_of(action)
-        values = self._limited(wanted, time_ns)
-        self._last, self._last_ns = values, time_ns
-        return self._built(values, time_ns), values != wanted
+    @property
+    def plain(self) -> dict[str, Any]:
+        """What `CommandMessages` needs, as JSON types."""
+        return {
+            "fields": [list(field) for field in self.fields],
+            "templates": self.templates,
+            "table": self._table,
+            "stop": self._stop,
+            "limits": [
+                None if each is None else each.tolist()
+                for each in (self._low, self._high, self._most)
+            ],
+        }
 
     def action_of(self, values: Command | None = None) -> Any:
         """Return the action of a command in the mapping, by default of the last command."""
@@ -170,9 +166,9 @@ class Commands:
             return self._rounded(tuple(zero.tolist()))
         if isinstance(given, str):
             names = list(self._action.actions or self._action.numbers)
-            if given in names and self._commands is not None:
+            if given in names and self._table is not None:
                 k = self._action.numbers.get(given, names.index(given))
-                return self._commands[k]
+                return self._table[k]
             if len(self._kinds) != 1 or are_numbers:
                 raise UsageError(
                     f"{place}: no action is named '{given}'; names: {', '.join(names)}"
@@ -183,40 +179,6 @@ class Commands:
                 f"{place} has {len(given)} values; the command has {len(self._kinds)} elements"
             )
         return self._rounded(tuple(given))
-
-    def _command_of(self, action: Any) -> Command:
-        if self._commands is not None:
-            return self._commands[int(action)]
-        return self._rounded(tuple(np.asarray(action, np.float64).ravel().tolist()))
-
-    def _limited(self, command: Command, time_ns: int) -> Command:
-        """Return a command within the limits of its values and of their change."""
-        if self._low is None and self._high is None and self._most is None:
-            return command
-        if any(isinstance(each, str) for each in command):
-            return command
-        values = np.array(command, np.float64)
-        low = values if self._low is None else self._low
-        high = values if self._high is None else self._high
-        values = np.minimum(np.maximum(values, low), high)
-        if self._most is not None:
-            last = np.array(self._last, np.float64)
-            elapsed_s = 0.0 if self._last_ns is None else (time_ns - self._last_ns) / NS_PER_S
-            most = self._most * min(elapsed_s, _LONGEST_S)
-            values = np.clip(values, last - most, last + most)
-        return self._rounded(tuple(values.tolist()))
-
-    def _rounded(self, command: Command) -> Command:
-        """Return the values as the fields of the message store them."""
-        return tuple(_stored(each, kind) for each, kind in zip(command, self._kinds, strict=True))
-
-    def _built(self, command: Command, time_ns: int) -> dict[str, Message]:
-        found = {topic: _empty(self._plan.bag.topics[topic], time_ns) for topic in self.topics}
-        first = 0
-        for field in self._fields:
-            field.set(found[field.topic], list(command[first : first + field.size]))
-            first += field.size
-        return found
 
 
 class _Field:
@@ -235,33 +197,19 @@ class _Field:
         found = Values(values, nothing, np.zeros(len(values)))
         return command_part(self._wanted, found, self._type_name)
 
-    def set(self, message: Message, values: Sequence[float | str]) -> None:
-        """Set the field of a message."""
-        found = [_published(value, self.kind) for value in values]
-        steps, names = self._steps, self._wanted.quantity.names
-        at = next((k for k, step in enumerate(steps) if isinstance(step, slice)), None)
-        if isinstance(names, list) and names:
-            _set(message, list(steps_of(self._wanted.source.names)), list(names))
-        if at is None:
-            _set(message, steps, found if self.is_array else found[0])
-            return
-        chosen = cast(slice, steps[at])
-        first, step = chosen.start or 0, chosen.step or 1
-        for k, value in enumerate(found):
-            _set(message, [*steps[:at], first + k * step, *steps[at + 1 :]], value)
-
-
-def _set(message: Any, steps: list[Step], value: Any) -> None:
-    """Set a part of nested dicts and lists, which grow as needed."""
-    for step, after in zip(steps, [*steps[1:], None], strict=True):
-        if isinstance(step, int):
-            message += [{} if isinstance(after, str) else 0 for _ in range(len(message), step + 1)]
-        if after is None:
-            message[step] = value
-        elif isinstance(message, dict):
-            message = message.setdefault(step, [] if isinstance(after, int) else {})
-        else:
-            message = message[step]
+    @property
+    def described(self) -> CommandField:
+        """The field, without its topic's type."""
+        names = self._wanted.quantity.names
+        return CommandField(
+            self.topic,
+            path_text(self._steps),
+            self._wanted.source.names,
+            list(names) if isinstance(names, list) else [],
+            self.is_array,
+            self.size,
+            self.kind,
+        )
 
 
 def _sizes(commands: Sequence[Wanted], space: Any) -> list[int | None]:
@@ -284,32 +232,6 @@ def _sizes(commands: Sequence[Wanted], space: Any) -> list[int | None]:
     if left > 0:
         k = found.index(0) if 0 in found else found.index(None) if None in found else 0
         found[k] = left + (0 if found[k] == 0 else 1)
-    return found
-
-
-def _stored(value: float | str, kind: str) -> float | str:
-    if isinstance(value, str) or kind == "string":
-        return value
-    if kind == "bool":
-        return float(value != 0)
-    if re.fullmatch(r"u?int\d+", kind):
-        limits = np.iinfo(kind)
-        return float(min(max(round(value), limits.min), limits.max))
-    return float(np.float32(value)) if kind == "float32" else float(value)
-
-
-def _published(value: float | str, kind: str) -> Any:
-    """Return a value as the type of Python that libraries of messages expect."""
-    if isinstance(value, str) or kind.startswith(("float", "double")):
-        return value
-    return bool(value) if kind == "bool" else int(value)
-
-
-def _empty(info: TopicInfo, time_ns: int) -> Message:
-    """Return a message with zeros, and the time in its header."""
-    found = _zeros(info.fields)
-    if isinstance(stamp := found.get("header", {}).get("stamp"), dict):
-        stamp["sec"], stamp["nanosec"] = divmod(time_ns, int(NS_PER_S))
     return found
 
 

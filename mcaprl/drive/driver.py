@@ -8,21 +8,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self, cast
+from typing import Any, Self, cast
 
 import numpy as np
 from gymnasium import spaces
 
 from mcaprl.base_policy import BasePolicy
 from mcaprl.drive.commands import Commands
+from mcaprl.drive.core import Command, DriverCore
 from mcaprl.drive.record import DriveLog
 from mcaprl.errors import LogError, PolicyError, UsageError
 from mcaprl.files import read_json
 from mcaprl.recorder.bags.bag import open_bag
 from mcaprl.recorder.bags.protobuf import ProtobufDecoder
 from mcaprl.recorder.bags.source import Definition
-from mcaprl.recorder.bags.values import ABSENT, value_at
-from mcaprl.recorder.mapping.align import NS_PER_S
 from mcaprl.recorder.mapping.config import Mapping as RobotMapping
 from mcaprl.recorder.mapping.config import Place, load_mapping
 from mcaprl.recorder.mapping.live import (
@@ -35,7 +34,6 @@ from mcaprl.recorder.mapping.live import (
 )
 from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.robot import Robot
-from mcaprl.recorder.mapping.runs import TIME_LIMIT
 from mcaprl.runs import ROBOT_NAME
 
 _STEP_NS = 100_000_000
@@ -43,31 +41,7 @@ _LEARNED = ("time", "clock", "observation", "stack", "action")
 """Keys of a mapping that a policy was trained with."""
 
 
-class Command(NamedTuple):
-    """What to publish at one step.
-
-    Attributes:
-        messages: Message of each commanded topic, as nested dicts: the stop command if there is a
-            reason.
-        reason: Why the robot has to stop; empty if the policy drives.
-        is_fatal: Whether the reason is an error, so that waiting does not help.
-        time_ns: Time of the step.
-        action: Action of the policy; None if there is a reason.
-        observation: Observation, as in the training; None if it is not complete.
-        log_prob: Log probability of the action, 0 for a policy that selects the best one of a
-            finite number; NaN if the command was limited, or has no density.
-    """
-
-    messages: dict[str, dict[str, Any]]
-    reason: str
-    is_fatal: bool
-    time_ns: int
-    action: Any = None
-    observation: Any = None
-    log_prob: float = math.nan
-
-
-class Driver:
+class Driver(DriverCore):
     """A trained policy that drives a robot, message by message.
 
     Attributes:
@@ -103,35 +77,21 @@ class Driver:
             PolicyError: The path has no policy, or the policy was trained with another mapping.
             UsageError: The mapping is missing, looks ahead, or has no command to stop the robot.
         """
-        self.policy, found = _loaded(run)
+        policy, found = _loaded(run)
         robot, place = _robot_of(run, found, mapping, bag)
-        self.mapping = robot.mapping
         self._topics = Topics(robot.topics)
         self._plan = Plan(self._topics, robot.mapping, place, trust_code=trust_code)
-        self._live = LiveSteps(self._plan, robot.shapes)
-        self._commands = Commands(self._plan, self.policy)
-        self._check_fits(robot)
-        self._episodes = LiveEpisodes(self._plan, self.policy.frame_stack)
-        topics, outputs = self._live.topics, self._commands.topics
-        self.inputs = {name: self._topics.topics[name].type_name for name in topics}
-        self.outputs = {name: self._topics.topics[name].type_name for name in outputs}
+        live = LiveSteps(self._plan, robot.shapes)
+        commands = Commands(self._plan, policy)
+        self._robot_commands = commands
+        _check_fits(policy, robot)
+        super().__init__(
+            self._plan, live, LiveEpisodes(self._plan, policy.frame_stack), commands, policy
+        )
         self.definitions: dict[str, Definition] = {
             name: robot.topics[name] for name in (*self.inputs, *self.outputs)
         }
-        rate_hz, self.clock_topic = robot.mapping.clock.rate_hz, robot.mapping.clock.topic
-        self.period_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
-        self.stop = self._commands.stop
         self._robot, self._log = robot, cast("DriveLog | None", None)
-        self.begin()
-
-    def begin(self) -> None:
-        """Drop all messages and the episode, and drive on after a terminal state."""
-        self._live.reset()
-        self._episodes.reset()
-        self.policy.begin()
-        self._is_over = False
-        self._last_ns: int | None = None
-        self._commands.reset()
 
     def record(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Record from now on: a log of this package, with the robot's topics beside it.
@@ -151,7 +111,7 @@ class Driver:
             self._plan,
             self._robot,
             self.policy,
-            self._commands,
+            self._robot_commands,
             is_late=is_late,
             overwrite=overwrite,
         )
@@ -170,173 +130,43 @@ class Driver:
         """Finish the log."""
         self.close()
 
-    def push(self, topic: str, message: Any, stamp_ns: int, publish_ns: int | None = None) -> None:
-        """Use a message of one of the `inputs`, in the order in which they come.
-
-        Args:
-            topic: Name of the topic.
-            message: Message of rclpy, rospy, rosbags or protobuf, nested dicts with the same
-                fields, or the bytes of a message in the encoding of the bag.
-            stamp_ns: Time at which it came, nanoseconds; the log_time of a bag.
-            publish_ns: Time at which it was published, for a mapping that uses it.
-
-        Raises:
-            UsageError: The topic is not needed, or the message has another type or lacks a field.
-        """
-        if topic not in self.inputs:
-            raise UsageError(f"{topic} is not needed; topics: {', '.join(self.inputs)}")
+    def _decoded(self, topic: str, message: Any) -> Any:
         decoder = self._topics.decoders[topic]
-        given = message
         if isinstance(message, bytes):
             try:
-                message = decoder.decode(message)
+                return decoder.decode(message)
             except LogError as error:
                 raise UsageError(f"{topic}: {error}") from error
-        self._check_type(topic, message)
-        if isinstance(decoder, ProtobufDecoder) and hasattr(message, "DESCRIPTOR"):
-            message = decoder.wrapped(message)
-        self._live.push(topic, message, stamp_ns, publish_ns)
+        is_protobuf = isinstance(decoder, ProtobufDecoder) and hasattr(message, "DESCRIPTOR")
+        return decoder.wrapped(message) if is_protobuf else message
+
+    def _pushed(self, topic: str, message: Any, stamp_ns: int) -> None:
         if self._log is not None:
-            self._log.add(topic, given, stamp_ns)
+            self._log.add(topic, message, stamp_ns)
 
-    def command(self, now_ns: int, *, enabled: bool = True) -> Command:
-        """Return what to publish at a step.
+    def _commanded(self, step: LiveStep, state: EpisodeState, found: Command, now_ns: int) -> None:
+        if self._log is None:
+            return
+        # A command that is aligned with the steps must not come before its step.
+        at_ns = max(now_ns, found.time_ns + (self.mapping.action.align == "during"))
+        for topic, message in found.messages.items():
+            self._log.add(topic, message, at_ns)
+        self._log.see(step, state, self._robot_commands.action_of(), float(np.exp(found.log_prob)))
 
-        For a fixed rate, the step is at `now_ns`, which should be `next_step_ns`; otherwise it is
-        at the last message of `clock_topic`.
 
-        Args:
-            now_ns: Time in nanoseconds, on the clock of the stamps.
-            enabled: Whether the policy may drive; if not, the stop command is returned.
-        """
-        time_ns = now_ns if self.clock_topic is None else self._live.clock_ns
-        if time_ns is None:
-            return self._stopped(now_ns, f"no message of {self.clock_topic} yet")
-        step, state = None, None
-        try:
-            step = self._live.step(time_ns)
-            state = self._episodes.see(step, acts=enabled and not self._is_over)
-            found = self._driven(step, state, enabled)
-        except (UsageError, LogError, PolicyError) as error:
-            found = self._stopped(time_ns, str(error), is_fatal=True)
-        self._last_ns = time_ns
-        if self._log is not None and step is not None and state is not None:
-            # A command that is aligned with the steps must not come before its step.
-            at_ns = max(now_ns, time_ns + (self.mapping.action.align == "during"))
-            for topic, message in found.messages.items():
-                self._log.add(topic, message, at_ns)
-            behavior = np.exp(found.log_prob)
-            self._log.see(step, state, self._commands.action_of(), float(behavior))
-        return found
-
-    @property
-    def next_step_ns(self) -> int | None:
-        """Time of the next step at a fixed rate, as in a bag; None before the first message."""
-        first_ns, rate_hz = self._live.anchor_ns, self.mapping.clock.rate_hz
-        if first_ns is None or rate_hz is None:
-            return None
-        period_ns = NS_PER_S / rate_hz
-        before_ns = first_ns - 1 if self._last_ns is None else self._last_ns
-        k = max(0, math.floor((before_ns - first_ns) / period_ns))
-        while first_ns + round(k * period_ns) <= before_ns:
-            k += 1
-        return first_ns + round(k * period_ns)
-
-    def _driven(self, step: LiveStep, state: EpisodeState, enabled: bool) -> Command:
-        if state.began:
-            self.policy.begin()
-        observation = state.observation
-        reason, is_fatal = step.reason, step.is_fatal
-        if not reason and (old := self._too_old(step)):
-            reason = old
-        if not reason and not enabled:
-            reason = "the policy is not enabled"
-        if not reason:
-            reason = self._why_stopped(state)
-        if reason:
-            return self._stopped(step.time_ns, reason, is_fatal, observation)
-        assert observation is not None, "a step without a reason is usable"
-        batch = (
-            {key: part[np.newaxis] for key, part in observation.items()}
-            if isinstance(observation, dict)
-            else observation[np.newaxis]
+def _check_fits(policy: BasePolicy, robot: Robot) -> None:
+    """Check that the policy has the observations of the mapping, as far as they are known."""
+    space = policy.observation_space
+    state = space[STATE] if isinstance(space, spaces.Dict) and STATE in space.spaces else space
+    names = [n for n, each in robot.mapping.observation.items() if each.image is None]
+    if not isinstance(state, spaces.Box) or not all(name in robot.shapes for name in names):
+        return
+    count = sum(math.prod(robot.shapes[name]) for name in names) * robot.mapping.stack
+    if names and state.shape != (count,):
+        raise PolicyError(
+            f"{policy.name} was trained with another mapping: it observes {state.shape}"
+            f" numbers, the mapping has {count}"
         )
-        action = self.policy.act(batch)[0]
-        if not np.isfinite(action).all():
-            reason = "the policy's action is not finite"
-            return self._stopped(step.time_ns, reason, True, observation)
-        messages, is_changed = self._commands.messages(action, step.time_ns)
-        is_finite = isinstance(self.policy.action_space, spaces.Discrete)
-        log_prob = 0.0 if is_finite and not is_changed else math.nan
-        return Command(messages, "", False, step.time_ns, action, observation, log_prob)
-
-    def _why_stopped(self, state: EpisodeState) -> str:
-        if state.ended is not None and state.ended.terminated and not self.mapping.drive.restart:
-            self._is_over = True
-        if self._is_over:
-            return "the episode ended in a terminal state: start again to drive on"
-        if state.is_open or (state.ended is not None and state.ended.reason == TIME_LIMIT):
-            return ""
-        return "no episode runs: `begin` of the mapping waits, or an end holds"
-
-    def _too_old(self, step: LiveStep) -> str:
-        timeout_s = self.mapping.drive.timeout_s
-        for name in self._plan.required if timeout_s is not None else ():
-            age_s = float(step.quantities[name].age_s[0])
-            if age_s > cast(float, timeout_s):
-                topic = self._plan.quantities[name].source.topic
-                return f"{name}: the last message of {topic} is {age_s:.3g} s old"
-        return ""
-
-    def _stopped(
-        self, time_ns: int, reason: str, is_fatal: bool = False, observation: Any = None
-    ) -> Command:
-        messages = self._commands.stopped(time_ns)
-        return Command(messages, reason, is_fatal, time_ns, None, observation)
-
-    def _check_type(self, topic: str, message: Any) -> None:
-        wanted, found = self.inputs[topic], type_of(message)
-        if found and _plain(found) != _plain(wanted):
-            raise UsageError(f"{topic} has messages of {found}, but the mapping needs {wanted}")
-        if found or self.definitions[topic].encoding in ("json", "protobuf"):
-            return
-        for name in self._live.fields.get(topic, ()):
-            value = value_at(message, name)
-            if value is None or value is ABSENT:
-                raise UsageError(f"a message of {topic} ({wanted}) has no field {name}")
-
-    def _check_fits(self, robot: Robot) -> None:
-        """Check that the policy has the observations of the mapping, as far as they are known."""
-        space = self.policy.observation_space
-        state = space[STATE] if isinstance(space, spaces.Dict) and STATE in space.spaces else space
-        names = [n for n, each in robot.mapping.observation.items() if each.image is None]
-        if not isinstance(state, spaces.Box) or not all(name in robot.shapes for name in names):
-            return
-        count = sum(math.prod(robot.shapes[name]) for name in names) * robot.mapping.stack
-        if names and state.shape != (count,):
-            raise PolicyError(
-                f"{self.policy.name} was trained with another mapping: it observes {state.shape}"
-                f" numbers, the mapping has {count}"
-            )
-
-
-def type_of(message: Any) -> str:
-    """Return the type of a message of rclpy, rospy, rosbags, cyclonedds or protobuf; else ''."""
-    for name in ("__msgtype__", "_type", "__idl_typename__"):
-        if isinstance(found := getattr(message, name, None), str):
-            return found
-    if (descriptor := getattr(message, "DESCRIPTOR", None)) is not None:
-        return str(getattr(descriptor, "full_name", ""))
-    if hasattr(message, "get_fields_and_field_types"):
-        own = type(message)
-        return f"{own.__module__.split('.')[0]}/msg/{own.__name__}"
-    return ""
-
-
-def _plain(name: str) -> tuple[str, str]:
-    """Return package and name of a type, whose form depends on the library."""
-    parts = [part for part in name.replace("::", "/").replace(".", "/").split("/") if part]
-    return parts[0], parts[-1].rstrip("_")
 
 
 def _loaded(run: Any) -> tuple[BasePolicy, Path | None]:
