@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from mcaprl.api.replay import browse, layout, render, replay, save_page, verify
     from mcaprl.api.sweep import sweep
     from mcaprl.api.train import train, train_online
+    from mcaprl.drive.driver import Driver
     from mcaprl.recorder.bags.bag import OpenBag, open_bag
     from mcaprl.recorder.dataset.dataset import Dataset
     from mcaprl.recorder.dataset.format_registry import Format
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ClusterOptions",
     "Dataset",
+    "Driver",
     "Episode",
     "Format",
     "LogError",
@@ -110,6 +112,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.api.ranges": ["ClusterOptions"],
         "mcaprl.api.replay": ["browse", "layout", "render", "replay", "save_page", "verify"],
         "mcaprl.api.train": ["train", "train_online"],
+        "mcaprl.drive.driver": ["Driver"],
         "mcaprl.ray": ["ray"],
         "mcaprl.torch": ["torch"],
         "mcaprl.recorder.bags.bag": ["OpenBag", "open_bag"],

@@ -1,6 +1,7 @@
 """Run folders and summaries of offline and online training.
 
 RUN/config.json                         algorithm, settings, seeds, the data or sim, and versions
+RUN/robot.json                          mapping and topics of the robot that the data is from
 RUN/seed-K/checkpoint.safetensors       state to resume from
 RUN/seed-K/metrics.csv                  loss terms of an offline run
 RUN/seed-K/policy.json, .safetensors    policy of an offline run, best policy of an online run
@@ -37,6 +38,7 @@ from mcaprl.files import (
 from mcaprl.texts import counted
 
 CONFIG_NAME = "config.json"
+ROBOT_NAME = "robot.json"
 CHECKPOINT_NAME = "checkpoint.safetensors"
 METRICS_NAME = "metrics.csv"
 CURVE_NAME = "curve.csv"

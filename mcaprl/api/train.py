@@ -19,7 +19,7 @@ from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.source import Source, open_data, opened
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.live_stream import DEFAULT_SPEED
-from mcaprl.runs import check_kind, choose_seeds, run_to_resume
+from mcaprl.runs import ROBOT_NAME, check_kind, choose_seeds, run_to_resume
 from mcaprl.settings import check_settings, settings_from_json
 from mcaprl.storage.remote import check_upload, upload_all
 
@@ -137,6 +137,8 @@ def train(
                 summaries = train_dataset(dataset, chosen, out, other_data=other_data, **request)
     if dataset.origin.mapping is not None:
         write_json(out / MAPPING_NAME, dataset.origin.mapping, TrainingError)
+    if dataset.robot:
+        write_json(out / ROBOT_NAME, dict(dataset.robot), TrainingError)
     with suppress(MissingExtraError):
         draw_curves(out)
     return Run(out, summaries)

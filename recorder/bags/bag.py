@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import heapq
+import itertools
+import operator
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -15,7 +18,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.limits import MAX_TIME_NS
-from mcaprl.recorder.bags.decoders import MessageDecoder, decoder_of, merged
+from mcaprl.recorder.bags.decoders import MessageDecoder, RosDecoder, decoder_of, merged
 from mcaprl.recorder.bags.files import DefinitionFiles, find_bags, open_recordings
 from mcaprl.recorder.bags.source import Definition, McapFile, RawMessage, RosbagFile, TopicSource
 from mcaprl.recorder.bags.values import (
@@ -28,6 +31,7 @@ from mcaprl.recorder.bags.values import (
     steps_of,
     value_at,
 )
+from mcaprl.recorder.format.reading import ROS1
 from mcaprl.texts import counted, printable
 
 _PUBLISH_TIME = "publish_time"
@@ -41,6 +45,15 @@ class Failure(NamedTuple):
     row: int
     log_time_ns: int
     reason: str
+
+
+class BagMessage(NamedTuple):
+    """A decoded message, with its times in nanoseconds."""
+
+    topic: str
+    log_time_ns: int
+    publish_time_ns: int
+    message: Any
 
 
 class Stream(NamedTuple):
@@ -174,6 +187,9 @@ class Bag(Protocol):
 
     def failures(self, topic: str) -> Iterator[Failure]:
         """Decode all messages of a topic one by one, and yield those that cannot be decoded."""
+
+    def definition(self, topic: str) -> Definition:
+        """Return the type of a topic's messages, with the text that defines it."""
 
     def close(self) -> None:
         """Close the files."""
@@ -318,6 +334,30 @@ class _Topic:
                     number = int(rows[row])
                     failures.append(Failure(number, int(self.times_ns[number]), str(error)))
         return values, sorted(failures)
+
+    def messages(self) -> Iterator[BagMessage]:
+        """Yield the messages that can be decoded, in the order of recording."""
+        sources = [
+            zip(
+                source.times_ns.tolist(),
+                source.raw(np.arange(len(source.times_ns))),
+                itertools.repeat(self._decoders[source.definition]),
+                strict=False,
+            )
+            for _, source in self._used
+        ]
+        for k in self._order[:, 2].tolist():
+            time_ns, raw, decoder = next(sources[k])
+            with suppress(LogError):
+                yield BagMessage(self.name, time_ns, raw.publish_ns, _decoded(decoder, raw))
+
+    def definition(self) -> Definition:
+        found = self._used[0][1].definition
+        decoder = self._decoders[found]
+        if found.schema or not isinstance(decoder, RosDecoder):
+            return found
+        encoding = ROS1 if found.encoding == "ros1" else "ros2msg"
+        return replace(found, schema_encoding=encoding, schema=decoder.text().encode())
 
     def failures(self) -> Iterator[Failure]:
         for k, (_, source) in enumerate(self._used):
@@ -475,6 +515,36 @@ class OpenBag:
             )
         # The fields of the messages in an array are within the field of the array.
         return [name for name in fields if "[" not in name]
+
+    def messages(self, topics: Sequence[str] | None = None) -> Iterator[BagMessage]:
+        """Yield decoded messages in the order of recording; those that cannot be are left out.
+
+        Args:
+            topics: Topics of the messages; default: all that can be read.
+
+        Yields:
+            Named tuples of `topic`, `log_time_ns`, `publish_time_ns`, and `message`: an object with
+            the fields as attributes, or a dict (JSON).
+
+        Raises:
+            LogError: A topic or a file cannot be read.
+            UnknownNameError: There is no such topic.
+        """
+        if topics is None:
+            topics = [name for name, info in self.topics.items() if not info.problem]
+        found = [self._readable(name) for name in topics]
+        each = [zip(map(tuple, one.places.tolist()), one.messages(), strict=False) for one in found]
+        merged_ = heapq.merge(*each, key=operator.itemgetter(0))
+        yield from (message for _, message in merged_)
+
+    def definition(self, topic: str) -> Definition:
+        """Return the type of a topic's messages, with the text that defines it.
+
+        Raises:
+            LogError: The topic cannot be read.
+            UnknownNameError: There is no such topic.
+        """
+        return self._readable(topic).definition()
 
     def failures(self, topic: str) -> Iterator[Failure]:
         """Decode all messages of a topic one by one, and yield those that cannot be decoded.

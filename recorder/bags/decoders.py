@@ -68,6 +68,10 @@ class JsonDecoder:
         self._root = found if isinstance(found, dict) else {}
         self._collect(self._root, "", "", ())
 
+    def encode(self, message: Any) -> bytes:
+        """Encode a dict."""
+        return json.dumps(message).encode()
+
     def decode(self, data: bytes) -> Any:
         """Decode a message to a dict."""
         try:
@@ -303,6 +307,14 @@ class RosDecoder:
             types = self._wide.types
         self.fields = leaf_kinds(types, self._name, inner=True)
 
+    def text(self) -> str:
+        """Return the definition of the type and of all types in it."""
+        return self._definitions.text(is_ros1=self._is_ros1)
+
+    def encode(self, message: Any) -> bytes:
+        """Encode a dict, or an object with an attribute for each field."""
+        return self._definitions.encode(message, is_ros1=self._is_ros1)
+
     def decode(self, data: bytes) -> Any:
         """Decode a message to an object with an attribute for each field."""
         whole = None if self._wide is None else self._wide.decode(data)
@@ -326,6 +338,9 @@ class MessageDecoder(Protocol):
 
     def decode(self, data: bytes) -> Any:
         """Decode a message to an object or a dict."""
+
+    def encode(self, message: Any) -> bytes:
+        """Encode a message, which may also be a dict."""
 
 
 def decoder_of(

@@ -95,6 +95,19 @@ class ProtobufDecoder:
         except Exception as error:
             raise LogError(f"cannot decode {len(data)} bytes as {self._name}: {error}") from error
 
+    def wrapped(self, message: Any) -> Any:
+        """Return a protobuf message as `decode` does."""
+        return self._wrapped(message)
+
+    def encode(self, message: Any) -> bytes:
+        """Encode a protobuf message, one that `decode` returned, or a dict."""
+        message = getattr(message, "_of_protobuf", message)
+        if isinstance(message, dict):
+            parser = import_extra(f"{_PACKAGE}.json_format", "bags")
+            message = parser.ParseDict(message, self._class())
+        found: bytes = message.SerializeToString()
+        return found
+
     def _collect(
         self, descriptor: Any, prefix: str, brackets: str, parents: tuple[str, ...]
     ) -> None:

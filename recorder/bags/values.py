@@ -467,15 +467,19 @@ def column_of(values: Sequence[Any], kind: str) -> NDArray[Any]:
     If all messages lack the field, and not just because they omit a key, the column contains the
     `Lack` objects. A time that a message lacks makes the column float64, with NaN.
     """
-    if are_bytes(kind):
-        values = [_bytes_of(value) for value in values]
-    elif kind == "time":
-        values = [_time_of(value) for value in values]
+    values = [converted(value, kind) for value in values]
     plain = [None if isinstance(value, Lack) else value for value in values]
     if any(value is not None for value in plain):
         return _column(plain)
     is_lacking = any(isinstance(value, Lack) and value is not ABSENT for value in values)
     return _objects(values) if is_lacking else _column(plain)
+
+
+def converted(value: Any, kind: str) -> Any:
+    """Return a value as its kind of field needs it: bytes as bytes, and times as integers."""
+    if are_bytes(kind):
+        return _bytes_of(value)
+    return _time_of(value) if kind == "time" else value
 
 
 def _column(values: list[Any]) -> NDArray[Any]:

@@ -9,6 +9,7 @@ from functools import cached_property, lru_cache
 from operator import attrgetter
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -237,6 +238,25 @@ class Definitions:
         except Exception as error:
             why = str(error) or type(error).__name__
             raise LogError(f"cannot decode {len(data)} bytes as {self.name}: {why}") from error
+
+    def text(self, *, is_ros1: bool = False) -> str:
+        """Return the definition of the type and of all types in it."""
+        return self._store.generate_msgdef(self.name, ros_version=1 if is_ros1 else 2)[0]
+
+    def encode(self, message: Any, *, is_ros1: bool = False) -> bytes:
+        """Encode a dict, or an object with an attribute for each field; absent fields are zeros.
+
+        Raises:
+            LogError: A value does not fit its field.
+        """
+        store = self._store
+        try:
+            encoded = store.serialize_ros1 if is_ros1 else store.serialize_cdr
+            return bytes(encoded(_built(store, self.name, message), self.name))
+        # rosbags and NumPy raise errors of many types for values that do not fit.
+        except Exception as error:
+            why = str(error) or type(error).__name__
+            raise LogError(f"a message cannot be encoded as {self.name}: {why}") from error
 
     def _beginning(self, data: bytes, *, is_ros1: bool) -> Any:
         """Decode the fields before the first that cannot be read."""
@@ -522,3 +542,42 @@ class _Sizes:
 _BYTES = {"string": 4, "wstring": 4} | {
     f"{kind}{bits}": bits // 8 for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64, 128)
 }
+
+
+def _built(store: Typestore, name: str, values: Any) -> Any:
+    """Return a message of rosbags with the values of a dict, or of a message of another library."""
+    if getattr(values, "__msgtype__", None) == name:
+        return values
+    found = {}
+    for field, description in store.fielddefs[name][1]:
+        value = values.get(field) if isinstance(values, Mapping) else getattr(values, field, None)
+        own = f"{field}_" if keyword.iskeyword(field) else field
+        found[own] = _value(store, description, value)
+    return store.types[name](**found)
+
+
+# Names of the parts of a time in ROS 1, and in rospy.
+_SECONDS = {"sec": "secs", "nanosec": "nsecs"}
+
+
+def _value(store: Typestore, description: Any, value: Any) -> Any:
+    kind, what = description
+    if kind == Nodetype.BASE:
+        default: Any = "" if what[0] in ("string", "wstring") else what[0] == "bool" and False
+        value = default if value is None else value
+        return value[0] if isinstance(value, bytes) and what[0] in ("byte", "octet") else value
+    if kind == Nodetype.NAME:
+        if hasattr(value, "secs"):
+            value = {ours: getattr(value, theirs) for ours, theirs in _SECONDS.items()}
+        return _built(store, what, {} if value is None else value)
+    element, count = what
+    if element[0] == Nodetype.BASE and element[1][0] not in ("string", "wstring"):
+        dtype = {"byte": "uint8", "octet": "uint8", "char": "uint8"}.get(*[element[1][0]] * 2)
+        is_fixed = kind == Nodetype.ARRAY
+        if value is None:
+            return np.zeros(count if is_fixed else 0, dtype)
+        is_bytes = isinstance(value, bytes | bytearray | memoryview)
+        found = np.frombuffer(value, np.uint8) if is_bytes else np.asarray(value, dtype)
+        return found.astype(dtype, copy=False)
+    given = value if value is not None else [None] * (count if kind == Nodetype.ARRAY else 0)
+    return [_value(store, element, each) for each in given]

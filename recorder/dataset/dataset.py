@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -322,6 +322,15 @@ class Dataset(Conversions):
         A label is such as `speed (0 to 2 m/s)`, or `steering (-1 right, 1 left)`.
         """
         return self._description.action_labels()
+
+    @property
+    def robot(self) -> Mapping[str, Any]:
+        """Mapping, topics and shapes of the robot from whose bag the data was made.
+
+        A policy that was trained on the data drives this robot; see docs/drive.md. They are JSON
+        types, with the keys `mapping`, `topics` and `shapes`; empty for other data.
+        """
+        return self._description.robot
 
     @property
     def action_commands(self) -> ActionCommands | None:

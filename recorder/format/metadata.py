@@ -28,6 +28,9 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
     versions            JSON object: package -> version
     behavior_prob       "estimated" if the probabilities of the actions were not logged but
                         estimated afterwards; otherwise absent
+    robot               JSON object: "mapping", "topics" (definitions) and "shapes" of the robot
+                        from whose bag the log was made, so that a policy can drive it; otherwise
+                        absent
     about               JSON object: description of the source dataset, such as its author, if the
                         log was converted from another tool's format; otherwise absent
     times               "none" if the data has no times, so that its times only count the steps;
@@ -174,6 +177,8 @@ class LogMetadata:
         versions: Versions of the packages that the recording ran with.
         behavior_prob: `ESTIMATED` if the probabilities of the actions were estimated; otherwise
             empty.
+        robot: Mapping, topics and shapes of the robot from whose bag the data was made, so that a
+            policy can drive it; JSON types only, empty for other data.
         about: Description of the source dataset if the log was converted from another tool's
             format; JSON types only.
         times: `NO_TIMES` if the data has no times, such as arrays; otherwise empty. The times of
@@ -200,6 +205,7 @@ class LogMetadata:
     unstored_kwargs: tuple[str, ...] = ()
     action_part_names: tuple[str, ...] = ()
     action_units: tuple[str, ...] = ()
+    robot: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
     def leaves(self) -> tuple[Leaf, ...]:
@@ -274,6 +280,7 @@ class LogMetadata:
                 if (found := getattr(self, name))
             },
             **({"behavior_prob": self.behavior_prob} if self.behavior_prob else {}),
+            **({"robot": json.dumps(dict(self.robot))} if self.robot else {}),
             **({"about": json.dumps(dict(self.about))} if self.about else {}),
             **({"times": self.times} if self.times else {}),
             **({"action_commands": json.dumps(commands.to_json())} if commands else {}),
@@ -313,6 +320,7 @@ class LogMetadata:
                 versions=_object(strings, "versions"),
                 behavior_prob=strings.get("behavior_prob", ""),
                 about=_object(strings, "about"),
+                robot=_object(strings, "robot"),
                 times=strings.get("times", ""),
                 action_commands=_commands(strings, action_space),
                 unstored_kwargs=_texts(strings, "unstored_kwargs"),
@@ -330,7 +338,8 @@ class LogMetadata:
 
         The spaces of all logs must be equal. `behavior_prob` is `ESTIMATED`, and `times` is
         `NO_TIMES`, if any of the logs has this value. The commands of the actions are those of the
-        first log that has them, if those of the others have the same fields.
+        first log that has them, if those of the others have the same fields. `robot` is that of the
+        first log, if the others differ in the commands only.
         """
         first, *others = parts
         blank = cls(first.observation_space, first.action_space)
@@ -348,6 +357,7 @@ class LogMetadata:
             "behavior_prob": ESTIMATED if estimated else "",
             "times": NO_TIMES if no_times else "",
             "action_commands": commands[0] if same else None,
+            "robot": _common_robot([part.robot for part in parts]),
         }
         return replace(first, **differing)
 
@@ -404,6 +414,22 @@ class LogMetadata:
             seed=seed,
             versions=installed_versions(),
         )
+
+
+def _common_robot(found: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Return the robot of several logs, with the commands of the first; empty if others differ."""
+
+    def without_commands(robot: Any) -> Any:
+        try:
+            mapping = robot["mapping"]
+            action = {**mapping["action"], "representatives": []}
+            return {**robot, "mapping": {**mapping, "action": action}}
+        # It is empty, or forged.
+        except (KeyError, TypeError):
+            return robot
+
+    first = without_commands(found[0])
+    return found[0] if all(without_commands(each) == first for each in found) else {}
 
 
 def _label(name: str, unit: str, bounds: tuple[float, float]) -> str:

@@ -20,10 +20,13 @@ from mcaprl.recorder.bags.values import (
     Lack,
     Step,
     as_array,
+    column_of,
     element_of,
     is_mapped,
+    kind_at,
     path_text,
     steps_of,
+    value_at,
     without_lacks,
 )
 from mcaprl.recorder.mapping.config import Stamp, TimeSource
@@ -435,6 +438,10 @@ class TopicStream:
     """Messages of one topic: times, and the fields that a mapping uses.
 
     Messages that cannot be decoded, or whose stamp is not a time, are left out.
+
+    Attributes:
+        topic: Name of the topic.
+        fields: Paths of the fields.
     """
 
     def __init__(
@@ -443,7 +450,7 @@ class TopicStream:
         """Select the fields; nothing is read yet."""
         self.topic = topic
         self._bag, self._left_out = bag, np.empty(0, np.int64)
-        self._fields = sorted(set(fields))
+        self.fields = sorted(set(fields))
         self._stamp: FieldPath | None = None
         self._unit_ns = 1
         if time == "publish_time":
@@ -455,11 +462,11 @@ class TopicStream:
     def _read(self) -> Stream:
         """Columns of the messages that can be used, in the order of recording."""
         stamp = [] if self._stamp is None else [self._stamp.field]
-        if not self._fields and not stamp:
+        if not self.fields and not stamp:
             times_ns = self._bag.times(self.topic)
             found = Stream(times_ns, {}, np.arange(len(times_ns)))
         else:
-            found = self._bag.read(self.topic, sorted({*self._fields, *stamp}))
+            found = self._bag.read(self.topic, sorted({*self.fields, *stamp}))
         keep = ~np.isin(found.rows, self._left_out)
         if self._stamp is not None:
             keep &= _is_time(self._stamp.select(found.columns[self._stamp.field]), self._unit_ns)
@@ -514,10 +521,24 @@ class TopicStream:
         found = self._read
         if self._stamp is None:
             return found.log_time_ns
-        stamps = self._stamp.select(found.columns[self._stamp.field])
+        return self._ns_of(self._stamp.select(found.columns[self._stamp.field]))
+
+    def _ns_of(self, stamps: NDArray[Any]) -> NDArray[np.int64]:
         if stamps.dtype.kind in "iu":
             return stamps.astype(np.int64) * self._unit_ns
         return np.rint(stamps.astype(np.float64) * self._unit_ns).astype(np.int64)
+
+    def time_of(self, message: Any, log_time_ns: int, publish_time_ns: int) -> int | None:
+        """Return the time of a decoded message in nanoseconds; None if its stamp is not a time."""
+        if self._stamp is None:
+            return log_time_ns
+        if self._stamp.field == _PUBLISH_TIME:
+            return publish_time_ns
+        path = path_text(self._stamp.steps)
+        kinds = self._bag.topics[self.topic].fields
+        stamp = column_of([value_at(message, path)], kind_at(kinds, path))
+        is_usable = _is_time(stamp, self._unit_ns).all()
+        return int(self._ns_of(stamp)[0]) if is_usable else None
 
     @property
     def places(self) -> NDArray[np.int64]:

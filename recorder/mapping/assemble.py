@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 import itertools
+import math
 import warnings
+from collections.abc import Mapping as MappingOf
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -25,8 +27,9 @@ from mcaprl.recorder.format.metadata import (
 )
 from mcaprl.recorder.format.spaces import leaves_of
 from mcaprl.recorder.mapping.align import NS_PER_S, as_numbers
-from mcaprl.recorder.mapping.config import Action, Limits, Quantity
+from mcaprl.recorder.mapping.config import Action, Limits, Mapping, Quantity
 from mcaprl.recorder.mapping.plan import Plan
+from mcaprl.recorder.mapping.robot import Robot
 from mcaprl.recorder.mapping.runs import Segment
 from mcaprl.recorder.mapping.steps import Steps
 
@@ -189,8 +192,9 @@ def assembled(
         action_commands=commands,
         action_part_names=runs[0].actions.names,
         action_units=runs[0].actions.units if any(runs[0].actions.units) else (),
-        step_duration_ns=_step_ns(plan, times),
+        step_duration_ns=(step_ns := _step_ns(plan, times)),
         policy=plan.mapping.meta.policy,
+        robot=_robot(plan, runs, observed, commands, space, step_ns),
     )
     transitions = Transitions(
         frames=tuple(observed.frames[leaf.path] for leaf in leaves_of(observed.space)),
@@ -203,6 +207,37 @@ def assembled(
         episodes=tuple(summaries),
     )
     return Dataset(transitions, metadata, origin=Origin(plan.bag.paths))
+
+
+def _robot(
+    plan: Plan,
+    runs: list[Steps],
+    observed: _Observations,
+    commands: ActionCommands | None,
+    space: spaces.Space[Any],
+    step_ns: int,
+) -> dict[str, Any]:
+    """Return the robot with a mapping that has all that was found in the data."""
+    found: dict[str, Any] = {}
+    if commands is not None and None not in commands.commands:
+        found["representatives"] = commands.to_json()["commands"]
+    if isinstance(space, spaces.Box):
+        box = plan.mapping.action.box
+        assert box is not None, "the action is a Box"
+        low, high = space.low.tolist(), space.high.tolist()
+        update = {"low": low if box.low is None else box.low}
+        update["high"] = high if box.high is None else box.high
+        found["box"] = box.model_copy(update=update)
+    shapes = dict[str, tuple[int, ...]]()
+    for name in plan.quantities:
+        if name in plan.images:
+            *size, channels = observed.frames[(name,) if len(observed.frames) > 1 else ()].shape[1:]
+            shapes[name] = (*size, channels // plan.mapping.stack)
+        else:
+            shapes[name] = max(run.quantities[name].values.shape[1:] for run in runs)
+    action = plan.mapping.action.model_copy(update=found)
+    mapping = plan.mapping.model_copy(update={"action": action})
+    return Robot.of_plan(plan, shapes, step_ns)._replace(mapping=mapping).to_json()
 
 
 def _shift(run: Steps, episodes: list[Segment], times: list[NDArray[np.int64]]) -> int:
@@ -285,8 +320,7 @@ def _observations(
             for name, array in vectors.items()
         }
         parts = {name: _repeated(space, count) for name, space in parts.items()}
-        ages = [f"_{age}_ago" if age else "" for age in range(count - 1, -1, -1)]
-        names = [f"{name}{age}" for age in ages for name in names]
+        names = _stacked_names(names, count)
     arrays: dict[str, Frames] = dict(vectors)
     is_complete = True
     for name, reader in plan.images.items():
@@ -350,6 +384,22 @@ def vector_names(plan: Plan, runs: list[Steps]) -> list[str]:
             count = max((shape[0] for shape in shapes if shape), default=1)
             names += element_names(name, quantity, count)
     return names
+
+
+def observed_names(mapping: Mapping, shapes: MappingOf[str, tuple[int, ...]]) -> tuple[str, ...]:
+    """Return the names of the elements of the observed vector for the shapes of the quantities."""
+    names = [
+        each
+        for name, quantity in mapping.observation.items()
+        if quantity.image is None
+        for each in element_names(name, quantity, math.prod(shapes[name]))
+    ]
+    return tuple(_stacked_names(names, mapping.stack))
+
+
+def _stacked_names(names: list[str], count: int) -> list[str]:
+    ages = [f"_{age}_ago" if age else "" for age in range(count - 1, -1, -1)]
+    return [f"{name}{age}" for age in ages for name in names]
 
 
 def _limits(quantity: Quantity) -> tuple[float, float]:

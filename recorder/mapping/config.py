@@ -459,6 +459,42 @@ class Meta(_Part):
     policy: str = Field(default="", description="Name of the policy that acted.")
 
 
+class Drive(_Part):
+    """What a policy may command when it drives the robot; it does not change what is learned."""
+
+    stop: str | list[CommandValue] | None = Field(
+        default=None,
+        description="Command that stops the robot: a value for each element of the command, or the"
+        " name of an action. Default: 0 for each number, which must be within the limits of a"
+        " `box`.",
+    )
+    low: list[Finite] | Finite | None = Field(
+        default=None,
+        description="Lowest value of each element of the command, or of all of them; lower values"
+        " are raised to it. Default: the limits of the `box`, or none.",
+    )
+    high: list[Finite] | Finite | None = Field(
+        default=None,
+        description="Highest value of each element of the command, or of all of them; higher values"
+        " are lowered to it.",
+    )
+    max_change: list[Positive] | Positive | None = Field(
+        default=None,
+        description="Largest change of each element of the command in a second, or of all of them."
+        " The stop command is not limited. Default: no limit.",
+    )
+    timeout_s: Positive | None = Field(
+        default=None,
+        description="Age in seconds of an observed value beyond which the robot stops. Default:"
+        " `tolerance_s` of the quantity, or else `gap_s`.",
+    )
+    restart: bool = Field(
+        default=False,
+        description="Whether the robot drives on with the next episode after a terminal state."
+        " Without it, it stops until the program is started again.",
+    )
+
+
 class Mapping(_Part):
     """Mapping of a bag's topics to transitions."""
 
@@ -492,6 +528,9 @@ class Mapping(_Part):
         default=None,
         description="Natural logarithm of the probability of the action, or of its density in the"
         " action's own units, which a `box` has; instead of `behavior_prob`.",
+    )
+    drive: Drive = Field(
+        default=Drive(), description="What a policy may command when it drives the robot."
     )
     meta: Meta = Field(default=Meta(), description="Facts that the bag does not contain.")
     strict: bool = Field(
@@ -547,6 +586,7 @@ MAPPING_SECTIONS: dict[str, type[BaseModel]] = {
     "action": Action,
     "action.box": Limits,
     "episodes": Episodes,
+    "drive": Drive,
     "meta": Meta,
 }
 """Pydantic models of the parts of a mapping, by section title of the reference documentation."""

@@ -328,6 +328,7 @@ class ImageReader:
         topic: Topic of the images.
         name: Name of the quantity, which is part of the name of a copy on disk.
         options: Options of the mapping.
+        fields: Fields of a message to read.
         failures: Messages without a readable image, by their index in the topic, as far as `read`
             found any. They are to be treated as if they did not exist.
     """
@@ -344,7 +345,7 @@ class ImageReader:
         """Find out whether the images are raw or compressed."""
         self.bag, self.topic, self.name = bag, topic, name
         self.options, self._strict = ImageOptions(topic, quantity), strict
-        self._fields = _image_fields(bag, bag.topics[topic])
+        self.fields = _image_fields(bag, bag.topics[topic])
         self.failures: dict[int, Failure] = {}
 
     def read(self, rows: NDArray[np.int64], storage: Storage = "memory") -> Frames | None:
@@ -479,7 +480,7 @@ class ImageReader:
                 largest = max(largest, _length(message["data"]))
                 try:
                     # The full image is not kept: the next one is decoded into the same memory.
-                    image = self.options.applied(self._decoded(message))
+                    image = self.options.applied(self.decoded(message))
                 except LogError as error:
                     time_ns = int(self.bag.times(self.topic)[row])
                     self.leave_out(Failure(row, time_ns, str(error)))
@@ -489,13 +490,14 @@ class ImageReader:
 
     def _messages(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, dict[str, Any] | Failure]]:
         """Yield the fields of each message, or why the message cannot be decoded."""
-        found = self.bag.read(self.topic, self._fields, rows)
+        found = self.bag.read(self.topic, self.fields, rows)
         messages: dict[int, dict[str, Any] | Failure] = {each.row: each for each in found.failures}
         for k, row in enumerate(found.rows.tolist()):
             messages[row] = {name: column[k] for name, column in found.columns.items()}
         yield from sorted(messages.items(), key=lambda each: each[0])
 
-    def _decoded(self, message: dict[str, Any]) -> Pixels:
+    def decoded(self, message: dict[str, Any]) -> Pixels:
+        """Decode the fields of an image message."""
         kind = str(message["encoding" if "encoding" in message else "format"])
         if is_video(kind):
             raise UsageError(

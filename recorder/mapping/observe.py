@@ -100,7 +100,12 @@ def _beside(info: TopicInfo, path: FieldPath) -> str:
 
 
 def by_names(
-    path: FieldPath, column: NDArray[Any], texts: NDArray[Any], wanted: str | list[str]
+    path: FieldPath,
+    column: NDArray[Any],
+    texts: NDArray[Any],
+    wanted: str | list[str],
+    *,
+    is_whole: bool = True,
 ) -> Named:
     """Return the elements with the wanted names.
 
@@ -109,6 +114,7 @@ def by_names(
         column: (M, K) numbers, or (M,) arrays of numbers.
         texts: (M,) lists of the names of the elements; None where a message has none.
         wanted: Names, or one name.
+        is_whole: Whether these are all messages, so that one of them must have each name.
 
     Returns:
         Numbers (M, K) of K names, with the messages that contain them; (M,) for one name.
@@ -128,7 +134,7 @@ def by_names(
             values[rows, number] = _elements(path, column, rows, places[name])
             present[rows, number] = True
     for name, is_found in zip(names, present.T, strict=True):
-        if len(column) and not is_found.any():
+        if is_whole and len(column) and not is_found.any():
             near = difflib.get_close_matches(name, known, n=3, cutoff=0.4) or list(known)[:8]
             what = f"nearest: {', '.join(near)}" if near else "no message has names"
             raise UsageError(f"{path}: no message has an element '{name}'; {what}")
@@ -208,6 +214,9 @@ def check_order(path: FieldPath, column: NDArray[Any], texts: NDArray[Any]) -> N
     orders: dict[tuple[str, ...], int] = {}
     length = column.shape[1] if column.ndim > 1 else None
     last: Any = None
+    if texts.dtype.kind != "O":
+        # All messages have empty arrays of names.
+        return
     for row, names in enumerate(texts):
         count = _length(column[row]) if length is None else length
         # Nearly always, the names are those of the message before.
@@ -322,7 +331,7 @@ def pose_of(
         quantity.parts,
         gap_s,
     )
-    return _shaped(quantity, found, np.isnan(age_s), age_s)
+    return shaped(quantity, found, np.isnan(age_s), age_s)
 
 
 def values_of(
@@ -350,7 +359,7 @@ def values_of(
     if quantity.as_ == "count":
         counts = np.searchsorted(run.times_ns, steps_ns, side="right").astype(np.float64)
         nothing = np.zeros(len(counts), bool)
-        return _shaped(quantity, counts, nothing, nothing.astype(np.float64))
+        return shaped(quantity, counts, nothing, nothing.astype(np.float64))
     if quantity.image is not None:
         match = _match(quantity, run, steps_ns, ends_ns, gap_s)
         rows = _rows(run, match)
@@ -367,7 +376,7 @@ def values_of(
     if updates.present is None or updates.present.ndim == 1:
         part = _within(run, updates.present)
         found, match = _aligned(quantity, updates.values, part, steps_ns, ends_ns, gap_s)
-        return _shaped(quantity, found, match.rows == NONE, match.age_s)
+        return shaped(quantity, found, match.rows == NONE, match.age_s)
     # Each element is in other messages than the others.
     parts = [
         _aligned(quantity, column, _within(run, present), steps_ns, ends_ns, gap_s)
@@ -378,7 +387,7 @@ def values_of(
     ages_s = np.stack([match.age_s for _, match in parts])
     oldest = np.nan_to_num(np.abs(ages_s), nan=-1.0).argmax(axis=0)
     age_s = ages_s[oldest, np.arange(len(steps_ns))]
-    return _shaped(quantity, found, missing, age_s)
+    return shaped(quantity, found, missing, age_s)
 
 
 def _within(run: Messages, present: NDArray[np.bool_] | None) -> Messages:
@@ -507,7 +516,7 @@ def _unwrapped(quantity: Quantity, column: NDArray[np.float64]) -> NDArray[np.fl
     return np.unwrap(column, axis=0) if is_angle and len(column) else column
 
 
-def _shaped(
+def shaped(
     quantity: Quantity,
     found: NDArray[np.float64],
     missing: NDArray[np.bool_],

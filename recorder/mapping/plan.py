@@ -149,6 +149,27 @@ class Plan:
         time = part.time or self.mapping.time
         return topic if time == self.mapping.time else f"{topic} by {_text(time)}"
 
+    @property
+    def required(self) -> list[str]:
+        """Names of the observed quantities without which there is no step."""
+        found = self.mapping.observation.items()
+        return [name for name, each in found if each.missing is None or each.image is not None]
+
+    def transform_time(self, topic: str) -> TimeSource:
+        """Return the time of the transforms of a topic."""
+        times = {
+            wanted.quantity.time or self.mapping.time
+            for wanted in self.quantities.values()
+            if wanted.quantity.transform is not None and wanted.source.topic == topic
+        }
+        time = times.pop()
+        if times or isinstance(time, Stamp):
+            raise UsageError(
+                f"{self.place.of('observation')}: all transforms of {topic} need the same"
+                " time: log_time, publish_time or header (the stamp of each transform)"
+            )
+        return time
+
     def leave_out_images(self) -> None:
         """Leave out the messages without a readable image, as far as known."""
         for name, reader in self.images.items():

@@ -55,11 +55,7 @@ class Blame:
     def __init__(self, plan: Plan, runs: list[Steps]) -> None:
         """Find what each required quantity and the action prevent."""
         self._plan, self._runs = plan, runs
-        required = [
-            name
-            for name, quantity in plan.mapping.observation.items()
-            if quantity.missing is None or quantity.image is not None
-        ]
+        required = plan.required
         self._topics = {name: plan.quantities[name].source.topic for name in required}
         # Of several topics of commands, the one with the fewest messages; none for expressions.
         commands = [command.source.topic for command in plan.commands]
@@ -306,25 +302,10 @@ def _read(plan: Plan, images: Storage) -> MappedBag | None:
     report = replace(report, images=problems)
     if (commands := dataset.action_commands) is not None:
         report = replace(report, commands=commands.by_name(dataset.action_names))
-    tree = mapping.model_dump(mode="json", by_alias=True)
-    if commands is not None and None not in commands.commands:
-        tree["action"]["representatives"] = commands.to_json()["commands"]
-    if isinstance(space := dataset.action_space, spaces.Box):
-        found = {"low": space.low.tolist(), "high": space.high.tolist()}
-        given = {name: each for name, each in tree["action"]["box"].items() if each is not None}
-        tree["action"]["box"] = {**found, **given}
+    if isinstance(dataset.action_space, spaces.Box):
         report = replace(report, action_parts=list(dataset.action_labels))
-    dataset.origin = replace(dataset.origin, mapping=_json_of(tree), report=report)
+    dataset.origin = replace(dataset.origin, mapping=dataset.robot["mapping"], report=report)
     return MappedBag(dataset, report)
-
-
-def _json_of(tree: Any) -> Any:
-    """Return keys and values with infinite numbers as texts, because JSON lacks them."""
-    if isinstance(tree, dict):
-        return {key: _json_of(each) for key, each in tree.items()}
-    if isinstance(tree, list):
-        return [_json_of(each) for each in tree]
-    return str(tree) if isinstance(tree, float) and math.isinf(tree) else tree
 
 
 def _longest(kept: list[list[Segment]], recordings: list[int]) -> list[list[Segment]]:

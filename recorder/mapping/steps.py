@@ -18,7 +18,6 @@ from mcaprl.errors import UsageError
 from mcaprl.recorder.format.behavior import PROBABILITY, BehaviorField, behavior_field
 from mcaprl.recorder.mapping.actions import Actions, CommandPart, actions_of, unit_of
 from mcaprl.recorder.mapping.align import NS_PER_S, as_numbers, time_order
-from mcaprl.recorder.mapping.config import Stamp, TimeSource
 from mcaprl.recorder.mapping.expression import Expression
 from mcaprl.recorder.mapping.observe import Values, pose_of, values_of
 from mcaprl.recorder.mapping.plan import Plan, Wanted
@@ -226,7 +225,7 @@ class StepReader:
         self._plan, self._mapping = plan, plan.mapping
         self._streams: dict[str, Recorded] = {**plan.streams}
         self._transforms: dict[str, Transforms] = {
-            topic: Transforms(plan.bag, self._transform_time(topic), topic=topic, frames=frames)
+            topic: Transforms(plan.bag, plan.transform_time(topic), topic=topic, frames=frames)
             for topic, frames in plan.frames.items()
         }
         # Names of the streams of each transform.
@@ -300,28 +299,13 @@ class StepReader:
         assert found is not None
         return found
 
-    def _transform_time(self, topic: str) -> TimeSource:
-        """Return the time of the transforms of a topic."""
-        times = {
-            wanted.quantity.time or self._mapping.time
-            for wanted in self._plan.quantities.values()
-            if wanted.quantity.transform is not None and wanted.source.topic == topic
-        }
-        time = times.pop()
-        if times or isinstance(time, Stamp):
-            raise UsageError(
-                f"{self._plan.place.of('observation')}: all transforms of {topic} need the same"
-                " time: log_time, publish_time or header (the stamp of each transform)"
-            )
-        return time
-
     def _ticks(self, run: Run) -> Ticks:
         """Return the times of the steps of a run."""
         plan, mapping = self._plan, self._mapping
         if plan.clock is not None:
             distinct(run.streams, plan.clock, self._streams)
         parts = stretches(
-            [each for name in self._required() for each in self._of(name, run)],
+            [each for name in self._plan.required for each in self._of(name, run)],
             [each for name in mapping.observation for each in self._of(name, run)],
             [each.times_ns for each in run.streams.values()],
             mapping.episodes.gap_s,
@@ -339,11 +323,6 @@ class StepReader:
         wanted = self._plan.quantities[name]
         names = self._frames.get(name, [wanted.stream])
         return [run.streams[each].times_ns for each in names]
-
-    def _required(self) -> list[str]:
-        """Return the names of the observed quantities without which there is no step."""
-        found = self._mapping.observation.items()
-        return [name for name, each in found if each.missing is None or each.image is not None]
 
     def _values(
         self,
@@ -392,7 +371,9 @@ class StepReader:
                 found = found._replace(values=numbers)
             elif found.values.dtype.kind != "O":
                 found = found._replace(values=self._scalars(wanted, found))
-            commands.append(_command(wanted, found, plan.bag.topics[wanted.source.topic].type_name))
+            commands.append(
+                command_part(wanted, found, plan.bag.topics[wanted.source.topic].type_name)
+            )
         for place, expression in enumerate(plan.expressions):
             with plan.place.named("action", "expressions", place):
                 values = expression.evaluate(columns, following).astype(np.float64)
@@ -426,7 +407,7 @@ class StepReader:
     def _usable(self, quantities: dict[str, Values], count: int) -> NDArray[np.bool_]:
         """Return a mask of the steps that have all observations, each at most `gap_s` old."""
         usable = np.ones(count, bool)
-        for name in self._required():
+        for name in self._plan.required:
             values = quantities[name]
             with np.errstate(invalid="ignore"):
                 is_stale = np.abs(values.age_s) > self._mapping.episodes.gap_s
@@ -434,7 +415,7 @@ class StepReader:
         return usable
 
 
-def _command(wanted: Wanted, found: Values, type_name: str) -> CommandPart:
+def command_part(wanted: Wanted, found: Values, type_name: str) -> CommandPart:
     """Return a field of the command, named by the last part of its path."""
     path, names = wanted.source.path, wanted.quantity.names
     assert path is not None, "commands are fields"

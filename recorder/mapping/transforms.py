@@ -84,18 +84,29 @@ def transforms_of(bag: Bag, topic: str, time: TimeSource) -> Iterator[Transform]
         for time_ns, place, message in zip(
             times_ns.tolist(), places[stream.rows].tolist(), messages, strict=True
         ):
-            for each in message if isinstance(message, Iterable) else ():
-                child = _field(each, _CHILD)
-                form = _FORMS[0] if _field(each, "header") is not None else _FORMS[1]
-                parent = value_at(each, form[0])
-                if not (isinstance(child, str) and isinstance(parent, str)):
-                    continue
-                child, parent = child.removeprefix("/"), parent.removeprefix("/")
-                if not child or not parent or child == parent:
-                    continue
-                own_ns = time_ns if time != "header" else _stamp(each, form[1], topic, child)
-                parts = (value_at(each, path) for path in form[2:])
-                yield Transform(child, parent, own_ns, place, *parts)
+            yield from transforms_in(message, topic, time, time_ns, place)
+
+
+def transforms_in(
+    message: Any, topic: str, time: TimeSource, time_ns: int, place: Sequence[int] = ()
+) -> Iterator[Transform]:
+    """Yield the transforms of a message that is a transform, or has a list of them."""
+    if not isinstance(message, list) and (found := _field(message, _LIST)) is not None:
+        message = found
+    elif _field(message, _CHILD) is not None:
+        message = [message]
+    for each in message if isinstance(message, Iterable) else ():
+        child = _field(each, _CHILD)
+        form = _FORMS[0] if _field(each, "header") is not None else _FORMS[1]
+        parent = value_at(each, form[0])
+        if not (isinstance(child, str) and isinstance(parent, str)):
+            continue
+        child, parent = child.removeprefix("/"), parent.removeprefix("/")
+        if not child or not parent or child == parent:
+            continue
+        own_ns = time_ns if time != "header" else _stamp(each, form[1], topic, child)
+        parts = (value_at(each, path) for path in form[2:])
+        yield Transform(child, parent, own_ns, place, *parts)
 
 
 def _fields_of_one(bag: Bag, topic: str) -> list[str]:
@@ -228,7 +239,7 @@ TF = "/tf"
 PLANAR = ("x", "y", "yaw")
 
 
-class _Edge(NamedTuple):
+class Edge(NamedTuple):
     """Poses of a frame in its parent: times (M,), positions (M, 3), quaternions (M, 4) x y z w.
 
     The (M, 2) places are those of the messages; see `Bag.places`.
@@ -240,7 +251,7 @@ class _Edge(NamedTuple):
     quaternions: Floats
     is_static: bool
 
-    def at(self, rows: NDArray[np.int64]) -> _Edge:
+    def at(self, rows: NDArray[np.int64]) -> Edge:
         """Return the poses `rows`."""
         return self._replace(
             times_ns=self.times_ns[rows],
@@ -262,7 +273,7 @@ class _Poses:
         self._integers.extend((time_ns, *place))
         self._numbers.extend(pose)
 
-    def edge(self) -> _Edge:
+    def edge(self) -> Edge:
         """Return the poses in the order of recording; a pose with an invalid number is NaN."""
         integers = np.array(self._integers, np.int64).reshape(-1, 3)
         numbers = np.array(self._numbers, np.float64).reshape(-1, 7)
@@ -271,7 +282,7 @@ class _Poses:
         positions, quaternions = numbers[:, :3], unit(numbers[:, 3:])
         is_bad = ~np.isfinite(np.hstack([positions, quaternions])).all(axis=1)
         positions[is_bad], quaternions[is_bad] = np.nan, np.nan
-        return _Edge(integers[:, 0], integers[:, 1:], positions, quaternions, self.is_static)
+        return Edge(integers[:, 0], integers[:, 1:], positions, quaternions, self.is_static)
 
 
 class Transforms:
@@ -478,7 +489,7 @@ def _plain(frame: str) -> str:
 
 
 def _at(
-    edge: _Edge,
+    edge: Edge,
     steps_ns: NDArray[np.int64],
     align: str,
     tolerance_s: float | None,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.recorder.bags.bag import Failure, Stream, TopicInfo
+from mcaprl.recorder.bags.source import Definition
 from mcaprl.recorder.bags.values import ABSENT, column_of, value_at
 
 SECOND_NS = 10**9
@@ -94,6 +95,9 @@ class MemoryBag:
                 absent[name] = np.array([value is ABSENT for value in values], bool)[chosen]
             columns[name] = column[chosen]
         return Stream(self._times[topic][chosen], columns, chosen, (), absent)
+
+    def definition(self, topic: str) -> Definition:
+        return Definition(self.topics[topic].type_name, "cdr")
 
     def failures(self, topic: str) -> Iterator[Failure]:
         return iter(())

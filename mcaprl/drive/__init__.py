@@ -1,0 +1,1 @@
+"""Driving of robots by policies that were trained from their bags."""

@@ -1,0 +1,346 @@
+"""Commands of a driver, its log, and what it refuses; observations of the bags of many robots."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from numpy.typing import NDArray
+
+import mcaprl
+from mcaprl.base_policy import BasePolicy
+from mcaprl.errors import LogError, McaprlError, UsageError
+from mcaprl.recorder.bags.decoders import decoder_of
+from mcaprl.recorder.mapping.config import parse_mapping
+from mcaprl.recorder.mapping.read import read_open_bag
+from tests.drive.test_live import START_NS, TYPES, Sent, StreamBag, mappings, odom, streams
+from tests.recorder.mapping.suggest.test_suggested_robots import ROBOTS
+from tests.support.robots import FORMATS, Robot, vector
+
+MS = 10**6
+SPEED = {"speed": {"field": "/odom.twist.twist.linear.x"}}
+
+
+class Fixed(BasePolicy):
+    """Policy that selects an action by the step."""
+
+    def __init__(self, data: mcaprl.Dataset, action: Callable[[int], Any] | None = None) -> None:
+        """Store the spaces of the data."""
+        self.observation_space, self.action_space = data.observation_space, data.action_space
+        self.action_commands, self._action, self.steps = data.action_commands, action, 0
+        self.name = "fixed"
+
+    def act(self, observations: Any) -> NDArray[Any]:
+        """Return the action of this step."""
+        self.steps += 1
+        if self._action is not None:
+            return np.array([self._action(self.steps - 1)])
+        assert self.action_space is not None
+        return self.action_space.sample()[np.newaxis]
+
+
+def bag_of(*sent: Sent, types: dict[str, str] | None = None) -> StreamBag:
+    return StreamBag({**TYPES, **(types or {})}, sorted(sent, key=lambda each: each.time_ns))
+
+
+def drive(
+    action: dict[str, Any],
+    commands: list[dict[str, Any]],
+    act: Callable[[int], Any] | None = None,
+    *,
+    kind: str = "geometry_msgs/msg/Twist",
+    **tree: Any,
+) -> mcaprl.Driver:
+    """Return a driver that learned from a bag with these commands, one each 100 ms."""
+    sent = [Sent(START_NS + k * 100 * MS, "/odom", odom(k)) for k in range(len(commands) + 1)]
+    sent += [Sent(START_NS + k * 100 * MS, "/do", each) for k, each in enumerate(commands)]
+    mapping = {"clock": {"rate_hz": 10}, "observation": SPEED, "action": action, **tree}
+    bag = bag_of(*sent, types={"/do": kind})
+    data = read_open_bag(bag, parse_mapping(mapping)).dataset  # type: ignore[arg-type]
+    return mcaprl.Driver(Fixed(data, act), mapping=data.robot)
+
+
+def commanded(driver: mcaprl.Driver, steps: int) -> list[dict[str, Any]]:
+    """Return the messages of steps at 10 Hz."""
+    found = []
+    for k in range(steps):
+        now_ns = START_NS + k * 100 * MS
+        driver.push("/odom", odom(0.5), now_ns)
+        command = driver.command(now_ns)
+        assert not command.reason, command.reason
+        found.append(command.messages["/do"])
+    return found
+
+
+def linear(x: float) -> dict[str, Any]:
+    return {"linear": vector(x)}
+
+
+BOX = {"fields": ["/do.linear.x", "/do.angular.z"], "box": {"low": [-1, -2], "high": [1, 2]}}
+
+
+def test_a_box_action_is_a_whole_message() -> None:
+    driver = drive(BOX, [linear(0.5), linear(-0.5)], lambda _: np.array([0.25, -1.5], np.float32))
+    assert (driver.inputs, driver.outputs) == (
+        {"/odom": "nav_msgs/msg/Odometry"},
+        {"/do": "geometry_msgs/msg/Twist"},
+    )
+    assert driver.period_ns == 100 * MS
+    assert commanded(driver, 1) == [{"linear": vector(0.25), "angular": vector(0, 0, -1.5)}]
+    assert driver.stop == {"/do": {"linear": vector(0), "angular": vector(0)}}
+
+
+def test_actions_have_the_commands_of_the_mapping() -> None:
+    named = {"fields": ["/do.linear.x"], "actions": {"stop": [0], "go": [1.5]}}
+    driver = drive(named, [linear(0), linear(1.4)], lambda k: k)
+    assert [each["linear"]["x"] for each in commanded(driver, 2)] == [0, 1.5]
+    # The median of the logged commands in each bin, and the edge of the one without any.
+    edges = {"fields": ["/do.linear.x"], "edges": [[0.0, 2.0]]}
+    driver = drive(edges, [linear(x) for x in (-1, -3, -2, 1)], lambda k: k)
+    assert [each["linear"]["x"] for each in commanded(driver, 3)] == [-2, 1, 2]
+    own = {**edges, "representatives": [[-0.5], [0.5], [3]]}
+    driver = drive(own, [linear(x) for x in (-1, 1)], lambda k: k)
+    assert [each["linear"]["x"] for each in commanded(driver, 3)] == [-0.5, 0.5, 3]
+    with pytest.raises(UsageError, match=r"the command \[1.0\] of action 0 is that of action 1"):
+        drive({**edges, "representatives": [[1], [0.5], [3]]}, [linear(-1), linear(1)])
+
+
+def test_a_discrete_field_needs_a_stop() -> None:
+    action = {"field": "/do.data", "names": {"halt": 0, "go": 1}}
+    texts = [{"data": "halt"}, {"data": "go"}]
+    with pytest.raises(UsageError, match=r"drive\.stop: 0 does not stop the robot"):
+        drive(action, texts, kind="std_msgs/msg/String")
+    driver = drive(action, texts, lambda k: k, kind="std_msgs/msg/String", drive={"stop": "halt"})
+    assert commanded(driver, 2) == [{"data": "halt"}, {"data": "go"}]
+    assert driver.stop == {"/do": {"data": "halt"}}
+
+
+def test_joints_have_their_names_and_places() -> None:
+    action = {"fields": ["/do.position"], "names": ["knee", "hip"], "box": {"low": -1, "high": 1}}
+    logged = [{"name": ["hip", "knee"], "position": [0.1 * k, 0.2 * k]} for k in range(3)]
+    kind = "sensor_msgs/msg/JointState"
+    driver = drive(action, logged, lambda _: np.array([0.5, -0.5], np.float32), kind=kind)
+    (message,) = commanded(driver, 1)
+    assert (message["name"], message["position"]) == (["knee", "hip"], [0.5, -0.5])
+    assert message["header"]["stamp"] == {"sec": START_NS // 10**9, "nanosec": 0}
+    action = {"fields": ["/do.position[1:3]"], "box": {"low": -1, "high": 1}}
+    logged = [{"position": [0.0, 0.1 * k, 0.2 * k]} for k in range(3)]
+    driver = drive(action, logged, lambda _: np.array([0.5, -0.5], np.float32), kind=kind)
+    assert commanded(driver, 1)[0]["position"] == [0, 0.5, -0.5]
+
+
+def test_commands_are_limited() -> None:
+    limits = {"max_change": [1.0, 100.0], "low": [-0.2, -1], "high": 0.25}
+    driver = drive(BOX, [linear(0.5)] * 3, lambda k: np.array([1, -2], np.float32), drive=limits)
+    found = commanded(driver, 5)
+    # From a standstill, and by at most 0.1 in 100 ms.
+    assert np.allclose([each["linear"]["x"] for each in found], [0, 0.1, 0.2, 0.25, 0.25])
+    assert [each["angular"]["z"] for each in found] == [0, -1, -1, -1, -1]
+    with pytest.raises(UsageError, match=r"drive\.max_change has 3 entries; the command has 2"):
+        drive(BOX, [linear(0.5)] * 3, drive={"max_change": [1, 2, 3]})
+    with pytest.raises(UsageError, match=r"drive\.stop: 0 does not stop the robot"):
+        drive({**BOX, "box": {"low": 1, "high": 2}}, [linear(1.5)] * 3)
+
+
+def test_nothing_moves_before_all_inputs_are_there() -> None:
+    driver = drive(BOX, [linear(0.5)] * 3, drive={"timeout_s": 0.3})
+    waiting = driver.command(START_NS)
+    assert (waiting.reason, waiting.is_fatal) == ("speed: no message of /odom yet", False)
+    assert waiting.messages == driver.stop
+    assert driver.next_step_ns is None
+    driver.push("/odom", odom(1), START_NS + 50 * MS)
+    assert driver.next_step_ns == START_NS + 50 * MS
+    assert not driver.command(START_NS + 50 * MS).reason
+    assert driver.next_step_ns == START_NS + 150 * MS
+    assert driver.command(START_NS + 60 * MS, enabled=False).reason == "the policy is not enabled"
+    old = driver.command(START_NS + 450 * MS)
+    assert old.reason == "speed: the last message of /odom is 0.4 s old"
+    assert old.observation is not None
+    back = driver.command(START_NS)
+    assert (back.reason, back.is_fatal) == ("the clock went back by 0.45 s", True)
+
+
+def test_a_terminal_state_stops_the_robot() -> None:
+    episodes = {"terminated": "speed > 5"}
+    for restart in (False, True):
+        driver = drive(BOX, [linear(0.5)] * 3, episodes=episodes, drive={"restart": restart})
+        reasons = []
+        for k, speed in enumerate([1.0, 9.0, 1.0]):
+            driver.push("/odom", odom(speed), START_NS + k * 100 * MS)
+            reasons.append(driver.command(START_NS + k * 100 * MS).reason)
+        assert reasons[0] == ""
+        assert reasons[1] != ""
+        assert bool(reasons[2]) != restart
+    driver.begin()
+    driver.push("/odom", odom(1), START_NS)
+    assert driver.command(START_NS).reason == ""
+
+
+class Odometry:
+    """Message as of rclpy."""
+
+    __module__ = "nav_msgs.msg._odometry"
+
+    def __init__(self) -> None:
+        self.twist = SimpleNamespace(twist=SimpleNamespace(linear=SimpleNamespace(x=0.25)))
+
+    @classmethod
+    def get_fields_and_field_types(cls) -> dict[str, str]:
+        """Return the types of the fields."""
+        return {"twist": "geometry_msgs/TwistWithCovariance"}
+
+
+def test_messages_of_all_libraries() -> None:
+    driver = drive(BOX, [linear(0.5)] * 3)
+    each = driver.definitions["/odom"]
+    decoder = decoder_of(each.encoding, each.type_name, each.schema_encoding, each.schema)
+    data = decoder.encode(odom(0.25))
+    rospy = SimpleNamespace(_type="nav_msgs/Odometry", twist=Odometry().twist)
+    for k, message in enumerate([odom(0.25), data, decoder.decode(data), Odometry(), rospy]):
+        driver.push("/odom", message, START_NS + k * MS)
+        assert driver.command(START_NS + k * MS).observation.tolist() == [0.25]
+    twist = SimpleNamespace(_type="geometry_msgs/Twist")
+    for wrong, text in [
+        (twist, "/odom has messages of geometry_msgs/Twist, but the mapping needs nav_msgs/msg"),
+        ({"pose": 1}, r"a message of /odom \(nav_msgs/msg/Odometry\) has no field twist.twist"),
+        (b"\0\1\0\0abc", "/odom: cannot decode 7 bytes as nav_msgs/msg/Odometry"),
+    ]:
+        with pytest.raises(UsageError, match=text):
+            driver.push("/odom", wrong, START_NS)
+    with pytest.raises(UsageError, match="/imu is not needed; topics: /odom"):
+        driver.push("/imu", {}, START_NS)
+
+
+def test_bad_numbers_and_sizes_are_fatal() -> None:
+    driver = drive(BOX, [linear(0.5)] * 3, lambda _: np.array([math.nan, 0], np.float32))
+    driver.push("/odom", odom(1), START_NS)
+    command = driver.command(START_NS)
+    assert (command.reason, command.is_fatal) == ("the policy's action is not finite", True)
+    assert command.messages == driver.stop
+    image = {"height": 2, "width": 3, "step": 3, "encoding": "mono8", "data": [1] * 6}
+    sent = [Sent(START_NS + k * 100 * MS, "/camera", image) for k in range(3)]
+    sent += [Sent(START_NS, "/cmd", linear(0.5))]
+    mapping = {"clock": {"rate_hz": 10}, "observation": {"camera": {"image": "/camera"}}}
+    tree = {**mapping, "action": {"fields": ["/cmd.linear.x"], "box": {"low": -1, "high": 1}}}
+    data = read_open_bag(bag_of(*sent), parse_mapping(tree)).dataset  # type: ignore[arg-type]
+    driver = mcaprl.Driver(Fixed(data), mapping=data.robot)
+    driver.push("/camera", {**image, "width": 2, "step": 2, "data": [1] * 4}, START_NS)
+    command = driver.command(START_NS)
+    assert command.is_fatal
+    assert "/camera has an image of (2, 2, 1)" in command.reason
+
+
+def episodes_of(data: mcaprl.Dataset) -> list[Any]:
+    return [each._replace(policy="", epsilon=0.0) for each in data._transitions.episodes]
+
+
+def assert_equal(own: mcaprl.Dataset, raw: mcaprl.Dataset) -> None:
+    """Check that a log equals what its topics give by the mapping."""
+    for name in ("log_time_ns", "actions", "rewards", "terminated", "truncated"):
+        one, other = (getattr(each._transitions, name) for each in (own, raw))
+        np.testing.assert_array_equal(one, other, name)
+    for one, other in zip(own._transitions.frames, raw._transitions.frames, strict=True):
+        np.testing.assert_array_equal(np.asarray(one[:]), np.asarray(other[:]))
+    assert episodes_of(own) == episodes_of(raw)
+    assert own.observation_names == raw.observation_names
+    assert own.action_labels == raw.action_labels
+
+
+REWARD = "next(total) - total + 10 * terminated"
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+@given(sent=streams(), tree=mappings())
+def test_the_log_equals_what_its_topics_give(
+    sent: list[Sent], tree: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    tree["fields"]["total"]["missing"] = 0
+    tree = {**tree, "reward": REWARD, "drive": {"restart": True}}
+    # A value that is missing for a while may turn out to be in a gap only later.
+    for name, quantity in tree["observation"].items():
+        if "missing" not in quantity:
+            tree["observation"][name] = {**quantity, "tolerance_s": None}
+    path = tmp_path_factory.mktemp("drive") / "drive.mcap"
+    bag = StreamBag(TYPES, sent)
+    try:
+        data = read_open_bag(bag, parse_mapping(tree)).dataset  # type: ignore[arg-type]
+        driver = mcaprl.Driver(Fixed(data), mapping=data.robot)
+    except (LogError, UsageError):
+        return
+    driver.record(path)
+    for k, each in enumerate(bag.sent):
+        while (next_ns := driver.next_step_ns) is not None and next_ns < each.time_ns:
+            driver.command(next_ns)
+        if each.topic not in driver.inputs:
+            continue
+        driver.push(each.topic, each.message, each.time_ns)
+        later = bag.sent[k + 1 :]
+        if each.topic == driver.clock_topic and not (later and later[0].time_ns == each.time_ns):
+            driver.command(each.time_ns)
+    driver.close()
+    try:
+        raw = mcaprl.open(path, mapping=tree)
+    except McaprlError:
+        return
+    assert_equal(mcaprl.open(path), raw)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_bags_of_many_robots(name: str, tmp_path: Path) -> None:
+    form = list(FORMATS)[list(ROBOTS).index(name) % len(FORMATS)]
+    robot: Robot = ROBOTS[name]()
+    bag = FORMATS[form](robot, tmp_path / "robot.mcap")
+    mapping = tmp_path / "robot.yaml"
+    try:
+        mapping.write_text(mcaprl.suggest_mapping(bag))
+        data = mcaprl.open(bag, mapping=mapping)
+        driver = mcaprl.Driver(Fixed(data), mapping=data.robot)
+    except McaprlError as error:
+        pytest.skip(str(error))
+    assert compared(driver, bag, data) == len(data._transitions.log_time_ns)
+
+
+def compared(driver: mcaprl.Driver, bag: Path, data: mcaprl.Dataset) -> int:
+    """Compare all observations of a bag, and return their number."""
+    times = data._transitions.log_time_ns.tolist()
+    rows = dict(zip(times, range(len(times)), strict=True))
+    found = 0
+    with mcaprl.open_bag(bag) as opened:
+        messages = list(opened.messages(list(driver.inputs)))
+    assert [each.log_time_ns for each in messages] == sorted(each.log_time_ns for each in messages)
+    steps = iter(times)
+    now_ns = next(steps)
+    for k, each in enumerate(messages):
+        while now_ns < each.log_time_ns and driver.clock_topic is None:
+            found += check(driver.command(now_ns), data, rows[now_ns])
+            now_ns = next(steps, sys.maxsize)
+        driver.push(each.topic, each.message, each.log_time_ns, each.publish_time_ns)
+        if each.topic == driver.clock_topic:
+            # Messages with the time of the step that were recorded after it belong to it.
+            for other in messages[k + 1 :]:
+                if other.log_time_ns > each.log_time_ns or other.topic == each.topic:
+                    break
+                driver.push(other.topic, other.message, other.log_time_ns)
+            command = driver.command(each.log_time_ns)
+            if command.time_ns in rows:
+                found += check(command, data, rows[command.time_ns])
+    while now_ns < sys.maxsize and driver.clock_topic is None:
+        found += check(driver.command(now_ns), data, rows[now_ns])
+        now_ns = next(steps, sys.maxsize)
+    return found
+
+
+def check(command: Any, data: mcaprl.Dataset, row: int) -> int:
+    seen = command.observation
+    assert seen is not None, command.reason
+    parts = seen if isinstance(seen, dict) else {"": seen}
+    for leaf, column in zip(data._leaves, data._transitions.frames, strict=True):
+        np.testing.assert_array_equal(parts["".join(leaf.path)], np.asarray(column[row]))
+    return 1

@@ -1,0 +1,274 @@
+"""Observations of a running robot equal those of its bag, bit for bit, at every step."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from mcaprl.errors import LogError, UsageError
+from mcaprl.recorder.mapping.config import Place, parse_mapping
+from mcaprl.recorder.mapping.live import STATE, LiveEpisodes, LiveSteps
+from mcaprl.recorder.mapping.plan import Plan
+from mcaprl.recorder.mapping.read import read_open_bag
+from mcaprl.recorder.mapping.robot import Robot
+from mcaprl.recorder.mapping.steps import StepReader
+from tests.support.stream_bag import Sent, StreamBag
+
+TYPES = {
+    "/odom": "nav_msgs/msg/Odometry",
+    "/joints": "sensor_msgs/msg/JointState",
+    "/scan": "sensor_msgs/msg/LaserScan",
+    "/mode": "std_msgs/msg/String",
+    "/goal": "geometry_msgs/msg/Vector3",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/camera": "sensor_msgs/msg/Image",
+    "/tick": "std_msgs/msg/Header",
+    "/cmd": "geometry_msgs/msg/Twist",
+}
+START_NS, MS = 1_700_000_000 * 10**9, 10**6
+GAP_S = 2.0
+
+numbers = st.floats(-1e3, 1e3, width=32)
+odd = st.one_of(*[numbers] * 6, st.sampled_from([math.nan, math.inf, -math.inf]))
+NAMES = ("hip", "knee", "foot")
+
+
+def stamp(time_ns: int) -> dict[str, Any]:
+    return {"stamp": {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}}
+
+
+@st.composite
+def contents(draw: st.DrawFn, topic: str, time_ns: int) -> dict[str, Any]:
+    """Return a message; its header is up to 30 ms older than its log_time."""
+    header = stamp(time_ns - draw(st.integers(0, 30)) * MS)
+    match topic:
+        case "/odom":
+            q = dict(zip("xyzw", draw(st.tuples(*[st.floats(-1, 1, width=32)] * 4)), strict=True))
+            twist = {"twist": {"linear": {"x": draw(odd)}}}
+            return {"header": header, "twist": twist, "pose": {"pose": {"orientation": q}}}
+        case "/joints":
+            names = draw(st.permutations(NAMES))[: draw(st.integers(1, 3))]
+            position = [draw(numbers) for _ in names]
+            return {"header": header, "name": names, "position": position}
+        case "/scan":
+            return {"header": header, "ranges": draw(st.lists(odd, max_size=9))}
+        case "/mode":
+            return {"data": draw(st.sampled_from(["drive", "drive", "park"]))}
+        case "/goal":
+            return {"x": draw(numbers), "y": draw(odd), "z": 0.0}
+        case "/tf" | "/tf_static":
+            parent, child = ("base", "cam") if topic == "/tf_static" else ("map", "base")
+            rotation = dict(zip("xyzw", draw(st.tuples(*[numbers] * 4)), strict=True))
+            translation = {"x": draw(numbers), "y": draw(numbers), "z": draw(odd)}
+            each = {"translation": translation, "rotation": rotation}
+            one = {"header": {**header, "frame_id": parent}, "child_frame_id": child}
+            return {"transforms": [{**one, "transform": each}]}
+        case "/camera":
+            data = draw(st.binary(min_size=6, max_size=6))
+            # Some images are damaged.
+            width = 3 if draw(st.integers(0, 4)) else 4
+            sizes = {"height": 2, "width": width, "step": 3}
+            return {"header": header, **sizes, "encoding": "mono8", "data": list(data)}
+        case "/cmd":
+            return {"linear": {"x": draw(numbers)}}
+    return header
+
+
+@st.composite
+def streams(draw: st.DrawFn) -> list[Sent]:
+    """Return messages of all topics, with gaps, in the order of recording."""
+    found = [Sent(START_NS, topic, draw(contents(topic, START_NS))) for topic in TYPES]
+    time_ns = START_NS
+    for _ in range(draw(st.integers(3, 12))):
+        pause = draw(st.sampled_from([50, 120, 400, 400, 2500])) * MS
+        for topic in [*draw(st.lists(st.sampled_from(list(TYPES)), max_size=4)), "/odom", "/tick"]:
+            time_ns += draw(st.sampled_from([0, 1, 7])) * MS
+            found.append(Sent(time_ns, topic, draw(contents(topic, time_ns))))
+        time_ns += pause
+    return found
+
+
+QUANTITIES: dict[str, dict[str, Any]] = {
+    "speed": {"field": "/odom.twist.twist.linear.x", "clip": [-500, 500], "scale": 0.1},
+    "yaw": {"field": "/odom.pose.pose.orientation", "as": "yaw", "missing": 0},
+    "late": {"field": "/odom.twist.twist.linear.x", "tolerance_s": 0.2, "missing": -1},
+    "joints": {"field": "/joints.position", "names": ["knee", "hip"], "missing": 5},
+    "foot": {"field": "/joints.position", "names": "foot", "wrap_angle": True, "missing": 0},
+    "first": {"field": "/scan.ranges[0]", "missing": 9, "clip": [0, 10]},
+    "sectors": {"field": "/scan.ranges", "pool": "min", "to": 3, "missing": 9},
+    "padded": {"field": "/scan.ranges[1:]", "pad": 4, "missing": -2, "offset": 1},
+    "goal": {"field": "/goal.x", "tolerance_s": 0.5, "missing": 0},
+    "side": {"field": "/goal.y"},
+    "count": {"field": "/goal", "as": "count"},
+    "pose": {"transform": "cam", "in": "map", "parts": ["x", "yaw", "qw"], "missing": 0},
+    "place": {"transform": "base", "in": "map"},
+    "camera": {"image": "/camera"},
+    "small": {"image": "/camera", "resize": [2, 1], "tolerance_s": 1.0},
+}
+
+
+@st.composite
+def mappings(draw: st.DrawFn) -> dict[str, Any]:
+    observed = draw(
+        st.lists(st.sampled_from(list(QUANTITIES)), min_size=1, max_size=5, unique=True)
+    )
+    clock = draw(
+        st.sampled_from(
+            [{"rate_hz": 4}, {"topic": "/tick", "time": "log_time"}, {"topic": "/odom"}]
+        )
+    )
+    episodes: dict[str, Any] = {"gap_s": GAP_S, "min_steps": 1}
+    if draw(st.booleans()):
+        episodes["terminated"] = "mode == 'park' and total > 0"
+    if draw(st.booleans()):
+        episodes["begin"] = "total > 0 and mode == 'drive'"
+    if draw(st.booleans()):
+        episodes["max_steps"] = draw(st.integers(1, 4))
+    return {
+        "clock": clock,
+        "time": "log_time",
+        "observation": {name: QUANTITIES[name] for name in observed},
+        "stack": draw(st.integers(1, 3)),
+        "fields": {
+            "mode": {"field": "/mode.data"},
+            "total": {"field": "/odom.twist.twist.linear.x"},
+        },
+        "action": {"fields": ["/cmd.linear.x"], "box": {"low": -1000, "high": 1000}},
+        "episodes": episodes,
+    }
+
+
+def sent_until(bag: StreamBag, time_ns: int, live: LiveSteps, at: int, clock: str | None) -> int:
+    """Push the messages up to a step; of equal times, those before the next one of the clock."""
+    ticks = 0
+    while at < len(bag.sent) and bag.sent[at].time_ns <= time_ns:
+        each = bag.sent[at]
+        ticks += each.topic == clock
+        if ticks > 1 and live.clock_ns == time_ns:
+            break
+        live.push(each.topic, each.message, each.time_ns)
+        at += 1
+    return at
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+@given(streams(), mappings())
+def test_every_step_equals_that_of_the_bag(sent: list[Sent], tree: dict[str, Any]) -> None:
+    bag, mapping = StreamBag(TYPES, sent), parse_mapping(tree)
+    try:
+        dataset = read_open_bag(bag, mapping).dataset  # type: ignore[arg-type]
+    except (LogError, UsageError):
+        return
+    frames = dict(zip(dataset._transitions.log_time_ns.tolist(), range(10**6), strict=False))
+    plan = Plan(bag, mapping, Place(), trust_code=False)  # type: ignore[arg-type]
+    for name, reader in plan.images.items():
+        times = bag.times("/camera")
+        list(reader._images(np.arange(len(times))))
+        plan.streams[plan.quantities[name].stream].leave_out(reader.failures)
+    (steps,) = [StepReader(plan).read(0)]
+    robot = Robot.from_json(dataset.robot, "robot")
+    live = LiveSteps(Plan(bag, robot.mapping, Place(), trust_code=False), robot.shapes)  # type: ignore[arg-type]
+    episodes, at, compared = LiveEpisodes(live._plan), 0, 0
+    for row, time_ns in enumerate(steps.times_ns.tolist()):
+        at = sent_until(bag, time_ns, live, at, mapping.clock.topic)
+        step = live.step(time_ns)
+        for name, values in steps.quantities.items():
+            found = step.quantities[name]
+            if name not in plan.images:
+                np.testing.assert_array_equal(found.values[0], values.values[row], name)
+            np.testing.assert_array_equal(found.age_s[0], values.age_s[row], name)
+            assert found.missing[0] == values.missing[row], name
+        state = episodes.see(step, acts=True)
+        if time_ns in frames:
+            compared += 1
+            place = frames[time_ns]
+            seen = (
+                state.observation
+                if isinstance(state.observation, dict)
+                else {"": state.observation}
+            )
+            for leaf, column in zip(dataset._leaves, dataset._transitions.frames, strict=True):
+                part = seen["".join(leaf.path)]
+                assert part.dtype == column.dtype
+                np.testing.assert_array_equal(part, column[place])
+    assert compared == len(frames)
+
+
+def plan_of(observation: dict[str, Any], **tree: Any) -> Plan:
+    mapping = {
+        "clock": {"rate_hz": 10},
+        "observation": observation,
+        "action": {"fields": ["/cmd.linear.x"], "box": {"low": -1, "high": 1}},
+        **tree,
+    }
+    return Plan(StreamBag(TYPES, []), parse_mapping(mapping), Place(), trust_code=False)  # type: ignore[arg-type]
+
+
+SPEED = {"speed": {"field": "/odom.twist.twist.linear.x"}}
+
+
+@pytest.mark.parametrize("align", ["nearest", "linear"])
+def test_looking_ahead_is_refused(align: str) -> None:
+    plan = plan_of({"speed": {**SPEED["speed"], "align": align}})
+    with pytest.raises(UsageError, match=f"speed.align: `{align}` looks ahead"):
+        LiveSteps(plan)
+
+
+def test_a_stack_whose_episode_begins_late_is_refused() -> None:
+    plan = plan_of(SPEED, stack=2, episodes={"begin": "next(speed) > speed"})
+    with pytest.raises(UsageError, match=r"episodes\.begin: `next` looks ahead"):
+        LiveEpisodes(plan)
+    assert LiveEpisodes(plan_of(SPEED, episodes={"begin": "next(speed) > speed"})).is_late
+
+
+def odom(speed: float) -> dict[str, Any]:
+    return {"twist": {"twist": {"linear": {"x": speed}}}}
+
+
+def test_why_there_is_no_observation() -> None:
+    live = LiveSteps(plan_of(SPEED, episodes={"gap_s": 1.0}))
+    assert live.step(START_NS).reason == "speed: no message of /odom yet"
+    live.push("/odom", odom(0.5), START_NS + 100 * MS)
+    step = live.step(START_NS + 200 * MS)
+    assert step.reason == ""
+    assert step.frame is not None
+    assert step.frame[STATE].tolist() == [0.5]
+    late = live.step(START_NS + 1500 * MS)
+    assert late.reason == "speed: the last message of /odom is 1.4 s old"
+    assert not late.is_fatal
+    live.push("/odom", odom(math.nan), START_NS + 1600 * MS)
+    nothing = live.step(START_NS + 1700 * MS)
+    assert nothing.reason == "speed of /odom has no number, or one that is not finite"
+    assert nothing.is_fatal
+    assert nothing.gap_before
+    live.push("/odom", odom(0.0), START_NS + 9000 * MS)
+    assert live.step(START_NS + 8800 * MS).reason.startswith("speed: the last message of /odom is")
+
+
+def test_a_clock_that_goes_back_drops_all_messages() -> None:
+    live = LiveSteps(plan_of(SPEED, episodes={"gap_s": 1.0}))
+    live.push("/odom", odom(0.5), START_NS + 5000 * MS)
+    live.push("/odom", odom(0.5), START_NS)
+    step = live.step(START_NS + 5100 * MS)
+    assert (step.reason, step.is_fatal) == ("the clock of /odom went back by 5 s", True)
+    assert live.step(START_NS + 5200 * MS).reason == "speed: no message of /odom yet"
+    assert live.step(START_NS + 5200 * MS).reason == "the clock went back by 0 s"
+
+
+def test_memory_is_bounded() -> None:
+    live = LiveSteps(plan_of({**SPEED, "camera": {"image": "/camera"}}))
+    image = {"height": 1, "width": 1, "step": 1, "encoding": "mono8", "data": [7]}
+    for k in range(5000):
+        live.push("/odom", odom(k), START_NS + k)
+        live.push("/camera", image, START_NS + k)
+    assert max(len(each._pending) for each in live._streams.values()) <= 1000
+    assert len(live._streams["/camera"]._pending) <= 16
+    step = live.step(START_NS + 5000)
+    assert step.frame is not None
+    assert step.frame[STATE].tolist() == [4999]
