@@ -121,7 +121,9 @@ class Quantity(_Part):
     )
     to: _Count | None = Field(default=None, description="Number of sectors of `pool`.")
     image: str | None = Field(
-        default=None, description="Topic of Image or CompressedImage messages."
+        default=None,
+        description="Topic of images (Image, CompressedImage) or of a video (CompressedVideo,"
+        " FFMPEGPacket).",
     )
     transform: str | None = Field(
         default=None,
