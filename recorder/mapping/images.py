@@ -48,6 +48,7 @@ from mcaprl.recorder.dataset.images import (
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.format.schema import IMAGES_PER_CHUNK
 from mcaprl.recorder.format.spaces import IMAGE_ENCODINGS, MAX_ELEMENTS, Leaf
+from mcaprl.recorder.mapping.calibration import Calibration, Rectifier
 from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.image_pixels import (
     Pixels,
@@ -76,14 +77,17 @@ class ImageOptions:
             are; empty if there were none.
     """
 
-    def __init__(self, topic: str, quantity: Quantity) -> None:
+    def __init__(
+        self, topic: str, quantity: Quantity, calibration: Calibration | None = None
+    ) -> None:
         """Store the options; `topic` is for error messages."""
         self._topic, self._quantity = topic, quantity
+        self._rectifier = None if calibration is None else Rectifier(calibration)
         self.ambiguous = ""
 
     def to_json(self) -> str:
         """Return the options that determine the pixels."""
-        names = {"crop", "resize", "gray", "range_m", "range", "as_"}
+        names = {"undistort", "crop", "resize", "gray", "range_m", "range", "as_"}
         return self._quantity.model_dump_json(include=names)
 
     def space(self, images: Frames) -> spaces.Box:
@@ -99,6 +103,8 @@ class ImageOptions:
         image, is_number = pixels.image, pixels.units_per_m > 0
         if is_number:
             image = _meters(image, pixels.units_per_m) if is_depth else _finite(image)
+        if self._rectifier is not None:
+            image = self._rectifier.rectified(np.asarray(image), nearest=is_depth)
         if quantity.crop is not None:
             image = self._cropped(image, *quantity.crop)
         if quantity.resize is not None:
@@ -181,7 +187,7 @@ def _resized(image: Any, width: int, height: int, *, is_depth: bool) -> Any:
     return image.resize((width, height), method)
 
 
-_VERSION = "1"
+_VERSION = "2"
 """Version of the decoders. It changes if they decode the same message to other pixels."""
 _FAILURES = "failures"
 _COPIED_BYTES = 1 << 20
@@ -338,13 +344,15 @@ class ImageReader:
     ) -> None:
         """Find out whether the images are raw, compressed, or frames of a video."""
         self.bag, self.topic, self.name = bag, topic, name
-        self.options, self._strict = ImageOptions(topic, quantity), strict
+        calibration = quantity.undistort and Calibration.of(bag, quantity.undistort)
+        self.options, self._strict = ImageOptions(topic, quantity, calibration or None), strict
         self._fields, is_stream = _image_fields(bag, bag.topics[topic])
         self.failures: dict[int, Failure] = {}
         self._video: VideoStream | None = None
         if is_stream:
             # A frame is averaged as it is decoded, unless a part of it is wanted.
-            self._converter = Converter(quantity.resize if quantity.crop is None else None)
+            is_whole = quantity.crop is None and calibration is None
+            self._converter = Converter(quantity.resize if is_whole else None)
             files = np.array(bag.recordings)[bag.places(topic)[:, 0]]
             begins = np.flatnonzero(np.diff(files, prepend=-1))
             self._video = VideoStream(self._packets, begins, bag.times(topic))
@@ -519,8 +527,12 @@ class ImageReader:
                 if row in wanted or not self._strict:
                     self._leave_out(row, frame)
             elif row in wanted:
-                pixels = Pixels(self._converter.pixels(frame), "video")
-                yield row, self.options.applied(pixels)
+                try:
+                    image = self.options.applied(Pixels(self._converter.pixels(frame), "video"))
+                except LogError as error:
+                    self._leave_out(row, str(error))
+                    continue
+                yield row, image
 
     def _packets(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, Message]]:
         """Yield the packets of a video."""

@@ -63,7 +63,7 @@ def frames(name: str, count: int = 40, width: int = 64, height: int = 48) -> lis
 @lru_cache(maxsize=32)
 def _stream(name: str, count: int, width: int, height: int) -> tuple[list[bytes], list[Any]]:
     encoder, decoder, options = _CODECS[name]
-    context = av.CodecContext.create(encoder, "w")
+    context: Any = av.CodecContext.create(encoder, "w")
     context.width, context.height, context.pix_fmt = width, height, "yuv420p"
     context.time_base, context.framerate = Fraction(1, 30), Fraction(30)
     context.gop_size, context.max_b_frames = GROUP, 2 if "B-frames" in name else 0
@@ -75,7 +75,7 @@ def _stream(name: str, count: int, width: int, height: int) -> tuple[list[bytes]
         found += context.encode(frame)
     found += context.encode(None)
     stream = [bytes(each) for each in found]
-    context, decoded = av.CodecContext.create(decoder, "r"), {}
+    context, decoded = av.CodecContext.create(decoder, "r"), dict[int, Any]()
     for row, data in enumerate(stream):
         packet = av.Packet(data)
         packet.pts = row
