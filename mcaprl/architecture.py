@@ -1,10 +1,12 @@
 """Architecture of networks, and the settings that select it. Importing this module loads no torch.
 
-Two encoders of images are available, which `ENCODERS` describes. `nature` has the convolutions of
+Three encoders of images are available, which `ENCODERS` describes. `nature` has the convolutions of
 "Human-level control through deep reinforcement learning" (https://doi.org/10.1038/nature14236).
 `compact` first averages squares of pixels, so that the image's shorter edge has about 42 pixels; it
 has two small convolutions. A gradient step with `compact` takes a fraction of the time of a step
-with `nature`. Images that are too small for both have the convolutions of `SMALL`.
+with `nature`. `small` has two convolutions of 3 x 3 pixels, for grids of cells; images that are
+too small for the others, with an edge of 8 to 35 pixels, always have it. Arrays with a smaller
+edge, such as the 7 x 7 cells of MiniGrid, are numbers of the vector: all layers see every cell.
 """
 
 from __future__ import annotations
@@ -52,11 +54,12 @@ class Encoder:
 ENCODERS: Final[dict[str, Encoder]] = {
     "nature": Encoder((32, 64, 64), ((8, 4), (4, 2), (3, 1))),
     "compact": Encoder((16, 32), ((4, 4), (3, 2)), edge=42),
+    "small": Encoder((16, 32), ((3, 1), (3, 2))),
 }
-SMALL: Final = Encoder((16, 32), ((3, 1), (3, 2)))
-"""Encoder of images with an edge of fewer than `SMALL_EDGE` pixels, such as grids of cells."""
+_DEFAULTS: Final = ("nature", "compact")
+"""Encoders that `auto` chooses from for images that are not small."""
 SMALL_EDGE: Final = 36
-"""Smallest edge in pixels for which the output of all convolutions in `ENCODERS` is not empty."""
+"""Edge in pixels below which the encoder is `small`: the output of the others would be empty."""
 
 
 def choose_encoder(name: str, widths: Sequence[int], channels: Iterable[int]) -> str:
@@ -64,7 +67,7 @@ def choose_encoder(name: str, widths: Sequence[int], channels: Iterable[int]) ->
     if name != AUTO:
         return name
     if widths:
-        counts = {len(encoder.kernels): key for key, encoder in ENCODERS.items()}
+        counts = {len(ENCODERS[key].kernels): key for key in _DEFAULTS}
         return counts[len(widths)]
     return "compact" if all(count == 1 for count in channels) else "nature"
 
@@ -93,7 +96,7 @@ class Architecture:
     def encoder_of(self, image_shape: Sequence[int]) -> Encoder:
         """Return the encoder for an image (height, width, ...), with its output channels."""
         is_small = min(image_shape[:2]) < SMALL_EDGE
-        encoder = SMALL if is_small else ENCODERS[self.encoder]
+        encoder = ENCODERS["small" if is_small else self.encoder]
         channels = self.channels[: len(encoder.kernels)] or encoder.channels
         return replace(encoder, channels=channels)
 
@@ -122,9 +125,10 @@ class NetworkSettings(Settings):
     """
 
     encoder: str = AUTO
-    """convolutions over images: nature, compact, or auto (compact for images with one channel)"""
+    """convolutions over images: nature, compact, small, or auto (small for an edge below 36 pixels,
+    compact for one channel)"""
     channels: tuple[int, ...] = ()
-    """output channels of the convolutions; by default, nature has 32,64,64 and compact 16,32"""
+    """output channels of the convolutions; by default, nature has 32,64,64, the others 16,32"""
     center_images: bool = True
     """subtract the mean image, and divide by the standard deviation of all pixels"""
     layer_norm: bool = False

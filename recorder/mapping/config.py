@@ -121,7 +121,9 @@ class Quantity(_Part):
     )
     to: _Count | None = Field(default=None, description="Number of sectors of `pool`.")
     image: str | None = Field(
-        default=None, description="Topic of Image or CompressedImage messages."
+        default=None,
+        description="Topic of images (Image, CompressedImage) or of a video (CompressedVideo,"
+        " FFMPEGPacket).",
     )
     transform: str | None = Field(
         default=None,
@@ -172,6 +174,11 @@ class Quantity(_Part):
         description="Lowest and highest value. Infinite values are clipped, too; NaN is missing.",
     )
     wrap_angle: bool = Field(default=False, description="Whether to wrap radians into [-pi, pi).")
+    undistort: str | None = Field(
+        default=None,
+        description="Topic of the camera's calibration (CameraInfo, foxglove.CameraCalibration), by"
+        " which images are rectified before all else, as by `image_proc`.",
+    )
     crop: tuple[int, int, _Count, _Count] | None = Field(
         default=None, description="Left, top, width and height of the cropped image, pixels."
     )
@@ -194,7 +201,7 @@ class Quantity(_Part):
         given = [name for name in ("field", "image", "transform") if getattr(self, name)]
         if len(given) != 1:
             raise ValueError("give one of field, image and transform")
-        for name in ("crop", "resize", "range_m", "range", "gray"):
+        for name in ("undistort", "crop", "resize", "range_m", "range", "gray"):
             if getattr(self, name) and given != ["image"]:
                 raise ValueError(f"{name} is for images only")
         if self.as_ is not None and (self.as_ in ("depth", "intensity")) != (given == ["image"]):

@@ -176,7 +176,9 @@ class _Draft:
         )
         try:
             reader = ImageReader(self._bag, topic.info.name, mapping.observation["camera"])
-            return reader.read(np.array([0])) is not None
+            # The first packets of a video may not be readable.
+            first = next(row for row in range(topic.info.count) if row not in reader.failures)
+            return reader.read(np.array([first])) is not None
         except (LogError, UsageError):
             return False
 

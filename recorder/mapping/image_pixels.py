@@ -21,12 +21,13 @@ from __future__ import annotations
 
 import re
 import struct
+import warnings
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError
+from mcaprl.errors import LogError, import_extra
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.images import FORMATS, decoded_file
 from mcaprl.texts import shortened
@@ -351,7 +352,7 @@ def compressed_pixels(kind: str, data: bytes) -> Pixels:
     encoding = kind.split(";")[0].strip().lower()
     if "compresseddepth" in kind.lower():
         return _depth(kind, encoding, data)
-    image = decoded_file(data, "bags", formats=FORMATS)
+    image = _upright(decoded_file(data, "bags", formats=FORMATS))
     if image.mode in ("I", "F") or image.mode.startswith("I;16"):
         units = 1.0 if image.mode == "F" else MM_PER_M
         return Pixels(np.asarray(image), kind, units, is_certain=encoding in CERTAIN_DEPTH)
@@ -359,6 +360,19 @@ def compressed_pixels(kind: str, data: bytes) -> Pixels:
     # Do not convert an image that has this mode, because the conversion would copy it.
     found = image if image.mode == wanted else image.convert(wanted)
     return Pixels(found, kind, has_lost_depth=encoding in UNITS_PER_M)
+
+
+def _upright(image: Any) -> Any:
+    """Turn a photo as its EXIF data say, which OpenCV's decoder does as well."""
+    if "exif" not in image.info:
+        return image
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return import_extra("PIL.ImageOps", "bags").exif_transpose(image)
+    # Pillow raises errors of many types for damaged EXIF data, which other readers ignore.
+    except Exception:
+        return image
 
 
 def _depth(kind: str, encoding: str, data: bytes) -> Pixels:

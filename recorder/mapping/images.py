@@ -19,7 +19,9 @@ import hashlib
 import json
 import math
 import shutil
+from collections import Counter
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +48,7 @@ from mcaprl.recorder.dataset.images import (
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.format.schema import IMAGES_PER_CHUNK
 from mcaprl.recorder.format.spaces import IMAGE_ENCODINGS, MAX_ELEMENTS, Leaf
+from mcaprl.recorder.mapping.calibration import Calibration, Rectifier
 from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.image_pixels import (
     Pixels,
@@ -54,9 +57,13 @@ from mcaprl.recorder.mapping.image_pixels import (
     one_line,
     raw_pixels,
 )
+from mcaprl.recorder.mapping.video import Converter, Message, VideoStream
 from mcaprl.texts import counted, size
 
 Image = NDArray[Any]
+
+Decoded = Iterator[tuple[int, Image]]
+"""Messages with readable images: index in the topic, and pixels."""
 
 _GRAY_WEIGHTS = np.array([0.299, 0.587, 0.114])
 """ITU-R BT.601 weights of red, green and blue."""
@@ -70,14 +77,17 @@ class ImageOptions:
             are; empty if there were none.
     """
 
-    def __init__(self, topic: str, quantity: Quantity) -> None:
+    def __init__(
+        self, topic: str, quantity: Quantity, calibration: Calibration | None = None
+    ) -> None:
         """Store the options; `topic` is for error messages."""
         self._topic, self._quantity = topic, quantity
+        self._rectifier = None if calibration is None else Rectifier(calibration)
         self.ambiguous = ""
 
     def to_json(self) -> str:
         """Return the options that determine the pixels."""
-        names = {"crop", "resize", "gray", "range_m", "range", "as_"}
+        names = {"undistort", "crop", "resize", "gray", "range_m", "range", "as_"}
         return self._quantity.model_dump_json(include=names)
 
     def space(self, images: Frames) -> spaces.Box:
@@ -93,6 +103,8 @@ class ImageOptions:
         image, is_number = pixels.image, pixels.units_per_m > 0
         if is_number:
             image = _meters(image, pixels.units_per_m) if is_depth else _finite(image)
+        if self._rectifier is not None:
+            image = self._rectifier.rectified(np.asarray(image), nearest=is_depth)
         if quantity.crop is not None:
             image = self._cropped(image, *quantity.crop)
         if quantity.resize is not None:
@@ -175,7 +187,7 @@ def _resized(image: Any, width: int, height: int, *, is_depth: bool) -> Any:
     return image.resize((width, height), method)
 
 
-_VERSION = "1"
+_VERSION = "2"
 """Version of the decoders. It changes if they decode the same message to other pixels."""
 _FAILURES = "failures"
 _COPIED_BYTES = 1 << 20
@@ -183,7 +195,7 @@ _COPIED_BYTES = 1 << 20
 
 
 def copied_images(
-    reader: ImageReader, rows: NDArray[np.int64], like: NDArray[Any]
+    reader: ImageReader, rows: NDArray[np.int64], like: NDArray[Any], images: Decoded
 ) -> MappedImages | None:
     """Return the images of messages from the copy on disk; write the copy if needed.
 
@@ -191,6 +203,7 @@ def copied_images(
         reader: Reader of the topic.
         rows: (N,) ascending positions of the messages in the topic.
         like: One of the images.
+        images: The images of `rows`, which are decoded only if the copy is written.
 
     Returns:
         (N, H, W, C) images; None if one cannot be decoded.
@@ -207,7 +220,7 @@ def copied_images(
     }
     found = _existing(reader, open_cache(path, description), leaf, rows)
     if found is None:
-        _write(reader, path, description, leaf, rows)
+        _write(reader, path, description, leaf, len(rows), images)
         found = _existing(reader, open_cache(path, description), leaf, rows)
     if found is None:
         raise LogError(f"{path} was changed by another process: try again")
@@ -250,10 +263,11 @@ def _write(
     path: Path,
     description: dict[str, str],
     leaf: Leaf,
-    rows: NDArray[np.int64],
+    count: int,
+    images: Decoded,
 ) -> None:
     image_bytes = leaf.size * leaf.dtype.itemsize
-    needed, notes = len(rows) * image_bytes, dict[str, str]()
+    needed, notes = count * image_bytes, dict[str, str]()
     remedy = "set `resize`, `crop` or a lower rate in the mapping, or images='memory'"
     try:
         free = shutil.disk_usage(path.parent).free
@@ -267,7 +281,7 @@ def _write(
     most = max(1, min(IMAGES_PER_CHUNK, _COPIED_BYTES // image_bytes))
 
     def blocks() -> Blocks:
-        yield from reader.blocks(rows, leaf.shape, leaf.dtype, most)
+        yield from reader.blocks(images, leaf.shape, leaf.dtype, most)
         if reader.failures:
             failed = [(each.row, each.reason) for each in reader.failures.values()]
             notes[_FAILURES] = json.dumps(failed)
@@ -297,27 +311,14 @@ def _files(paths: tuple[Path, ...]) -> Iterator[Path]:
         yield from sorted(path.iterdir()) if path.is_dir() else [path]
 
 
+_REASONS = 4
+"""Number of reasons that are listed for images of a video that have none."""
 _BLOCK_ROWS, _BLOCK_BYTES = 32, 1 << 22
 """Largest number and size of the messages that are in memory at a time."""
 # foxglove.RawImage has no is_bigendian: its pixels are little-endian.
 _RAW_FIELDS, _BIG_ENDIAN = ("height", "width", "encoding", "step", "data"), "is_bigendian"
 _COMPRESSED_FIELDS = ("format", "data")
-_TYPES = ("Image", "CompressedImage", "RawImage")
-_PACKAGES = ("sensor_msgs", "foxglove", "foxglove_msgs")
-
-
-def is_image_type(type_name: str) -> bool:
-    """Return whether messages of a type are images that can be read.
-
-    ROS 1 names, which have no `/msg/`, and those of Foxglove are known.
-
-    >>> is_image_type("sensor_msgs/msg/Image"), is_image_type("sensor_msgs/Image")
-    (True, True)
-    >>> is_image_type("foxglove.RawImage"), is_image_type("sensor_msgs/msg/Imu")
-    (True, False)
-    """
-    package, *_, name = type_name.replace(".", "/").split("/") * 2
-    return package in _PACKAGES and name in _TYPES
+_PACKET_FIELDS, _STAMPS = ("encoding", "pts", "data"), ("timestamp", "header.stamp")
 
 
 class ImageReader:
@@ -342,11 +343,30 @@ class ImageReader:
         name: str = "image",
         strict: bool = False,
     ) -> None:
-        """Find out whether the images are raw or compressed."""
+        """Find out whether the images are raw, compressed, or frames of a video."""
         self.bag, self.topic, self.name = bag, topic, name
-        self.options, self._strict = ImageOptions(topic, quantity), strict
-        self.fields = _image_fields(bag, bag.topics[topic])
+        calibration = quantity.undistort and Calibration.of(bag, quantity.undistort)
+        self.options, self._strict = ImageOptions(topic, quantity, calibration or None), strict
+        self.fields, is_stream = _image_fields(bag, bag.topics[topic])
         self.failures: dict[int, Failure] = {}
+        self._video: VideoStream | None = None
+        if is_stream:
+            # A frame is averaged as it is decoded, unless a part of it is wanted.
+            is_whole = quantity.crop is None and calibration is None
+            self._converter = Converter(quantity.resize if is_whole else None)
+            files = np.array(bag.recordings)[bag.places(topic)[:, 0]]
+            begins = np.flatnonzero(np.diff(files, prepend=-1))
+            self._video = VideoStream(self._packets, begins, bag.times(topic))
+            if not strict:
+                for row, reason in self._video.before_keyframes():
+                    self._leave_out(row, reason)
+            if len(self.failures) == len(files) > 0:
+                raise LogError(f"{topic}: no frame can be decoded: {self.failures[0].reason}")
+
+    @property
+    def is_video(self) -> bool:
+        """Whether the messages are packets of a video, which depend on each other."""
+        return self._video is not None
 
     def read(self, rows: NDArray[np.int64], storage: Storage = "memory") -> Frames | None:
         """Return the images of N messages as (N, H, W, C); repeated messages are decoded only once.
@@ -362,10 +382,11 @@ class ImageReader:
             in `failures` then: choose other rows, and read again.
         """
         wanted, places = np.unique(rows, return_inverse=True)
-        first = next(self._images(wanted), None)
+        images = self._images(wanted)
+        first = next(images, None)
         if first is None:
             raise LogError(f"{self.topic}: {self._why_none(wanted)}")
-        image = first[1]
+        image, images = first[1], chain([first], images)
         elements = image.size * (rows.shape[1] if rows.ndim > 1 else 1)
         if elements > MAX_ELEMENTS:
             raise UsageError(
@@ -373,8 +394,10 @@ class ImageReader:
                 f" {MAX_ELEMENTS} can be used: set `resize` or `crop`, or a smaller `stack`"
             )
         if not is_mapped(storage, rows.size * image.nbytes):
-            found: Frames | None = self._in_memory(wanted, places.reshape(rows.shape), image)
-        elif (mapped := copied_images(self, wanted, image)) is not None:
+            found: Frames | None = self._in_memory(
+                wanted, places.reshape(rows.shape), image, images
+            )
+        elif (mapped := copied_images(self, wanted, image, images)) is not None:
             found = mapped.rows(places.reshape(rows.shape))
         else:
             found = None
@@ -382,23 +405,30 @@ class ImageReader:
 
     def blocks(
         self,
-        rows: NDArray[np.int64],
+        decoded: Decoded,
         shape: tuple[int, ...],
         dtype: np.dtype[Any],
         count: int,
     ) -> Iterator[tuple[NDArray[np.int64], Image]]:
-        """Yield positions (K,) and images (K, H, W, C) of the messages with readable images.
+        """Yield positions (K,) and images (K, H, W, C) in blocks of `count`.
 
         The arrays are used again for the next block.
         """
         numbers, images = np.empty(count, np.int64), np.empty((count, *shape), dtype)
         filled = 0
-        for row, image in self._images(rows):
+        for row, image in decoded:
             if image.shape != shape or image.dtype != dtype:
-                raise LogError(
-                    f"{self.topic}: image {row} is {image.shape} {image.dtype}, but the"
-                    f" first is {shape} {dtype}: set `resize` in the mapping"
+                what = (
+                    f"image {row} is {image.shape} {image.dtype}, but the first is {shape} {dtype}:"
+                    " set `resize` in the mapping"
                 )
+                if self._video is None:
+                    raise LogError(f"{self.topic}: {what}")
+                self._leave_out(row, what)
+                continue
+            if count == 1:
+                yield np.array([row]), image[np.newaxis]
+                continue
             numbers[filled], images[filled] = row, image
             filled += 1
             if filled == count:
@@ -422,8 +452,13 @@ class ImageReader:
             first = self.failures[min(self.failures)]
             what = f"{counted(len(self.failures), 'image')} cannot be decoded"
             what += f", the first is message {first.row} at {first.log_time_ns} ns"
+            reasons = Counter(self.failures[row].reason for row in sorted(self.failures))
+            effect = first.reason
+            if self._video is not None and len(reasons) > 1:
+                listed = [f"{count}: {reason}" for reason, count in reasons.most_common(_REASONS)]
+                effect = "; ".join(listed)
             action = "they are left out: the image before is used"
-            found.append(Problem(what, self.topic, effect=first.reason, next=action))
+            found.append(Problem(what, self.topic, effect=effect, next=action))
         return found
 
     def leave_out(self, failure: Failure) -> None:
@@ -433,7 +468,12 @@ class ImageReader:
             raise LogError(f"{self.topic}: message {row} at {time_ns} ns: {reason}")
         self.failures[failure.row] = failure
 
-    def _in_memory(self, wanted: NDArray[np.int64], places: NDArray[np.intp], like: Image) -> Image:
+    def _leave_out(self, row: int, reason: str) -> None:
+        self.leave_out(Failure(row, int(self.bag.times(self.topic)[row]), reason))
+
+    def _in_memory(
+        self, wanted: NDArray[np.int64], places: NDArray[np.intp], like: Image, decoded: Decoded
+    ) -> Image:
         """Return the images at `places` (N,) or (N, K), which are indexes of `wanted`."""
         stack = places.shape[1] if places.ndim > 1 else 1
         *edges, channels = like.shape
@@ -447,7 +487,7 @@ class ImageReader:
         # Places of each message in the result, message by message.
         order = np.argsort(places, axis=None, kind="stable")
         bounds = np.searchsorted(places.ravel()[order], np.arange(len(wanted) + 1))
-        for rows, images in self.blocks(wanted, like.shape, like.dtype, 1):
+        for rows, images in self.blocks(decoded, like.shape, like.dtype, 1):
             k = int(np.searchsorted(wanted, rows[0]))
             frames = order[bounds[k] : bounds[k + 1]]
             if stack == 1:
@@ -467,25 +507,63 @@ class ImageReader:
             f" {first.log_time_ns} ns: {first.reason}"
         )
 
-    def _images(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, Image]]:
-        """Yield the messages with readable images: index in the topic, and pixels."""
+    def _images(self, rows: NDArray[np.int64]) -> Decoded:
+        """Yield the messages with readable images among `rows`, which ascend."""
+        if self._video is not None:
+            yield from self._frames(self._video, rows)
+            return
+        for row, message in self._in_blocks(rows):
+            if isinstance(message, Failure):
+                self.leave_out(message)
+                continue
+            try:
+                # The full image is not kept: the next one is decoded into the same memory.
+                image = self.options.applied(self.decoded(message))
+            except LogError as error:
+                self._leave_out(row, str(error))
+                continue
+            yield row, image
+
+    def _frames(self, video: VideoStream, rows: NDArray[np.int64]) -> Decoded:
+        """Yield the frames of a video; with B-frames, their rows do not ascend."""
+        wanted = set(rows.tolist())
+        for row, frame in video.frames(rows):
+            if isinstance(frame, str):
+                # The frames beside the wanted ones are left out as well: they may be chosen next.
+                if row in wanted or not self._strict:
+                    self._leave_out(row, frame)
+            elif row in wanted:
+                try:
+                    image = self.options.applied(Pixels(self._converter.pixels(frame), "video"))
+                except LogError as error:
+                    self._leave_out(row, str(error))
+                    continue
+                yield row, image
+
+    def _packets(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, Message]]:
+        """Yield the packets of a video."""
+        for row, message in self._in_blocks(rows):
+            if isinstance(message, Failure):
+                yield row, message.reason
+                continue
+            stamps = [message[name] for name in _STAMPS if name in message]
+            times_ns = [int(each) for each in stamps if isinstance(each, int | np.integer)]
+            times_ns.insert(0, int(self.bag.times(self.topic)[row]))
+            try:
+                yield row, (_kind_of(message), _bytes_of(message["data"]), tuple(times_ns))
+            except LogError as error:
+                yield row, str(error)
+
+    def _in_blocks(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, dict[str, Any] | Failure]]:
+        """Yield the fields of each message, a few MB of which are in memory at a time."""
         at, count = 0, 1
         while at < len(rows):
             block = rows[at : at + count]
             largest = 1
             for row, message in self._messages(block):
-                if isinstance(message, Failure):
-                    self.leave_out(message)
-                    continue
-                largest = max(largest, _length(message["data"]))
-                try:
-                    # The full image is not kept: the next one is decoded into the same memory.
-                    image = self.options.applied(self.decoded(message))
-                except LogError as error:
-                    time_ns = int(self.bag.times(self.topic)[row])
-                    self.leave_out(Failure(row, time_ns, str(error)))
-                    continue
-                yield row, image
+                if not isinstance(message, Failure):
+                    largest = max(largest, _length(message["data"]))
+                yield row, message
             at, count = at + len(block), min(_BLOCK_ROWS, max(1, _BLOCK_BYTES // largest))
 
     def _messages(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, dict[str, Any] | Failure]]:
@@ -498,15 +576,12 @@ class ImageReader:
 
     def decoded(self, message: dict[str, Any]) -> Pixels:
         """Decode the fields of an image message."""
-        kind = str(message["encoding" if "encoding" in message else "format"])
-        if is_video(kind):
-            raise UsageError(
-                f"{self.topic} has video ({one_line(kind)}): video topics are not supported"
-                " yet; convert it to JPEG images (sensor_msgs/msg/CompressedImage)"
-            )
+        kind = _kind_of(message)
         if "encoding" in message:
             return raw_pixels({**message, "data": _bytes_of(message["data"])})
         try:
+            if is_video(kind):
+                raise LogError("the topic has files of images as well")
             return compressed_pixels(kind, _bytes_of(message["data"]))
         except LogError as error:
             raise LogError(
@@ -514,26 +589,31 @@ class ImageReader:
             ) from error
 
 
-def _image_fields(bag: Bag, topic: TopicInfo) -> tuple[str, ...]:
-    """Return the fields of an image message to read."""
-    if is_video(topic.type_name):
-        raise UsageError(
-            f"{topic.name} has video ({topic.type_name}): video topics are not supported yet;"
-            " convert it to JPEG images (sensor_msgs/msg/CompressedImage)"
-        )
-    every = (*_RAW_FIELDS, _BIG_ENDIAN, *_COMPRESSED_FIELDS)
+def _kind_of(message: dict[str, Any]) -> str:
+    """Return the name of an encoding or a codec."""
+    return str(message["encoding" if "encoding" in message else "format"])
+
+
+def _image_fields(bag: Bag, topic: TopicInfo) -> tuple[tuple[str, ...], bool]:
+    """Return the fields of an image message to read, and whether they are packets of a video."""
+    every = (*_RAW_FIELDS, _BIG_ENDIAN, *_COMPRESSED_FIELDS, *_STAMPS)
     known = {name.split("[")[0] for name in topic.fields}
     if not topic.fields and topic.count:
         # JSON without a schema: the first message shows the fields.
         columns = bag.read(topic.name, every, np.zeros(1, np.int64)).columns
         known = {name for name, column in columns.items() if _is_given(column)}
+    stamps = tuple({*_STAMPS} & known)
     if known.issuperset(_RAW_FIELDS):
-        return (*_RAW_FIELDS, *({_BIG_ENDIAN} & known))
+        return (*_RAW_FIELDS, *({_BIG_ENDIAN} & known)), False
     if known.issuperset(_COMPRESSED_FIELDS):
-        return _COMPRESSED_FIELDS
+        found = bag.read(topic.name, ("format",), np.arange(min(1, topic.count))).columns["format"]
+        is_stream = is_video(topic.type_name) or any(is_video(str(each)) for each in found)
+        return (*_COMPRESSED_FIELDS, *(stamps if is_stream else ())), is_stream
+    if known.issuperset(_PACKET_FIELDS):
+        return (*_PACKET_FIELDS, *stamps), True
     raise UsageError(
         f"{topic.name} has {topic.type_name}, not images: expected sensor_msgs/Image or"
-        " CompressedImage, or foxglove.RawImage or CompressedImage"
+        " CompressedImage, foxglove.RawImage, CompressedImage or CompressedVideo, or FFMPEGPacket"
     )
 
 

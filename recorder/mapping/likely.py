@@ -30,7 +30,8 @@ _ARE_FRESH, _ARE_FINITE = 0.9, 0.95
 
 IMAGES = {
     *("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
-    *("foxglove.RawImage", "foxglove.CompressedImage"),
+    *("foxglove.RawImage", "foxglove.CompressedImage", "foxglove.CompressedVideo"),
+    *("foxglove_msgs/msg/CompressedVideo", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"),
 }
 _NEVER_TOPICS = {
     *("rosout", "rosout_agg", "parameter_events", "tf", "tf_static", "diagnostics"),
@@ -40,7 +41,7 @@ _NEVER_TYPES = re.compile(
     r"rosgraph_msgs/msg/.*|rcl_interfaces/msg/.*|tf2?_msgs/msg/.*|diagnostic_msgs/msg/.*"
     r"|sensor_msgs/msg/(CameraInfo|PointCloud2?)|nav_msgs/msg/(OccupancyGrid|Path|MapMetaData)"
     r"|visualization_msgs/msg/.*|bond/msg/.*|foxglove[.](Log|CameraCalibration|PointCloud|Grid"
-    r"|SceneUpdate|FrameTransforms?|CompressedVideo|ImageAnnotations|GeoJSON)"
+    r"|SceneUpdate|FrameTransforms?|ImageAnnotations|GeoJSON)"
 )
 LIKELY = {
     "nav_msgs/msg/Odometry": (

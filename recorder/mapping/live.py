@@ -748,6 +748,12 @@ def _check_looks_back(plan: Plan) -> None:
                 f"{plan.place.of(*wanted.keys, 'align')}: `{wanted.quantity.align}` looks ahead,"
                 " and a robot lacks the messages after the step: use `last`, and train again"
             )
+    for name, reader in plan.images.items():
+        if reader.is_video:
+            raise UsageError(
+                f"{name}: a driver cannot decode the video of {reader.topic} yet: use a topic of"
+                " images"
+            )
 
 
 class Ending(NamedTuple):

@@ -1,7 +1,8 @@
 """What of an environment can be recorded: values as arrays, infos, and the space of observations.
 
 A log stores a Tuple as a Dict with the keys `0`, `1`, ..., and may omit parts of a Dict or Tuple.
-The agent still receives the observation of the environment.
+Texts in an observation, such as the missions of MiniGrid, become infos. The agent still receives
+the observation of the environment.
 
 Simulators on a GPU return tensors of PyTorch or arrays of JAX, CuPy or Warp. Their packages are not
 imported here.
@@ -327,15 +328,35 @@ class RecordedSpace(NamedTuple):
         leaves: Leaves of this space.
         paths: Path of each leaf in an observation of the environment. Keys of a Dict are strings,
             indexes of a Tuple are integers.
+        texts: Path of each text by the name of its info.
     """
 
     space: spaces.Space[Any]
     leaves: tuple[Leaf, ...]
     paths: tuple[tuple[str | int, ...], ...]
+    texts: dict[str, tuple[str | int, ...]]
 
     def of(self, observation: Any) -> Any:
         """Return an observation of the environment, or a batch of them, in the form of the log."""
         return nest(self.leaves, [value_at(observation, path) for path in self.paths])
+
+    def infos(self, wanted: bool | Sequence[str]) -> bool | Sequence[str]:
+        """Return the names of the infos to record, with those of the texts."""
+        if wanted is True or not self.texts:
+            return wanted
+        return [*([wanted] if isinstance(wanted, str) else wanted or []), *self.texts]
+
+    def info(self, info: Any, observation: Any, number: int | None = None) -> Any:
+        """Return an info with the texts of an observation.
+
+        For a batch of observations, `number` is that of the environment.
+        """
+        if not self.texts:
+            return info
+        found = {name: value_at(observation, path) for name, path in self.texts.items()}
+        if number is not None:
+            found = {name: texts[number] for name, texts in found.items()}
+        return {**info, **{name: str(text) for name, text in found.items()}}
 
 
 def recorded_space(space: spaces.Space[Any], keys: Sequence[str] | None = None) -> RecordedSpace:
@@ -344,12 +365,17 @@ def recorded_space(space: spaces.Space[Any], keys: Sequence[str] | None = None) 
     paths = list(parts)
     if keys is not None:
         paths = _selected(paths, keys, space)
+    texts = {
+        f"observation.{'.'.join(map(str, path))}": path for path in paths if _is_text(parts[path])
+    }
+    if len(texts) < len(paths):
+        paths = [path for path in paths if not _is_text(parts[path])]
     changes = len(paths) < len(parts) or any(isinstance(key, int) for path in paths for key in path)
     logged = space
     if changes:
         logged = _dict_of([(tuple(map(str, path)), parts[path]) for path in paths])
     try:
-        return RecordedSpace(logged, observation_leaves(logged), tuple(paths))
+        return RecordedSpace(logged, observation_leaves(logged), tuple(paths), texts)
     except SpaceError as error:
         cure = "convert it with a TransformObservation wrapper"
         if any(paths):
@@ -378,6 +404,11 @@ def _parts(
             yield from _parts(part, (*path, index))
     else:
         yield path, space
+
+
+def _is_text(space: spaces.Space[Any]) -> bool:
+    """Return whether values of a space are texts, also if it is not one of Gymnasium's."""
+    return space.dtype is not None and np.dtype(space.dtype).kind == "U"
 
 
 def _selected(

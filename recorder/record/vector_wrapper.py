@@ -164,7 +164,8 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         if policy_version is not None:
             self._learner = OpenRows(log.learner_rows(), count, ["epsilon", "policy_version"])
         topics = InfoTopics(log)
-        self._infos = [EpisodeInfos(topics, infos) for _ in range(count)] if infos else []
+        wanted, self._recorded = recorded.infos(infos), recorded
+        self._infos = [EpisodeInfos(topics, wanted) for _ in range(count)] if wanted else []
         self._places = [
             (self._images[leaf], "data") if leaf in self._images else (self._columns, leaf.name)
             for leaf in recorded.leaves
@@ -244,7 +245,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         values = [convert(observations) for convert in self._converters]
         with HoldSignals():
             self._put(self._now.row, [value[numbers] for value in values], numbers)
-            self._begin(numbers, infos)
+            self._begin(numbers, infos, observations)
             for number in numbers.tolist():
                 self._open[number].seed, self._open[number].options = seeds[number], given or None
             self._update_flags()
@@ -282,7 +283,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             ended = self._running & over
             if self._infos:
                 infos = as_arrays(infos)
-                self._add_infos(infos, ended)
+                self._add_infos(infos, observations, ended)
             any_ended = np.count_nonzero(ended)
             if any_ended or self._any_due or self._now.row + 1 >= self._full_at:
                 # A signal must not interrupt the writes and the update of the row.
@@ -290,9 +291,10 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
                     self._make_room()
                     self._observe(values, rewards_64)
                     if self._any_due:
-                        self._begin(np.flatnonzero(self._due), infos)
+                        self._begin(np.flatnonzero(self._due), infos, observations)
                     if any_ended:
-                        self._end_some(np.flatnonzero(ended), values, terminated, truncated, infos)
+                        flags = terminated, truncated
+                        self._end_some(np.flatnonzero(ended), observations, values, flags, infos)
                     self._update_flags()
             else:
                 self._observe(values, rewards_64)
@@ -372,16 +374,23 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         for (table, field), value in zip(self._places, values, strict=True):
             table.put(field, row, value, environments)
 
-    def _add_infos(self, infos: dict[str, Any], ended: NDArray[np.bool_]) -> None:
+    def _add_infos(
+        self, infos: dict[str, Any], observations: Any, ended: NDArray[np.bool_]
+    ) -> None:
         """Store the infos of the environments that made a step."""
         same_step = self._autoreset is AutoresetMode.SAME_STEP
         for number in np.flatnonzero(self._running).tolist():
             is_final = same_step and ended[number]
             source = final_info(infos) if is_final else infos
             step = self._now.row + 1 - int(self._first[number])
-            self._infos[number].add(step, info_of(source, number, self.num_envs))
+            info = info_of(source, number, self.num_envs)
+            if is_final and self._recorded.texts:
+                info = self._recorded.info(info, self._final(infos, number))
+            else:
+                info = self._recorded.info(info, observations, number)
+            self._infos[number].add(step, info)
 
-    def _begin(self, numbers: NDArray[np.int64], infos: dict[str, Any]) -> None:
+    def _begin(self, numbers: NDArray[np.int64], infos: dict[str, Any], observations: Any) -> None:
         """Begin an episode of each of these environments.
 
         Its first observation is already in the current row.
@@ -389,30 +398,33 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         for number in numbers.tolist():
             self._open[number] = OpenEpisode(self.policy, self.epsilon)
             if self._infos:
-                self._infos[number].begin(info_of(infos, number, self.num_envs))
+                info = info_of(infos, number, self.num_envs)
+                self._infos[number].begin(self._recorded.info(info, observations, number))
         self._first[numbers], self._now.returns[numbers] = self._now.row, 0.0
         self._running[numbers], self._due[numbers] = True, False
 
     def _end_some(
         self,
         numbers: NDArray[np.int64],
+        observations: Any,
         values: list[NDArray[Any]],
-        terminated: NDArray[np.bool_],
-        truncated: NDArray[np.bool_],
+        flags: tuple[NDArray[np.bool_], NDArray[np.bool_]],
         infos: dict[str, Any],
     ) -> None:
-        """End the episodes of these environments.
+        """End the episodes of these environments; `flags` are `terminated` and `truncated`.
 
         In same-step mode, also begin their next episodes.
         """
+        terminated, truncated = flags
         same_step = self._autoreset is AutoresetMode.SAME_STEP
         infos_of_ended = final_info(infos) if same_step else infos
         ended: list[_Ended] = []
         try:
             for number in numbers.tolist():
                 if same_step:
-                    final = self._final_observation(infos, number)
-                    self._put(self._now.row, final, number)
+                    final = self._final(infos, number)
+                    values_of_one = [convert(final) for convert in self._converters_of_one]
+                    self._put(self._now.row, values_of_one, number)
                 is_terminal = bool(terminated[number])
                 reason = reason_of(info_reason(infos_of_ended, number), is_terminal)
                 ended.append(_Ended(number, is_terminal, bool(truncated[number]), reason))
@@ -420,10 +432,10 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             self._end(ended)
         if same_step:
             self._put(self._now.row, [value[numbers] for value in values], numbers)
-            self._begin(numbers, infos)
+            self._begin(numbers, infos, observations)
         self._due[numbers] = self._autoreset is AutoresetMode.NEXT_STEP
 
-    def _final_observation(self, infos: dict[str, Any], number: int) -> list[NDArray[Any]]:
+    def _final(self, infos: dict[str, Any], number: int) -> Any:
         """Return an episode's last observation from the infos of same-step mode."""
         space = self.single_observation_space
         final = final_observation(infos, number, self.num_envs, space)
@@ -432,7 +444,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
                 f"environment {number} was reset in its episode's last step, but infos['final_obs']"
                 " does not contain the episode's last observation"
             )
-        return [convert(final) for convert in self._converters_of_one]
+        return final
 
     def _update_flags(self) -> None:
         """Update the flags that the next step checks; call this after episodes began or ended."""

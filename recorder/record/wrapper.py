@@ -74,7 +74,8 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
         Args:
             env: Environment with a Box, Discrete, MultiDiscrete or MultiBinary action space. Its
                 observation space is one of these, or a Dict or Tuple of them. A Tuple is recorded
-                as a Dict with the keys `0`, `1`, ...
+                as a Dict with the keys `0`, `1`, ...; a text in a Dict or Tuple, such as the
+                mission of MiniGrid, as the info `observation.mission`.
             path: File to write.
             policy: Name of the policy.
             epsilon: Probability of a random action; NaN if unknown.
@@ -129,7 +130,8 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
             start_time_ns=start_time_ns,
         )
         log = self._recording.log
-        self._infos = EpisodeInfos(InfoTopics(log), infos) if infos else None
+        wanted, self._recorded = recorded.infos(infos), recorded
+        self._infos = EpisodeInfos(InfoTopics(log), wanted) if wanted else None
         self._display = Display(log, env.unwrapped, scene=scene, camera=camera)
         self._columns = columns = StepColumns(log)
         self._shows_steps = self._display.shows_steps
@@ -190,7 +192,7 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
         with HoldSignals():
             self._begin(OpenEpisode(self.policy, self.epsilon, seed, options), observation)
         if self._infos is not None:
-            self._infos.begin(info)
+            self._infos.begin(self._recorded.info(info, observation))
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -236,7 +238,7 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
             observation, reward, terminated, truncated, info = transition
             self._store_observation(observation)
             if self._infos is not None:
-                self._infos.add(step, info)
+                self._infos.add(step, self._recorded.info(info, observation))
             try:
                 self._store_reward(reward)
                 number = reward

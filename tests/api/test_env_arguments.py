@@ -278,15 +278,15 @@ def test_own_sims_need_no_trust(tmp_path: Path) -> None:
 
 
 class Noted(Wide):
-    """An environment with a Dict of a vector and a text."""
+    """An environment with a Dict of a vector and a list of any length."""
 
     def __init__(self) -> None:
         super().__init__()
-        inner = {"x": self.observation_space, "note": spaces.Text(9)}
+        inner = {"x": self.observation_space, "note": spaces.Sequence(spaces.Discrete(9))}
         self.observation_space = spaces.Dict(inner)
 
     def _see(self) -> Any:
-        return {"x": self.np_random.uniform(-9, 9, 2).astype(np.float32), "note": "hello"}
+        return {"x": self.np_random.uniform(-9, 9, 2).astype(np.float32), "note": (1,)}
 
 
 def test_a_policy_of_some_keys_acts_in_the_whole_environment(
@@ -314,6 +314,37 @@ def test_a_policy_of_some_keys_acts_in_the_whole_environment(
             mcaprl.evaluate(tmp_path / "run", "Noted-v0", episodes=1, record=tmp_path / "no.mcap")
     finally:
         gym.registry.pop("Noted-v0")
+
+
+class Said(Noted):
+    """An environment with a Dict of a vector and a text, as MiniGrid has."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = spaces.Dict({**self.observation_space, "note": spaces.Text(9)})
+
+    def _see(self) -> Any:
+        return {**super()._see(), "note": "hello"}
+
+
+def test_a_text_is_an_info_and_no_input_of_a_policy(tmp_path: Path) -> None:
+    gym.register("Said-v0", cast(Any, Said), disable_env_checker=True, max_episode_steps=9)
+    try:
+        log = tmp_path / "log.mcap"
+        mcaprl.record("Said-v0", log, policy="random", episodes=2)
+        data = mcaprl.open(log)
+        assert data.observation_space == spaces.Dict({"x": spaces.Box(-9, 9, (2,), np.float32)})
+        assert set(data.infos["observation.note"].tolist()) == {"hello"}
+        config = BCConfig(updates=2, hidden=(4,))
+        train_offline(data, config, tmp_path / "run", progress=lambda _: None)
+        out = tmp_path / "evaluated.mcap"
+        mcaprl.evaluate(tmp_path / "run", "Said-v0", episodes=2, record=out)
+        policy = mcaprl.load_policy(tmp_path / "run")
+        found = mcaprl.open(out)
+        assert found.actions.tolist() == policy.act(found.observations).tolist()
+        assert mcaprl.verify(log, trust_env=True).difference is None
+    finally:
+        gym.registry.pop("Said-v0")
 
 
 def test_a_policy_of_a_tuple_acts_in_its_environment(tmp_path: Path) -> None:

@@ -28,6 +28,9 @@ PAIR = spaces.Tuple(
 )
 
 
+LIST = spaces.Sequence(spaces.Discrete(3))
+
+
 class MissionSpace(spaces.Space[str]):
     """A space of texts that is not one of Gymnasium's, like MiniGrid's."""
 
@@ -109,13 +112,6 @@ def test_tuples_of_vector_environments(tmp_path: Path, mode: AutoresetMode) -> N
 
 
 def test_keys_select_the_recorded_parts(log_path: Path) -> None:
-    with pytest.raises(
-        SpaceError,
-        match=r"observation\['mission'\] is a MissionSpace space.*leave it out with"
-        r" `keys=\['direction', 'image'\]`",
-    ):
-        mcaprl.RecordMcap(Grid(), log_path)
-    assert not log_path.exists()
     with closing(mcaprl.RecordMcap(Grid(), log_path, keys=["image", "direction"])) as env:
         observation, _ = env.reset(seed=1)
         assert observation["mission"] == "get the key"
@@ -123,6 +119,64 @@ def test_keys_select_the_recorded_parts(log_path: Path) -> None:
     data = mcaprl.open(log_path)
     assert list(data.frames) == ["direction", "image"]
     assert (data.frames["image"] == data.frames["direction"][:, None, None, None]).all()
+
+
+@pytest.mark.parametrize(("infos", "names"), [(False, []), ("turn", ["turn"]), (True, ["turn"])])
+def test_texts_are_recorded_as_infos(
+    log_path: Path, infos: Any, names: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        Grid, "step", lambda self, action: (self._see(), 0.0, action == 2, False, {"turn": 3})
+    )
+    with closing(mcaprl.RecordMcap(Grid(), log_path, infos=infos)) as env:
+        for _ in range(2):
+            assert env.reset(seed=1)[0]["mission"] == "get the key"
+            env.step(1)
+            env.step(2)
+    data = mcaprl.open(log_path)
+    assert list(data.frames) == ["direction", "image"]
+    assert data.observation_space == spaces.Dict(
+        {key: part for key, part in Grid.observation_space.items() if key != "mission"}
+    )
+    assert sorted(data.infos) == ["observation.mission", *names]
+    assert data.infos["observation.mission"].tolist() == ["get the key"] * 6
+
+
+def test_texts_that_are_not_wanted_or_the_only_part(log_path: Path) -> None:
+    with pytest.raises(SpaceError, match=r"observation\['mission'\] is a MissionSpace space"):
+        recorded_space(Grid.observation_space, ["mission"])
+    with pytest.raises(SpaceError, match="observation is a Text space"):
+        recorded_space(spaces.Text(5))
+    assert recorded_space(Grid.observation_space, ["image"]).texts == {}
+    nested = spaces.Dict({"a": spaces.Tuple([spaces.Discrete(2), spaces.Text(9)])})
+    assert recorded_space(nested).texts == {"observation.a.1": ("a", 1)}
+    assert recorded_space(nested).space == spaces.Dict(
+        {"a": spaces.Dict({"0": spaces.Discrete(2)})}
+    )
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_texts_of_vector_environments(
+    log_path: Path, mode: AutoresetMode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def see(self: Grid) -> dict[str, Any]:
+        image = np.zeros((7, 7, 3), np.uint8)
+        return {"image": image, "direction": self._turn, "mission": f"turn {self._turn}"}
+
+    monkeypatch.setattr(Grid, "_see", see)
+    envs = SyncVectorEnv([Grid] * 2, autoreset_mode=mode)
+    with closing(mcaprl.RecordVecMcap(envs, log_path)) as env:
+        env.reset(seed=[1, 4])
+        ended = np.zeros(2, bool)
+        for action in (1, 1, 1, 1, 1, 1, 1):
+            if mode is AutoresetMode.DISABLED and ended.any():
+                env.reset(options={"reset_mask": ended})
+            ended = env.step(np.array([action, 2]))[2]
+    data = mcaprl.open(log_path)
+    assert len(data.episodes) > 2
+    # The text of each row is that of its own observation, at the last one of an episode as well.
+    found = data.infos["observation.mission"].tolist()
+    assert found == [f"turn {each}" for each in data.frames["direction"]]
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))
@@ -181,10 +235,10 @@ def test_logs_of_tuples_are_verified(log_path: Path) -> None:
         (spaces.Text(3), None, SpaceError, "Text space.*; convert it with a TransformObservation"),
         (spaces.Tuple([spaces.Text(3)]), None, SpaceError, r"\['0'\] is a Text.*no part"),
         (
-            spaces.Dict({"a": spaces.Dict({"b": spaces.Text(3), "c": spaces.Discrete(3)})}),
+            spaces.Dict({"a": spaces.Dict({"b": LIST, "c": spaces.Discrete(3)})}),
             ["a"],
             SpaceError,
-            r"observation\['a'\]\['b'\] is a Text space.*keys=\['a/c'\]",
+            r"observation\['a'\]\['b'\] is a Sequence space.*keys=\['a/c'\]",
         ),
     ],
 )

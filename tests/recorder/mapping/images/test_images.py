@@ -252,17 +252,6 @@ def test_images_in_json_without_a_schema() -> None:
             read(bag, [0])
 
 
-@pytest.mark.parametrize("kind", ["h264", "H265", "hevc", "rgb8; h.264"])
-def test_video_is_not_supported_yet(kind: str) -> None:
-    bag = compressed_bag(kind, b"\0\0\0\1\x67\x42")
-    with pytest.raises(UsageError, match="video topics are not supported yet; convert it to JPEG"):
-        read(bag, [0])
-    types = {"/camera": "foxglove.CompressedVideo"}
-    bag = MemoryBag({"/camera": ([0], {"format": ["x"], "data": [b"x"]})}, KINDS, types)
-    with pytest.raises(UsageError, match=r"/camera has video \(foxglove.CompressedVideo\)"):
-        read(bag, [0])
-
-
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
