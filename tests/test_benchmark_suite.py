@@ -87,9 +87,8 @@ def test_behaviors_are_small_and_load() -> None:
 def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Make logs and trainings of CartPole small, and write behaviors and results elsewhere."""
     task = tasks.Task("CartPole-v1", "tests", steps=200, pilot=lambda env: tasks.Scripted(lean))
-    monkeypatch.setattr(suite, "TASKS", {"CartPole": task})
-    monkeypatch.setattr(tasks, "TASKS", suite.TASKS)
-    monkeypatch.setattr(page, "TASKS", suite.TASKS)
+    for module in (suite, tasks, page):
+        monkeypatch.setattr(module, "TASKS", {"CartPole": task})
     monkeypatch.setattr(tasks, "BEHAVIORS", tmp_path / "behaviors")
     (tmp_path / "behaviors").mkdir()
     monkeypatch.setattr(page, "RESULTS", tmp_path / "results")
@@ -125,8 +124,8 @@ def test_an_interrupted_suite_continues_with_the_next_cell(
     assert second > 300 > 50 > first
     scores = (np.mean(cell["returns"], axis=1) - first) / (second - first)
     assert cell["scores"] == pytest.approx(scores, abs=1e-3)
-    run(monkeypatch, small, "--policies", str(small / "run"))
-    assert "policies run: " in capsys.readouterr().out
+    run(monkeypatch, small, "--policies", str(small / "runs" / "CartPole" / "replay-bc"))
+    assert "policies replay-bc: " in capsys.readouterr().out
     assert page.read_cells(page.RESULTS).keys() == cells.keys()
 
 

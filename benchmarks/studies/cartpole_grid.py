@@ -152,8 +152,6 @@ Q_SWAPS: dict[str, dict[str, Any]] = {
     "ours": {},
     "d3rlpy": {},
     "ours, falling learning rate": DECAY,
-    "ours, normalized observations": {"normalize": True},
-    "ours, sync every 50 updates": {"target_interval": 50},
 }
 SWAPS: dict[tuple[str, str], dict[str, dict[str, Any]]] = {
     ("mixed", "bc"): {
@@ -181,10 +179,8 @@ def swap(data: mcaprl.Dataset, algo: str, name: str, seeds: int, changes: Any) -
 
 
 def run_swaps(logs: dict[str, mcaprl.Dataset], path: Path, seeds: int) -> None:
-    """Run the missing trainings of SWAPS; write their table to the docs."""
+    """Run the missing trainings of SWAPS; write the table of the finished ones to the docs."""
     found: dict[str, list[float]] = json.loads(path.read_text()) if path.exists() else {}
-    lines = ["| log, algorithm | training | mean return, 95 % interval | of each seed |"]
-    lines.append("|---|---|---|---|")
     for (log, algo), trainings in SWAPS.items():
         for name, changes in trainings.items():
             key = f"{log}, {algo} | {name}"
@@ -192,10 +188,17 @@ def run_swaps(logs: dict[str, mcaprl.Dataset], path: Path, seeds: int) -> None:
                 found[key] = swap(logs[log], algo, name, seeds, changes)
                 print(key, np.round(found[key]), file=sys.stderr, flush=True)
                 write_json(path, found)
-            interval = mean_interval(found[key])
-            each = " ".join(f"{value:.0f}" for value in sorted(found[key]))
-            lines.append(f"| {key} | {np.mean(found[key]):.0f} ({interval}) | {each} |")
-    write_section("cartpole-swaps", "\n".join(lines))
+    write_section("cartpole-swaps", swap_table(found))
+
+
+def swap_table(found: dict[str, list[float]]) -> str:
+    """Return a row for each training of SWAPS, as Markdown."""
+    lines = ["| log, algorithm | training | mean return, 95 % interval | of each seed |"]
+    lines.append("|---|---|---|---|")
+    for key, values in found.items():
+        each = " ".join(f"{value:.0f}" for value in sorted(values))
+        lines.append(f"| {key} | {np.mean(values):.0f} ({mean_interval(values)}) | {each} |")
+    return "\n".join(lines)
 
 
 def mean_interval(values: list[float]) -> str:

@@ -97,7 +97,8 @@ def _cell(name: str, kind: str, learner: str, given: argparse.Namespace) -> dict
     if given.policies:
         policies, cpu_s = load_policies(given.policies), 0.0
     else:
-        policies, cpu_s = train(task, data, learner, given.seeds, given.folder / "run")
+        run = given.folder / "runs" / name / f"{kind}-{learner}"
+        policies, cpu_s = train(task, data, learner, given.seeds, run)
     first, second = scale(name)
     returns = score(name, policies).returns
     is_rival = learner.startswith(RIVAL)
