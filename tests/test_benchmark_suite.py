@@ -147,6 +147,7 @@ def cell(kind: str, learner: str, *scores: float, box: bool = False) -> dict[str
         "kind": kind,
         "learner": learner,
         "box": box,
+        "tier": "tests",
         "behavior": 0.5,
         "scores": list(scores),
         "cpu_s": 6.0,
@@ -165,10 +166,10 @@ def test_page_has_the_tables_of_the_cells(tmp_path: Path) -> None:
     found = page.read_cells(tmp_path)
     # Only the replay log has cells of both: .25 and .15 are the means of the middle two.
     # Wins of 16 pairs: .1 beats 0 and ties with .1, .2 beats two and ties, .3 beats three, .4 all.
-    assert "| discrete | bc | 1 | 0.25 | 0.15 | +0.10 (" in (text := page.rivals(found))
+    assert "| tests, discrete | bc | 1 | 0.25 | 0.15 | +0.10 (" in (text := page.rivals(found))
     assert f"| {(1.5 + 2.5 + 3 + 4) / 16:.2f} (" in text
-    assert "| discrete | bc | 2 | 0.42 | " in (text := page.summaries(found))
-    assert "| Box | iql | 1 | 1.00 | 1.00 to 1.00 | 1.5 |" in text
+    assert "| tests, discrete | bc | 2 | 0.42 | " in (text := page.summaries(found))
+    assert "| tests, Box | iql | 1 | 1.00 | 1.00 to 1.00 | 1.5 |" in text
     (tmp_path / "images").mkdir()
     sections = ("cells", "statistics", "rivals")
     text = "\n".join(f"<!-- benchmark-{each} -->\n<!-- /benchmark-{each} -->" for each in sections)

@@ -84,25 +84,25 @@ def common(cells: Cells, learners: Sequence[str]) -> list[NDArray[np.float64]]:
 
 
 def groups(cells: Cells) -> dict[str, Cells]:
-    """Return the cells by the kind of actions, which have different learners."""
-    kinds = {"discrete": False, "Box": True}
-    return {
-        title: {key: cell for key, cell in cells.items() if cell["box"] == box}
-        for title, box in kinds.items()
-    }
+    """Return the cells by tier and kind of actions, which have different learners."""
+    found: dict[str, Cells] = {}
+    for key, cell in sorted(cells.items(), key=lambda item: (item[1]["box"], item[1]["tier"])):
+        title = f"{cell['tier']}, {'Box' if cell['box'] else 'discrete'}"
+        found.setdefault(title, {})[key] = cell
+    return found
 
 
 def complete(cells: Cells) -> list[str]:
-    """Return the learners that have a cell for each log of which there are at least two cells."""
+    """Return the learners that have a cell for each log of these cells."""
     logs = {key[:2] for key in cells}
     found = dict.fromkeys(learner for _, _, learner in cells)
     return [one for one in found if all((*log, one) in cells for log in logs)]
 
 
 def summaries(cells: Cells) -> str:
-    """Return a table of each kind of actions: IQM over logs and seeds, and CPU time."""
-    lines = ["| actions | learner | logs | IQM | 95 % interval | CPU s of a seed |", "|---|" * 1]
-    lines[1] = "|---|" + "---|" * 5
+    """Return a row for each learner of a group: IQM over logs and seeds, and CPU time."""
+    lines = ["| tier, actions | learner | logs | IQM | 95 % interval | CPU s of a seed |"]
+    lines.append("|---|" + "---|" * 5)
     for title, own in groups(cells).items():
         learners = complete(own)
         for learner, scores in zip(learners, common(own, learners), strict=True):
@@ -118,7 +118,7 @@ def summaries(cells: Cells) -> str:
 def rivals(cells: Cells) -> str:
     """Return a table that compares each algorithm here with that of d3rlpy."""
     lines = [
-        "| actions | algorithm | logs | IQM here | d3rlpy | difference, 95 % interval |"
+        "| tier, actions | algorithm | logs | IQM here | d3rlpy | difference, 95 % interval |"
         " probability of improvement |",
         "|---|" + "---|" * 6,
     ]
@@ -144,14 +144,14 @@ def rivals(cells: Cells) -> str:
 
 
 def draw(cells: Cells, path: Path) -> None:
-    """Draw the performance profiles of each kind of actions."""
+    """Draw the performance profiles of each group."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
     thresholds = np.linspace(-0.1, 1.2, 131)
-    parts = {title: own for title, own in groups(cells).items() if own}
+    parts = groups(cells)
     figure, axes = pyplot.subplots(1, len(parts), figsize=(5 * len(parts), 3.6), squeeze=False)
     for axis, (title, own) in zip(axes[0], parts.items(), strict=True):
         learners = complete(own)
