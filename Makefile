@@ -16,7 +16,7 @@ NEWEST_TESTS := tests/recorder tests/sims tests/offline tests/online tests/api
 # A change of these files reinstalls the environments.
 SETTINGS := pyproject.toml constraints.txt setup.py recorder/columns/_native.c
 
-.PHONY: help demo test core newest faults fuzz sanitize check bench bench-learning sim-grid docs docs-test vendor wheel clean
+.PHONY: help demo test core newest faults fuzz sanitize check bench bench-learning suite sim-grid docs docs-test vendor wheel clean
 
 help:
 	@echo "make demo             record a car, train on its log offline, evaluate, and write the replay"
@@ -28,6 +28,7 @@ help:
 	@echo "make sanitize         test the C code with AddressSanitizer and UndefinedBehaviorSanitizer (needs gcc)"
 	@echo "make check            check format, lint, words, types, import contracts and the size of the code"
 	@echo "make bench            measure speed relative to other libraries"
+	@echo "make suite            train and score all learners on the logs of the benchmark's first tier"
 	@echo "make bench-learning   measure training and off-policy estimates relative to d3rlpy, SB3 and SCOPE-RL"
 	@echo "make sim-grid         train offline on six logs of each sim, four seeds (hours; resumes if interrupted)"
 	@echo "make docs             generate the references and images of the docs, and build their site"
@@ -90,6 +91,9 @@ bench-learning: $(VENV)/.rivals
 	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.studies.off_policy
 	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.studies.cartpole_grid $(VENV)/cartpole
 
+suite: $(VENV)/.rivals
+	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.suite
+
 sim-grid: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.studies.sim_grid $(VENV)/sim-grid
 
@@ -149,7 +153,7 @@ $(BENCH)/.ready: $(SETTINGS)
 $(VENV)/.rivals: $(SETTINGS) benchmarks/rivals.txt | $(VENV)/bin/python
 	@echo "installing into $(VENV)/rivals"
 	$(BIN)/python -m venv $(VENV)/rivals
-	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -e '.[offline,online]'
+	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -e '.[sims,offline,online]'
 	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -r benchmarks/rivals.txt
 	$(VENV)/rivals/bin/python -m pip install -qq --no-deps d3rlpy==2.8.1 scope-rl==0.2.1
 	@touch $@

@@ -27,7 +27,15 @@ if TYPE_CHECKING:
     from mcaprl.base_policy import BasePolicy as Policy
     from mcaprl.sims.drawing.camera import lens
     from mcaprl.sims.drawing.depth import DepthCamera, encode_depth
-    from mcaprl.sims.evaluation.evaluate import PolicyScore, Scale, evaluate, make_pilot, normalize
+    from mcaprl.sims.evaluation.evaluate import (
+        PolicyScore,
+        Scale,
+        evaluate,
+        improvement_probability,
+        interquartile_mean,
+        make_pilot,
+        normalize,
+    )
     from mcaprl.sims.evaluation.rollout import EpsilonGreedy, NoisyPolicy, episode_seed, rollout
     from mcaprl.sims.lane.camera import CarCamera
     from mcaprl.sims.lane.env import LaneKeepingEnv
@@ -201,6 +209,8 @@ __all__ = [
     "encode_depth",
     "episode_seed",
     "evaluate",
+    "improvement_probability",
+    "interquartile_mean",
     "lens",
     "make_device_sims",
     "make_pilot",
@@ -221,6 +231,8 @@ __getattr__ = lazy_attributes(
             "PolicyScore",
             "Scale",
             "evaluate",
+            "improvement_probability",
+            "interquartile_mean",
             "make_pilot",
             "normalize",
         ),

@@ -24,12 +24,13 @@ import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import stats
 
 import mcaprl
 from benchmarks.page import write_section
 from benchmarks.studies.cartpole_data import NAMES, make_logs
 from mcaprl.files import write_json
-from mcaprl.offline import ALGORITHMS, BootstrapConfig, TransitionBuffer, build_head
+from mcaprl.offline import ALGORITHMS, BootstrapConfig, Learner, TransitionBuffer, build_head
 
 UPDATES, EVALUATED_AT, EPISODES = 5000, (4000, 4500, 5000), 10
 SHARED: dict[str, Any] = {
@@ -68,11 +69,13 @@ def mean_return(act: Act, seed: int) -> float:
     return float(returns.mean())
 
 
-def ours(data: mcaprl.Dataset, algo: str, seeds: int) -> list[float]:
-    """Return the mean return of each seed."""
-    learner_type = ALGORITHMS[algo]
+def ours(
+    data: mcaprl.Dataset, learner_type: type[Learner], seeds: int, **changes: Any
+) -> list[float]:
+    """Return the mean return of each seed; `changes` are other settings than those of the table."""
     values = VALUES if issubclass(learner_type.config_type, BootstrapConfig) else {}
-    config = learner_type.config_type(**SHARED, **values, **SPECIAL.get(learner_type.name, {}))
+    special = SPECIAL.get(learner_type.name, {})
+    config = learner_type.config_type(**(SHARED | values | special | changes))
     learner = learner_type(
         config, TransitionBuffer.from_dataset(data, config.packing), range(seeds)
     )
@@ -99,11 +102,11 @@ def greedy(learner: Any, seed: int) -> Act:
     return act
 
 
-def theirs(data: mcaprl.Dataset, algo: str) -> list[float]:
-    """Return the mean return of d3rlpy with one seed."""
+def theirs(data: mcaprl.Dataset, algo: str, seed: int, **changes: Any) -> float:
+    """Return the mean return of a seed of d3rlpy; `changes` are other settings of its config."""
     import d3rlpy
 
-    d3rlpy.seed(0)
+    d3rlpy.seed(seed)
     log = d3rlpy.dataset.MDPDataset(
         data.observations,
         data.actions,
@@ -116,7 +119,7 @@ def theirs(data: mcaprl.Dataset, algo: str) -> list[float]:
     settings: dict[str, Any] = {"learning_rate": 1e-3, "batch_size": 64, "encoder_factory": encoder}
     if algo != "bc":
         settings |= {"gamma": 0.99, "target_update_interval": 200}
-    learner = getattr(d3rlpy.algos, RIVALS[algo])(**settings).create(device="cpu")
+    learner = getattr(d3rlpy.algos, RIVALS[algo])(**(settings | changes)).create(device="cpu")
     found = []
 
     def on_update(algorithm: Any, _: int, step: int) -> None:
@@ -131,7 +134,77 @@ def theirs(data: mcaprl.Dataset, algo: str) -> list[float]:
         logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
         callback=on_update,
     )
-    return [float(np.mean(found))]
+    return float(np.mean(found))
+
+
+class FlatBC(ALGORITHMS["bc"]):  # type: ignore[misc]
+    """Clone with d3rlpy's penalty: half the mean square of the log probabilities."""
+
+    def losses(self, batch: Any) -> dict[str, torch.Tensor]:
+        """Return the terms of BC, with the penalty in the loss."""
+        terms: dict[str, torch.Tensor] = super().losses(batch)
+        log_probs = self.outputs("logits", batch.observations).log_softmax(1)
+        return {**terms, "loss": terms["loss"] + 0.5 * log_probs.square().mean(1)}
+
+
+DECAY = {"final_learning_rate_fraction": 0.02}
+Q_SWAPS: dict[str, dict[str, Any]] = {
+    "ours": {},
+    "d3rlpy": {},
+    "ours, falling learning rate": DECAY,
+}
+SWAPS: dict[tuple[str, str], dict[str, dict[str, Any]]] = {
+    ("mixed", "bc"): {
+        "ours": {},
+        "d3rlpy": {},
+        "ours, d3rlpy's penalty": {},
+        "d3rlpy, no penalty": {"beta": 0.0},
+        "ours, falling learning rate": DECAY,
+        "ours, normalized observations": {"normalize": True},
+        "ours, weight decay .01": {"weight_decay": 0.01},
+        "ours, batch 256": {"batch_size": 256},
+    },
+    ("replay", "cql"): Q_SWAPS,
+    ("replay", "double-dqn"): Q_SWAPS,
+}
+"""Trainings that differ in one setting, by log and algorithm."""
+
+
+def swap(data: mcaprl.Dataset, algo: str, name: str, seeds: int, changes: Any) -> list[float]:
+    """Return the mean return of each seed of a training of SWAPS."""
+    if name.startswith("d3rlpy"):
+        return [theirs(data, algo, seed, **changes) for seed in range(seeds)]
+    learner_type = FlatBC if name.endswith("d3rlpy's penalty") else ALGORITHMS[algo]
+    return ours(data, learner_type, seeds, **changes)
+
+
+def run_swaps(logs: dict[str, mcaprl.Dataset], path: Path, seeds: int) -> None:
+    """Run the missing trainings of SWAPS; write the table of the finished ones to the docs."""
+    found: dict[str, list[float]] = json.loads(path.read_text()) if path.exists() else {}
+    for (log, algo), trainings in SWAPS.items():
+        for name, changes in trainings.items():
+            key = f"{log}, {algo} | {name}"
+            if key not in found:
+                found[key] = swap(logs[log], algo, name, seeds, changes)
+                print(key, np.round(found[key]), file=sys.stderr, flush=True)
+                write_json(path, found)
+    write_section("cartpole-swaps", swap_table(found))
+
+
+def swap_table(found: dict[str, list[float]]) -> str:
+    """Return a row for each training of SWAPS, as Markdown."""
+    lines = ["| log, algorithm | training | mean return, 95 % interval | of each seed |"]
+    lines.append("|---|---|---|---|")
+    for key, values in found.items():
+        each = " ".join(f"{value:.0f}" for value in sorted(values))
+        lines.append(f"| {key} | {np.mean(values):.0f} ({mean_interval(values)}) | {each} |")
+    return "\n".join(lines)
+
+
+def mean_interval(values: list[float]) -> str:
+    """Return the 95 % interval of the mean over seeds, by Student's t."""
+    low, high = stats.t.interval(0.95, len(values) - 1, np.mean(values), stats.sem(values) or 1e-9)
+    return f"{low:.0f} to {high:.0f}"
 
 
 Found = dict[str, dict[str, list[float]]]
@@ -173,18 +246,22 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--only", default=",".join(ALGOS))
+    parser.add_argument("--swaps", action="store_true", help="run SWAPS instead of the table")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     logs, path = make_logs(arguments.folder), arguments.folder / "grid.json"
+    if arguments.swaps:
+        run_swaps(logs, path.with_name("swaps.json"), arguments.seeds)
+        return
     result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     result["behavior"] = {name: data.statistics.mean_return for name, data in logs.items()}
     for side, algo, name in cells(arguments.only.split(",")):
         row = result.setdefault(side, {}).setdefault(name, {})
         if algo not in row:
-            is_ours = side == "mcaprl"
-            row[algo] = (
-                ours(logs[name], algo, arguments.seeds) if is_ours else theirs(logs[name], algo)
-            )
+            if side == "mcaprl":
+                row[algo] = ours(logs[name], ALGORITHMS[algo], arguments.seeds)
+            else:
+                row[algo] = [theirs(logs[name], algo, seed) for seed in range(arguments.seeds)]
             print(side, name, algo, row[algo], file=sys.stderr, flush=True)
             write_json(path, result)
     print(text := summary(result))

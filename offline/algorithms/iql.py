@@ -11,11 +11,11 @@ two target networks. They are synced every `target_interval` updates.
 
 Departures from the paper: by default, advantages are divided by their root mean square, because
 their size differs between tasks; with `normalize_advantages=False`, they are those of the paper.
-With a finite action space, the policy is a classifier and Q has one output per action, target
-networks are synced at intervals instead of averaged, and Q is trained with the Huber loss. With a
-Box, the policy is a normal distribution with the same deviations in all states, as in the paper,
-but truncated to the Box, so that its density integrates to one there; its learning rate decays as
-that of the other networks, and the target networks are averaged faster.
+With a finite action space, the policy is a classifier and Q has one output per action, and target
+networks are synced at intervals instead of averaged. With a Box, the policy is a normal
+distribution with the same deviations in all states, as in the paper, but truncated to the Box, so
+that its density integrates to one there; its learning rate decays as that of the other networks,
+and the target networks are averaged faster.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from mcaprl.offline.algorithms.losses import (
     chosen,
     cross_entropy,
     expectile_regression,
-    huber_regression,
+    square_regression,
     twin_regression,
 )
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
@@ -77,7 +77,9 @@ class IQL(Learner):
         v_loss = expectile_regression(v_tm1, q_a_tm1, self.config.expectile)
         target_tm1 = self.targets(batch)
         q_loss, twin_loss = (
-            huber_regression(self.outputs(name, batch.observations), batch.actions, target_tm1)
+            square_regression(
+                chosen(self.outputs(name, batch.observations), batch.actions), target_tm1
+            )
             for name in _TWINS
         )
         weight = advantage_weights(self, q_a_tm1 - v_tm1.detach().squeeze(1))

@@ -288,6 +288,23 @@ def test_iql_values_are_between_mean_and_maximum() -> None:
     assert values[2] == pytest.approx(0.9, abs=0.05)
 
 
+def test_iql_values_are_means_of_large_rewards() -> None:
+    # One of ten steps has a reward of 10. Where errors above 1 have the gradient 1, nine errors of
+    # q and a gradient of 1 are in balance at q = 1 / 9; the mean is 1.
+    observations = np.ones((10, 1), np.float32)
+    data = Dataset.from_arrays(
+        observations=observations,
+        actions=np.zeros(10, np.int64),
+        rewards=np.eye(10)[0] * 10,
+        terminated=np.ones(10, bool),
+        truncated=np.zeros(10, bool),
+        next_observations=observations,
+    )
+    config = IQLConfig(**{**SMALL_Q, "batch_size": 512})
+    learner = trained(learner_of(config, data))
+    assert outputs(learner, observations[:1]).item() == pytest.approx(1.0, abs=0.15)
+
+
 def test_normalized_advantages_do_not_depend_on_the_unit_of_the_reward() -> None:
     learner = cast(IQL, learner_of(IQLConfig(**{**SMALL_Q, "updates": 1}), corridor(), 0, 1))
     assert learner.config.normalize_advantages
