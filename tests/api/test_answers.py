@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
 from mcaprl.api.estimate import LogEstimates
@@ -13,8 +11,20 @@ from mcaprl.offline.estimate.off_policy import Estimate, ranking
 
 def found(*estimates: Estimate, check: BehaviorCheck | None = None) -> LogEstimates:
     """Return estimates from a log whose mean return is 5.0, from 4.0 to 6.0."""
-    parts: tuple[Any, ...] = ("log", 50, 0.97, 0.0, 5.0, (4.0, 6.0), None, None, {})
-    return LogEstimates(*parts, estimates, ranking(estimates), behavior_check=check)
+    return LogEstimates(
+        data="log",
+        episodes=50,
+        gamma=0.97,
+        epsilon=0.0,
+        behavior_return=5.0,
+        behavior_interval=(4.0, 6.0),
+        behavior_calibration=None,
+        behavior_estimate=None,
+        coverage={},
+        estimates=estimates,
+        ranking=ranking(estimates),
+        behavior_check=check,
+    )
 
 
 def by_weights(low: float, high: float, verdict: str = "ok", policy: str = "cql") -> Estimate:
@@ -26,7 +36,7 @@ def by_weights(low: float, high: float, verdict: str = "ok", policy: str = "cql"
     [
         (6.5, 7.5, "7.000 (6.500 to 7.500) by WDR: better than the log's 5.000; try it"),
         (1.0, 3.0, "2.000 (1.000 to 3.000) by WDR: worse than the log's 5.000; train on"),
-        (5.0, 9.0, "7.000 (5.000 to 9.000) by WDR: cannot be told from the log's 5.000; record"),
+        (5.0, 9.0, "7.000 (5.000 to 9.000) by WDR: not clearly different from the log's 5.000; record"),
     ],
 )
 def test_a_trusted_estimate_is_compared_with_the_log(low: float, high: float, answer: str) -> None:
