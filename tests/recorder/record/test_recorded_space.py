@@ -174,7 +174,7 @@ def test_texts_of_vector_environments(
             ended = env.step(np.array([action, 2]))[2]
     data = mcaprl.open(log_path)
     assert len(data.episodes) > 2
-    # The text of each row is that of its own observation, at the last one of an episode as well.
+    # The text of each row is that of the observation in it, also at the end of an episode.
     found = data.infos["observation.mission"].tolist()
     assert found == [f"turn {each}" for each in data.frames["direction"]]
 
