@@ -10,13 +10,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from benchmarks.measure import Table
-from benchmarks.speed import bags, edits, formats, growth, logs, sims, video
+from benchmarks.speed import bags, camera, edits, formats, growth, logs, sims, video
 from benchmarks.speed.workloads import IMAGE_STEPS
 from mcaprl.files import write_json
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"
-PARTS = ["logs", "bags", "edits", "formats", "growth", "sims", "video"]
+PARTS = ["logs", "bags", "camera", "edits", "formats", "growth", "sims", "video"]
 LIBRARIES = (
     "numpy",
     "zstandard",
@@ -118,6 +118,8 @@ def main() -> None:
             found += logs.tables(folder, arguments.transitions)
         if "bags" in arguments.only:
             found += bags.tables(folder)
+        if "camera" in arguments.only:
+            found += camera.tables(folder)
         if "edits" in arguments.only:
             found += edits.tables(folder)
         if "formats" in arguments.only:

@@ -70,7 +70,7 @@ def record(
     sim_options: Mapping[str, Any] | None = None,
     trust_env: bool = False,
     scene: bool = True,
-    camera: bool = False,
+    camera: bool | str = False,
     infos: bool | Sequence[str] = False,
     keys: Sequence[str] | None = None,
     compression: str = "zstd",
@@ -115,7 +115,8 @@ def record(
         trust_env: Whether the arguments of the training may be passed to environments other than
             the sims of `SIMS`.
         scene: Whether topics that only viewers use are recorded.
-        camera: Whether metric depth images are recorded.
+        camera: Whether metric depth images are recorded; or `h264` for a video of what the
+            environment renders (extra `video`).
         infos: Whether the infos of the environment are recorded, or the names of infos to record.
         keys: Keys of the parts of a Dict or Tuple observation that are recorded; default: all.
         compression: Compression of chunks: `zstd`, `lz4` or `none`.

@@ -73,7 +73,7 @@ class FileRequest:
     seed: int
     sim_options: Mapping[str, Any]
     scene: bool
-    camera: bool
+    camera: bool | str
     infos: bool | Sequence[str]
     keys: Sequence[str] | None
     compression: str
@@ -133,6 +133,9 @@ def try_request(request: FileRequest) -> None:
 
 
 def _env(request: FileRequest) -> gym.Env[Any, Any]:
+    if isinstance(request.camera, str) and isinstance(request.sim, str):
+        options = {"render_mode": "rgb_array", **request.sim_options}
+        request = replace(request, sim_options=options)
     # A number of steps ends the recording, so it needs no default limit.
     if request.steps is not None and request.max_steps is None:
         return make_or_borrow(request.sim, **request.sim_options)

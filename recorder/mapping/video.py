@@ -316,6 +316,7 @@ _CODECS: Final = {
 }
 
 
+@lru_cache(maxsize=16)
 def _codec_of(kind: str) -> _Codec:
     """Return the codec that a message names: `h264`, `libx264`, `hevc_nvenc`, `h264;yuv420p`."""
     name = kind.replace("x26", "h26")

@@ -9,6 +9,7 @@
 /telemetry              numbers to plot: the environment's telemetry and the return so far
 /camera/depth           metric depth in millimeters
 /camera/camera_info     intrinsics of the depth camera, once
+/camera/image           video of what the environment renders, with `camera="h264"`
 
 After a seek, a viewer needs only the latest message of each scene topic.
 """
@@ -19,11 +20,22 @@ import math
 import warnings
 from collections.abc import Sequence
 from operator import itemgetter
+from typing import Any
+
+import gymnasium as gym
 
 from mcaprl.recorder.format.log_writer import LogTopics
 from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.schema import telemetry_message, telemetry_schema
 from mcaprl.recorder.format.writing import HoldSignals
+from mcaprl.recorder.record.camera import (
+    VIDEO,
+    VIDEO_PERIOD_NS,
+    VIDEO_TEXT,
+    VIDEO_TYPE,
+    VideoEncoder,
+    rendered,
+)
 from mcaprl.recorder.record.layout import RETURN_SO_FAR
 from mcaprl.recorder.record.scene import (
     DepthSource,
@@ -92,7 +104,15 @@ class ShownTopics:
 class Display:
     """Buffer of the display messages of an episode, which are written in separate chunks."""
 
-    def __init__(self, log: LogTopics, source: object, *, scene: bool, camera: bool) -> None:
+    def __init__(
+        self,
+        log: LogTopics,
+        source: object,
+        *,
+        scene: bool,
+        camera: bool,
+        rendering: gym.Env[Any, Any] | None = None,
+    ) -> None:
         """Select the topics to record.
 
         Args:
@@ -101,6 +121,7 @@ class Display:
             scene: Whether to record shapes, frames and telemetry.
             camera: Whether to record the depth camera. If observations contain images, the depth
                 camera is recorded even without this flag.
+            rendering: Environment whose rendered images are recorded as video; None for no video.
         """
         self._log, self._source = log, source if scene else None
         self._messages: list[tuple[int, int, bytes]] = []
@@ -114,7 +135,8 @@ class Display:
         self._depth = source if camera and isinstance(source, DepthSource) else None
         self._depth_images: ImageColumn | None = None
         self._camera = b""
-        self.shows_steps = any((self._scene, self._telemetry, self._depth))
+        self._rendering, self._video = rendering, None if rendering is None else VideoEncoder()
+        self.shows_steps = any((self._scene, self._telemetry, self._depth, self._rendering))
         self._shown: ShownTopics | None = None
         self._tracks, self._bytes_since_tracks, self._tracks_bytes = Tracks(), 0, 0
         self._static: dict[str, bytes] = {}
@@ -144,6 +166,7 @@ class Display:
         self._return_so_far = 0.0
         self._tracks.begin()
         self._steps_per_scene = max(1, _SCENE_PERIOD_NS // step_ns)
+        self._steps_per_image = max(1, math.ceil(VIDEO_PERIOD_NS / step_ns))
         if self._shown is None:
             self._shown = ShownTopics(self._log, self._source)
             if self._depth is not None:
@@ -153,6 +176,11 @@ class Display:
                     self._camera = camera_info(self._depth.depth_focal_px(), shape)
                     channel = self._log.add_channel(CAMERA_INFO, "sensor_msgs/msg/CameraInfo")
                     self.shown.channels[CAMERA_INFO] = channel
+            if self._rendering is not None:
+                channel = self._log.sink.add_channel(VIDEO, VIDEO_TYPE, VIDEO_TEXT)
+                self.shown.channels[VIDEO] = channel
+        if self._rendering is not None:
+            self._video = VideoEncoder()
         if self._scene is not None:
             self._emit_changed(SCENE_STATIC, start_ns, self._encode_static(self._scene))
             self._emit_changed(TF_STATIC, start_ns, transforms(self._scene.static_frames(), 0))
@@ -181,6 +209,8 @@ class Display:
         if self._telemetry is not None:
             message = self.shown.telemetry(self._telemetry, self._return_so_far)
             self._emit(TELEMETRY, time_ns, message)
+        if self._video is not None and step % self._steps_per_image == 0:
+            self._emit(VIDEO, time_ns, self._video.encode(rendered(self._rendering), time_ns))
         if self._depth is not None and self._depth_images is not None:
             if step >= self._depth_images.full_at:
                 with HoldSignals():

@@ -24,6 +24,7 @@ from mcaprl.recorder.format.schema import (
 )
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.record import panels
+from mcaprl.recorder.record.camera import VIDEO
 from mcaprl.recorder.record.panels import Node, Panel
 
 LAYOUT_NAME = "foxglove-layout.json"
@@ -238,6 +239,8 @@ class _Screens:
             title = f"depth {low:g}-{high:g} m, black: none"
             panel = panels.image(title, _DEPTH, **colors, **limits_mm)
             names.append(self._put("Image!depth", panel))
+        if VIDEO in self.topics:
+            names.append(self._put("Image!rendered", panels.image("rendered", VIDEO)))
         for leaf in observation_leaves(self.metadata.observation_space):
             if leaf.encoding is not None:
                 panel = panels.image(f"observation: {leaf.name}", leaf.topic)

@@ -17,7 +17,7 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 import numpy as np
 
-from mcaprl.errors import SpaceError
+from mcaprl.errors import SpaceError, UsageError, import_extra
 from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.format.log_writer import InfoTopics
 from mcaprl.recorder.format.messages import INTERRUPTED
@@ -63,7 +63,7 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
         append: bool = False,
         max_file_bytes: int | None = None,
         scene: bool = True,
-        camera: bool = False,
+        camera: bool | str = False,
         infos: bool | Sequence[str] = False,
         keys: Sequence[str] | None = None,
         step_duration_s: float | None = None,
@@ -89,7 +89,9 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
                 episodes; `mcaprl.open` reads the folder of the files as one dataset.
             scene: Whether to record shapes, frames and telemetry for viewers, if the environment
                 provides them.
-            camera: Whether to record the environment's metric depth image.
+            camera: Whether to record the environment's metric depth image; or `h264` to record what
+                an environment with `render_mode="rgb_array"` renders, as video for viewers, at up
+                to 30 images per simulated second. Video needs the extra `video`.
             infos: Whether to record the infos that the environment returns, or the names of the
                 infos to record; `episode` includes `episode.r`. Values other than numbers, flags,
                 strings and arrays are not recorded and cause a warning.
@@ -103,11 +105,12 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
         Raises:
             SpaceError: The log format does not support the environment's spaces.
             UnknownNameError: The observation has no such key.
-            UsageError: Timestamps would not increase, the observation has no keys, or `env` is not
-                an environment of Gymnasium.
+            UsageError: Timestamps would not increase, the observation has no keys, `env` is not an
+                environment of Gymnasium, or does not render images for a video.
             OutputExistsError, LogError: The file cannot be created or appended to.
         """
         check_single(env)
+        rendering = _rendering(env, camera)
         recorded = recorded_space(env.observation_space, keys)
         action_leaf(env.action_space)
         super().__init__(env)
@@ -132,7 +135,9 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
         log = self._recording.log
         wanted, self._recorded = recorded.infos(infos), recorded
         self._infos = EpisodeInfos(InfoTopics(log), wanted) if wanted else None
-        self._display = Display(log, env.unwrapped, scene=scene, camera=camera)
+        self._display = Display(
+            log, env.unwrapped, scene=scene, camera=camera is True, rendering=rendering
+        )
         self._columns = columns = StepColumns(log)
         self._shows_steps = self._display.shows_steps
         self._take_action, self._store_reward = columns.take_action, columns.store_reward
@@ -338,6 +343,21 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
         self._recording.advance(summary)
         if self._infos is not None:
             self._infos.warn()
+
+
+def _rendering(env: gym.Env[Any, Any], camera: bool | str) -> gym.Env[Any, Any] | None:
+    """Return the environment whose images are recorded as video; None for no video."""
+    if isinstance(camera, bool):
+        return None
+    if camera != "h264":
+        raise UsageError(f"camera must be True, False or h264, not {camera!r:.40}")
+    if env.render_mode != "rgb_array":
+        raise UsageError(
+            f"camera 'h264' records what the environment renders, but its render_mode is"
+            f' {env.render_mode}: make it with `render_mode="rgb_array"`'
+        )
+    import_extra("av", "video")
+    return env
 
 
 # Reprs and pickles contain this public import path.

@@ -321,7 +321,8 @@ class Said(Noted):
 
     def __init__(self) -> None:
         super().__init__()
-        self.observation_space = spaces.Dict({**self.observation_space, "note": spaces.Text(9)})
+        inner = {"x": spaces.Box(-9, 9, (2,), np.float32), "note": spaces.Text(9)}
+        self.observation_space = spaces.Dict(inner)
 
     def _see(self) -> Any:
         return {**super()._see(), "note": "hello"}

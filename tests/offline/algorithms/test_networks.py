@@ -11,8 +11,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from mcaprl.architecture import Architecture
+from mcaprl.architecture import ENCODERS, Architecture
+from mcaprl.errors import UsageError
 from mcaprl.networks import ImageInput, Network
+from mcaprl.offline.algorithms.config import BCConfig
 from mcaprl.offline.algorithms.models import AnyModel, Model, StackedMLP, build_model
 from mcaprl.offline.batches.observations import Observations
 
@@ -67,6 +69,28 @@ def test_small_images_have_two_convolutions_of_three_pixels() -> None:
     network = Network(0, [ImageInput((10, 10, 4))], (6,), Architecture((128,), encoder="nature"))
     assert weights_of(network) == [(16, 4, 3, 3), (32, 16, 3, 3), (128, 3 * 3 * 32), (6, 128)]
     assert network(images(5, (10, 10, 4))).shape == (5, 6)
+
+
+@pytest.mark.parametrize("name", ["nature", "compact", "small", "auto"])
+@pytest.mark.parametrize("shape", [(8, 8, 3), (10, 10, 7), (35, 35, 1), (35, 84, 3)])
+def test_grids_of_cells_have_the_small_encoder_whatever_is_named(
+    name: str, shape: tuple[int, ...]
+) -> None:
+    architecture = BCConfig(encoder=name).architecture_for([shape[2]])
+    assert architecture.encoder_of(shape) == ENCODERS["small"]
+
+
+def test_encoders_that_can_be_named() -> None:
+    cameras = [(BCConfig(encoder=each), each) for each in ("nature", "compact", "small")]
+    for config, name in cameras:
+        assert config.architecture_for([3]).encoder_of((84, 84, 3)) == ENCODERS[name]
+    # 84 -> 82 -> 40 pixels.
+    assert Architecture((16,), encoder="small").features((84, 84, 3)) == 40 * 40 * 32
+    assert BCConfig(encoder="small", channels=(4, 5)).architecture_for([1]).channels == (4, 5)
+    with pytest.raises(UsageError, match="channels must be 2 numbers of at least 1"):
+        BCConfig(encoder="small", channels=(4, 5, 6))
+    # Two widths without a name still select the compact encoder.
+    assert BCConfig(channels=(4, 5)).architecture_for([3]).encoder == "compact"
 
 
 def test_a_small_image_and_a_camera_have_their_own_convolutions() -> None:

@@ -174,7 +174,7 @@ def test_texts_of_vector_environments(
             ended = env.step(np.array([action, 2]))[2]
     data = mcaprl.open(log_path)
     assert len(data.episodes) > 2
-    # The text of a row belongs to the observation of that row, also at the end of an episode.
+    # The text of each row is that of the observation in it, also at the end of an episode.
     found = data.infos["observation.mission"].tolist()
     assert found == [f"turn {each}" for each in data.frames["direction"]]
 

@@ -1,0 +1,87 @@
+"""Video of the images that an environment renders, as a topic for viewers.
+
+Each image is one message of H.264 in Annex B, without B-frames, and each keyframe has its parameter
+sets, as Foxglove and Lichtblick need it. Each episode begins with a keyframe.
+"""
+
+from __future__ import annotations
+
+import struct
+from fractions import Fraction
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, import_extra
+
+VIDEO: Final = "/camera/image"
+VIDEO_TYPE: Final = "foxglove_msgs/msg/CompressedVideo"
+VIDEO_TEXT: Final = f"""\
+# One image of a video.
+builtin_interfaces/Time timestamp
+string frame_id
+uint8[] data
+string format
+{"=" * 80}
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+VIDEO_PERIOD_NS: Final = 33_000_000
+"""Shortest time between two images, simulated: viewers show up to 30 in a second."""
+_KEYFRAME_EVERY: Final = 60
+_OPTIONS: Final = {"preset": "superfast", "tune": "zerolatency", "crf": "25"}
+# Encapsulation header of CDR, then seconds and nanoseconds; an empty frame_id, and its padding.
+_START: Final = struct.Struct("<4sII")
+_NO_FRAME: Final = b"\1\0\0\0\0\0\0\0"
+
+
+class VideoEncoder:
+    """Encoder of images to messages of `VIDEO_TYPE`; each episode has a new one."""
+
+    def __init__(self) -> None:
+        """Import PyAV; the first image determines the size."""
+        self._av = import_extra("av", "video")
+        self._context: Any = None
+        self._count = 0
+
+    def encode(self, image: NDArray[np.uint8], time_ns: int) -> bytes:
+        """Return the message of an image (H, W, 3) at a time.
+
+        An odd height or width is cut by one pixel, because H.264 has even ones.
+        """
+        height, width = (edge // 2 * 2 for edge in image.shape[:2])
+        if self._context is None:
+            self._context = self._av.CodecContext.create("libx264", "w")
+            self._context.width, self._context.height = width, height
+            self._context.pix_fmt, self._context.time_base = "yuv420p", Fraction(1, 30)
+            self._context.framerate = Fraction(30)
+            self._context.gop_size, self._context.max_b_frames = _KEYFRAME_EVERY, 0
+            self._context.thread_count, self._context.options = 1, _OPTIONS
+        if (width, height) != (self._context.width, self._context.height):
+            raise LogError(
+                f"the environment renders images of {width} x {height} pixels, but its first one"
+                f" had {self._context.width} x {self._context.height}"
+            )
+        pixels = np.ascontiguousarray(image[:height, :width])
+        frame = self._av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuv420p")
+        frame.pts, self._count = self._count, self._count + 1
+        data = b"".join(bytes(packet) for packet in self._context.encode(frame))
+        content = _START.pack(b"\0\1\0\0", *divmod(time_ns, 10**9)) + _NO_FRAME
+        content += struct.pack("<I", len(data)) + data
+        return content + bytes(-len(content) % 4) + struct.pack("<I", 5) + b"h264\0"
+
+
+def rendered(env: Any) -> NDArray[np.uint8]:
+    """Return the image that an environment renders.
+
+    Raises:
+        LogError: It does not render an image (H, W, 3) of 8 bits.
+    """
+    image = np.asarray(env.render())
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape) < 2:
+        raise LogError(
+            f"the environment renders {image.dtype} of shape {image.shape}, not an image of 8 bits"
+        )
+    return image
