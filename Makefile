@@ -10,7 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE
 PIP := PYTHONWARNINGS=ignore:::setuptools.command.editable_wheel $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 # CI also runs the tests that take minutes.
 QUICK := $(if $(filter true,$(CI)),,-m "not slow and not long")
-EXTRAS := sims,offline,online,contrib,report,tables,video,export,foxglove,bags,remote,ray,fast
+EXTRAS := sims,offline,online,contrib,report,tables,video,export,foxglove,bags,dds,remote,ray,fast
 # What works with new versions of the dependencies: reading, recording, sims, learning and the API.
 NEWEST_TESTS := tests/recorder tests/sims tests/offline tests/online tests/api
 # A change of these files reinstalls the environments.

@@ -19,6 +19,7 @@ import click
 from mcaprl._interrupt import INTERRUPTED, raise_interrupt, repeat_lost_interrupt
 from mcaprl._version import __version__
 from mcaprl.cli.completion import completion
+from mcaprl.cli.drive import drive
 from mcaprl.cli.evaluate import evaluate
 from mcaprl.cli.help import EXIT_CODES, Program
 from mcaprl.cli.logs import (
@@ -58,6 +59,7 @@ _COMMANDS = (
     train_online,
     train_offline,
     evaluate,
+    drive,
     annotate,
     export,
     replay,

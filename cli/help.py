@@ -39,6 +39,7 @@ EXIT_CODES: Final[dict[int, str]] = {
 
 SECTIONS: Final[dict[str, tuple[str, ...]]] = {
     "Record and learn": ("record", "train-online", "train-offline", "evaluate", "export"),
+    "Drive a robot": ("drive",),
     "Look at logs": ("info", "replay", "layout", "annotate"),
     "Check and repair logs": ("check", "recover"),
     "Convert and edit logs": ("convert", "merge", "split", "filter", "slice", "relabel"),
@@ -66,6 +67,11 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     "evaluate": (
         "mcaprl evaluate runs/cql pilot random --sim lane --behavior data --report report",
         "mcaprl evaluate runs/cql --data data",
+    ),
+    "drive": (
+        "mcaprl drive runs/robot --bag bag",
+        "mcaprl drive runs/robot --dds --dry-run",
+        "mcaprl drive runs/robot --ros2 --enable /joy.buttons[4]",
     ),
     "export": ("mcaprl export runs/cql --out policy.onnx",),
     "info": (
@@ -149,6 +155,12 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         "Output": ("as_json",),
         **_BAGS,
         **_RAY,
+    },
+    "drive": {
+        "Way to the robot": ("dds", "ros1", "ros2", "bag", "domain_id", "interface"),
+        "When it drives": ("enable", "dry_run", "duration_s", "deadline_s"),
+        "Log": ("record", "overwrite"),
+        "Mapping": ("mapping", "trust_code"),
     },
     "info": {"Bags of other robots": ("mapping", "definitions", "trust_code")},
     "check": _BAGS,

@@ -34,18 +34,18 @@ def quiet_option() -> click.Option:
 
 def hint(text: str) -> None:
     """Print a line that says what the user can do next."""
-    if not _is_quiet():
+    if not is_quiet():
         echo(text)
 
 
 def working(text: str) -> AbstractContextManager[ProgressBar]:
     """Show on a terminal that a command is working, until the command opens a progress bar."""
-    return nullcontext(no_progress) if _is_quiet() else terminal_wait(text)
+    return nullcontext(no_progress) if is_quiet() else terminal_wait(text)
 
 
 def training_progress(unit: str, *terms: str) -> AbstractContextManager[ProgressCallback]:
     """Show progress bars of training; see `mcaprl.progress.terminal_progress`."""
-    return nullcontext(lambda _: None) if _is_quiet() else terminal_progress(unit, *terms)
+    return nullcontext(lambda _: None) if is_quiet() else terminal_progress(unit, *terms)
 
 
 @contextmanager
@@ -66,6 +66,7 @@ def checkpoints_kept(run: Path) -> AbstractContextManager[None]:
     return keeping("continue with --resume", run / CONFIG_NAME)
 
 
-def _is_quiet() -> bool:
+def is_quiet() -> bool:
+    """Return whether the program prints results only."""
     context = click.get_current_context(silent=True)
     return context is not None and context.meta.get(_QUIET, False)

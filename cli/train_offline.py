@@ -160,14 +160,21 @@ def _print_choice(choice: Choice, report: str) -> None:
 
 @click.command(cls=Command)
 @click.argument("run", metavar="RUN", type=PATH)
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="ONNX file to write.")
-@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-def export(run: str, out: Path, overwrite: bool) -> None:
+@click.option("--out", type=click.Path(path_type=Path), help="ONNX file to write.")
+@click.option(
+    "--node",
+    type=click.Path(path_type=Path),
+    help="Python file to write: a program of rclpy that drives the robot of the run's bag.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace existing files.")
+def export(run: str, out: Path | None, node: Path | None, overwrite: bool) -> None:
     """Write the policy of RUN, or of RUN/seed-K, as ONNX: observations in, actions out.
 
     The inputs are the parts of an observation, with the same names as in the log. The outputs are
-    action and scores. ONNX Runtime runs the file without this package.
+    action and scores. ONNX Runtime runs the file without this package. A node needs ONNX Runtime,
+    NumPy and ROS 2.
     """
     with working("loading the policy"):
-        policy = mcaprl.export(run, out, overwrite=overwrite)
-    echo(f"{out}: {policy.algo} policy {policy.name}, {out.stat().st_size / 1000:.0f} kB")
+        policy = mcaprl.export(run, out, node=node, overwrite=overwrite)
+    for file in filter(None, (out, node)):
+        echo(f"{file}: {policy.algo} policy {policy.name}, {file.stat().st_size / 1000:.0f} kB")

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mcaprl import ray, torch
     from mcaprl.api.behavior import estimate_behavior
     from mcaprl.api.convert import convert, suggest_mapping
+    from mcaprl.api.drive import drive_robot
     from mcaprl.api.edit import annotate, filter, merge, relabel, slice, split
     from mcaprl.api.estimate import estimate
     from mcaprl.api.evaluate import evaluate
@@ -65,6 +66,7 @@ __all__ = [
     "browse",
     "check",
     "convert",
+    "drive_robot",
     "estimate",
     "estimate_behavior",
     "evaluate",
@@ -112,6 +114,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.api.ranges": ["ClusterOptions"],
         "mcaprl.api.replay": ["browse", "layout", "render", "replay", "save_page", "verify"],
         "mcaprl.api.train": ["train", "train_online"],
+        "mcaprl.api.drive": ["drive_robot"],
         "mcaprl.drive.driver": ["Driver"],
         "mcaprl.ray": ["ray"],
         "mcaprl.torch": ["torch"],

@@ -22,8 +22,9 @@ ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
 SHELL_SCRIPTS = sorted(EXAMPLES.rglob("*.sh"))
 EXPERIMENTS = sorted((EXAMPLES / "experiments").glob("*.py"))
-# The stand-in for a robot, whose bag an example reads; it knows nothing of this package.
+# The stand-ins for robots, which know nothing of this package.
 ROBOT = {EXAMPLES / "05_robot_bag" / name for name in ("robot.py", "writers.py")}
+ROBOT |= {EXAMPLES / "06_drive" / name for name in ("robot.py", "messages.py")}
 ALL = sorted({*EXAMPLES.rglob("*.py"), *SHELL_SCRIPTS} - ROBOT)
 SCRIPTS = sorted(EXAMPLES.glob("[0-9]*.py"))
 NOTEBOOKS = sorted(EXAMPLES.glob("[0-9]*.ipynb"))

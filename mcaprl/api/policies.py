@@ -117,8 +117,14 @@ def load_policies(path: str | PathLike[str]) -> list[Policy]:
     return [_load(file) for file in _found_files(Path(path))]
 
 
-def export(run: str | PathLike[str], out: str | Path, *, overwrite: bool = False) -> Policy:
-    """Write a trained policy as ONNX, which ONNX Runtime runs without this package.
+def export(
+    run: str | PathLike[str],
+    out: str | Path | None = None,
+    *,
+    node: str | Path | None = None,
+    overwrite: bool = False,
+) -> Policy:
+    """Write a trained policy as ONNX, or as a node of ROS 2, which run without this package.
 
     The inputs are the parts of an observation, with the same names as in the log. The outputs are
     `action` and `scores`.
@@ -126,21 +132,35 @@ def export(run: str | PathLike[str], out: str | Path, *, overwrite: bool = False
     Args:
         run: Run folder, folder of one seed, or `.zip` file of Stable-Baselines3.
         out: ONNX file to write.
-        overwrite: Whether an existing file is replaced.
+        node: Python file to write: a program of rclpy that drives the robot from whose bag the
+            policy was trained, as `Driver` does. It contains the policy, and needs ONNX Runtime and
+            NumPy.
+        overwrite: Whether existing files are replaced.
 
     Returns:
         The policy that was exported.
 
     Raises:
-        OutputExistsError: `out` exists.
+        OutputExistsError: A file exists.
         PolicyError: There is no policy, or it cannot be exported.
+        UsageError: No file is given, or a node cannot drive by the mapping of the run.
         MissingExtraError: The packages of the `export` extra are not installed.
     """
     from mcaprl.offline.export import export_onnx
 
-    check_target(Path(out), overwrite=overwrite)
+    files = [Path(each) for each in (out, node) if each is not None]
+    if not files:
+        raise UsageError("pass `out`, `node`, or both")
+    for file in files:
+        check_target(file, overwrite=overwrite)
     policy = load_policy(run)
-    export_onnx(policy, Path(out), overwrite=overwrite)
+    if node is not None:
+        from mcaprl.drive.driver import Driver
+        from mcaprl.drive.node import export_node
+
+        export_node(Driver(run), Path(node), overwrite=overwrite)
+    if out is not None:
+        export_onnx(policy, Path(out), overwrite=overwrite)
     return policy
 
 

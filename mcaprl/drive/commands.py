@@ -15,10 +15,12 @@ from mcaprl.errors import PolicyError, UsageError
 from mcaprl.recorder.bags.bag import TopicInfo
 from mcaprl.recorder.bags.values import NUMBERS, general_path, path_text
 from mcaprl.recorder.format.metadata import Command
-from mcaprl.recorder.mapping.actions import Actions, CommandPart, actions_of
+from mcaprl.recorder.mapping.actions import Actions, CommandPart, actions_of, unit_of
 from mcaprl.recorder.mapping.observe import Values
 from mcaprl.recorder.mapping.plan import Plan, Wanted
 from mcaprl.recorder.mapping.steps import command_part
+
+_RATES = ("m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N m")
 
 
 class Commands(CommandMessages):
@@ -136,6 +138,10 @@ class Commands(CommandMessages):
                 f" that of action {int(actions.values[k])}: set `representatives`"
             )
 
+    def _units(self) -> list[str]:
+        """Return the unit of each element by the type of its message."""
+        return [field.unit for field in self._fields for _ in range(field.size)]
+
     def _limit(self, name: str) -> NDArray[np.float64] | None:
         given, count = getattr(self._drive, name), len(self._kinds)
         if given is None and name in ("low", "high") and isinstance(self._space, spaces.Box):
@@ -158,7 +164,10 @@ class Commands(CommandMessages):
             low = -np.inf if self._low is None else self._low
             high = np.inf if self._high is None else self._high
             zero = np.zeros(len(self._kinds))
-            if not is_command or ((zero < low) | (zero > high)).any():
+            outside = (zero < low) | (zero > high)
+            # A velocity of 0 stops a robot, also if it is no command of the policy.
+            is_rate = np.array([unit in _RATES for unit in self._units()])
+            if not is_command or (outside & ~is_rate).any():
                 raise UsageError(
                     f"{place}: 0 does not stop the robot: set the value of each element,"
                     " or the name of an action"
@@ -189,6 +198,8 @@ class _Field:
         assert path is not None, "commands are fields"
         self._wanted, self._type_name, self._steps = wanted, info.type_name, list(path.steps)
         self.topic, self.is_array, self.size = path.topic, size is not None, size or 1
+        label = str(path).removeprefix(path.topic).lstrip(".")
+        self.unit = unit_of(info.type_name, label)
         self.kind = info.fields.get(general_path(path.field), "float64").partition("[")[0]
 
     def part(self, values: NDArray[Any]) -> CommandPart:

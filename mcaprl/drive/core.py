@@ -5,9 +5,10 @@ This module, and what it imports to run, needs nothing but NumPy; see `node`.
 
 from __future__ import annotations
 
-import copy
 import math
 import re
+from collections.abc import Callable
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,9 @@ from mcaprl.recorder.bags.values import ABSENT, Step, steps_of, value_at
 from mcaprl.recorder.mapping.align import NS_PER_S
 from mcaprl.recorder.mapping.live import EpisodeState, LiveEpisodes, LiveStep, LiveSteps
 from mcaprl.recorder.mapping.runs import TIME_LIMIT
+
+LATE = "the command was late"
+"""Reason of a stop command that replaced a late command."""
 
 
 class Command(NamedTuple):
@@ -145,7 +149,7 @@ class CommandMessages:
         return tuple(_stored(each, kind) for each, kind in zip(command, self._kinds, strict=True))
 
     def _built(self, command: Values, time_ns: int) -> dict[str, Message]:
-        found = copy.deepcopy(self.templates)
+        found = deepcopy(self.templates)
         for message in found.values():
             if isinstance(stamp := message.get("header", {}).get("stamp"), dict):
                 stamp["sec"], stamp["nanosec"] = divmod(time_ns, int(NS_PER_S))
@@ -262,7 +266,13 @@ class DriverCore:
     def _commanded(self, step: LiveStep, state: EpisodeState, found: Command, now_ns: int) -> None:
         """Do something with a command."""
 
-    def command(self, now_ns: int, *, enabled: bool = True) -> Command:
+    def command(
+        self,
+        now_ns: int,
+        *,
+        enabled: bool = True,
+        is_late: Callable[[], bool] = lambda: False,
+    ) -> Command:
         """Return what to publish at a step.
 
         For a fixed rate, the step is at `now_ns`, which should be `next_step_ns`; otherwise it is
@@ -271,6 +281,8 @@ class DriverCore:
         Args:
             now_ns: Time in nanoseconds, on the clock of the stamps.
             enabled: Whether the policy may drive; if not, the stop command is returned.
+            is_late: Function that is called when the policy has decided; if it returns true, the
+                stop command is returned and recorded instead.
         """
         time_ns = now_ns if self.clock_topic is None else self._live.clock_ns
         if time_ns is None:
@@ -280,6 +292,8 @@ class DriverCore:
             step = self._live.step(time_ns)
             state = self._episodes.see(step, acts=enabled and not self._is_over)
             found = self._driven(step, state, enabled)
+            if not found.reason and is_late():
+                found = self._stopped(time_ns, LATE, False, found.observation)
         except (UsageError, LogError, PolicyError) as error:
             found = self._stopped(time_ns, str(error), is_fatal=True)
         self._last_ns = time_ns
@@ -290,7 +304,8 @@ class DriverCore:
     @property
     def next_step_ns(self) -> int | None:
         """Time of the next step at a fixed rate, as in a bag; None before the first message."""
-        first_ns, rate_hz = self._live.anchor_ns, self.mapping.clock.rate_hz
+        first_ns = self._live.anchor_ns
+        rate_hz: float | None = self.mapping.clock.rate_hz
         if first_ns is None or rate_hz is None:
             return None
         period_ns = NS_PER_S / rate_hz

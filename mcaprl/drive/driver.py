@@ -143,8 +143,9 @@ class Driver(DriverCore):
                 return decoder.decode(message)
             except LogError as error:
                 raise UsageError(f"{topic}: {error}") from error
-        is_protobuf = isinstance(decoder, ProtobufDecoder) and hasattr(message, "DESCRIPTOR")
-        return decoder.wrapped(message) if is_protobuf else message
+        if isinstance(decoder, ProtobufDecoder) and hasattr(message, "DESCRIPTOR"):
+            return decoder.wrapped(message)
+        return message
 
     def _pushed(self, topic: str, message: Any, stamp_ns: int) -> None:
         if self._log is not None:

@@ -243,6 +243,10 @@ class Definitions:
         """Return the definition of the type and of all types in it."""
         return self._store.generate_msgdef(self.name, ros_version=1 if is_ros1 else 2)[0]
 
+    def md5(self) -> str:
+        """Return the hash by which nodes of ROS 1 compare types."""
+        return self._store.generate_msgdef(self.name, ros_version=1)[1]
+
     def encode(self, message: Any, *, is_ros1: bool = False) -> bytes:
         """Encode a dict, or an object with an attribute for each field; absent fields are zeros.
 

@@ -7,6 +7,7 @@ from mcaprl.recorder.columns.chunks import Scratch, chunk_header
 from mcaprl.recorder.columns.definitions import (
     ROS1,
     UNREADABLE,
+    Definitions,
     TypeSource,
     definitions_of,
     full_name,
@@ -26,6 +27,7 @@ __all__ = [
     "UNREADABLE",
     "Columns",
     "Decoder",
+    "Definitions",
     "McapReader",
     "MessageRange",
     "Scratch",

@@ -442,13 +442,14 @@ class TopicStream:
     Attributes:
         topic: Name of the topic.
         fields: Paths of the fields.
+        time: Time of the messages.
     """
 
     def __init__(
         self, bag: Bag, topic: str, fields: Iterable[str], time: TimeSource | Stamp
     ) -> None:
         """Select the fields; nothing is read yet."""
-        self.topic = topic
+        self.topic, self.time = topic, time
         self._bag, self._left_out = bag, np.empty(0, np.int64)
         self.fields = sorted(set(fields))
         self._stamp: FieldPath | None = None

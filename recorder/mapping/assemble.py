@@ -387,11 +387,15 @@ def vector_names(plan: Plan, runs: list[Steps]) -> list[str]:
 
 
 def observed_names(mapping: Mapping, shapes: MappingOf[str, tuple[int, ...]]) -> tuple[str, ...]:
-    """Return the names of the elements of the observed vector for the shapes of the quantities."""
+    """Return the names of the elements of the observed vector for the shapes of the quantities.
+
+    With images, the vector is a part of the observation, and there are no names.
+    """
+    if any(quantity.image is not None for quantity in mapping.observation.values()):
+        return ()
     names = [
         each
         for name, quantity in mapping.observation.items()
-        if quantity.image is None
         for each in element_names(name, quantity, math.prod(shapes[name]))
     ]
     return tuple(_stacked_names(names, mapping.stack))

@@ -473,7 +473,7 @@ class Drive(_Part):
         default=None,
         description="Command that stops the robot: a value for each element of the command, or the"
         " name of an action. Default: 0 for each number, which must be within the limits of a"
-        " `box`.",
+        " `box`, unless it is a velocity, an acceleration or a force by its message type.",
     )
     low: list[Finite] | Finite | None = Field(
         default=None,

@@ -629,6 +629,8 @@ def _bytes_of(data: Any) -> bytes:
         if isinstance(data, str):
             return base64.b64decode(data, validate=True)
         values = np.asarray(data)
+        if values.ndim == 1 and values.dtype == np.uint8:
+            return values.tobytes()
         if values.ndim == 1 and values.dtype.kind in "iu" and not (values & ~0xFF).any():
             return values.astype(np.uint8).tobytes()
     except ValueError as error:

@@ -306,12 +306,16 @@ class _Image(_Value):
 
     def __init__(self, wanted: Wanted, reader: ImageReader, shape: tuple[int, ...] | None) -> None:
         super().__init__(wanted, {}, shape)
+        info = reader.bag.topics[reader.topic]
+        self._kinds = {name: kind_at(info.fields, name) for name in reader.fields}
         self._reader = reader
         self._waiting: list[tuple[int, dict[str, Any]]] = []
         self.image: NDArray[Any] | None = None
 
     def raw(self, message: Any) -> Any:
-        return {name: value_at(message, name) for name in self._reader.fields}
+        return {
+            name: converted(value_at(message, name), kind) for name, kind in self._kinds.items()
+        }
 
     def take(self, time_ns: int, raw: Any) -> None:
         bisect.insort(self._waiting, (time_ns, raw), key=_first)
@@ -365,13 +369,16 @@ class _Waiting:
     Attributes:
         newest_ns: Time of the newest message; None before the first.
         first_ns: Time of the oldest message so far; None before the first.
+        start_ns: Time of the last message that came after a gap; None if there was no gap.
         last_ns: Time of the last message up to the last step; None before the first.
         gap_ns: Times of the messages before and after a gap that ended since the step before; None
             if no gap did.
     """
 
-    def __init__(self, take: Callable[[int, Any], None], most: int = _MOST_PENDING) -> None:
-        self._take, self._most = take, most
+    def __init__(
+        self, take: Callable[[int, Any], None], gap_ns: float, most: int = _MOST_PENDING
+    ) -> None:
+        self._take, self._gap_ns, self._most = take, gap_ns, most
         self.drop()
 
     def drop(self) -> None:
@@ -379,6 +386,7 @@ class _Waiting:
         self._pending: list[tuple[int, Any]] = []
         self.newest_ns: int | None = None
         self.first_ns: int | None = None
+        self.start_ns: int | None = None
         self.last_ns: int | None = None
         self.gap_ns: tuple[int, int] | None = None
 
@@ -388,18 +396,20 @@ class _Waiting:
             self._pending.append((time_ns, content))
         else:
             bisect.insort(self._pending, (time_ns, content), key=_first)
+        if self.newest_ns is not None and time_ns - self.newest_ns > self._gap_ns:
+            self.start_ns = time_ns
         self.newest_ns = max(time_ns, self.newest_ns or time_ns)
         self.first_ns = min(time_ns, self.first_ns or time_ns)
         if len(self._pending) > self._most:
             self._take(*self._pending.pop(0))
 
-    def pass_on(self, time_ns: int, gap_ns: float) -> None:
+    def pass_on(self, time_ns: int) -> None:
         """Pass on the messages up to a step, and find a gap between them."""
         count = bisect.bisect_right(self._pending, time_ns, key=_first)
         self.gap_ns = None
         for own_ns, content in self._pending[:count]:
             self._take(own_ns, content)
-            if self.last_ns is not None and own_ns - self.last_ns > gap_ns:
+            if self.last_ns is not None and own_ns - self.last_ns > self._gap_ns:
                 self.gap_ns = (self.last_ns, own_ns)
             self.last_ns = max(own_ns, self.last_ns or own_ns)
         del self._pending[:count]
@@ -408,7 +418,8 @@ class _Waiting:
 class _Frames(Transforms):
     """Last transform of each frame of a topic."""
 
-    def __init__(self, topic: str, time: TimeSource) -> None:
+    def __init__(self, topic: str, time: TimeSource, gap_ns: float) -> None:
+        self._gap_ns = gap_ns
         self.topic, self._time = topic.removesuffix(STATIC), time
         self.waiting: dict[str, _Waiting] = {}
         self.drop()
@@ -440,7 +451,7 @@ class _Frames(Transforms):
             elif edge.is_static:
                 self._edges[each.child] = edge._replace(is_static=False)
             if each.child not in self.waiting:
-                self.waiting[each.child] = _Waiting(self._taker(each.child))
+                self.waiting[each.child] = _Waiting(self._taker(each.child), self._gap_ns)
             self.waiting[each.child].put(each.time_ns, now)
             times_ns.append(each.time_ns)
         return times_ns
@@ -513,7 +524,9 @@ class LiveSteps:
         """
         _check_looks_back(plan)
         self._plan, self._gap_ns = plan, plan.mapping.episodes.gap_s * NS_PER_S
-        self._frames = {topic: _Frames(topic, plan.transform_time(topic)) for topic in plan.frames}
+        self._frames = {
+            topic: _Frames(topic, plan.transform_time(topic), self._gap_ns) for topic in plan.frames
+        }
         self._values: dict[str, _Value] = {}
         self._members: dict[str, list[_Value]] = {name: [] for name in plan.streams}
         for name, wanted in plan.quantities.items():
@@ -522,16 +535,15 @@ class LiveSteps:
                 self._values[name] = _value_of(wanted, kinds, reader, (shapes or {}).get(name))
                 self._members[wanted.stream].append(self._values[name])
         self._streams: dict[str, _Waiting] = {}
-        self._any = _Waiting(lambda *_: None)
+        self._any = _Waiting(lambda *_: None, self._gap_ns)
         self._of_topic: dict[str, list[str]] = {}
         used = {wanted.stream for wanted in plan.quantities.values()} | {plan.clock or ""}
         # The messages of the clock come first, because they shift those of the other streams.
         for name in sorted(used & plan.streams.keys(), key=lambda each: each != plan.clock):
             members = self._members[name]
             has_images = any(isinstance(each, _Image) for each in members)
-            self._streams[name] = _Waiting(
-                _taker(members), _MOST_IMAGES if has_images else _MOST_PENDING
-            )
+            most = _MOST_IMAGES if has_images else _MOST_PENDING
+            self._streams[name] = _Waiting(_taker(members), self._gap_ns, most)
             self._of_topic.setdefault(plan.streams[name].topic, []).append(name)
         tf = [each for one in self._frames.values() for each in (one.topic, one.topic + STATIC)]
         self.topics = (*self._of_topic, *(each for each in tf if each in plan.bag.topics))
@@ -541,7 +553,6 @@ class LiveSteps:
         }
         self.clock_ns: int | None = None
         self._raw_ns: int | None = None
-        self._anchor_ns: int | None = None
         self._last_ns: int | None = None
         self._nth, self._problem = 0, ""
 
@@ -589,12 +600,26 @@ class LiveSteps:
 
         It is that of the first message, or of the one that ended the last gap.
         """
-        return self._any.first_ns if self._anchor_ns is None else self._anchor_ns
+        first_ns = self._any.first_ns
+        if first_ns is None:
+            return None
+        found = [first_ns]
+        for stream in self._required:
+            if stream.first_ns is not None and stream.first_ns - first_ns > self._gap_ns:
+                found.append(stream.first_ns)
+            if stream.start_ns is not None:
+                found.append(stream.start_ns)
+        return max(found)
 
     @property
     def last_ns(self) -> int | None:
-        """Time of the last message of an observed topic up to the last step; None if unknown."""
-        found = [each.last_ns for each in self._streams_of(self._plan.mapping.observation)]
+        """Time of the last message of an observed topic up to the last step; None if unknown.
+
+        If no quantity is required, that of any topic.
+        """
+        required = self._streams_of(self._plan.required)
+        every = self._streams_of(self._plan.mapping.observation) if required else [self._any]
+        found = [each.last_ns for each in every]
         return max((each for each in found if each is not None), default=None)
 
     def reset(self) -> None:
@@ -602,7 +627,7 @@ class LiveSteps:
         parts: list[_Value | _Waiting | _Frames] = [*self._values.values(), *self._frames.values()]
         for part in [*parts, *self._streams.values(), self._any]:
             part.drop()
-        self.clock_ns = self._raw_ns = self._anchor_ns = self._last_ns = None
+        self.clock_ns = self._raw_ns = self._last_ns = None
         self._nth, self._problem = 0, ""
 
     def step(self, time_ns: int) -> LiveStep:
@@ -620,29 +645,22 @@ class LiveSteps:
             self.reset()
             return LiveStep(time_ns, {}, {}, None, problem, True, True, None)
         for stream in self._streams.values():
-            stream.pass_on(time_ns, self._gap_ns)
+            stream.pass_on(time_ns)
         for frames in self._frames.values():
             for stream in frames.waiting.values():
-                stream.pass_on(time_ns, self._gap_ns)
+                stream.pass_on(time_ns)
         quantities = {name: self._at(name, time_ns) for name in self._plan.quantities}
         reason, is_fatal = self._why_not(quantities, time_ns)
         images = self._plan.images
         columns = {name: each.values for name, each in quantities.items() if name not in images}
-        # If no quantity is required, a gap is one of all streams.
-        self._any.pass_on(time_ns, self._gap_ns)
-        required = self._streams_of(self._plan.required) or [self._any]
+        self._any.pass_on(time_ns)
+        required = self._required
         ended = [each.gap_ns for each in required if each.gap_ns is not None]
         silent = [
             each.last_ns
             for each in required
             if each.last_ns is not None and time_ns - each.last_ns > self._gap_ns
         ]
-        first_ns = self._any.first_ns or 0
-        began = [each.first_ns for each in required if each.first_ns is not None]
-        starts = [each for each in began if each - first_ns > self._gap_ns]
-        starts += [high_ns for _, high_ns in ended]
-        if starts:
-            self._anchor_ns = max(*starts, self._anchor_ns or 0)
         is_late = before_ns is not None and time_ns - before_ns > self._gap_ns
         return LiveStep(
             time_ns,
@@ -667,6 +685,11 @@ class LiveSteps:
                 frames = self._frames[wanted.source.topic]
                 found += frames.moving(wanted.quantity.transform, wanted.quantity.in_)
         return found
+
+    @property
+    def _required(self) -> list[_Waiting]:
+        """Streams without whose messages there is no step; if there are none, that of all."""
+        return self._streams_of(self._plan.required) or [self._any]
 
     def _at(self, name: str, time_ns: int) -> Values:
         wanted = self._plan.quantities[name]
