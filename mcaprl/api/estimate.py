@@ -92,7 +92,7 @@ class LogEstimates:
                 return f"{text}: better than {log}; try it, and record that"
             if high < self.behavior_interval[0]:
                 return f"{text}: worse than {log}; train on, or with another algorithm"
-            return f"{text}: not clearly different from {log}; record more episodes, or try it in a sim"
+            return f"{text}: as good as {log}, as far as it shows; record more episodes"
         model = found.get("FQE")
         is_right = self.behavior_check is not None and self.behavior_check.passes
         if is_right and model is not None and model.value is not None and not model.is_refused:
