@@ -129,6 +129,21 @@ def test_an_interrupted_suite_continues_with_the_next_cell(
     assert page.read_cells(page.RESULTS).keys() == cells.keys()
 
 
+def test_settings_are_shared_and_the_rest_is_the_default() -> None:
+    discrete, box = tasks.TASKS["CartPole"], tasks.TASKS["Pendulum"]
+    q = learners.SHARED | {"gamma": 0.99, **learners.TARGET}
+    assert learners.settings_of(discrete, "bc") == learners.SHARED
+    assert learners.settings_of(discrete, "cql") == learners.settings_of(discrete, "auto") == q
+    # Its target networks have another default interval, and d3rlpy has no discrete IQL.
+    assert learners.settings_of(discrete, "iql") == learners.SHARED | {"gamma": 0.99}
+    assert learners.settings_of(box, "iql") == learners.SHARED | {"gamma": 0.97}
+    assert learners.settings_of(box, "auto") == learners.SHARED | {"gamma": 0.97}
+    assert learners.settings_of(box, "my-algorithm") == learners.SHARED
+    assert "d3rlpy-rebrac" in learners.learners_of(box, with_rivals=True)
+    own = {"double-dqn", "cql", "bc", "bcq", "iql"}
+    assert set(learners.learners_of(discrete, with_rivals=False)) == own
+
+
 def test_a_log_with_other_returns_is_refused(small: Path) -> None:
     tasks.check_returns("CartPole", "replay", [1.0, 2.0, 4.0])
     tasks.check_returns("CartPole", "replay", [4.0, 1.0, 2.0])

@@ -66,11 +66,12 @@ def learners_of(task: Task, *, with_rivals: bool) -> list[str]:
 
 def settings_of(task: Task, algo: str) -> dict[str, Any]:
     """Return the settings of a learner of this package; all others are its defaults."""
-    settings = RELEASE if task.tier == "release" else SHARED
-    own = BOX_ALGORITHMS if is_box(task) else ALGORITHMS
-    learner = own.get(algo)
+    settings, box = RELEASE if task.tier == "release" else SHARED, is_box(task)
+    if algo == "auto":
+        return settings | {"gamma": task.gamma} | ({} if box else TARGET)
+    learner = (BOX_ALGORITHMS if box else ALGORITHMS).get(algo)
     if learner is None:
-        return settings | ({"gamma": task.gamma} if algo == "auto" else {})
+        return settings
     if issubclass(learner.config_type, BootstrapConfig):
         settings = settings | {"gamma": task.gamma}
         if algo in RIVALS:
