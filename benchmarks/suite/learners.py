@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 
 import mcaprl
 from benchmarks.suite.tasks import Task, space_of
@@ -109,7 +110,7 @@ def train_d3rlpy(task: Task, data: mcaprl.Dataset, algo: str, seeds: int) -> Tra
         settings |= {f"{part}learning_rate": shared["learning_rate"]}
     if algo == "iql":
         settings |= {"value_encoder_factory": encoder}
-    if box:
+    if isinstance(data.action_space, spaces.Box):
         bounds = {"minimum": data.action_space.low, "maximum": data.action_space.high}
         settings |= {
             "observation_scaler": d3rlpy.preprocessing.StandardObservationScaler(),

@@ -129,7 +129,8 @@ def lander(env: Any) -> Scripted:
     from gymnasium.envs.box2d.lunar_lander import heuristic
 
     dtype = np.float32 if env.unwrapped.continuous else np.int64
-    return Scripted(lambda seen: np.asarray(heuristic(env.unwrapped, seen), dtype))
+    choose: Any = heuristic
+    return Scripted(lambda seen: np.asarray(choose(env.unwrapped, seen), dtype))
 
 
 def swing(_: Any) -> Scripted:
