@@ -313,6 +313,50 @@ def drive_along(driver: mcaprl.Driver, bag: StreamBag) -> None:
         driver.command(next_ns)
 
 
+def driven(path: Path) -> mcaprl.Driver:
+    """Drive for 40 steps, in episodes of at most 10, and record it; the log is still open."""
+    commands = [linear(0.05 * (k % 7)) for k in range(30)]
+    driver = drive(
+        BOX,
+        commands,
+        lambda k: np.array([0.1 * (k % 5), 0.5 * (k % 2)], np.float32),
+        episodes={"max_steps": 10},
+        reward="speed",
+        drive={"restart": True},
+    )
+    driver.record(path)
+    commanded(driver, 40)
+    return driver
+
+
+def test_the_log_of_a_drive_trains_the_next_policy(tmp_path: Path) -> None:
+    """The log is data as it is, and its run drives again."""
+    driver = driven(tmp_path / "drive.mcap")
+    driver.close()
+    data = mcaprl.open(tmp_path / "drive.mcap")
+    assert [episode.length for episode in data.episodes][:3] == [10, 10, 10]
+    np.testing.assert_allclose(data.actions[:3], [[0, 0], [0.1, 0.5], [0.2, 0]], atol=1e-6)
+    assert data.rewards[0] == pytest.approx(0.5)
+    mcaprl.train(tmp_path / "drive.mcap", tmp_path / "next", algo="bc", updates=5, seeds=1)
+    again = mcaprl.Driver(tmp_path / "next")
+    again.push("/odom", odom(0.5), START_NS)
+    assert again.command(START_NS).messages["/do"].keys() == {"linear", "angular"}
+
+
+def test_a_killed_drive_keeps_its_finished_episodes(tmp_path: Path) -> None:
+    """What is on disk when the process dies is recovered: all episodes but the open one."""
+    driver = driven(tmp_path / "drive.mcap")
+    (killed,) = tmp_path.glob("*drive.mcap*")
+    (tmp_path / "copy.mcap").write_bytes(killed.read_bytes())
+    driver.close()
+    mcaprl.recover(tmp_path / "copy.mcap", tmp_path / "recovered.mcap")
+    whole, found = mcaprl.open(tmp_path / "drive.mcap"), mcaprl.open(tmp_path / "recovered.mcap")
+    count = len(found.episodes)
+    assert count >= len(whole.episodes) - 2 > 0
+    np.testing.assert_array_equal(found.actions, whole.actions[: len(found)])
+    np.testing.assert_array_equal(found.rewards, whole.rewards[: len(found)])
+
+
 @pytest.mark.parametrize("name", ROBOTS)
 def test_bags_of_many_robots(name: str, tmp_path: Path) -> None:
     form = list(FORMATS)[list(ROBOTS).index(name) % len(FORMATS)]
