@@ -29,7 +29,12 @@ _PIPE_WIDTH = 120
 _MAX_ROWS = 40
 """Number of rows of a wide table that are printed."""
 _ARGUMENT = re.compile(r"""`([a-z]\w*)=('[^']*'|"[^"]*"|[^`]*)`""")
-_OPTIONS = {"sim_options": "--env-arg", "sources": "--from"}
+_OPTIONS = {
+    "sim_options": "--env-arg",
+    "sources": "--from",
+    "duration_s": "--duration",
+    "deadline_s": "--deadline",
+}
 """Options whose names differ from those of the arguments."""
 
 

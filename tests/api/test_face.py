@@ -40,6 +40,7 @@ FUNCTIONS = {
     "check": ("check", "open"),
     "evaluate": ("evaluate", "estimate", "open"),
     "replay": ("replay", "verify", "render", "browse", "save_page"),
+    "drive": ("drive_robot",),
     "completion": (),
 }
 """Functions of commands that have several functions, a function with another name, or none, since
@@ -59,6 +60,11 @@ ONLY_OPTIONS = {
     "replay --verify": "it selects the function verify",
     "record --no-scene": "scene=False",
     "evaluate --all": "the function returns all estimates",
+    "drive --dds": "transport='dds'",
+    "drive --ros1": "transport='ros1'",
+    "drive --ros2": "transport='ros2'",
+    "drive --duration": "duration_s",
+    "drive --deadline": "deadline_s",
     "train-offline --sweep": "it selects the function sweep",
     "train-online --from": "`from` is a keyword of Python: sources",
 }

@@ -70,6 +70,7 @@ WAITING = {
     "replay --save": ("replay", "LOG", "--save", "OUT.html"),
     "replay --verify": ("replay", "LOG", "--verify"),
     "layout": ("layout", "LOG", "--out", "-"),
+    "drive": ("drive", "LOG", "--bag", "LOG"),
     "annotate": ("annotate", "LOG", "--scene", "--out", "OUT.mcap"),
     "check": ("check", "LOG"),
     "recover": ("recover", "LOG", "OUT.mcap"),

@@ -326,7 +326,7 @@ def test_the_command_prints_the_four_parts_in_order(
     from mcaprl.cli import run
 
     arguments = ["evaluate", "random", "--data", str(log), "--updates", "20", "--gamma", "0.9"]
-    assert run(arguments) == 0
+    assert run([*arguments, "--all"]) == 0
     shown = capsys.readouterr().out
     parts = ["mean return discounted", "FQE predicts", "importance sampling", "actions as near to"]
     places = [shown.index(part) for part in parts]
