@@ -125,7 +125,7 @@ class NetworkSettings(Settings):
     """
 
     encoder: str = AUTO
-    """convolutions over images: nature, compact, small, or auto, which selects by edge and channels"""
+    """convolutions over images: nature, compact, small, or auto, which selects by the image"""
     channels: tuple[int, ...] = ()
     """output channels of the convolutions; by default, nature has 32,64,64, the others 16,32"""
     center_images: bool = True

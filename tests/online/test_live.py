@@ -216,8 +216,9 @@ def test_other_algorithms_and_environments(
     layout = json.loads((tmp_path / "run" / "foxglove-layout.json").read_text())
     check_panels(layout, Topics(schemas))
     # The most important metrics come first.
-    first = [path["value"] for path in layout["configById"]["Plot!training"]["paths"]]
-    assert first == ["/rl/training.mean_return", "/rl/training.score"]
+    for name in ("mean_return", "score"):
+        (first,) = layout["configById"][f"Plot!training {name}"]["paths"]
+        assert first["value"] == f"/rl/training.{name}"
     loss = layout["configById"]["Plot!loss"]["lichtblickPanelTitle"]
     assert loss == TRAINING_LABELS["loss"] == "loss of the last update"
     assert layout["configById"]["Tab!metrics"]["tabs"][0]["title"] == "mean q"
