@@ -7,6 +7,7 @@ from tests.support.paths import CORE, TESTS
 OTHER = {
     "device",
     "docs",
+    "drive",
     "golden",
     "online",
     "ray",

@@ -31,7 +31,15 @@ def modules() -> list[str]:
 
 
 def test_every_folder_is_a_package() -> None:
-    found = {"mcaprl", "mcaprl.api", "mcaprl.device", "mcaprl.ray", "mcaprl.storage"}
+    found = {
+        "mcaprl",
+        "mcaprl.api",
+        "mcaprl.device",
+        "mcaprl.drive",
+        "mcaprl.drive.transports",
+        "mcaprl.ray",
+        "mcaprl.storage",
+    }
     for root in ROOTS:
         for init in (ROOT / root).rglob("__init__.py"):
             found.add("mcaprl." + ".".join(init.parent.relative_to(ROOT).parts))
