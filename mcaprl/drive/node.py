@@ -1,5 +1,7 @@
 """Export of a driver as a program of one file, which needs rclpy, ONNX Runtime and NumPy only.
 
+Images that are compressed or resized need Pillow as well.
+
 The file has the code of `node_main` and of all that it uses from this package, so that the node
 does what `Driver` does; the mapping as resolved, and the policy as an ONNX model.
 """
@@ -18,15 +20,18 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from mcaprl.drive.driver import Driver
-from mcaprl.errors import PolicyError, UsageError
+from mcaprl.errors import PolicyError
 from mcaprl.files import replacing
 
 _MAIN = "mcaprl.drive.node_main"
-_REPLACED = {("mcaprl.recorder.mapping.config", "Stamp"): (_MAIN, "NodeStamp")}
+_REPLACED = {
+    ("mcaprl.recorder.mapping.config", "Stamp"): (_MAIN, "NodeStamp"),
+    ("mcaprl.errors", "import_extra"): (_MAIN, "node_import"),
+}
 _WIDTH = 96
 _HEAD = '''"""Node that drives a robot by a trained policy; written by `mcaprl export --node`.
 
-It needs rclpy, onnxruntime and numpy: source your ROS 2, and run `python3 {name}`.
+It needs rclpy, onnxruntime and numpy{more}: source your ROS 2, and run `python3 {name}`.
 """
 
 from __future__ import annotations
@@ -37,7 +42,6 @@ def export_node(driver: Driver, path: Path, *, overwrite: bool = False) -> None:
     """Write the node of a driver.
 
     Raises:
-        UsageError: The mapping observes images, which a node cannot decode.
         OutputExistsError: The file exists.
     """
     from mcaprl.offline.export import export_onnx
@@ -49,7 +53,7 @@ def export_node(driver: Driver, path: Path, *, overwrite: bool = False) -> None:
     spec = json.dumps(_spec(driver))
     text = "\n".join(
         [
-            _HEAD.format(name=path.name),
+            _HEAD.format(name=path.name, more=", and Pillow" if driver._plan.images else ""),
             _Bundle().text("main"),
             "import json\n",
             f"SPEC = json.loads(\n{_quoted(spec)}\n)",
@@ -71,11 +75,6 @@ def _quoted(text: str) -> str:
 def _spec(driver: Driver) -> dict[str, Any]:
     """Return what `NodePlan` reads."""
     plan, mapping = driver._plan, driver.mapping
-    if plan.images:
-        raise UsageError(
-            f"{plan.place.of('observation', next(iter(plan.images)))}: a node cannot decode images:"
-            " use mcaprl.Driver on the robot"
-        )
     names = [*driver.inputs, *driver.outputs]
     infos = {
         name: {**vars(info), "unreadable": dict(info.unreadable)}
@@ -108,12 +107,14 @@ def _spec(driver: Driver) -> dict[str, Any]:
         "observation": {name: each.model_dump() for name, each in mapping.observation.items()},
         "quantities": quantities,
         "streams": streams,
+        "images": {name: reader.fields for name, reader in plan.images.items()},
         "conditions": {name: each.text for name, each in plan.conditions.items()},
         "constants": {name: int(each) for name, each in plan.constants.items()},
         "frames": {topic: plan.transform_time(topic) for topic in plan.frames},
         "clock_stream": plan.clock,
         "required": plan.required,
         "shapes": {name: list(shape) for name, shape in driver._robot.shapes.items()},
+        "inputs": {leaf.name: "".join(leaf.path) for leaf in driver.policy.encoder.leaves},
         "frame_stack": driver.policy.frame_stack,
         "commands": driver._robot_commands.plain,
     }

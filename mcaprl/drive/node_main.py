@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 
 from mcaprl.drive.core import CommandMessages, DriverCore
-from mcaprl.frames import FrameStack
+from mcaprl.errors import UsageError
+from mcaprl.frames import FrameStack, parts_of
 from mcaprl.recorder.bags.bag import TopicInfo
 from mcaprl.recorder.mapping.align import TopicStream, path_in
 from mcaprl.recorder.mapping.expression import Expression
+from mcaprl.recorder.mapping.images import ImageOptions
 from mcaprl.recorder.mapping.live import LiveEpisodes, LiveSteps
 from mcaprl.recorder.mapping.observe import Source
 from mcaprl.recorder.mapping.plan import Wanted
@@ -27,6 +29,15 @@ _SILENCE_S = 0.5
 
 class NodeStamp(SimpleNamespace):
     """Time of a message in one of its fields."""
+
+
+def node_import(module: str, extra: str) -> Any:
+    """Import a package that a node needs for some mappings only."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        missing = "Pillow" if module.startswith("PIL") else module
+        raise UsageError(f"{missing} is not installed, which the images need") from error
 
 
 class NodePlace:
@@ -63,8 +74,18 @@ class NodePlan:
         self.constants = {name: np.array(value) for name, value in spec["constants"].items()}
         self.frames, self._times = spec["frames"], spec["frames"]
         self.clock, self.required = spec["clock_stream"], spec["required"]
-        self.images: dict[str, Any] = {}
+        self.images = {
+            name: self._image(self.quantities[name], fields)
+            for name, fields in spec["images"].items()
+        }
         self.place = NodePlace()
+
+    def _image(self, wanted: Wanted, fields: list[str]) -> Any:
+        """Return the attributes of an `ImageReader` that decode a message."""
+        topic = wanted.source.topic
+        options = ImageOptions(topic, wanted.quantity)
+        own = {"bag": self.bag, "topic": topic, "fields": fields, "options": options}
+        return SimpleNamespace(**own, is_video=False)
 
     def transform_time(self, topic: str) -> str:
         """Return the time of the transforms of a topic."""
@@ -87,30 +108,32 @@ class NodePolicy:
 
     name = "the policy"
 
-    def __init__(self, model: bytes, frame_stack: int) -> None:
-        """Load the model."""
+    def __init__(self, model: bytes, frame_stack: int, inputs: dict[str, str]) -> None:
+        """Load the model, whose `inputs` are the parts of an observation."""
         runtime = importlib.import_module("onnxruntime")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = 1
         self._session = runtime.InferenceSession(model, options)
         self.frame_stack, self._frames = frame_stack, FrameStack(frame_stack)
+        self._inputs = inputs
 
     def begin(self) -> None:
         """Drop the frames of the episode before."""
         self._frames.clear()
 
     def act(self, observations: Any) -> Any:
-        """Return the action (1, *shape) of an observation (1, *shape)."""
+        """Return the action (1, *shape) of an observation (1, *shape), or of a dict of them."""
+        parts = parts_of(observations)
         if self.frame_stack > 1:
-            observations = self._frames.see({"": observations})[""]
-        name = self._session.get_inputs()[0].name
-        return self._session.run(["action"], {name: observations})[0]
+            parts = self._frames.see(parts)
+        inputs = {name: parts[part] for name, part in self._inputs.items()}
+        return self._session.run(["action"], inputs)[0]
 
 
 def node_driver(spec: dict[str, Any], model: str) -> DriverCore:
     """Return the driver of a node; `model` is the ONNX model in base64."""
     plan: Any = NodePlan(spec)
-    policy = NodePolicy(base64.b64decode(model), spec["frame_stack"])
+    policy = NodePolicy(base64.b64decode(model), spec["frame_stack"], spec["inputs"])
     shapes = {name: tuple(shape) for name, shape in spec["shapes"].items()}
     live, episodes = LiveSteps(plan, shapes), LiveEpisodes(plan, policy.frame_stack)
     return DriverCore(plan, live, episodes, CommandMessages.of_plain(spec["commands"]), policy)

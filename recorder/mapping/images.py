@@ -75,6 +75,7 @@ class ImageOptions:
     Attributes:
         ambiguous: Encoding of images that were read as depth, although it does not say that they
             are; empty if there were none.
+        is_intensity: Whether numbers are no depth.
     """
 
     def __init__(
@@ -83,19 +84,12 @@ class ImageOptions:
         """Store the options; `topic` is for error messages."""
         self._topic, self._quantity = topic, quantity
         self._rectifier = None if calibration is None else Rectifier(calibration)
-        self.ambiguous = ""
+        self.ambiguous, self.is_intensity = "", quantity.as_ == "intensity"
 
     def to_json(self) -> str:
         """Return the options that determine the pixels."""
         names = {"undistort", "crop", "resize", "gray", "range_m", "range", "as_"}
         return self._quantity.model_dump_json(include=names)
-
-    def space(self, images: Frames) -> spaces.Box:
-        """Return the space of one image or stack of images (N, H, W, C)."""
-        if images.dtype == np.uint8:
-            return spaces.Box(0, 255, images.shape[1:], np.uint8)
-        low = -np.inf if self._quantity.as_ == "intensity" else 0.0
-        return spaces.Box(low, np.inf, images.shape[1:], np.float32)
 
     def applied(self, pixels: Pixels) -> Image:
         """Return the image (H, W, C) of an observation."""
@@ -123,7 +117,7 @@ class ImageOptions:
     def _is_depth(self, pixels: Pixels) -> bool:
         """Return whether the pixels are read as depth."""
         wanted, kind = self._quantity.as_, one_line(pixels.encoding)
-        if wanted == "intensity":
+        if self.is_intensity:
             return False
         if pixels.has_lost_depth:
             raise UsageError(
@@ -439,7 +433,10 @@ class ImageReader:
 
     def space(self, images: Frames) -> spaces.Box:
         """Return the space of one of the images (N, H, W, C)."""
-        return self.options.space(images)
+        if images.dtype == np.uint8:
+            return spaces.Box(0, 255, images.shape[1:], np.uint8)
+        low = -np.inf if self.options.is_intensity else 0.0
+        return spaces.Box(low, np.inf, images.shape[1:], np.float32)
 
     def problems(self) -> list[Problem]:
         """Return problems of the images that `read` decoded."""
@@ -518,7 +515,7 @@ class ImageReader:
                 continue
             try:
                 # The full image is not kept: the next one is decoded into the same memory.
-                image = self.options.applied(self.decoded(message))
+                image = self.options.applied(pixels_of(message))
             except LogError as error:
                 self._leave_out(row, str(error))
                 continue
@@ -574,19 +571,18 @@ class ImageReader:
             messages[row] = {name: column[k] for name, column in found.columns.items()}
         yield from sorted(messages.items(), key=lambda each: each[0])
 
-    def decoded(self, message: dict[str, Any]) -> Pixels:
-        """Decode the fields of an image message."""
-        kind = _kind_of(message)
-        if "encoding" in message:
-            return raw_pixels({**message, "data": _bytes_of(message["data"])})
-        try:
-            if is_video(kind):
-                raise LogError("the topic has files of images as well")
-            return compressed_pixels(kind, _bytes_of(message["data"]))
-        except LogError as error:
-            raise LogError(
-                f"a compressed image ({one_line(kind)}) cannot be read: {error}"
-            ) from error
+
+def pixels_of(message: dict[str, Any]) -> Pixels:
+    """Decode the fields of an image message."""
+    kind = _kind_of(message)
+    if "encoding" in message:
+        return raw_pixels({**message, "data": _bytes_of(message["data"])})
+    try:
+        if is_video(kind):
+            raise LogError("the topic has files of images as well")
+        return compressed_pixels(kind, _bytes_of(message["data"]))
+    except LogError as error:
+        raise LogError(f"a compressed image ({one_line(kind)}) cannot be read: {error}") from error
 
 
 def _kind_of(message: dict[str, Any]) -> str:

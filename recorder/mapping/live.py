@@ -36,7 +36,7 @@ from mcaprl.recorder.bags.values import (
 )
 from mcaprl.recorder.mapping.align import NS_PER_S, padded, pooled
 from mcaprl.recorder.mapping.config import TimeSource
-from mcaprl.recorder.mapping.images import ImageReader
+from mcaprl.recorder.mapping.images import ImageReader, pixels_of
 from mcaprl.recorder.mapping.observe import Values, by_names, check_order, pose_of, shaped
 from mcaprl.recorder.mapping.plan import Plan, Wanted
 from mcaprl.recorder.mapping.runs import GAP, NO_ACTION, RESTARTED, TIME_LIMIT
@@ -332,7 +332,7 @@ class _Image(_Value):
             if self.time_ns is not None and own_ns < self.time_ns:
                 break
             try:
-                image = self._reader.options.applied(self._reader.decoded(raw))
+                image = self._reader.options.applied(pixels_of(raw))
             except LogError:
                 continue
             if self.shape is not None and image.shape != self.shape:

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 import mcaprl
 from mcaprl.cli import run
+from tests.drive.test_driver import Fixed, compared
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "05_robot_bag"
 
@@ -60,9 +62,20 @@ def assert_same_drives(recorded: mcaprl.Dataset, read: mcaprl.Dataset) -> None:
     assert (read.truncated == recorded.truncated).all()
 
 
+def assert_driver_sees(bag: Path, data: mcaprl.Dataset) -> None:
+    """Check that a driver builds all observations of a bag message by message."""
+    tree = data.robot
+    has_buttons = isinstance(data.action_space, spaces.Discrete)
+    tree["mapping"]["drive"]["stop"] = "brake" if has_buttons else [-1, 0]
+    driver = mcaprl.Driver(Fixed(data), mapping=tree)
+    assert compared(driver, bag, data) == len(data._transitions.log_time_ns)
+
+
 @pytest.mark.parametrize("form", ["ros2", "protobuf", "json"])
 def test_the_bag_gives_the_transitions_of_the_native_log(native: Path, form: str) -> None:
-    read = mcaprl.open(make(native, form), mapping=EXAMPLE / "robot.yaml")
+    bag = make(native, form)
+    read = mcaprl.open(bag, mapping=EXAMPLE / "robot.yaml")
+    assert_driver_sees(bag, read)
     assert_same_drives(mcaprl.open(native), read)
     assert read.action_labels == (
         "linear.x (-1 full brake, 1 full throttle)",
@@ -72,7 +85,9 @@ def test_the_bag_gives_the_transitions_of_the_native_log(native: Path, form: str
 
 def test_the_bag_of_a_car_with_buttons(buttons: Path) -> None:
     recorded = mcaprl.open(buttons)
-    read = mcaprl.open(make(buttons, "ros2"), mapping=EXAMPLE / "buttons.yaml")
+    bag = make(buttons, "ros2")
+    read = mcaprl.open(bag, mapping=EXAMPLE / "buttons.yaml")
+    assert_driver_sees(bag, read)
     assert_same_drives(recorded, read)
     assert read.action_meanings == recorded.action_meanings
     assert [episode.reason for episode in read.episodes] == ["gap", "gap", "stall"]

@@ -5,22 +5,26 @@ from __future__ import annotations
 import importlib.util
 import subprocess
 import sys
+from io import BytesIO
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 import mcaprl
+from mcaprl.drive.node_main import node_import
 from mcaprl.errors import UsageError
 from tests.support.robots import Robot, odometry, transform, twist, write_mcap
 
 START_NS = 1_700_000_000 * 10**9
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 TF = "tf2_msgs/msg/TFMessage"
+RAW = "sensor_msgs/msg/Image"
 
 
 def plain_type(kind: str) -> type:
@@ -41,7 +45,7 @@ def plain_type(kind: str) -> type:
             elif node == Nodetype.BASE:
                 value = "" if what[0] == "string" else 0
             else:
-                value = [0.0] * int(what[1])
+                value = [0.0] * int(what[1] or 0)
             setattr(self, field, value)
 
     found = type(name, (), {**body, "__init__": start})
@@ -133,6 +137,7 @@ def rclpy(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.setitem(sys.modules, "rclpy.qos", qos)
     for package, names in {
         "nav_msgs": ["Odometry"],
+        "sensor_msgs": ["Image", "CompressedImage"],
         "geometry_msgs": ["Twist", "TransformStamped"],
         "tf2_msgs": ["TFMessage"],
     }.items():
@@ -143,11 +148,29 @@ def rclpy(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return found
 
 
+def image(t: float, encoding: str, width: int) -> dict[str, Any]:
+    """Return an image of 8 x 6 pixels of `width` bytes, which changes from step to step."""
+    data = np.random.default_rng(round(1000 * t)).integers(0, 255, 8 * 6 * width).tolist()
+    data = data if encoding != "32FC1" else list(np.linspace(t, 9, 48, dtype="<f4").tobytes())
+    size = {"height": 6, "width": 8, "step": 8 * width, "is_bigendian": 0}
+    return {**size, "encoding": encoding, "data": data}
+
+
+def photo(t: float) -> dict[str, Any]:
+    """Return a PNG file."""
+    buffer = BytesIO()
+    Image.fromarray(np.full((4, 6, 3), round(40 * t), np.uint8)).save(buffer, "PNG")
+    return {"format": "png", "data": list(buffer.getvalue())}
+
+
 def robot() -> Robot:
     found = Robot([])
     found.add("/odom", "nav_msgs/msg/Odometry", 20, odometry, last_s=6)
     found.add("/cmd_vel", "geometry_msgs/msg/Twist", 10, twist, last_s=6)
     frames = [("map", "base")]
+    for topic, *kind in (("/camera", "bgr8", 3), ("/depth", "32FC1", 4)):
+        found.add(topic, RAW, 10, lambda t, kind=kind: image(t, *kind), last_s=6)
+    found.add("/photo", "sensor_msgs/msg/CompressedImage", 10, photo, last_s=6)
     found.add("/tf", TF, 20, lambda t: {"transforms": [transform(*f, t) for f in frames]}, last_s=6)
     return found
 
@@ -168,6 +191,17 @@ MAPPING = {
     "episodes": {"max_steps": 10, "terminated": "speed > 100"},
     "drive": {"max_change": 2.0},
 }
+SIGHT = {
+    **MAPPING,
+    "observation": {
+        "speed": MAPPING["observation"]["speed"],
+        "camera": {"image": "/camera", "gray": True},
+        "small": {"image": "/camera", "resize": [4, 3]},
+        "depth": {"image": "/depth", "range_m": [0, 10]},
+        "photo": {"image": "/photo", "crop": [1, 1, 4, 3]},
+    },
+    "stack": 1,
+}
 BINS = {
     **MAPPING,
     "clock": {"topic": "/odom"},
@@ -175,7 +209,7 @@ BINS = {
 }
 
 
-@pytest.mark.parametrize(("mapping", "algo"), [(MAPPING, "bc"), (BINS, "bc")])
+@pytest.mark.parametrize(("mapping", "algo"), [(MAPPING, "bc"), (BINS, "bc"), (SIGHT, "bc")])
 def test_a_node_commands_what_the_driver_commands(
     mapping: dict[str, Any], algo: str, tmp_path: Path, rclpy: Any
 ) -> None:
@@ -230,6 +264,13 @@ def test_a_node_commands_what_the_driver_commands(
     assert not heavy & {name.partition(".")[0] for name in done_.stdout.split()}
 
 
-def test_images_need_the_driver(tmp_path: Path) -> None:
+def test_a_node_names_the_package_that_its_images_need(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    monkeypatch.delitem(sys.modules, "PIL.Image")
+    with pytest.raises(UsageError, match="Pillow is not installed, which the images need"):
+        node_import("PIL.Image", "bags")
+
+
+def test_an_export_needs_a_file_to_write(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="pass `out`, `node`, or both"):
         mcaprl.export(tmp_path)

@@ -22,6 +22,7 @@ import mcaprl
 from mcaprl.drive.transports import Wire
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.source import Definition
+from tests.conftest import need
 from tests.support.bags import STORE1, STORE2, messages, write_rosbag1, write_rosbag2
 from tests.support.memory_robot import TURN, Cruise, driver
 
@@ -274,8 +275,7 @@ print(turns)
 @pytest.fixture
 def ros_master() -> Any:
     master = shutil.which("rosmaster")
-    if master is None or not (DIST_PACKAGES / "rospy").exists():
-        pytest.skip("rospy is not installed")
+    need(master is not None and (DIST_PACKAGES / "rospy").exists(), "rospy is not installed")
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         port = one.getsockname()[1]
