@@ -23,7 +23,8 @@ esac
 
 # Drive the robot with a policy, and record the drive.
 drive() {
-  python "$here/robot.py" "$sim" "$actions" --episodes "${EPISODES:-8}" --limit 200 &
+  python "$here/robot.py" "$sim" "$actions" --episodes "${EPISODES:-8}" --limit 200 \
+    --seed "${SEED:-1000}" &
   robot=$!
   # The robot does without commands for half a second.
   mcaprl drive "$1" --dds --deadline 0.3 --record "$2" --quiet &
