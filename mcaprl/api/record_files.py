@@ -8,7 +8,6 @@ import multiprocessing
 import os
 import shutil
 import signal
-import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -51,6 +50,7 @@ from mcaprl.sims.evaluation.rollout import (
     noisy_name,
     rollout,
 )
+from mcaprl.system import END, STOPS, blocked_stops, unblock_stops
 from mcaprl.texts import counted
 
 
@@ -168,17 +168,8 @@ def _recorder(request: FileRequest, env: gym.Env[Any, Any], behavior: EpsilonGre
     )
 
 
-if sys.platform != "win32":
-    from multiprocessing import resource_tracker
-
 T = TypeVar("T")
 _Kind = Literal["message", "done", "interrupted", "error"]
-_STOPS = [
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-]
-# Signal that ends a worker: SIGTERM, because background processes ignore SIGINT. Windows has no
-# SIGTERM, so SIGINT is used there.
-_END = signal.SIGINT if sys.platform == "win32" else signal.SIGTERM
 
 
 class WorkerEndedError(Exception):
@@ -216,7 +207,7 @@ def run_workers(
     processes = []
     open_pipes: dict[Connection, int] = {}
     try:
-        with _signals_blocked():
+        with blocked_stops():
             for index, request in enumerate(requests):
                 messages, sender = context.Pipe(duplex=False)
                 process = context.Process(target=_work, args=(task, request, ours, sender))
@@ -258,12 +249,11 @@ def _work(
     """Run a task; send its messages, and then its outcome."""
     outcome: tuple[_Kind, Any]
     try:
-        for number in _STOPS:
-            if signal.getsignal(number) is not signal.SIG_IGN or number == _END:
+        for number in STOPS:
+            if signal.getsignal(number) is not signal.SIG_IGN or number == END:
                 signal.signal(number, _interrupt_once)
         threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-        if sys.platform != "win32":
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
+        unblock_stops()
         task(request, partial(_send, to))
         outcome = "done", None
     except KeyboardInterrupt:
@@ -289,10 +279,10 @@ def _end_with(parent: Connection) -> None:
     """Interrupt the main thread when the parent exits or closes the pipe."""
     with suppress(EOFError, OSError):
         parent.recv()
-    send_to_main_thread(_END)
+    send_to_main_thread(END)
 
 
-def _interrupt_once(number: int = _END, frame: FrameType | None = None) -> None:
+def _interrupt_once(number: int = END, frame: FrameType | None = None) -> None:
     if is_postponed(number, frame):
         return
     # The terminal and the parent both send a signal. The second must not interrupt the clean-up.
@@ -302,27 +292,12 @@ def _interrupt_once(number: int = _END, frame: FrameType | None = None) -> None:
 
 def _ignore_stops() -> None:
     # Do not use SIG_IGN, because Python then prints an error for a signal that has already arrived.
-    for number in _STOPS:
+    for number in STOPS:
         signal.signal(number, _ignore)
 
 
 def _ignore(*_: Any) -> None:
     pass
-
-
-@contextmanager
-def _signals_blocked() -> Iterator[None]:
-    """Block signals in this thread and in new processes. A process unblocks them when ready."""
-    if sys.platform == "win32":
-        yield
-        return
-    # Start the resource tracker first: its start unblocks the signals.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 # Default number of files on Ray: at most 64, each with at least 10,000 steps.

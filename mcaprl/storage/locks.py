@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import stat
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import FileIO
@@ -18,9 +17,7 @@ from typing import BinaryIO, Protocol
 from weakref import WeakKeyDictionary
 
 from mcaprl.errors import LogError
-
-if sys.platform != "win32":
-    import fcntl
+from mcaprl.system import lock_descriptor, unlock_descriptor
 
 _TAKEN = "{} is being written by another process; wait until it ends, or choose another path"
 _NOT_REGULAR = "it is not a regular file"
@@ -100,20 +97,7 @@ def try_lock(descriptor: int) -> bool:
     The lock is advisory and ends when the file is closed. On systems without `flock`, such as
     Windows and some network file systems, nothing is locked, and the result is True.
     """
-    return surely_locked(descriptor) is not False
-
-
-def surely_locked(descriptor: int) -> bool | None:
-    """Lock an open file or folder as `try_lock` does; return None on systems without `flock`."""
-    if sys.platform == "win32":
-        return None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return None
-    return True
+    return lock_descriptor(descriptor) is not False
 
 
 def taken(path: Path, descriptor: int | None = None) -> LogError:
@@ -134,18 +118,13 @@ def waiting_lock(file: BinaryIO | FileIO) -> Iterator[None]:
 
     On systems without `flock`, nothing is locked; see `try_lock`.
     """
-    if sys.platform == "win32":
-        yield
-        return
-    with suppress(OSError):
-        fcntl.flock(file, fcntl.LOCK_EX)
+    lock_descriptor(file.fileno(), wait=True)
     try:
         yield
     finally:
         file.flush()
         # A forked process may still have the file open, so closing it does not end the lock.
-        with suppress(OSError):
-            fcntl.flock(file, fcntl.LOCK_UN)
+        unlock_descriptor(file.fileno())
 
 
 @contextmanager

@@ -21,7 +21,6 @@ import os
 import re
 import shutil
 import stat
-import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -31,7 +30,13 @@ from pathlib import Path
 from typing import Any
 
 from mcaprl.errors import LogError, McaprlError, OutputExistsError, UsageError
-from mcaprl.storage.locks import OpenFolder, lock, locked_file, surely_locked, taken
+from mcaprl.storage.locks import OpenFolder, lock, locked_file, taken
+from mcaprl.system import (
+    HAS_FOLDER_DESCRIPTORS,
+    folder_descriptor,
+    is_of_another_user,
+    lock_descriptor,
+)
 
 _MARK, _FILES = ".mcaprl-work-folder", "files"
 _MAX_NAME_BYTES = 255
@@ -230,7 +235,7 @@ def _opened(folder: Path, *, create: bool = True) -> OpenFolder:
         if not stat.S_ISDIR(mode):
             kind = "a symbolic link" if stat.S_ISLNK(mode) else "not a folder"
             raise _foreign(folder, f"is {kind}")
-        opened = OpenFolder(_descriptor_of(folder))
+        opened = OpenFolder(folder_descriptor(folder, follow=False))
     except FileNotFoundError:
         if not create:
             raise
@@ -246,18 +251,12 @@ def _opened(folder: Path, *, create: bool = True) -> OpenFolder:
     return opened
 
 
-def _descriptor_of(folder: Path) -> int:
-    if sys.platform == "win32":
-        return os.open(os.devnull, os.O_RDONLY)
-    return os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-
-
 def _problem(folder: Path, opened: OpenFolder) -> str:
     """Return why an existing folder is not one of this package; empty if it is one.
 
     Earlier versions made no mark: their folders contain nothing but the target.
     """
-    if sys.platform != "win32" and os.fstat(opened.fileno()).st_uid != os.geteuid():
+    if HAS_FOLDER_DESCRIPTORS and is_of_another_user(os.fstat(opened.fileno())):
         return "belongs to another user"
     entries = _entries(folder, opened)
     is_marked = stat.S_ISREG(entries.get(_MARK, 0))
@@ -273,7 +272,7 @@ def _foreign(folder: Path, problem: str) -> OutputExistsError:
 
 
 def _is_at(opened: OpenFolder, folder: Path) -> bool:
-    if sys.platform == "win32":
+    if not HAS_FOLDER_DESCRIPTORS:
         return True
     try:
         return os.path.samestat(os.fstat(opened.fileno()), folder.lstat())
@@ -283,7 +282,7 @@ def _is_at(opened: OpenFolder, folder: Path) -> bool:
 
 def _at(folder: Path, opened: OpenFolder) -> tuple[int | Path, dict[str, int]]:
     """Return how to list a folder, and the argument with which names are relative to it."""
-    if sys.platform == "win32":
+    if not HAS_FOLDER_DESCRIPTORS:
         return folder, {}
     return opened.fileno(), {"dir_fd": opened.fileno()}
 
@@ -336,7 +335,7 @@ def _remove_left(folder: Path, *, marked: bool = False) -> None:
     try:
         entries = _entries(folder, opened)
         is_left = _MARK in entries if marked else bool(entries)
-        if is_left and surely_locked(opened.fileno()) and _is_at(opened, folder):
+        if is_left and lock_descriptor(opened.fileno()) and _is_at(opened, folder):
             _restore(folder)
             _remove(folder, opened)
     finally:
@@ -353,8 +352,8 @@ def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Ite
     is_new, opened = not folder.exists(), None
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if sys.platform != "win32":
-            opened = OpenFolder(os.open(folder, os.O_RDONLY | os.O_DIRECTORY))
+        if HAS_FOLDER_DESCRIPTORS:
+            opened = OpenFolder(folder_descriptor(folder))
     except OSError as error:
         raise error_type(f"cannot write {folder}: {_reason(folder, error)}") from error
     try:
@@ -383,7 +382,7 @@ def subfolder(path: Path, *, own: bool = False) -> Path:
     state, problem = path.lstat(), ""
     if not stat.S_ISDIR(state.st_mode):
         problem = "is a symbolic link" if path.is_symlink() else "is not a folder"
-    elif own and sys.platform != "win32" and state.st_uid != os.geteuid():
+    elif own and is_of_another_user(state):
         problem = "belongs to another user"
     if problem:
         raise OutputExistsError(f"{path} {problem}: move or delete it, or choose another output")

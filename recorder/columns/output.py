@@ -20,7 +20,6 @@ import inspect
 import os
 import signal
 import stat
-import sys
 import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -47,6 +46,7 @@ from mcaprl.recorder.columns.records import (
     records_of,
 )
 from mcaprl.recorder.columns.summary import Summary
+from mcaprl.system import STOPS, unlock_descriptor
 
 try:
     # These functions return plain numbers. Their wrappers in `signal` convert the numbers to enums,
@@ -56,10 +56,6 @@ try:
 except ImportError:
     from signal import getsignal
     from signal import signal as set_handler
-
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
-# Windows has no SIGHUP.
-_HELD = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 
 
 class HoldSignals:
@@ -80,7 +76,7 @@ class HoldSignals:
         self._waiting: list[int] = []
         try:
             HoldSignals._is_held = True
-            for number in _HELD:
+            for number in STOPS:
                 handler = getsignal(number)
                 # A handler that was not installed from Python (None) cannot be restored.
                 if handler is not None:
@@ -116,9 +112,6 @@ class HoldSignals:
         for number, handler in self._handlers.items():
             set_handler(number, handler)
 
-
-if sys.platform != "win32":
-    import fcntl
 
 _COPIED_BYTES = 2**20
 
@@ -159,9 +152,8 @@ def reopen(path: Path) -> FileIO:
 
 def release(file: FileIO) -> None:
     """Unlock and close a file, even if a child process still has it open."""
-    if not file.closed and sys.platform != "win32":
-        with contextlib.suppress(OSError):
-            fcntl.flock(file, fcntl.LOCK_UN)
+    if not file.closed:
+        unlock_descriptor(file.fileno())
     file.close()
 
 

@@ -18,7 +18,6 @@ import io
 import mmap
 import os
 import struct
-import sys
 from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -45,6 +44,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
 from mcaprl.files import open_at_once
+from mcaprl.system import memory_maps
 
 try:
     from mcaprl.recorder.columns._native import copy_fields as copy_fields
@@ -385,20 +385,7 @@ class _Map:
             _LIBC.munmap(self._address, self._size)
 
 
-def _libc() -> Any:
-    """Return the C library; None if it has no `mmap` of 64-bit offsets."""
-    if sys.platform == "win32" or ctypes.sizeof(ctypes.c_long) < 8:
-        return None
-    libc = ctypes.CDLL(None, use_errno=True)
-    address, size, number = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
-    libc.mmap.restype = address
-    libc.mmap.argtypes = [address, size, number, number, number, ctypes.c_long]
-    libc.munmap.argtypes = [address, size]
-    libc.madvise.argtypes = [address, size, number]
-    return libc
-
-
-_LIBC = _libc()
+_LIBC = memory_maps()
 
 
 MAGIC = b"\x89MCAP0\r\n"

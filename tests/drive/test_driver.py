@@ -338,7 +338,7 @@ def test_the_log_of_a_drive_trains_the_next_policy(tmp_path: Path) -> None:
     driver.close()
     data = mcaprl.open(tmp_path / "drive.mcap")
     assert [episode.length for episode in data.episodes][:3] == [10, 10, 10]
-    np.testing.assert_allclose(data.actions[:3], [[0, 0], [0.1, 0.5], [0.2, 0]], atol=1e-6)
+    np.testing.assert_allclose(data.actions[:3], [[0.0, 0.0], [0.1, 0.5], [0.2, 0.0]], atol=1e-6)
     assert data.rewards[0] == pytest.approx(0.5)
     mcaprl.train(tmp_path / "drive.mcap", tmp_path / "next", algo="bc", updates=5, seeds=1)
     again = mcaprl.Driver(tmp_path / "next")

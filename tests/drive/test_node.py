@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import subprocess
 import sys
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -148,8 +149,9 @@ def rclpy(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return found
 
 
-def image(t: float, encoding: str, width: int) -> dict[str, Any]:
+def image(kind: tuple[str, int], t: float) -> dict[str, Any]:
     """Return an image of 8 x 6 pixels of `width` bytes, which changes from step to step."""
+    encoding, width = kind
     data = np.random.default_rng(round(1000 * t)).integers(0, 255, 8 * 6 * width).tolist()
     data = data if encoding != "32FC1" else list(np.linspace(t, 9, 48, dtype="<f4").tobytes())
     size = {"height": 6, "width": 8, "step": 8 * width, "is_bigendian": 0}
@@ -168,8 +170,8 @@ def robot() -> Robot:
     found.add("/odom", "nav_msgs/msg/Odometry", 20, odometry, last_s=6)
     found.add("/cmd_vel", "geometry_msgs/msg/Twist", 10, twist, last_s=6)
     frames = [("map", "base")]
-    for topic, *kind in (("/camera", "bgr8", 3), ("/depth", "32FC1", 4)):
-        found.add(topic, RAW, 10, lambda t, kind=kind: image(t, *kind), last_s=6)
+    for topic, kind in (("/camera", ("bgr8", 3)), ("/depth", ("32FC1", 4))):
+        found.add(topic, RAW, 10, partial(image, kind), last_s=6)
     found.add("/photo", "sensor_msgs/msg/CompressedImage", 10, photo, last_s=6)
     found.add("/tf", TF, 20, lambda t: {"transforms": [transform(*f, t) for f in frames]}, last_s=6)
     return found
@@ -194,7 +196,7 @@ MAPPING = {
 SIGHT = {
     **MAPPING,
     "observation": {
-        "speed": MAPPING["observation"]["speed"],
+        "speed": {"field": "/odom.twist.twist.linear.x", "scale": 0.5},
         "camera": {"image": "/camera", "gray": True},
         "small": {"image": "/camera", "resize": [4, 3]},
         "depth": {"image": "/depth", "range_m": [0, 10]},

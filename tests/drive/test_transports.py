@@ -22,6 +22,7 @@ import mcaprl
 from mcaprl.drive.transports import Wire
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.source import Definition
+from mcaprl.system import udp_sockets
 from tests.conftest import need
 from tests.support.bags import STORE1, STORE2, messages, write_rosbag1, write_rosbag2
 from tests.support.memory_robot import TURN, Cruise, driver
@@ -198,15 +199,19 @@ def test_dds_stays_on_this_machine(bag: Path) -> None:
     pytest.importorskip("cyclonedds")
     from mcaprl.drive.transports import dds
 
-    before = dds._udp_sockets()
+    before = udp_sockets() or set()
     transport = dds.DdsTransport(domain_id=next(DOMAIN))
     transport.open({}, {}, lambda *_: None)
-    opened = dds._udp_sockets() - before
+    opened = (udp_sockets() or set()) - before
     assert opened
     for number in opened:
         with socket.socket(fileno=os.dup(number)) as one:
             assert one.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16) == b"lo\0"
     transport.close()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dds, "udp_sockets", lambda: None)
+        with pytest.raises(UsageError, match="cannot keep DDS on this machine"):
+            dds.DdsTransport(domain_id=next(DOMAIN)).open({}, {}, lambda *_: None)
     for given, message in (
         ({"domain_id": 233}, "0 to 232"),
         ({"interface": "<x/>"}, "is not a network interface"),
@@ -274,8 +279,8 @@ print(turns)
 
 @pytest.fixture
 def ros_master() -> Any:
-    master = shutil.which("rosmaster")
-    need(master is not None and (DIST_PACKAGES / "rospy").exists(), "rospy is not installed")
+    master = shutil.which("rosmaster") or ""
+    need(bool(master) and (DIST_PACKAGES / "rospy").exists(), "rospy is not installed")
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         port = one.getsockname()[1]

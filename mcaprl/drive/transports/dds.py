@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import re
-import socket
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -19,6 +18,7 @@ from rosbags.interfaces import Nodetype
 
 from mcaprl.drive.transports import Receive, Wire
 from mcaprl.errors import UsageError, import_extra
+from mcaprl.system import bind_to_interface, udp_sockets
 
 LOOPBACK = "lo"
 _CONFIG = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="{interface}"/>
@@ -109,7 +109,11 @@ class DdsTransport:
             multicast="false" if is_local else "spdp",
             peers=_PEERS if is_local else "",
         )
-        before = _udp_sockets()
+        before = udp_sockets()
+        if is_local and before is None:
+            raise UsageError(
+                "this system cannot keep DDS on this machine: choose the network by --interface"
+            )
         try:
             self._domain = domains.Domain(self._id, config)
             self._participant = domains.DomainParticipant(self._id)
@@ -119,11 +123,8 @@ class DdsTransport:
             ) from error
         if is_local:
             # Cyclone receives on all addresses, also if it sends on one interface alone.
-            for number in _udp_sockets() - before:
-                with socket.socket(fileno=os.dup(number)) as one:
-                    one.setsockopt(
-                        socket.SOL_SOCKET, socket.SO_BINDTODEVICE, f"{LOOPBACK}\0".encode()
-                    )
+            for number in (udp_sockets() or set()) - (before or set()):
+                bind_to_interface(number, LOOPBACK)
 
     def _reader(self, core: Any, topic: str, wire: Wire, receive: Receive) -> Any:
         found, qos, sample_type = self._topic(core, topic, wire, is_command=False)
@@ -202,15 +203,3 @@ def _field(types: Mapping[str, Any], description: Any, known: dict[str, Any]) ->
 def _ros_name(name: str) -> str:
     """Return the name in ROS of a type of DDS."""
     return name.replace("::dds_::", "::").removesuffix("_").replace("::", "/")
-
-
-def _udp_sockets() -> set[int]:
-    """Return the UDP sockets of this process."""
-    found = set()
-    for name in os.listdir("/proc/self/fd"):
-        with suppress(OSError):
-            if os.readlink(f"/proc/self/fd/{name}").startswith("socket:"):
-                with socket.socket(fileno=os.dup(int(name))) as one:
-                    if (one.family, one.type) == (socket.AF_INET, socket.SOCK_DGRAM):
-                        found.add(int(name))
-    return found

@@ -8,7 +8,6 @@ belong to one array.
 from __future__ import annotations
 
 import math
-import os
 import re
 import struct
 from collections.abc import Iterator, Sequence
@@ -26,6 +25,7 @@ from mcaprl.errors import LogError, McaprlError, import_extra
 from mcaprl.files import open_at_once
 from mcaprl.limits import MAX_NESTED_GROUPS, MAX_READ_RATIO, UNPACKED_ALLOWANCE_BYTES
 from mcaprl.recorder.dataset.formats.columns import Budget
+from mcaprl.system import read_at
 from mcaprl.texts import printable
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -141,12 +141,12 @@ class _Input(FileIO):
         for _ in range(min(size, self._size) // 16 + 1):
             if not 1 < free <= size - 16:
                 return
-            free = int.from_bytes(os.pread(self.fileno(), 8, data + free), "little")
+            free = int.from_bytes(read_at(self.fileno(), 8, data + free), "little")
         raise OSError("a list of free blocks is circular")
 
     def _check_global_heap(self, place: int, size: int) -> None:
         """Check that each object in a collection of texts ends after its start."""
-        data = os.pread(self.fileno(), min(size, _MAX_GLOBAL_HEAP_BYTES), place)
+        data = read_at(self.fileno(), min(size, _MAX_GLOBAL_HEAP_BYTES), place)
         offset = 16
         while offset + 16 <= len(data):
             index, _, _, length = struct.unpack_from("<HHIQ", data, offset)
