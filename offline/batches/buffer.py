@@ -40,7 +40,7 @@ MAX_JOINT_ACTIONS = 1_024
 """Largest number of combinations of a MultiDiscrete or MultiBinary space."""
 _BLOCK_ROWS = 1 << 18
 """Rows that are checked at once."""
-_ON_DEVICE = ("frames", "starts", "places", "actions", "returns", "next_rows")
+_ON_DEVICE = ("frames", "starts", "places", "actions", "returns", "next_rows", "ends")
 
 
 @dataclass(frozen=True)
@@ -90,6 +90,7 @@ class TransitionBuffer:
         box: Scaling of the actions of a Box; None for a finite space.
         next_rows: (N,) int64, row of the transition that starts at each transition's next
             observation; -1 at the end of an episode. Empty for a finite space.
+        ends: (N,) int64, row after the last one of each row's episode; empty without chunks.
     """
 
     encoder: ObservationEncoder
@@ -106,6 +107,7 @@ class TransitionBuffer:
     is_fixed: bool = True
     box: BoxActions | None = None
     next_rows: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
+    ends: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
 
     @classmethod
     def from_dataset(
@@ -175,6 +177,9 @@ class TransitionBuffer:
             reward_scale=reward_scale,
             box=box,
             next_rows=_next_rows(lengths, packing.n_steps if is_box else 0),
+            ends=torch.from_numpy(
+                np.repeat(np.cumsum(lengths), lengths) if packing.chunk > 1 else np.empty(0, int)
+            ),
         )
         return buffer if weights is None else buffer.with_weights(np.repeat(weights, lengths))
 
@@ -231,6 +236,18 @@ class TransitionBuffer:
         else:
             states = [self.observe(here), self.observe(there)]
         return Batch(rows, states[0], actions, rewards, discounts, states[1])
+
+    def chunks(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the actions of rows (R,) and of the steps after them, and which of them exist.
+
+        Returns:
+            Actions (R, H) or (R, H, n), and a mask (R, H), bool. After the end of the episode, the
+            last action is repeated, and the mask is False.
+        """
+        steps = torch.arange(self.packing.chunk, device=rows.device)
+        every, ends = rows.unsqueeze(1) + steps, self.ends.index_select(0, rows).unsqueeze(1)
+        found = self.actions.index_select(0, torch.minimum(every, ends - 1).flatten())
+        return found.view(*every.shape, *self.actions.shape[1:]), every < ends
 
     def with_weights(self, weights: NDArray[np.float64]) -> TransitionBuffer:
         """Return the same transitions with relative sampling weights (N,).
