@@ -115,6 +115,7 @@ def _spec(driver: Driver) -> dict[str, Any]:
         "required": plan.required,
         "shapes": {name: list(shape) for name, shape in driver._robot.shapes.items()},
         "frame_stack": driver.policy.frame_stack,
+        "chunk": driver.policy.chunk.to_json(),
         "commands": driver._robot_commands.plain,
     }
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mcaprl.chunks import ChunkExecution, Chunks
 from mcaprl.drive.core import CommandMessages, DriverCore
 from mcaprl.frames import FrameStack
 from mcaprl.recorder.bags.bag import TopicInfo
@@ -87,30 +88,41 @@ class NodePolicy:
 
     name = "the policy"
 
-    def __init__(self, model: bytes, frame_stack: int) -> None:
+    def __init__(self, model: bytes, frame_stack: int, chunk: Chunks) -> None:
         """Load the model."""
         runtime = importlib.import_module("onnxruntime")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = 1
         self._session = runtime.InferenceSession(model, options)
         self.frame_stack, self._frames = frame_stack, FrameStack(frame_stack)
+        self._chunk, self._execution = chunk, ChunkExecution(chunk)
 
     def begin(self) -> None:
-        """Drop the frames of the episode before."""
+        """Drop the frames and chunks of the episode before."""
         self._frames.clear()
+        self._execution.clear()
+
+    def interrupt(self) -> None:
+        """Drop the actions that were predicted for the next steps."""
+        self._execution.clear()
 
     def act(self, observations: Any) -> Any:
         """Return the action (1, *shape) of an observation (1, *shape)."""
         if self.frame_stack > 1:
             observations = self._frames.see({"": observations})[""]
         name = self._session.get_inputs()[0].name
-        return self._session.run(["action"], {name: observations})[0]
+
+        def predict() -> Any:
+            return self._session.run(["action"], {name: observations})[0]
+
+        return predict() if self._chunk.length == 1 else self._execution.act(1, predict)
 
 
 def node_driver(spec: dict[str, Any], model: str) -> DriverCore:
     """Return the driver of a node; `model` is the ONNX model in base64."""
     plan: Any = NodePlan(spec)
-    policy = NodePolicy(base64.b64decode(model), spec["frame_stack"])
+    chunk = Chunks(**spec["chunk"])
+    policy = NodePolicy(base64.b64decode(model), spec["frame_stack"], chunk)
     shapes = {name: tuple(shape) for name, shape in spec["shapes"].items()}
     live, episodes = LiveSteps(plan, shapes), LiveEpisodes(plan, policy.frame_stack)
     return DriverCore(plan, live, episodes, CommandMessages.of_plain(spec["commands"]), policy)

@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 
 import mcaprl
 from mcaprl.base_policy import BasePolicy
+from mcaprl.chunks import planned
 from mcaprl.errors import LogError, McaprlError, UsageError
 from mcaprl.recorder.bags.decoders import decoder_of
 from mcaprl.recorder.mapping.config import parse_mapping
 from mcaprl.recorder.mapping.read import read_open_bag
+from mcaprl.sims.evaluation.rollout import EpsilonGreedy
 from tests.drive.test_live import QUANTITIES, START_NS, TYPES, mappings, odom, streams
 from tests.recorder.mapping.suggest.test_suggested_robots import ROBOTS
 from tests.support.robots import FORMATS, Robot, vector
@@ -171,6 +173,41 @@ def test_nothing_moves_before_all_inputs_are_there() -> None:
     assert old.observation is not None
     back = driver.command(START_NS)
     assert (back.reason, back.is_fatal) == ("the clock went back by 0.45 s", True)
+
+
+@pytest.mark.parametrize("own", [{"chunk": 5, "execute": 3}, {"chunk": 4, "ensemble": True}])
+def test_chunks_are_executed_as_in_an_evaluation(own: dict[str, Any], tmp_path: Path) -> None:
+    commands = [{**linear(0.05 * (k % 7)), "angular": vector(0, 0, k % 2)} for k in range(30)]
+    sent = [Sent(START_NS + k * 100 * MS, "/odom", odom(k % 4)) for k in range(31)]
+    sent += [Sent(START_NS + k * 100 * MS, "/do", each) for k, each in enumerate(commands)]
+    mapping = {"clock": {"rate_hz": 10}, "observation": SPEED, "action": BOX}
+    tree = {**mapping, "episodes": {"truncated": "speed > 8"}, "drive": {"timeout_s": 0.25}}
+    bag = bag_of(*sent, types={"/do": "geometry_msgs/msg/Twist"})
+    data = read_open_bag(bag, parse_mapping(tree)).dataset
+    run = mcaprl.train(data, tmp_path / "run", algo="bc", updates=3, held_out=0.0, **own)
+    driver = mcaprl.Driver(run.policy, mapping=data.robot)
+    random = np.random.default_rng(0)
+    speeds, found = random.uniform(0, 3, 30).astype(np.float32), list[Any]()
+    # A new episode begins after step 10; from step 20 on, /odom is silent for four steps.
+    speeds[10] = 9
+    for k, speed in enumerate(speeds):
+        now_ns = START_NS + k * 100 * MS
+        if not 20 <= k < 24:
+            driver.push("/odom", odom(float(speed)), now_ns)
+        found.append(driver.command(now_ns))
+    assert [k for k, each in enumerate(found) if each.reason] == [10, 22, 23]
+    for first, stop in ((0, 10), (11, 22), (24, 30)):
+        part = found[first:stop]
+        seen = np.array([each.observation for each in part])
+        wanted = planned(run.policy.chunk, run.policy.act_chunk(seen))
+        np.testing.assert_allclose([each.action for each in part], wanted, atol=1e-6)
+        # The same as in an environment with these observations.
+        behavior = EpsilonGreedy(run.policy, 0.0, data.action_space)
+        own_actions = [behavior.choose(each)[0] for each in seen]
+        np.testing.assert_array_equal([each.action for each in part], own_actions)
+        messages = [each.messages["/do"] for each in part]
+        sent_ = [(each["linear"]["x"], each["angular"]["z"]) for each in messages]
+        np.testing.assert_allclose(sent_, own_actions, atol=1e-6)
 
 
 def test_a_terminal_state_stops_the_robot() -> None:
