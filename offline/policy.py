@@ -35,6 +35,7 @@ from mcaprl.offline.algorithms.heads import ENCODER, Head, build_head
 from mcaprl.offline.algorithms.iql import LOG_STD
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
+from mcaprl.offline.batches.relative import RelativeActions
 from mcaprl.recorder.format.metadata import ActionCommands
 from mcaprl.recorder.format.spaces import (
     check_actions,
@@ -48,7 +49,8 @@ from mcaprl.storage.tensor_files import check_finite, read_tensors, write_tensor
 
 FORMAT_VERSION = 2
 _CHUNKS_VERSION = 3
-"""Version of the file of a policy with chunks, which earlier versions of mcaprl cannot execute."""
+"""Version of a policy with chunks or relative actions, for which earlier versions have no code."""
+_RELATIVE = ("relative.low", "relative.high")
 TWIN = "q_twin"
 """Name of the second critic of a policy for a Box, which is not used to act."""
 _WEIGHTS_NAME = "policy.safetensors"
@@ -340,11 +342,14 @@ def save_policy(
         if image.shift is not None:
             weights[_IMAGE_SHIFT.format(number)] = torch.from_numpy(image.shift)
             weights[_IMAGE_SCALE.format(number)] = torch.tensor(image.scale)
+    relative = buffer.relative
+    if relative is not None:
+        weights |= dict(zip(_RELATIVE, (relative.low.cpu(), relative.high.cpu()), strict=True))
     write_tensors(folder / _WEIGHTS_NAME, weights, {"updates": learner.step})
     chunks = getattr(learner.config, "chunks", Chunks())
     has_chunks = chunks.length > 1
     description = {
-        "format_version": _CHUNKS_VERSION if has_chunks else FORMAT_VERSION,
+        "format_version": _CHUNKS_VERSION if has_chunks or relative else FORMAT_VERSION,
         "algo": learner.name,
         "acts_by": learner.acts_by,
         "threshold": getattr(learner.config, "threshold", 0.0),
@@ -359,6 +364,7 @@ def save_policy(
         "observation_space": json.loads(space_to_json(buffer.encoder.space)),
         "action_space": json.loads(space_to_json(buffer.action_space)),
         **({"chunk": chunks.to_json()} if has_chunks else {}),
+        **({"relative_to": list(relative.relation)} if relative else {}),
         **_box_description(learner),
         **({"action_commands": action_commands.to_json()} if action_commands else {}),
     }
@@ -398,6 +404,7 @@ class _Description:
     action_range: Any = None
     critics: dict[str, dict[str, Any]] = field(default_factory=dict)
     chunk: dict[str, Any] = field(default_factory=dict)
+    relative_to: list[int | None] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.threshold) and 0 < self.reward_scale < math.inf):
@@ -443,8 +450,9 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
     log_std = weights.pop(LOG_STD, None)
     if log_std is not None and (box is None or log_std.shape != (box.size,)):
         raise ValueError(f"{LOG_STD} has shape {tuple(log_std.shape)}")
-    networks = _networks(description, encoder, 0 if box is None else box.size, weights)
     chunk = Chunks(**description.chunk)
+    relative = _relative(description, encoder, box, chunk.length, weights)
+    networks = _networks(description, encoder, 0 if box is None else box.size, weights)
     head = build_head(
         description.acts_by,
         networks,
@@ -453,6 +461,7 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
         box=box,
         log_std=log_std,
         chunk=chunk.length,
+        relative=relative,
     )
     head.networks.load_state_dict(weights)
     commands = description.action_commands
@@ -473,6 +482,22 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
         mask_from=mask_from,
         chunk=chunk,
     )
+
+
+def _relative(
+    description: _Description,
+    encoder: ObservationEncoder,
+    box: BoxActions | None,
+    length: int,
+    weights: dict[str, Tensor],
+) -> RelativeActions | None:
+    """Return the conversion of relative actions, whose ranges are removed from `weights`."""
+    if not description.relative_to:
+        return None
+    low, high = (weights.pop(name) for name in _RELATIVE)
+    if box is None or low.shape != (length, box.size) or not (low < high).all():
+        raise ValueError("the ranges of relative actions do not fit the action space")
+    return RelativeActions(tuple(description.relative_to), encoder, box, low, high)
 
 
 def _networks(

@@ -10,7 +10,8 @@ for demonstrations that do the same thing in several ways.
 
 With the setting `chunk`, the network predicts the actions of the next H steps, which are masked in
 the loss after the end of an episode; see `mcaprl.chunks`. A mixture is one of whole chunks, so that
-the actions of a chunk are those of one way.
+the actions of a chunk are those of one way. Actions may be relative to observations; see
+`offline.batches.relative`.
 """
 
 from __future__ import annotations
@@ -87,12 +88,16 @@ class BoxBC(Learner):
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return the mean squared error or the negative log density, and the absolute error.
 
-        Both are those of actions that are scaled to [-1, 1].
+        Both are those of actions, or relative ones, that are scaled to [-1, 1].
         """
         outputs = self.models["actor"](batch.observations)
         actions, known = batch.actions, torch.ones_like(batch.actions)
-        if self.config.chunk > 1:
+        relative = self.buffer.relative
+        if self.config.chunk > 1 or relative is not None:
             found, exist = self.buffer.chunks(batch.rows)
+            if relative is not None:
+                # Only those of held-out episodes are outside.
+                found = relative.numbers(found, batch.observations.vector).clamp(-1, 1)
             actions, known = found.flatten(1), exist.repeat_interleave(self.n_actions, 1).float()
         error = self.head.best(outputs) - actions
         if self.config.head == "deterministic":

@@ -165,6 +165,8 @@ class BoxBCConfig(BCConfig):
     """what the network outputs: deterministic, gaussian, or mixture (of 5 Gaussians)"""
     ensemble: bool = False
     """predict a chunk at each step, and average those of the last steps (temporal ensembling)"""
+    relative: bool = True
+    """learn actions relative to observations, where the data declare it (`relative_to`)"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -176,6 +178,11 @@ class BoxBCConfig(BCConfig):
     def chunks(self) -> Chunks:
         """Length of the chunks and how they are executed."""
         return Chunks(self.chunk, 1, ACT_DECAY) if self.ensemble else super().chunks
+
+    @property
+    def packing(self) -> Packing:
+        """Settings for building transitions from the log."""
+        return replace(super().packing, relative=self.relative)
 
 
 @dataclass(frozen=True)

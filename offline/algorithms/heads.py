@@ -43,6 +43,7 @@ from mcaprl.offline.algorithms.losses import (
 )
 from mcaprl.offline.batches.buffer import discrete_actions
 from mcaprl.offline.batches.observations import Observations
+from mcaprl.offline.batches.relative import RelativeActions
 
 
 class Head(nn.Module):
@@ -201,6 +202,7 @@ class BoxHead(Head):
     Attributes:
         box: Scaling of the actions to numbers in [-1, 1].
         log_std: (n,) logarithms of the standard deviations, if they are the same in all states.
+        relative: Conversion of the networks' numbers, if they are relative to the observations.
     """
 
     log_std: Tensor | None
@@ -213,10 +215,11 @@ class BoxHead(Head):
         box: BoxActions,
         log_std: Tensor | None = None,
         chunk: int = 1,
+        relative: RelativeActions | None = None,
     ) -> None:
         """Wrap the networks."""
         super().__init__(networks, chunk)
-        self.box = box
+        self.box, self.relative = box, relative
         self.register_buffer("log_std", log_std)
         # In float64, so that the bounds are the same numbers as in the space.
         self.register_buffer("_low", torch.from_numpy(box.low), persistent=False)
@@ -251,8 +254,9 @@ class BoxHead(Head):
         With chunks, they are (B, H, *shape).
         """
         numbers = self.best(self._outputs(observations)).double()
-        if self.chunk > 1:
-            numbers = numbers.view(-1, self.chunk, self.box.size)
+        numbers = numbers.view(-1, self.chunk, self.box.size)
+        if self.relative is not None:
+            numbers = self.relative.actions(numbers, observations.vector)
         values = self._low + (numbers + 1) / 2 * (self._high - self._low)
         dtype = getattr(torch, str(self.box.space.dtype))
         chunk = (self.chunk,) if self.chunk > 1 else ()
@@ -260,6 +264,8 @@ class BoxHead(Head):
 
     def log_prob(self, observations: Observations, actions: NDArray[Any]) -> Tensor:
         """Return the log densities (B,) of actions (B, *shape), in their own units."""
+        if self.relative is not None:
+            raise PolicyError("actions that are relative to observations have no density")
         outputs = self._outputs(observations)
         numbers = torch.from_numpy(self.box.scaled(actions)).clamp(-1, 1)
         log_density = self.log_density(outputs, numbers, self.log_std) + self.box.log_scale
@@ -479,6 +485,7 @@ def build_head(
     box: BoxActions | None = None,
     log_std: Tensor | None = None,
     chunk: int = 1,
+    relative: RelativeActions | None = None,
 ) -> Head:
     """Return the head of a policy file or learner.
 
@@ -490,13 +497,14 @@ def build_head(
         box: Scaling of the actions of a Box.
         log_std: Logarithms (n,) of the deviations of `Gaussian`, unless the network outputs them.
         chunk: Number of actions that are predicted from one observation.
+        relative: Conversion of relative actions of a Box.
 
     Raises:
         ValueError: There is no such head, or it predicts no chunks.
         SpaceError: The head does not support the action space.
     """
     if box is not None and acts_by in BOX_HEADS:
-        return BOX_HEADS[acts_by](networks, box, log_std, chunk)
+        return BOX_HEADS[acts_by](networks, box, log_std, chunk, relative)
     if acts_by not in HEADS or (chunk > 1 and acts_by != "logits"):
         raise ValueError(f"acts_by {acts_by!r} is not supported")
     return HEADS[acts_by](networks, action_space, threshold, chunk)

@@ -20,6 +20,7 @@ class Packing:
             returns of all transitions.
         clip_actions: Whether logged actions outside a Box are clipped to its bounds.
         chunk: Number of successive actions that are learned from one observation.
+        relative: Whether actions are learned relative to observations, where the data declare it.
     """
 
     frame_stack: int = 1
