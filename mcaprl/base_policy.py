@@ -11,6 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.actions import JointActions, allowed_actions
+from mcaprl.chunks import Chunks
 from mcaprl.errors import PolicyError, UsageError
 
 
@@ -32,6 +33,7 @@ class BasePolicy:
         env_id: Gymnasium id of the environment in which the policy was trained; empty if unknown.
         env_kwargs: Arguments of that environment.
         frame_stack: Number of successive observations that determine an action.
+        chunk: Length of the chunks of actions that the policy predicts, and their execution.
         action_commands: Commands of a robot that the actions stand for; None if unknown.
         mask_from: Source of the action mask; see `mcaprl.actions`.
         is_deterministic: Whether `act` has no randomness. If not, recordings of finite spaces have
@@ -45,12 +47,23 @@ class BasePolicy:
     env_id: str = ""
     env_kwargs: Mapping[str, Any] = MappingProxyType({})
     frame_stack: int = 1
+    chunk: Chunks = Chunks()
     action_commands: Any = None
     mask_from: str = ""
     is_deterministic: bool = True
 
     def begin(self) -> None:
         """Drop what the policy stores, at the start of an episode."""
+
+    def interrupt(self) -> None:
+        """Drop the actions that were predicted for the next steps; observations are kept."""
+
+    def act_chunk(self, observations: Any) -> NDArray[Any]:
+        """Return the chunks (B, H, *shape) of observations, whatever was executed before.
+
+        H is `chunk.length`. Nothing is stored.
+        """
+        raise PolicyError(f"{self.name} predicts no chunks")
 
     def act(self, observations: Any) -> NDArray[Any]:
         """Return actions (B, *shape) for observations (B, *shape) or nested dicts of them."""

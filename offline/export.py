@@ -14,6 +14,7 @@ fastest (`numpy.unravel_index(k, sizes)`). The metadata of the file contain this
 
 from __future__ import annotations
 
+import json
 import logging
 import warnings
 from collections.abc import Iterator
@@ -130,16 +131,24 @@ def export_onnx(policy: object, path: Path, *, overwrite: bool = True) -> None:
 def _metadata(policy: Policy) -> dict[str, str]:
     """Return the properties of the ONNX file that describe its outputs."""
     space = {"action_space": space_to_json(policy.action_space)}
+    if policy.chunk.length > 1:
+        space |= {
+            "chunk": json.dumps(policy.chunk.to_json()),
+            "execution": f"action[:, k] is for the k-th step from now: {policy.chunk}; when an"
+            " episode begins, earlier predictions are dropped",
+        }
     if not isinstance(policy.head, DiscreteHead):
         return space
-    joint = policy.head.joint
+    joint, scores = policy.head.joint, "scores[:, k]"
+    if policy.chunk.length > 1:
+        scores = "scores[:, step, k]"
     if not joint.shape:
-        order = f"scores[:, k] is the score of action k + {joint.first}"
+        order = f"{scores} is the score of action k + {joint.first}"
     else:
         elements = f"numpy.unravel_index(k, {joint.sizes})"
         if joint.starts.any():
             elements += f" + {joint.starts.tolist()}"
-        order = f"scores[:, k] is the score of the action {elements}, in C order"
+        order = f"{scores} is the score of the action {elements}, in C order"
     return {**space, "scores": order}
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +26,7 @@ from torch import Tensor
 from mcaprl.actions import OBSERVATION_KEY, BoxActions, has_source, joint_actions
 from mcaprl.architecture import architecture_of
 from mcaprl.base_policy import BasePolicy
+from mcaprl.chunks import ChunkExecution, Chunks
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
 from mcaprl.files import as_type, parse_json, read_file, write_json
 from mcaprl.frames import FrameStack, mapped
@@ -33,6 +35,7 @@ from mcaprl.offline.algorithms.heads import ENCODER, Head, build_head
 from mcaprl.offline.algorithms.iql import LOG_STD
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
+from mcaprl.offline.batches.relative import RelativeActions
 from mcaprl.recorder.format.metadata import ActionCommands
 from mcaprl.recorder.format.spaces import (
     check_actions,
@@ -45,6 +48,9 @@ from mcaprl.runs import POLICY_NAME
 from mcaprl.storage.tensor_files import check_finite, read_tensors, write_tensors
 
 FORMAT_VERSION = 2
+_CHUNKS_VERSION = 3
+"""Version of a policy with chunks or relative actions, for which earlier versions have no code."""
+_RELATIVE = ("relative.low", "relative.high")
 TWIN = "q_twin"
 """Name of the second critic of a policy for a Box, which is not used to act."""
 _WEIGHTS_NAME = "policy.safetensors"
@@ -78,6 +84,8 @@ class Policy(BasePolicy):
         mask_from: Source of the action mask, `info:NAME` or a key of the observation; empty if
             the environment's observations have the mask, or there is none. With a source, the
             observations of `act` are `{"observation": ..., "action_mask": ...}`.
+        chunk: Length of the chunks of actions that the networks predict, and how `act` executes
+            them. With chunks, `act` also stores these, and there are no scores or probabilities.
     """
 
     name: str
@@ -92,10 +100,48 @@ class Policy(BasePolicy):
     reward_scale: float = 1.0
     action_commands: ActionCommands | None = None
     mask_from: str = ""
+    chunk: Chunks = field(default_factory=Chunks)
 
-    def begin(self) -> None:
-        """Drop the stored frames. The next observations start new episodes."""
-        self._frames.clear()
+    def begin(self, rows: Sequence[int] | None = None) -> None:
+        """Drop the stored frames and chunks. The next observations start new episodes.
+
+        Args:
+            rows: Rows of a batch of environments in which new episodes start; default: all.
+        """
+        if rows is None:
+            self._frames.clear()
+            self._new_rows.clear()
+        elif self.frame_stack > 1:
+            self._new_rows.extend(rows)
+        self._execution.clear(rows)
+
+    def interrupt(self) -> None:
+        """Drop the actions that were predicted for the next steps; frames are kept."""
+        self._execution.clear()
+
+    def with_execution(
+        self, *, execute: int | None = None, ensemble: float | None = None
+    ) -> Policy:
+        """Return the same policy with another execution of its chunks; see `mcaprl.chunks`.
+
+        Args:
+            execute: Number of actions that are executed before the next prediction.
+            ensemble: Coefficient of temporal ensembling, instead of `execute`.
+
+        Raises:
+            PolicyError: A number is out of range, both are given, or actions are not numbers.
+        """
+        if (execute is None) == (ensemble is None):
+            raise PolicyError("pass either `execute` or `ensemble`")
+        try:
+            return replace(self, chunk=Chunks(self.chunk.length, execute or 1, ensemble))
+        except ValueError as error:
+            raise PolicyError(f"{self.name}: {error}") from error
+
+    def __post_init__(self) -> None:
+        """Check that averaged actions are numbers."""
+        if self.chunk.ensemble is not None and not isinstance(self.action_space, spaces.Box):
+            raise PolicyError(f"{self.name}: actions of {self.action_space} have no average")
 
     @property
     def env_observation_space(self) -> spaces.Space[Any] | None:
@@ -110,7 +156,8 @@ class Policy(BasePolicy):
     def act(self, observations: Any) -> NDArray[Any]:
         """Return the best actions (B, *shape) in `action_space`; a tie selects the first action.
 
-        The actions of a Box are in its own units.
+        The actions of a Box are in its own units. Those of a policy with chunks may have been
+        predicted in an earlier call since `begin`.
 
         Raises:
             PolicyError: The shape of the observations is not (B, *shape).
@@ -120,7 +167,21 @@ class Policy(BasePolicy):
             inputs = self._stack_onto_stored(self._encode(observations))
         else:
             inputs = self._inputs(observations)
-        return self.head.actions(inputs).numpy()
+        if self.chunk.length == 1:
+            return self.head.actions(inputs).numpy()
+        return self._execution.act(len(inputs), lambda: self.head.actions(inputs).numpy())
+
+    @torch.inference_mode()
+    def act_chunk(self, observations: Any) -> NDArray[Any]:
+        """Return the chunks (B, H, *shape) of observations; H is `chunk.length`.
+
+        Nothing is stored.
+
+        Raises:
+            PolicyError: The observations have another shape.
+        """
+        found: NDArray[Any] = self.head.actions(self._inputs(observations)).numpy()
+        return found if self.chunk.length > 1 else found[:, None]
 
     @torch.inference_mode()
     def log_prob(self, observations: Any, actions: NDArray[Any]) -> NDArray[np.float32]:
@@ -135,7 +196,7 @@ class Policy(BasePolicy):
                 Box, which has no density.
         """
         return cast(
-            NDArray[np.float32], self.head.log_prob(self._inputs(observations), actions).numpy()
+            NDArray[np.float32], self.head.log_prob(self._of_single(observations), actions).numpy()
         )
 
     @torch.inference_mode()
@@ -147,7 +208,7 @@ class Policy(BasePolicy):
         Raises:
             PolicyError: The observations have another shape.
         """
-        scores = self.head.scores(self._inputs(observations))
+        scores = self.head.scores(self._of_single(observations))
         return None if scores is None else scores.numpy()
 
     @torch.inference_mode()
@@ -157,7 +218,7 @@ class Policy(BasePolicy):
         Raises:
             PolicyError: The policy has no values, or the observations have another shape.
         """
-        values = self.head.q_values(self._inputs(observations))
+        values = self.head.q_values(self._of_single(observations))
         if values is None:
             lacking = "no Q-values, only probabilities"
             if isinstance(self.action_space, spaces.Box):
@@ -172,7 +233,7 @@ class Policy(BasePolicy):
         Raises:
             PolicyError: The policy has no values, or the observations have another shape.
         """
-        values = self.head.action_values(self._inputs(observations), actions)
+        values = self.head.action_values(self._of_single(observations), actions)
         if values is None:
             raise PolicyError(f"{self.name} ({self.algo}) has no Q-values")
         return cast(NDArray[np.float32], values.numpy())
@@ -187,7 +248,7 @@ class Policy(BasePolicy):
             PolicyError: The actions are not finite in number, or the observations have another
                 shape.
         """
-        found = self.head.probabilities(self._inputs(observations))
+        found = self.head.probabilities(self._of_single(observations))
         if found is None:
             raise PolicyError(f"{self.name} ({self.algo}) has no probabilities, only densities")
         return cast(NDArray[np.float32], found.numpy())
@@ -213,13 +274,33 @@ class Policy(BasePolicy):
         flat = mapped(lambda part: part.reshape(-1, *part.shape[2:]), observations)
         return self._encode(flat).stacked(self.frame_stack)
 
+    def _of_single(self, observations: Any) -> Observations:
+        """Return the networks' inputs, unless an action depends on more than an observation."""
+        if self.chunk.length > 1:
+            raise PolicyError(
+                f"{self.name} predicts {self.chunk}: an action has no probability or value given"
+                " one observation"
+            )
+        return self._inputs(observations)
+
     @cached_property
     def _frames(self) -> FrameStack:
         return FrameStack(self.frame_stack)
 
+    @cached_property
+    def _execution(self) -> ChunkExecution:
+        return ChunkExecution(self.chunk)
+
+    @cached_property
+    def _new_rows(self) -> list[int]:
+        """Rows whose next observation is the first one of an episode."""
+        return []
+
     def _stack_onto_stored(self, now: Observations) -> Observations:
         """Store observations, and return stacks of the last k observations."""
         stacks = self._frames.see(dict(enumerate(part.numpy() for part in now.parts())))
+        while self._new_rows:
+            self._frames.begin_one(self._new_rows.pop())
         parts = [torch.from_numpy(stack).flatten(0, 1) for stack in stacks.values()]
         return now.like(parts).stacked(self.frame_stack)
 
@@ -261,9 +342,14 @@ def save_policy(
         if image.shift is not None:
             weights[_IMAGE_SHIFT.format(number)] = torch.from_numpy(image.shift)
             weights[_IMAGE_SCALE.format(number)] = torch.tensor(image.scale)
+    relative = buffer.relative
+    if relative is not None:
+        weights |= dict(zip(_RELATIVE, (relative.low.cpu(), relative.high.cpu()), strict=True))
     write_tensors(folder / _WEIGHTS_NAME, weights, {"updates": learner.step})
+    chunks = getattr(learner.config, "chunks", Chunks())
+    has_chunks = chunks.length > 1
     description = {
-        "format_version": FORMAT_VERSION,
+        "format_version": _CHUNKS_VERSION if has_chunks or relative else FORMAT_VERSION,
         "algo": learner.name,
         "acts_by": learner.acts_by,
         "threshold": getattr(learner.config, "threshold", 0.0),
@@ -277,6 +363,8 @@ def save_policy(
         "mask_from": learner.config.mask_from,
         "observation_space": json.loads(space_to_json(buffer.encoder.space)),
         "action_space": json.loads(space_to_json(buffer.action_space)),
+        **({"chunk": chunks.to_json()} if has_chunks else {}),
+        **({"relative_to": list(relative.relation)} if relative else {}),
         **_box_description(learner),
         **({"action_commands": action_commands.to_json()} if action_commands else {}),
     }
@@ -315,6 +403,8 @@ class _Description:
     reward_scale: float = 1.0
     action_range: Any = None
     critics: dict[str, dict[str, Any]] = field(default_factory=dict)
+    chunk: dict[str, Any] = field(default_factory=dict)
+    relative_to: list[int | None] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.threshold) and 0 < self.reward_scale < math.inf):
@@ -331,7 +421,7 @@ def read_policy(folder: Path) -> Policy:
     try:
         found = parse_json(read_file(folder / POLICY_NAME))
         description: _Description = as_type(_Description, found, POLICY_NAME)
-        if description.format_version != FORMAT_VERSION:
+        if description.format_version not in (FORMAT_VERSION, _CHUNKS_VERSION):
             raise ValueError(f"format_version {description.format_version} is not supported")
         return _build(folder, description, read_tensors(folder / _WEIGHTS_NAME)[0])
     except FileNotFoundError as error:
@@ -360,10 +450,18 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
     log_std = weights.pop(LOG_STD, None)
     if log_std is not None and (box is None or log_std.shape != (box.size,)):
         raise ValueError(f"{LOG_STD} has shape {tuple(log_std.shape)}")
+    chunk = Chunks(**description.chunk)
+    relative = _relative(description, encoder, box, chunk.length, weights)
     networks = _networks(description, encoder, 0 if box is None else box.size, weights)
-    threshold = description.threshold
     head = build_head(
-        description.acts_by, networks, action_space, threshold, box=box, log_std=log_std
+        description.acts_by,
+        networks,
+        action_space,
+        description.threshold,
+        box=box,
+        log_std=log_std,
+        chunk=chunk.length,
+        relative=relative,
     )
     head.networks.load_state_dict(weights)
     commands = description.action_commands
@@ -382,7 +480,24 @@ def _build(folder: Path, description: _Description, weights: dict[str, Tensor]) 
         if commands is None or joint is None
         else ActionCommands.from_json(commands, joint.count),
         mask_from=mask_from,
+        chunk=chunk,
     )
+
+
+def _relative(
+    description: _Description,
+    encoder: ObservationEncoder,
+    box: BoxActions | None,
+    length: int,
+    weights: dict[str, Tensor],
+) -> RelativeActions | None:
+    """Return the conversion of relative actions, whose ranges are removed from `weights`."""
+    if not description.relative_to:
+        return None
+    low, high = (weights.pop(name) for name in _RELATIVE)
+    if box is None or low.shape != (length, box.size) or not (low < high).all():
+        raise ValueError("the ranges of relative actions do not fit the action space")
+    return RelativeActions(tuple(description.relative_to), encoder, box, low, high)
 
 
 def _networks(

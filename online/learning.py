@@ -381,6 +381,10 @@ def _check_spaces(dataset: Dataset, observation_space: Any, action_space: Any) -
 
 def _check_fits(policy: Policy, action_space: Any, frame_stack: int) -> None:
     """Check that an agent can take the weights of a policy."""
+    if policy.chunk.length > 1:
+        raise PolicyError(
+            f"{policy.name} predicts {policy.chunk}: online algorithms learn single actions"
+        )
     if isinstance(action_space, spaces.Box):
         if policy.action_space != action_space:
             raise PolicyError(

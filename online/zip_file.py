@@ -57,6 +57,7 @@ from mcaprl.offline.algorithms.heads import (
     Head,
     SquashedGaussian,
     build_head,
+    known_sum,
     unsquashed,
 )
 from mcaprl.offline.algorithms.losses import squashed_normal_log_density
@@ -424,9 +425,15 @@ class ClampedGaussian(SquashedGaussian):
     """Squashed Gaussian of SB3's SAC: outputs (B, 2, n) are means and log deviations themselves."""
 
     @staticmethod
-    def log_density(outputs: Tensor, actions: Tensor, log_std: Tensor | None = None) -> Tensor:
+    def log_density(
+        outputs: Tensor,
+        actions: Tensor,
+        log_std: Tensor | None = None,
+        known: Tensor | None = None,
+    ) -> Tensor:
         """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
-        return squashed_normal_log_density(unsquashed(actions), *outputs.unbind(1)).sum(1)
+        found = squashed_normal_log_density(unsquashed(actions), *outputs.unbind(1))
+        return known_sum(found, known)
 
 
 class ClippedGaussian(BoxHead):
@@ -447,11 +454,16 @@ class ClippedGaussian(BoxHead):
         return outputs[:, 0].clamp(-1, 1)
 
     @staticmethod
-    def log_density(outputs: Tensor, actions: Tensor, log_std: Tensor | None = None) -> Tensor:
+    def log_density(
+        outputs: Tensor,
+        actions: Tensor,
+        log_std: Tensor | None = None,
+        known: Tensor | None = None,
+    ) -> Tensor:
         """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
         mean, log_std = outputs.unbind(1)
         normal: Any = torch.distributions.Normal(mean, log_std.exp())
-        found: Tensor = normal.log_prob(actions).sum(1)
+        found = known_sum(normal.log_prob(actions), known)
         return found.masked_fill((actions.abs() >= 1).any(1), torch.nan)
 
 

@@ -14,6 +14,7 @@ from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
 from mcaprl.api.ranges import check_fraction, check_least
 from mcaprl.api.train import torch_threads
 from mcaprl.base_policy import BasePolicy, RandomPolicy
+from mcaprl.errors import PolicyError
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.statistics import Calibration, calibration
 from mcaprl.recorder.source import Data, named, opened
@@ -243,5 +244,10 @@ def _policies(names: Sequence[str], dataset: Dataset, seed: int) -> dict[str, Ba
             continue
         loaded = trained_policies(name, dataset)
         for policy in loaded:
+            if policy.chunk.has_memory:
+                raise PolicyError(
+                    f"{name} predicts {policy.chunk}: the value of a state depends on what was"
+                    " predicted before; evaluate it in a sim, or train it with `execute=1`"
+                )
             found[policy.name if len(loaded) > 1 else shown[name]] = policy
     return found

@@ -327,6 +327,8 @@ class DriverCore:
         if not reason:
             reason = self._why_stopped(state)
         if reason:
+            # What was predicted before is for steps in which the robot did not stop.
+            self.policy.interrupt()
             return self._stopped(step.time_ns, reason, is_fatal, observation)
         assert observation is not None, "a step without a reason is usable"
         batch = (

@@ -116,6 +116,7 @@ def _spec(driver: Driver) -> dict[str, Any]:
         "shapes": {name: list(shape) for name, shape in driver._robot.shapes.items()},
         "inputs": {leaf.name: "".join(leaf.path) for leaf in driver.policy.encoder.leaves},
         "frame_stack": driver.policy.frame_stack,
+        "chunk": driver.policy.chunk.to_json(),
         "commands": driver._robot_commands.plain,
     }
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mcaprl.chunks import ChunkExecution, Chunks
 from mcaprl.drive.core import CommandMessages, DriverCore
 from mcaprl.errors import UsageError
 from mcaprl.frames import FrameStack, parts_of
@@ -108,7 +109,9 @@ class NodePolicy:
 
     name = "the policy"
 
-    def __init__(self, model: bytes, frame_stack: int, inputs: dict[str, str]) -> None:
+    def __init__(
+        self, model: bytes, frame_stack: int, inputs: dict[str, str], chunk: Chunks
+    ) -> None:
         """Load the model, whose `inputs` are the parts of an observation."""
         runtime = importlib.import_module("onnxruntime")
         options = runtime.SessionOptions()
@@ -116,10 +119,16 @@ class NodePolicy:
         self._session = runtime.InferenceSession(model, options)
         self.frame_stack, self._frames = frame_stack, FrameStack(frame_stack)
         self._inputs = inputs
+        self._chunk, self._execution = chunk, ChunkExecution(chunk)
 
     def begin(self) -> None:
-        """Drop the frames of the episode before."""
+        """Drop the frames and chunks of the episode before."""
         self._frames.clear()
+        self._execution.clear()
+
+    def interrupt(self) -> None:
+        """Drop the actions that were predicted for the next steps."""
+        self._execution.clear()
 
     def act(self, observations: Any) -> Any:
         """Return the action (1, *shape) of an observation (1, *shape), or of a dict of them."""
@@ -127,13 +136,18 @@ class NodePolicy:
         if self.frame_stack > 1:
             parts = self._frames.see(parts)
         inputs = {name: parts[part] for name, part in self._inputs.items()}
-        return self._session.run(["action"], inputs)[0]
+
+        def predict() -> Any:
+            return self._session.run(["action"], inputs)[0]
+
+        return predict() if self._chunk.length == 1 else self._execution.act(1, predict)
 
 
 def node_driver(spec: dict[str, Any], model: str) -> DriverCore:
     """Return the driver of a node; `model` is the ONNX model in base64."""
     plan: Any = NodePlan(spec)
-    policy = NodePolicy(base64.b64decode(model), spec["frame_stack"], spec["inputs"])
+    chunk, inputs = Chunks(**spec["chunk"]), spec["inputs"]
+    policy = NodePolicy(base64.b64decode(model), spec["frame_stack"], inputs, chunk)
     shapes = {name: tuple(shape) for name, shape in spec["shapes"].items()}
     live, episodes = LiveSteps(plan, shapes), LiveEpisodes(plan, policy.frame_stack)
     return DriverCore(plan, live, episodes, CommandMessages.of_plain(spec["commands"]), policy)

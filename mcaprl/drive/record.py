@@ -26,7 +26,7 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.schema import ImageRows
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.mapping.align import NS_PER_S
-from mcaprl.recorder.mapping.assemble import observed_names
+from mcaprl.recorder.mapping.assemble import observed_names, relation
 from mcaprl.recorder.mapping.live import Ending, EpisodeState, LiveStep, Topics, joined
 from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.robot import Robot
@@ -79,6 +79,7 @@ class DriveLog:
             action_commands=policy.action_commands,
             action_part_names=found.names,
             action_units=found.units if any(found.units) else (),
+            relative_to=relation(plan, found.names, robot.shapes),
             step_duration_ns=robot.step_ns,
             policy=policy.name,
             robot=robot.to_json(),

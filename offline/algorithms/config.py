@@ -8,12 +8,16 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from mcaprl.architecture import Architecture, NetworkSettings
+from mcaprl.chunks import Chunks
 from mcaprl.lazy import installed
 from mcaprl.offline.batches.packing import Packing
 
 ENTRY_POINT_GROUP: Final = "mcaprl.algorithms"
 HEADS: Final = ("deterministic", "gaussian", "mixture")
 """What the network of a policy for a Box outputs."""
+MAX_CHUNK: Final = 1_000
+ACT_DECAY: Final = 0.01
+"""Coefficient of temporal ensembling in ACT."""
 ALPHA_RANGE: Final = (1e-4, 100.0)
 """Range of CQL's alpha if it is learned."""
 
@@ -123,11 +127,27 @@ class BCConfig(TrainingConfig):
 
     top: float = 1.0
     """fraction of the episodes to learn from: those with the largest returns"""
+    chunk: int = 1
+    """actions that are predicted from one observation: those of its step and of the next ones"""
+    execute: int = 0
+    """actions of a chunk that are executed before the next prediction; 0 for half of them"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
         super().__post_init__()
         self._require("top", 0 < self.top <= 1, "within (0, 1]")
+        self._require("chunk", 1 <= self.chunk <= MAX_CHUNK, f"within [1, {MAX_CHUNK}]")
+        self._require("execute", 0 <= self.execute <= self.chunk, f"within [0, {self.chunk}]")
+
+    @property
+    def chunks(self) -> Chunks:
+        """Length of the chunks and how they are executed."""
+        return Chunks(self.chunk, self.execute or (self.chunk + 1) // 2)
+
+    @property
+    def packing(self) -> Packing:
+        """Settings for building transitions from the log."""
+        return replace(super().packing, chunk=self.chunk)
 
     @property
     def best_fraction(self) -> float:
@@ -143,11 +163,26 @@ class BoxBCConfig(BCConfig):
     """normalize the network's inputs to mean 0 and standard deviation 1 over the data"""
     head: str = "deterministic"
     """what the network outputs: deterministic, gaussian, or mixture (of 5 Gaussians)"""
+    ensemble: bool = False
+    """predict a chunk at each step, and average those of the last steps (temporal ensembling)"""
+    relative: bool = True
+    """learn actions relative to observations, where the data declare it (`relative_to`)"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
         super().__post_init__()
         self._require("head", self.head in HEADS, f"one of {', '.join(HEADS)}")
+        self._require("execute", not (self.ensemble and self.execute > 1), "1 with an ensemble")
+
+    @property
+    def chunks(self) -> Chunks:
+        """Length of the chunks and how they are executed."""
+        return Chunks(self.chunk, 1, ACT_DECAY) if self.ensemble else super().chunks
+
+    @property
+    def packing(self) -> Packing:
+        """Settings for building transitions from the log."""
+        return replace(super().packing, relative=self.relative)
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,7 @@ from mcaprl.offline.algorithms.losses import (
 )
 from mcaprl.offline.batches.buffer import discrete_actions
 from mcaprl.offline.batches.observations import Observations
+from mcaprl.offline.batches.relative import RelativeActions
 
 
 class Head(nn.Module):
@@ -50,16 +51,21 @@ class Head(nn.Module):
 
     Attributes:
         networks: Networks by name, such as `q` and `logits`.
+        chunk: Number of actions H that are predicted from one observation. With more than one, only
+            `actions` and `scores` are defined.
     """
 
-    def __init__(self, networks: Mapping[str, nn.Module]) -> None:
+    def __init__(self, networks: Mapping[str, nn.Module], chunk: int = 1) -> None:
         """Wrap the networks."""
         super().__init__()
-        self.networks = nn.ModuleDict(networks)
+        self.networks, self.chunk = nn.ModuleDict(networks), chunk
 
     @abstractmethod
     def actions(self, observations: Observations) -> Tensor:
-        """Return the best actions (B, *shape), as values of the action space."""
+        """Return the best actions (B, *shape), as values of the action space.
+
+        With chunks, they are (B, H, *shape).
+        """
 
     @abstractmethod
     def log_prob(self, observations: Observations, actions: NDArray[Any]) -> Tensor:
@@ -92,13 +98,14 @@ class DiscreteHead(Head):
         networks: Mapping[str, nn.Module],
         action_space: spaces.Space[Any],
         threshold: float = 0.0,
+        chunk: int = 1,
     ) -> None:
         """Wrap the networks; `threshold` is that of `FilteredQ`.
 
         Raises:
             SpaceError: The action space is not finite, or has too many actions.
         """
-        super().__init__(networks)
+        super().__init__(networks, chunk)
         self.joint = discrete_actions(action_space)
         self.threshold = threshold
         values = torch.from_numpy(self.joint.values(np.arange(self.joint.count)))
@@ -106,7 +113,10 @@ class DiscreteHead(Head):
 
     @abstractmethod
     def scores(self, observations: Observations) -> Tensor:
-        """Return a score of each action (B, A); minus infinity for masked actions."""
+        """Return a score of each action (B, A); minus infinity for masked actions.
+
+        With chunks, they are (B, H, A).
+        """
 
     def outputs(self, name: str, observations: Observations) -> Tensor:
         """Return a network's outputs (B, A), with minus infinity for masked actions."""
@@ -118,8 +128,9 @@ class DiscreteHead(Head):
         return self.best(self.scores(observations))
 
     def best(self, scores: Tensor) -> Tensor:
-        """Return the actions (B, *shape) with the largest scores (B, A)."""
-        return self._values.index_select(0, scores.argmax(1))
+        """Return the actions (B, *shape) with the largest scores (B, A), or of chunks (B, H, A)."""
+        best = scores.argmax(-1)
+        return self._values.index_select(0, best.flatten()).view(*best.shape, *self.joint.shape)
 
     def log_prob(self, observations: Observations, actions: NDArray[Any]) -> Tensor:
         """Return the log probabilities (B,) of actions (B, *shape)."""
@@ -152,7 +163,9 @@ class Categorical(DiscreteHead):
     """Probabilities as the softmax of logits."""
 
     def scores(self, observations: Observations) -> Tensor:
-        """Return the logits (B, A)."""
+        """Return the logits (B, A), or (B, H, A) of chunks."""
+        if self.chunk > 1:
+            return cast(Tensor, self.networks["logits"](observations))
         return self.outputs("logits", observations)
 
     def probabilities(self, observations: Observations) -> Tensor:
@@ -189,6 +202,7 @@ class BoxHead(Head):
     Attributes:
         box: Scaling of the actions to numbers in [-1, 1].
         log_std: (n,) logarithms of the standard deviations, if they are the same in all states.
+        relative: Conversion of the networks' numbers, if they are relative to the observations.
     """
 
     log_std: Tensor | None
@@ -196,11 +210,16 @@ class BoxHead(Head):
     _high: Tensor
 
     def __init__(
-        self, networks: Mapping[str, nn.Module], box: BoxActions, log_std: Tensor | None = None
+        self,
+        networks: Mapping[str, nn.Module],
+        box: BoxActions,
+        log_std: Tensor | None = None,
+        chunk: int = 1,
+        relative: RelativeActions | None = None,
     ) -> None:
         """Wrap the networks."""
-        super().__init__(networks)
-        self.box = box
+        super().__init__(networks, chunk)
+        self.box, self.relative = box, relative
         self.register_buffer("log_std", log_std)
         # In float64, so that the bounds are the same numbers as in the space.
         self.register_buffer("_low", torch.from_numpy(box.low), persistent=False)
@@ -217,19 +236,36 @@ class BoxHead(Head):
         """Return the best actions (B, n), in [-1, 1]."""
 
     @staticmethod
-    def log_density(outputs: Tensor, actions: Tensor, log_std: Tensor | None = None) -> Tensor:
-        """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
+    def log_density(
+        outputs: Tensor,
+        actions: Tensor,
+        log_std: Tensor | None = None,
+        known: Tensor | None = None,
+    ) -> Tensor:
+        """Return the log densities (B,) of actions (B, n) in [-1, 1].
+
+        With `known` (B, n), it is that of the numbers with a 1; the others, with a 0, may be any.
+        """
         raise PolicyError("a deterministic policy has no density of actions")
 
     def actions(self, observations: Observations) -> Tensor:
-        """Return the best actions (B, *shape), in the units and dtype of the space."""
+        """Return the best actions (B, *shape), in the units and dtype of the space.
+
+        With chunks, they are (B, H, *shape).
+        """
         numbers = self.best(self._outputs(observations)).double()
+        numbers = numbers.view(-1, self.chunk, self.box.size)
+        if self.relative is not None:
+            numbers = self.relative.actions(numbers, observations.vector)
         values = self._low + (numbers + 1) / 2 * (self._high - self._low)
         dtype = getattr(torch, str(self.box.space.dtype))
-        return values.clamp(self._low, self._high).to(dtype).view(-1, *self.box.shape)
+        chunk = (self.chunk,) if self.chunk > 1 else ()
+        return values.clamp(self._low, self._high).to(dtype).view(-1, *chunk, *self.box.shape)
 
     def log_prob(self, observations: Observations, actions: NDArray[Any]) -> Tensor:
         """Return the log densities (B,) of actions (B, *shape), in their own units."""
+        if self.relative is not None:
+            raise PolicyError("actions that are relative to observations have no density")
         outputs = self._outputs(observations)
         numbers = torch.from_numpy(self.box.scaled(actions)).clamp(-1, 1)
         log_density = self.log_density(outputs, numbers, self.log_std) + self.box.log_scale
@@ -285,21 +321,32 @@ class Gaussian(BoxHead):
         return (outputs if outputs.ndim == 2 else outputs[:, 0]).tanh()
 
     @staticmethod
-    def log_density(outputs: Tensor, actions: Tensor, log_std: Tensor | None = None) -> Tensor:
+    def log_density(
+        outputs: Tensor,
+        actions: Tensor,
+        log_std: Tensor | None = None,
+        known: Tensor | None = None,
+    ) -> Tensor:
         """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
         raw = outputs[:, 1] if log_std is None else log_std
         mean, log_std = Gaussian.best(outputs), bounded_log_std(raw)
-        return truncated_normal_log_density(actions, mean, log_std).sum(-1)
+        return known_sum(truncated_normal_log_density(actions, mean, log_std), known)
 
 
 class SquashedGaussian(Gaussian):
     """Tanh of independent normal distributions; outputs (B, 2, n) are means and deviations."""
 
     @staticmethod
-    def log_density(outputs: Tensor, actions: Tensor, log_std: Tensor | None = None) -> Tensor:
+    def log_density(
+        outputs: Tensor,
+        actions: Tensor,
+        log_std: Tensor | None = None,
+        known: Tensor | None = None,
+    ) -> Tensor:
         """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
         mean, raw = outputs.unbind(1)
-        return squashed_normal_log_density(unsquashed(actions), mean, bounded_log_std(raw)).sum(1)
+        found = squashed_normal_log_density(unsquashed(actions), mean, bounded_log_std(raw))
+        return known_sum(found, known)
 
     @staticmethod
     def sample(outputs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -334,14 +381,20 @@ class Mixture(BoxHead):
         return means.gather(1, places).squeeze(1).tanh()
 
     @staticmethod
-    def log_density(outputs: Tensor, actions: Tensor, log_std: Tensor | None = None) -> Tensor:
+    def log_density(
+        outputs: Tensor,
+        actions: Tensor,
+        log_std: Tensor | None = None,
+        known: Tensor | None = None,
+    ) -> Tensor:
         """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
         mean, raw = Mixture._components(outputs).unbind(2)
         log_densities = truncated_normal_log_density(
             actions.unsqueeze(1), mean.tanh(), bounded_log_std(raw)
         )
         log_weights = outputs[:, :COMPONENTS].log_softmax(1)
-        return (log_weights + log_densities.sum(-1)).logsumexp(1)
+        mask = None if known is None else known.unsqueeze(1)
+        return (log_weights + known_sum(log_densities, mask)).logsumexp(1)
 
     @staticmethod
     def pit(outputs: Tensor, actions: Tensor, uniform_share: float = 0.0) -> Tensor:
@@ -393,6 +446,11 @@ _LARGEST: Final = 1 - 1e-6
 """Largest action of which a tanh has a density; larger ones have the same."""
 
 
+def known_sum(log_densities: Tensor, known: Tensor | None) -> Tensor:
+    """Return the sums (...,) of log densities (..., n), or of those that are known."""
+    return (log_densities if known is None else log_densities * known).sum(-1)
+
+
 def bounded_log_std(raw: Tensor) -> Tensor:
     """Return log standard deviations from -5 to 1, and -2 for raw numbers of 0."""
     return _LOG_STD_CENTER + _LOG_STD_HALF * (raw / _LOG_STD_HALF).tanh()
@@ -426,6 +484,8 @@ def build_head(
     *,
     box: BoxActions | None = None,
     log_std: Tensor | None = None,
+    chunk: int = 1,
+    relative: RelativeActions | None = None,
 ) -> Head:
     """Return the head of a policy file or learner.
 
@@ -436,13 +496,15 @@ def build_head(
         threshold: Threshold of `FilteredQ`.
         box: Scaling of the actions of a Box.
         log_std: Logarithms (n,) of the deviations of `Gaussian`, unless the network outputs them.
+        chunk: Number of actions that are predicted from one observation.
+        relative: Conversion of relative actions of a Box.
 
     Raises:
-        ValueError: There is no such head.
+        ValueError: There is no such head, or it predicts no chunks.
         SpaceError: The head does not support the action space.
     """
     if box is not None and acts_by in BOX_HEADS:
-        return BOX_HEADS[acts_by](networks, box, log_std)
-    if acts_by not in HEADS:
+        return BOX_HEADS[acts_by](networks, box, log_std, chunk, relative)
+    if acts_by not in HEADS or (chunk > 1 and acts_by != "logits"):
         raise ValueError(f"acts_by {acts_by!r} is not supported")
-    return HEADS[acts_by](networks, action_space, threshold)
+    return HEADS[acts_by](networks, action_space, threshold, chunk)

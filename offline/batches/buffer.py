@@ -7,6 +7,7 @@ read.
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 from collections.abc import Sequence
@@ -27,6 +28,7 @@ from mcaprl.networks import ImageInput
 from mcaprl.offline.batches.items import n_step_returns, returns_to_go
 from mcaprl.offline.batches.observations import FramesOnDisk, ObservationEncoder, Observations
 from mcaprl.offline.batches.packing import Packing
+from mcaprl.offline.batches.relative import RelativeActions
 from mcaprl.recorder.dataset.arrays import is_beyond_float32
 from mcaprl.recorder.format.spaces import check_actions
 from mcaprl.texts import counted
@@ -40,7 +42,7 @@ MAX_JOINT_ACTIONS = 1_024
 """Largest number of combinations of a MultiDiscrete or MultiBinary space."""
 _BLOCK_ROWS = 1 << 18
 """Rows that are checked at once."""
-_ON_DEVICE = ("frames", "starts", "places", "actions", "returns", "next_rows")
+_ON_DEVICE = ("frames", "starts", "places", "actions", "returns", "next_rows", "ends")
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,8 @@ class TransitionBuffer:
         box: Scaling of the actions of a Box; None for a finite space.
         next_rows: (N,) int64, row of the transition that starts at each transition's next
             observation; -1 at the end of an episode. Empty for a finite space.
+        ends: (N,) int64, row after the last one of each row's episode; empty without chunks.
+        relative: Conversion of chunks to relative numbers; None if all actions are absolute.
     """
 
     encoder: ObservationEncoder
@@ -106,6 +110,8 @@ class TransitionBuffer:
     is_fixed: bool = True
     box: BoxActions | None = None
     next_rows: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
+    ends: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
+    relative: RelativeActions | None = None
 
     @classmethod
     def from_dataset(
@@ -116,6 +122,7 @@ class TransitionBuffer:
         encoder: ObservationEncoder | None = None,
         reward_scale: float | None = None,
         box: BoxActions | None = None,
+        relative: RelativeActions | None = None,
         weights: NDArray[np.float64] | None = None,
     ) -> TransitionBuffer:
         """Pack a dataset.
@@ -127,6 +134,8 @@ class TransitionBuffer:
             reward_scale: Divisor of the rewards; default: see `packing.scale_rewards`.
             box: Scaling of the actions of a Box; default: by the bounds of the space, and by the
                 data where they are infinite, with a warning.
+            relative: Ranges of relative actions of other data; default: those of the episodes whose
+                weight is above 0.
             weights: (E,) relative sampling weight of each transition of an episode; default: all
                 equal.
 
@@ -163,6 +172,23 @@ class TransitionBuffer:
             actions = torch.from_numpy(_numbered(dataset, joint))
         _require_finite("sums of rewards", _is_finite(torch.from_numpy(returns[0])))
         _check_data(dataset, frames, actions)
+        is_relative = packing.relative and any(each is not None for each in dataset.relative_to)
+        ends = torch.from_numpy(np.repeat(np.cumsum(lengths), lengths))
+        if is_relative and relative is None:
+            assert box is not None, "only actions of a Box are relative"
+            used = (
+                np.ones(len(dataset), bool) if weights is None else np.repeat(weights, lengths) > 0
+            )
+            relative = RelativeActions.fitted(
+                dataset.relative_to,
+                encoder,
+                box,
+                actions,
+                frames.vector.index_select(0, torch.from_numpy(places[0])),
+                ends,
+                torch.from_numpy(np.flatnonzero(used)),
+                packing.chunk,
+            )
         buffer = cls(
             encoder=encoder,
             action_space=dataset.action_space,
@@ -175,6 +201,8 @@ class TransitionBuffer:
             reward_scale=reward_scale,
             box=box,
             next_rows=_next_rows(lengths, packing.n_steps if is_box else 0),
+            ends=ends if packing.chunk > 1 or is_relative else ends[:0],
+            relative=relative if is_relative else None,
         )
         return buffer if weights is None else buffer.with_weights(np.repeat(weights, lengths))
 
@@ -203,7 +231,8 @@ class TransitionBuffer:
         Rows are still drawn on the CPU, so a seed draws the same rows for every device.
         """
         parts = {name: getattr(self, name).to(device) for name in _ON_DEVICE}
-        return replace(self, **parts)
+        relative = None if self.relative is None else copy.deepcopy(self.relative).to(device)
+        return replace(self, **parts, relative=relative)
 
     def sample_rows(self, count: int, generator: torch.Generator) -> Tensor:
         """Draw row numbers (count,) on the CPU, with replacement, in proportion to the weights."""
@@ -231,6 +260,18 @@ class TransitionBuffer:
         else:
             states = [self.observe(here), self.observe(there)]
         return Batch(rows, states[0], actions, rewards, discounts, states[1])
+
+    def chunks(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the actions of rows (R,) and of the steps after them, and which of them exist.
+
+        Returns:
+            Actions (R, H) or (R, H, n), and a mask (R, H), bool. After the end of the episode, the
+            last action is repeated, and the mask is False.
+        """
+        steps = torch.arange(self.packing.chunk, device=rows.device)
+        every, ends = rows.unsqueeze(1) + steps, self.ends.index_select(0, rows).unsqueeze(1)
+        found = self.actions.index_select(0, torch.minimum(every, ends - 1).flatten())
+        return found.view(*every.shape, *self.actions.shape[1:]), every < ends
 
     def with_weights(self, weights: NDArray[np.float64]) -> TransitionBuffer:
         """Return the same transitions with relative sampling weights (N,).

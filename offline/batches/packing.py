@@ -19,6 +19,8 @@ class Packing:
         scale_rewards: Whether rewards are divided by the standard deviation of the discounted
             returns of all transitions.
         clip_actions: Whether logged actions outside a Box are clipped to its bounds.
+        chunk: Number of successive actions that are learned from one observation.
+        relative: Whether actions are learned relative to observations, where the data declare it.
     """
 
     frame_stack: int = 1
@@ -28,3 +30,5 @@ class Packing:
     n_steps: int = 1
     scale_rewards: bool = False
     clip_actions: bool = False
+    chunk: int = 1
+    relative: bool = False

@@ -181,7 +181,9 @@ def estimate_behavior(
         )
     config: BCConfig = BCConfig(updates=updates, normalize=True)
     if is_box:
-        config = BoxBCConfig(updates=updates, head="mixture", clip_actions=clip_actions)
+        config = BoxBCConfig(
+            updates=updates, head="mixture", clip_actions=clip_actions, relative=False
+        )
     buffer = TransitionBuffer.from_dataset(dataset, config.packing)
     random = np.random.default_rng(seed)
     fold_of = random.permutation(count) % folds

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from mcaprl.actions import joint_actions
 from mcaprl.base_policy import BasePolicy, batch_size
+from mcaprl.chunks import planned
 from mcaprl.errors import PolicyError
 from mcaprl.files import read_json
 from mcaprl.frames import mapped, rows_of, stacked_frames
@@ -38,7 +39,12 @@ def value_columns(
     if joint is None:
         return _of_commands(policy, observations, episode, action_space, gamma)
     taken = joint.indexes(episode.actions)
-    preference = probabilities = policy.action_probabilities(observations)
+    if policy.chunk.length == 1:
+        probabilities = policy.action_probabilities(observations)
+    else:
+        own = joint.indexes(_commands(policy, observations))
+        probabilities = np.eye(joint.count, dtype=np.float32)[own]
+    preference = probabilities
     best = probabilities[:-1].argmax(1)
     try:
         q = policy.q_values(observations)
@@ -70,7 +76,7 @@ def _of_commands(
 ) -> Columns:
     """Return the fields of a policy with Box actions, at observations (T + 1, ...)."""
     steps = len(episode)
-    command = by_rows(policy.act, observations)
+    command = _commands(policy, observations)
     seen = rows_of(observations, slice(steps))
     try:
         q = policy.action_values(seen, episode.actions)
@@ -90,6 +96,13 @@ def _of_commands(
         "td_error": episode.rewards + np.where(episode.terminated, 0.0, ahead) - q,
         "log_prob": log_prob,
     }
+
+
+def _commands(policy: BasePolicy, observations: Any) -> NDArray[Any]:
+    """Return the actions (T + 1, *shape) that a policy executes along an episode."""
+    if policy.chunk.length == 1:
+        return by_rows(policy.act, observations)
+    return planned(policy.chunk, by_rows(policy.act_chunk, observations))
 
 
 def command_columns(

@@ -374,7 +374,9 @@ class _Race:
         updates = min(self._config.updates, CLONE_UPDATES)
         config = replace(self._config, updates=updates, held_out=0.0)
         is_box = isinstance(self._dataset.action_space, spaces.Box)
-        clone = Candidate("clone", "bc", {"head": "gaussian"} if is_box else {}, is_box)
+        clone = Candidate(
+            "clone", "bc", {"head": "gaussian", "relative": False} if is_box else {}, is_box
+        )
         ends = time.perf_counter() + self._left_s(SHARES[0] / 2)
         folder = self._out / "clone"
         self._train_into(

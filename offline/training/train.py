@@ -26,6 +26,7 @@ from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import Algorithm, choose_algorithm
 from mcaprl.offline.batches.buffer import TransitionBuffer, choose_device
 from mcaprl.offline.batches.observations import ObservationEncoder
+from mcaprl.offline.batches.relative import RelativeActions
 from mcaprl.offline.policy import read_policy, save_policy
 from mcaprl.offline.training.metrics import MetricsWriter, OfflineSummary
 from mcaprl.offline.training.watch import (
@@ -380,6 +381,7 @@ class Scales(NamedTuple):
     encoder: ObservationEncoder | None = None
     reward_scale: float | None = None
     box: BoxActions | None = None
+    relative: RelativeActions | None = None
 
 
 def earlier_scales(folder: Path) -> Scales:
@@ -388,7 +390,8 @@ def earlier_scales(folder: Path) -> Scales:
     if not policies:
         return Scales()
     policy = read_policy(policies[0].parent)
-    return Scales(policy.encoder, policy.reward_scale, getattr(policy.head, "box", None))
+    boxes = (getattr(policy.head, name, None) for name in ("box", "relative"))
+    return Scales(policy.encoder, policy.reward_scale, *boxes)
 
 
 def _packed(
@@ -418,7 +421,7 @@ def with_more_data(
 ) -> Learner:
     """Return a learner for the grown dataset, with the weights and state of `learner`."""
     earlier = learner.buffer
-    scales = Scales(earlier.encoder, earlier.reward_scale, earlier.box)
+    scales = Scales(earlier.encoder, earlier.reward_scale, earlier.box, earlier.relative)
     buffer = _packed(dataset, learner.config, scales, held_out_episodes).to(earlier.device)
     grown = type(learner)(learner.config, buffer, learner.seeds)
     for seed in learner.seeds:

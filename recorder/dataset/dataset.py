@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -316,6 +317,15 @@ class Dataset(Conversions):
         return self._description.action_units
 
     @property
+    def relative_to(self) -> tuple[int | None, ...]:
+        """Index of the observed element that each element of an action is relative to.
+
+        It is one of the observation's vector, or None for an absolute element; empty if all are
+        absolute. `actions` are absolute all the same: learning subtracts, and policies add again.
+        """
+        return self._description.relative_to
+
+    @property
     def action_labels(self) -> tuple[str, ...]:
         """Names of a vector action's elements with their bounds and units; empty without names.
 
@@ -495,6 +505,31 @@ class Dataset(Conversions):
         """
         return self._changed(*with_mask(self._transitions, self._description, source))
 
+    def with_relative_actions(self, parts: Mapping[str | int, str | int]) -> Dataset:
+        """Return the same transitions, whose actions are learned relative to observations.
+
+        Args:
+            parts: Element of a vector observation for each element of the action that is relative,
+                by names or numbers, in the same units. The others, such as grippers, are absolute.
+
+        Raises:
+            SpaceError: The actions are no Box, or there is no such element.
+        """
+        if not isinstance(self.action_space, spaces.Box):
+            raise SpaceError(f"relative actions need a Box, not {self.action_space}")
+        count = math.prod(self.action_space.shape)
+        own = self.action_part_names or [f"action[{k}]" for k in range(count)]
+        width = max(
+            (math.prod(leaf.shape) for leaf in self._leaves if len(leaf.shape) < 2), default=0
+        )
+        seen = self.observation_names or [f"observation[{k}]" for k in range(width)]
+        found: list[int | None] = [None] * count
+        for part, name in parts.items():
+            found[_place(part, own, "action")] = _place(name, seen, "observation")
+        return self._changed(
+            self._transitions, dataclasses.replace(self._description, relative_to=tuple(found))
+        )
+
     def grow(self) -> Dataset:
         """Return the dataset with the episodes that have ended since it was read.
 
@@ -639,3 +674,12 @@ class Dataset(Conversions):
 
 # Reprs and pickles contain this public import path.
 Dataset.__module__ = "mcaprl"
+
+
+def _place(given: str | int, names: Sequence[str], what: str) -> int:
+    """Return the index of an element that is given by its name or index."""
+    if isinstance(given, int) and 0 <= given < len(names):
+        return given
+    if given not in names:
+        raise SpaceError(f"the {what} has no element {given!r}; elements: {', '.join(names)}")
+    return list(names).index(str(given))

@@ -18,6 +18,8 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
     action_part_names   JSON list: names of the elements of a vector action; absent if unknown
     action_units        JSON list: unit of each of these elements, which may be empty; absent if
                         unknown
+    relative_to         JSON list: for each element of a vector action, the index of the element of
+                        the observation's vector that learning subtracts, or null; absent if none
     action_commands     JSON object: "fields", the paths of the fields of a command in another
                         program's messages, and "commands", a list with the values of the fields for
                         each discrete action, or null; absent if unknown
@@ -164,6 +166,7 @@ class LogMetadata:
         action_meanings: Names of the discrete actions; empty if unknown.
         action_part_names: Names of a vector action's elements; empty if unknown.
         action_units: Units of these elements; see `Dataset.action_units`.
+        relative_to: Observed elements that actions are relative to; see `Dataset.relative_to`.
         action_commands: Commands that the discrete actions stand for; None if unknown.
         success_reasons: End reasons of successful episodes; empty if unknown.
         view: Numbers for viewers, empty if unknown. `distance_m` and `tilt_deg` place the follow
@@ -205,6 +208,7 @@ class LogMetadata:
     unstored_kwargs: tuple[str, ...] = ()
     action_part_names: tuple[str, ...] = ()
     action_units: tuple[str, ...] = ()
+    relative_to: tuple[int | None, ...] = ()
     robot: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
@@ -276,7 +280,7 @@ class LogMetadata:
             "versions": json.dumps(dict(self.versions)),
             **{
                 name: json.dumps(found)
-                for name in ("unstored_kwargs", "action_part_names", "action_units")
+                for name in ("unstored_kwargs", "action_part_names", "action_units", "relative_to")
                 if (found := getattr(self, name))
             },
             **({"behavior_prob": self.behavior_prob} if self.behavior_prob else {}),
@@ -326,6 +330,7 @@ class LogMetadata:
                 unstored_kwargs=_texts(strings, "unstored_kwargs"),
                 action_part_names=_texts(strings, "action_part_names"),
                 action_units=_texts(strings, "action_units"),
+                relative_to=_relation(strings, action_space),
             )
         except (KeyError, ValueError, TypeError, MemoryError) as error:
             raise LogError(
@@ -546,6 +551,17 @@ def _texts(strings: Mapping[str, str], name: str) -> tuple[str, ...]:
     found = parse_json(strings.get(name, "[]"))
     if not (isinstance(found, list) and all(isinstance(part, str) for part in found)):
         raise ValueError(f"{name} is not a JSON list of strings")
+    return tuple(found)
+
+
+def _relation(strings: Mapping[str, str], space: spaces.Space[Any]) -> tuple[int | None, ...]:
+    """Return an index or None for each element of an action; empty if there is no such field."""
+    found = parse_json(strings.get("relative_to", "[]"))
+    are_indexes = isinstance(found, list) and all(
+        each is None or (type(each) is int and each >= 0) for each in found
+    )
+    if not are_indexes or (found and len(found) != math.prod(space.shape or ())):
+        raise ValueError("relative_to is not a JSON list with an index for each element")
     return tuple(found)
 
 

@@ -7,6 +7,7 @@ import itertools
 import math
 import warnings
 from collections.abc import Mapping as MappingOf
+from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -32,6 +33,7 @@ from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.robot import Robot
 from mcaprl.recorder.mapping.runs import Segment
 from mcaprl.recorder.mapping.steps import Steps
+from mcaprl.texts import counted
 
 
 def action_commands(
@@ -192,6 +194,15 @@ def assembled(
         action_commands=commands,
         action_part_names=runs[0].actions.names,
         action_units=runs[0].actions.units if any(runs[0].actions.units) else (),
+        relative_to=relation(
+            plan,
+            runs[0].actions.names,
+            {
+                name: max(run.quantities[name].values.shape[1:] for run in runs)
+                for name in plan.mapping.observation
+                if name not in plan.images
+            },
+        ),
         step_duration_ns=(step_ns := _step_ns(plan, times)),
         policy=plan.mapping.meta.policy,
         robot=_robot(plan, runs, observed, commands, space, step_ns),
@@ -399,6 +410,43 @@ def observed_names(mapping: Mapping, shapes: MappingOf[str, tuple[int, ...]]) ->
         for each in element_names(name, quantity, math.prod(shapes[name]))
     ]
     return tuple(_stacked_names(names, mapping.stack))
+
+
+def relation(
+    plan: Plan, parts: Sequence[str], shapes: MappingOf[str, tuple[int, ...]]
+) -> tuple[int | None, ...]:
+    """Return `Dataset.relative_to` of a mapping, for the elements of a command and the shapes.
+
+    Raises:
+        UsageError: There is no such quantity or element, or their numbers do not fit.
+    """
+    action, place = plan.mapping.action, plan.place
+    if action.relative_to is None:
+        return ()
+    unknown = [name for name in action.absolute if name not in parts]
+    if unknown:
+        raise UsageError(
+            f"{place.of('action', 'absolute')}: the command has no element"
+            f" '{unknown[0]}'; elements: {', '.join(parts)}"
+        )
+    names = [name for name, each in plan.mapping.observation.items() if each.image is None]
+    where = place.of("action", "relative_to")
+    if action.relative_to not in names:
+        raise UsageError(
+            f"{where}: '{action.relative_to}' is no observed vector: {', '.join(names) or 'none'}"
+        )
+    sizes = [math.prod(shapes[name]) for name in names]
+    at = names.index(action.relative_to)
+    # Of a stack, the newest frame is the last one.
+    first = (plan.mapping.stack - 1) * sum(sizes) + sum(sizes[:at])
+    relative = [part for part in parts if part not in action.absolute]
+    if sizes[at] not in (len(parts), len(relative)):
+        raise UsageError(
+            f"{where}: '{action.relative_to}' has {counted(sizes[at], 'element')}, but the command"
+            f" has {len(parts)}, of which {len(relative)} are relative"
+        )
+    paired = parts if sizes[at] == len(parts) else relative
+    return tuple(None if part in action.absolute else first + paired.index(part) for part in parts)
 
 
 def _stacked_names(names: list[str], count: int) -> list[str]:

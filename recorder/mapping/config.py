@@ -328,6 +328,18 @@ class Action(_Part):
         description="Limits of a Box action; commands are clipped to them. `{}` takes the limits"
         " from the data.",
     )
+    relative_to: str | None = Field(
+        default=None,
+        description="With `box`: name of the observed quantity that `bc` subtracts from the"
+        " command to learn, in the same units, such as the measured positions of the joints."
+        " Policies, drivers and logs have absolute commands all the same. The quantity has an"
+        " element for each element of the command, or for each one that is not in `absolute`.",
+    )
+    absolute: list[str] = Field(
+        default=[],
+        description="With `relative_to`: names of the elements of the command that stay absolute,"
+        " such as a gripper.",
+    )
     units: list[str] = Field(
         default=[],
         description="With `box`: unit of each element of the command, such as `m/s`. Default: those"
@@ -374,6 +386,10 @@ class Action(_Part):
         if self.selected is not None and given != ["fields"]:
             raise ValueError("a list of names is for `fields`")
         _check_names(self.selected, self.names_from)
+        if self.relative_to is not None and self.box is None:
+            raise ValueError("relative_to is for a command with box")
+        if self.absolute and self.relative_to is None:
+            raise ValueError("absolute is for a command with relative_to")
         if self.units and self.box is None:
             raise ValueError("units are for a command with box")
         if self.representatives and self.box is not None:

@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 
 import mcaprl
 from mcaprl.base_policy import BasePolicy
+from mcaprl.chunks import planned
 from mcaprl.errors import LogError, McaprlError, UsageError
 from mcaprl.recorder.bags.decoders import decoder_of
 from mcaprl.recorder.mapping.config import parse_mapping
 from mcaprl.recorder.mapping.read import read_open_bag
+from mcaprl.sims.evaluation.rollout import EpsilonGreedy
 from tests.drive.test_live import QUANTITIES, START_NS, TYPES, mappings, odom, streams
 from tests.recorder.mapping.suggest.test_suggested_robots import ROBOTS
 from tests.support.robots import FORMATS, Robot, vector
@@ -141,6 +143,66 @@ def test_joints_have_their_names_and_places() -> None:
     assert commanded(driver, 1)[0]["position"] == [0, 0.5, -0.5]
 
 
+ARM: dict[str, Any] = {
+    "fields": ["/do.position"],
+    "names": ["hip", "knee", "grip"],
+    "box": {"low": -9, "high": 9},
+    "relative_to": "joints",
+    "absolute": ["grip"],
+}
+
+
+def arm(action: dict[str, Any], observed: dict[str, Any]) -> mcaprl.Dataset:
+    """Return data of an arm whose joints are commanded 0.1 and 0.2 ahead of their positions."""
+    sent = []
+    for k in range(40):
+        now_ns, name = START_NS + k * 100 * MS, ["hip", "knee", "grip"]
+        here, ahead = [0.1 * k, -0.2 * k, 1.0], [0.1 * k + 0.1, -0.2 * k - 0.2, k % 2 + k / 100]
+        sent += [Sent(now_ns, "/joints", {"name": name, "position": here})]
+        sent += [Sent(now_ns + MS, "/do", {"name": name, "position": ahead})]
+    kinds = dict.fromkeys(("/joints", "/do"), "sensor_msgs/msg/JointState")
+    tree = {"clock": {"rate_hz": 10}, "stack": 2, "observation": observed, "action": action}
+    return read_open_bag(bag_of(*sent, types=kinds), parse_mapping(tree)).dataset
+
+
+def test_relative_actions_are_absolute_commands(tmp_path: Path) -> None:
+    joints = {"field": "/joints.position", "names": ["hip", "knee"]}
+    observed = {"grip": {"field": "/joints.position[2]"}, "joints": joints}
+    data = arm(ARM, observed)
+    # Of the stack, the second frame is the newest one: 3 numbers, then the grip, hip and knee.
+    assert data.relative_to == (4, 5, None)
+    assert data.observation_names[4:] == ("joints_hip", "joints_knee")
+    assert arm(ARM, {"joints": {**joints, "names": ARM["names"]}}).relative_to == (3, 4, None)
+    run = mcaprl.train(data, tmp_path / "run", algo="bc", updates=20, chunk=4, held_out=0.0)
+    with mcaprl.Driver(run.policy, mapping=data.robot) as driver:
+        driver.record(tmp_path / "drive.mcap")
+        for k in range(8):
+            now_ns, here = START_NS + k * 100 * MS, [5.0 - k, -6.0, 1.0]
+            driver.push("/joints", {"name": ARM["names"], "position": here}, now_ns)
+            command = driver.command(now_ns)
+            sent = command.messages["/do"]["position"]
+            assert not command.reason
+            # The number k of a chunk is 0.1 (k + 1) ahead of where the joint was at its start.
+            start, at = np.array([5.0 - (k - k % 2), -6.0]), k % 2 + 1
+            np.testing.assert_allclose(sent[:2] - start, [0.1 * at, -0.2 * at], atol=1e-4)
+            np.testing.assert_array_equal(np.float32(sent), command.action)
+    again = mcaprl.open(tmp_path / "drive.mcap")
+    assert again.relative_to == data.relative_to
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({"relative_to": "arm"}, r"action\.relative_to: 'arm' is no observed vector: grip, joints"),
+        (
+            {"absolute": ["hand"]},
+            r"action\.absolute: the command has no element 'hand'; elements: h",
+        ),
+        ({"absolute": []}, "'joints' has 2 elements, but the command has 3, of which 3 are relat"),
+        ({"relative_to": None}, "absolute is for a command with relative_to"),
+        ({"box": None, "edges": [[0.0]] * 3}, "relative_to is for a command with box"),
+    ]
+    for wrong, text in cases:
+        with pytest.raises(UsageError, match=text):
+            arm({**ARM, **wrong}, observed)
+
+
 def test_commands_are_limited() -> None:
     limits = {"max_change": [1.0, 100.0], "low": [-0.2, -1], "high": 0.25}
     driver = drive(BOX, [linear(0.5)] * 3, lambda k: np.array([1, -2], np.float32), drive=limits)
@@ -171,6 +233,41 @@ def test_nothing_moves_before_all_inputs_are_there() -> None:
     assert old.observation is not None
     back = driver.command(START_NS)
     assert (back.reason, back.is_fatal) == ("the clock went back by 0.45 s", True)
+
+
+@pytest.mark.parametrize("own", [{"chunk": 5, "execute": 3}, {"chunk": 4, "ensemble": True}])
+def test_chunks_are_executed_as_in_an_evaluation(own: dict[str, Any], tmp_path: Path) -> None:
+    commands = [{**linear(0.05 * (k % 7)), "angular": vector(0, 0, k % 2)} for k in range(30)]
+    sent = [Sent(START_NS + k * 100 * MS, "/odom", odom(k % 4)) for k in range(31)]
+    sent += [Sent(START_NS + k * 100 * MS, "/do", each) for k, each in enumerate(commands)]
+    mapping = {"clock": {"rate_hz": 10}, "observation": SPEED, "action": BOX}
+    tree = {**mapping, "episodes": {"truncated": "speed > 8"}, "drive": {"timeout_s": 0.25}}
+    bag = bag_of(*sent, types={"/do": "geometry_msgs/msg/Twist"})
+    data = read_open_bag(bag, parse_mapping(tree)).dataset
+    run = mcaprl.train(data, tmp_path / "run", algo="bc", updates=3, held_out=0.0, **own)
+    driver = mcaprl.Driver(run.policy, mapping=data.robot)
+    random = np.random.default_rng(0)
+    speeds, found = random.uniform(0, 3, 30).astype(np.float32), list[Any]()
+    # A new episode begins after step 10; from step 20 on, /odom is silent for four steps.
+    speeds[10] = 9
+    for k, speed in enumerate(speeds):
+        now_ns = START_NS + k * 100 * MS
+        if not 20 <= k < 24:
+            driver.push("/odom", odom(float(speed)), now_ns)
+        found.append(driver.command(now_ns))
+    assert [k for k, each in enumerate(found) if each.reason] == [10, 22, 23]
+    for first, stop in ((0, 10), (11, 22), (24, 30)):
+        part = found[first:stop]
+        seen = np.array([each.observation for each in part])
+        wanted = planned(run.policy.chunk, run.policy.act_chunk(seen))
+        np.testing.assert_allclose([each.action for each in part], wanted, atol=1e-6)
+        # The same as in an environment with these observations.
+        behavior = EpsilonGreedy(run.policy, 0.0, data.action_space)
+        own_actions = [behavior.choose(each)[0] for each in seen]
+        np.testing.assert_array_equal([each.action for each in part], own_actions)
+        messages = [each.messages["/do"] for each in part]
+        sent_ = [(each["linear"]["x"], each["angular"]["z"]) for each in messages]
+        np.testing.assert_allclose(sent_, own_actions, atol=1e-6)
 
 
 def test_a_terminal_state_stops_the_robot() -> None:

@@ -211,13 +211,25 @@ BINS = {
 }
 
 
-@pytest.mark.parametrize(("mapping", "algo"), [(MAPPING, "bc"), (BINS, "bc"), (SIGHT, "bc")])
+CHUNKS: list[dict[str, Any]] = [{"chunk": 4, "execute": 3}, {"chunk": 3, "ensemble": True}]
+
+
+@pytest.mark.parametrize(
+    ("mapping", "settings"),
+    [
+        (MAPPING, {}),
+        (BINS, {}),
+        (SIGHT, {}),
+        (BINS, CHUNKS[0]),
+        *((MAPPING, each) for each in CHUNKS),
+    ],
+)
 def test_a_node_commands_what_the_driver_commands(
-    mapping: dict[str, Any], algo: str, tmp_path: Path, rclpy: Any
+    mapping: dict[str, Any], settings: dict[str, Any], tmp_path: Path, rclpy: Any
 ) -> None:
     bag = write_mcap(robot(), tmp_path / "bag.mcap")
     data = mcaprl.open(bag, mapping=mapping)
-    run = mcaprl.train(data, tmp_path / "run", algo=algo, updates=3)
+    run = mcaprl.train(data, tmp_path / "run", algo="bc", updates=3, **settings)
     node = tmp_path / "drive.py"
     mcaprl.export(run, node=node)
     driver = mcaprl.Driver(run)

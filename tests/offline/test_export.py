@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from gymnasium import spaces
 
 from mcaprl.api.policies import load_policy
+from mcaprl.chunks import Chunks
 from mcaprl.cli import run
 from mcaprl.offline.algorithms.config import (
     BCConfig,
@@ -137,6 +139,26 @@ def test_the_exported_policy_returns_actions_in_the_units_of_their_box(
         assert action.dtype == expected.dtype == dtype
         np.testing.assert_allclose(action, expected, rtol=1e-5, atol=1e-6)
         assert all(space.contains(one) for one in expected)
+
+
+@pytest.mark.parametrize("head", ["mixture", None])
+def test_the_exported_policy_returns_chunks(head: str | None, tmp_path: Path) -> None:
+    need(onnxruntime is not None, "onnxruntime is not installed")
+    space = spaces.Box(-3, 5, (2,), np.float32) if head else None
+    own: dict[str, Any] = {**TINY, "chunk": 5, "execute": 2, "frame_stack": 2}
+    config = BoxBCConfig(**own, head=head) if head else BCConfig(**own)
+    policy = policy_of(config, VECTOR, tmp_path, space)
+    export_onnx(policy, tmp_path / "policy.onnx")
+    session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
+    (inputs,) = (tensor.numpy() for tensor in ExportedPolicy(policy).examples(3, seed=1))
+    found = session.run(["action"], {"observation": inputs})[0]
+    np.testing.assert_allclose(found, policy.act_chunk(inputs), rtol=1e-5, atol=1e-6)
+    about = session.get_modelmeta().custom_metadata_map
+    assert Chunks(**json.loads(about["chunk"])) == policy.chunk
+    assert about["execution"].startswith(
+        "action[:, k] is for the k-th step from now: chunks of 5 actions, of which 2 are executed;"
+    )
+    assert head or about["scores"] == "scores[:, step, k] is the score of action k + 7"
 
 
 @pytest.mark.parametrize("name", ["online-dqn.zip", "online-camera.zip", "sb3-a2c.zip"])

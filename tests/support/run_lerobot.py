@@ -1,6 +1,7 @@
 """LeRobot's own reader and writer, run by the tests in an environment that has LeRobot.
 
     python run_lerobot.py read FOLDER OUT.npz    all items of a dataset, by key
+    python run_lerobot.py chunks FOLDER OUT.npz  the same, with the actions of the next 4 steps
     python run_lerobot.py merge FOLDER TARGET    a dataset with the episodes of FOLDER twice
     python run_lerobot.py make FOLDER KIND       the golden dataset of KIND `image` or `video`
 
@@ -20,12 +21,23 @@ import torch
 
 def main(command: str, folder: str, target: str) -> None:
     """Run a command."""
-    {"read": read, "merge": merge, "make": make}[command](Path(folder), target)
+    {"read": read, "chunks": chunks, "merge": merge, "make": make}[command](Path(folder), target)
+
+
+def chunks(folder: Path, target: str) -> None:
+    """Write what LeRobot reads with chunks of 4 actions, and the flags of their padding."""
+    reader = _lerobot().LeRobotDataset
+    fps = reader("any/name", root=folder).fps
+    steps = {"action": [step / fps for step in range(4)]}
+    _write(reader("any/name", root=folder, delta_timestamps=steps), target)
 
 
 def read(folder: Path, target: str) -> None:
     """Write what LeRobot reads: items, statistics, frame rate and episode lengths."""
-    dataset = _lerobot().LeRobotDataset("any/name", root=folder)
+    _write(_lerobot().LeRobotDataset("any/name", root=folder), target)
+
+
+def _write(dataset: Any, target: str) -> None:
     items = [dataset[row] for row in range(len(dataset))]
     found: dict[str, Any] = {
         key: np.stack([np.asarray(item[key]) for item in items]) for key in items[0]

@@ -391,6 +391,11 @@ class _Writer:
                 f"not written: the infos {', '.join(sorted(infos))}; LeRobot has a place for"
                 " numbers of every step"
             )
+        if any(each is not None for each in self._dataset.relative_to):
+            found.append(
+                "not written: which observations the actions are relative to, because LeRobot has"
+                " absolute actions; restore it by `with_relative_actions`"
+            )
         lasts = np.cumsum(self._dataset.episode_lengths) - 1
         if cut := int((~self._dataset.terminated[lasts]).sum()):
             found.append(

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from hypothesis import assume, given, settings
 from hypothesis.extra.numpy import arrays
@@ -22,6 +23,8 @@ from numpy.typing import NDArray
 import mcaprl
 from mcaprl import Dataset
 from mcaprl.errors import LogError, SpaceError
+from mcaprl.offline.algorithms.config import BoxBCConfig
+from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.recorder.dataset.formats import lerobot_writer
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.dataset.formats.lerobot_features import Feature
@@ -700,3 +703,47 @@ def test_rates_and_tasks() -> None:
     assert lerobot_writer.task_of("[1]", metadata) == "act"
     assert lerobot_writer.task_of('{"task": "lift"}', metadata) == "lift"
     assert lerobot_writer.frames_per_second(33_333_333) == 30
+
+
+@pytest.mark.filterwarnings("ignore:.*the final observation is not stored")
+def test_lerobot_has_the_same_chunks(tmp_path: Path) -> None:
+    """Chunks, their padding, and relative actions are those of our training."""
+    random = np.random.default_rng(0)
+    ends = np.isin(np.arange(12), [5, 8, 11])
+    seen = random.uniform(-1, 1, (12, 3)).astype(np.float32)
+    data = Dataset.from_arrays(
+        observations=seen,
+        next_observations=np.concatenate([seen[1:], seen[-1:]]),
+        actions=random.uniform(-4, 4, (12, 2)).astype(np.float32),
+        rewards=np.ones(12),
+        terminated=ends,
+        truncated=np.zeros(12, bool),
+        observation_space=spaces.Box(-1, 1, (3,), np.float32),
+        action_space=spaces.Box(-4, 4, (2,), np.float32),
+    ).with_relative_actions({1: 2})
+    data.save(tmp_path / "log.mcap")
+    notes = mcaprl.open(tmp_path / "log.mcap").to_lerobot(tmp_path / "written")
+    assert any("which observations the actions are relative to" in note for note in notes)
+    _run_lerobot("chunks", tmp_path / "written", tmp_path / "items.npz", home=tmp_path / "home")
+    items = np.load(tmp_path / "items.npz")
+    buffer = TransitionBuffer.from_dataset(data, BoxBCConfig(chunk=4).packing)
+    rows = torch.arange(12)
+    actions, exist = buffer.chunks(rows)
+    np.testing.assert_array_equal(items["action_is_pad"], ~exist.numpy())
+    np.testing.assert_allclose(items["action"], 4 * actions.numpy(), atol=1e-6)
+    # The difference of LeRobot's chunk and state is ours, and so are its ranges.
+    relative = buffer.relative
+    assert relative is not None
+    numbers = relative.numbers(actions, buffer.batch(rows).observations.vector).double()
+    scaled = relative.low + (numbers + 1) / 2 * (relative.high - relative.low)
+    theirs = items["action"][:, :, 1] - items["observation.state"][:, None, 2]
+    np.testing.assert_allclose(4 * scaled[:, :, 1].numpy(), theirs, atol=1e-5)
+    own = theirs[exist.numpy()]
+    steps = np.broadcast_to(np.arange(4), exist.shape)[exist.numpy()]
+    for step in range(4):
+        found = own[steps == step]
+        np.testing.assert_allclose(4 * float(relative.low[step, 1]), found.min(), atol=1e-5)
+        np.testing.assert_allclose(4 * float(relative.high[step, 1]), found.max(), atol=1e-5)
+    again = mcaprl.open(tmp_path / "written")
+    assert again.relative_to == ()
+    np.testing.assert_array_equal(again.actions, data.actions)
