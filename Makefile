@@ -130,12 +130,12 @@ $(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
 	@test -f $@
 
 $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
-	@echo "installing into $(VENV)"
+	@echo "installing into $(VENV): the package with its extras and the tools of the tests, about 3.3 GB, some minutes"
 	$(PIP) -e '.[$(EXTRAS)]' --group dev
 	@touch $@
 
 $(VENV)/.core: $(SETTINGS) | $(VENV)/bin/python
-	@echo "installing into $(VENV)"
+	@echo "installing into $(VENV): PyTorch, Numba and others, about 1.7 GB, some minutes"
 	$(PIP) -e '.[sims,offline]' pytest hypothesis
 	@touch $@
 
@@ -151,7 +151,7 @@ $(BENCH)/.ready: $(SETTINGS)
 # d3rlpy requires an older gymnasium but runs with the one of constraints.txt; it and SCOPE-RL are
 # installed without their dependencies.
 $(VENV)/.rivals: $(SETTINGS) benchmarks/rivals.txt | $(VENV)/bin/python
-	@echo "installing into $(VENV)/rivals"
+	@echo "installing into $(VENV)/rivals: d3rlpy and SCOPE-RL with PyTorch, about 1.9 GB"
 	$(BIN)/python -m venv $(VENV)/rivals
 	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -e '.[sims,offline,online]'
 	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -r benchmarks/rivals.txt
@@ -161,7 +161,7 @@ $(VENV)/.rivals: $(SETTINGS) benchmarks/rivals.txt | $(VENV)/bin/python
 # LeRobot, which the tests run in a separate environment: it requires older versions of PyTorch, NumPy
 # and pandas than constraints.txt has. It runs with those of tests/lerobot.txt, without its pins.
 $(VENV)/.lerobot: tests/lerobot.txt | $(VENV)/bin/python
-	@echo "installing into $(VENV)/lerobot"
+	@echo "installing into $(VENV)/lerobot: LeRobot with PyTorch, about 1.6 GB"
 	$(BIN)/python -m venv $(VENV)/lerobot
 	$(VENV)/lerobot/bin/python -m pip install -qq -r tests/lerobot.txt
 	$(VENV)/lerobot/bin/python -m pip install -qq --no-deps lerobot==0.4.4 torchvision==0.28.0
@@ -169,7 +169,7 @@ $(VENV)/.lerobot: tests/lerobot.txt | $(VENV)/bin/python
 
 # An S3 server, which requires an older python-dateutil than constraints.txt has.
 $(VENV)/.s3: tests/s3.txt | $(VENV)/bin/python
-	@echo "installing into $(VENV)/s3"
+	@echo "installing into $(VENV)/s3: an S3 server, about 0.5 GB"
 	$(BIN)/python -m venv $(VENV)/s3
 	$(VENV)/s3/bin/python -m pip install -qq -r tests/s3.txt -e '.[remote]'
 	@touch $@

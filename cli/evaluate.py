@@ -181,7 +181,7 @@ def _refuse_unused(given: dict[str, Any], names: Sequence[str], needed: str) -> 
 
 def _print_scores(found: Evaluation) -> None:
     rows = _score_rows(found)
-    # Discrete actions have no change of the command.
+    # Discrete actions have no change of the command, and most environments no pilot.
     columns = [name for name in rows[-1] if any(row.get(name) is not None for row in rows)]
     episodes = found.policies[0].returns.shape[1]
     print_table(
@@ -189,6 +189,8 @@ def _print_scores(found: Evaluation) -> None:
         columns,
         [[row.get(name) or "" for name in columns] for row in rows],
     )
+    if not all(score.has_interval for score in found.policies):
+        echo("no interval of 2 seeds, which have one difference only: train 3 seeds or more")
     if not found.improvements:
         return
     print_table(
@@ -222,10 +224,10 @@ def _score_rows(found: Evaluation) -> list[dict[str, str | None]]:
             {
                 "policy": score.policy,
                 "mean return": f"{score.mean_return:.2f}",
-                "95 % interval": _interval(score.interval),
+                "95 % interval": _interval(score.interval) if score.has_interval else "2 seeds",
                 "IQM": f"{float(interquartile_mean(score.returns)):.2f}",
                 "random 0, pilot 1": _score(score.normalized_score),
-                "success": "" if rate is None else f"{rate:.0%}",
+                "success": None if rate is None else f"{rate:.0%}",
                 "ends": ", ".join(f"{count} {reason}" for reason, count in score.ends.items()),
                 "change a step": None if change is None else f"{change:.3g}",
             }
@@ -294,5 +296,5 @@ def _interval(interval: Sequence[float], digits: int = 2) -> str:
     return f"{interval[0]:.{digits}f} to {interval[1]:.{digits}f}"
 
 
-def _score(score: float | None) -> str:
-    return "" if score is None else f"{score:.3f}"
+def _score(score: float | None) -> str | None:
+    return None if score is None else f"{score:.3f}"

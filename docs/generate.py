@@ -3,6 +3,7 @@
 docs/cli.md                    the commands and their options, from the help of the program
 docs/api.md                    the functions and classes of `mcaprl`, from their docstrings
 docs/mapping.md                the keys of a mapping file, from their descriptions
+docs/cards/SIM.md              the card of each sim, from the docstring of its class
 docs/images/SIM-pilot.png      an episode of the pilot in each sim: from above, and its depth images
 docs/images/SIM-random.png     the same with random actions
 docs/images/comparison.png     copied from the last `make demo`, if there is one
@@ -11,7 +12,9 @@ docs/images/trajectories.png   copied from the last `make demo`, if there is one
 
 from __future__ import annotations
 
+import importlib
 import inspect
+import re
 import shutil
 import textwrap
 from collections.abc import Iterator
@@ -29,12 +32,13 @@ import mcaprl
 from mcaprl.api import SCRIPTED
 from mcaprl.cli import EXIT_CODES, cli
 from mcaprl.recorder import MAPPING_SECTIONS
-from mcaprl.sims import make_pilot, make_sim
+from mcaprl.sims import highway, lane, make_pilot, make_sim, powerline, racer
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"
 DEMO_REPORT = DOCS.parent / "demo" / "report"
 SEED = 1
+BUILT_IN = (lane.SPEC, powerline.SPEC, racer.SPEC, highway.SPEC)
 SHEET_WIDTH = 14.4
 # Range of the color scale of depth images, which is logarithmic.
 NEAREST_M, FARTHEST_M = 2.0, 200.0
@@ -103,10 +107,51 @@ def api_reference() -> str:
 
 
 def _reference(name: str, value: Any) -> str:
-    texts = [f"mcaprl.{name}{_signature(value)}", str(inspect.getdoc(value))]
+    parts = [_entry("##", f"mcaprl.{name}", value)]
     if inspect.isclass(value):
-        texts += [_member(value, member) for member in _members(value)]
-    return _section(f"mcaprl.{name}", "\n\n".join(texts))
+        parts += [_entry("###", f"{name}.{one}", getattr(value, one)) for one in _members(value)]
+    return "\n".join(parts)
+
+
+def _entry(level: str, name: str, value: Any) -> str:
+    """Return a heading, which is the anchor, the signature and the docstring."""
+    signature = _signature(value)
+    shown = f"```text\n{name.rpartition('.')[2]}{signature}\n```\n\n" if signature else ""
+    return f"{level} {name}\n\n{shown}{_prose(str(inspect.getdoc(value)))}\n"
+
+
+def _prose(docstring: str) -> str:
+    """Return a docstring as Markdown: sections with a list of names, and examples in blocks."""
+    blocks = []
+    for block in re.split(r"\n{2,}", docstring.strip()):
+        head, _, body = block.partition("\n")
+        text = textwrap.dedent(block)
+        if re.fullmatch(r"[A-Z]\w+:", head) and body:
+            found = re.sub(r"^(\S[^:\n]*):", r"- `\1`:", textwrap.dedent(body), flags=re.MULTILINE)
+            blocks.append(
+                f"**{head[:-1]}**\n\n" + re.sub(r"^    ", "  ", found, flags=re.MULTILINE)
+            )
+        elif text.startswith(">>>"):
+            blocks.append(f"```pycon\n{text}\n```")
+        elif block.startswith("    ") and not text.startswith("|"):
+            blocks.append(f"```text\n{text}\n```")
+        else:
+            blocks.append(block)
+    return "\n\n".join(blocks)
+
+
+def cards() -> dict[str, str]:
+    """Return the card of each sim, as Markdown."""
+    found = {}
+    for spec in BUILT_IN:
+        module, _, name = spec.entry_point.partition(":")
+        text = _prose(str(inspect.getdoc(getattr(importlib.import_module(module), name))))
+        shown = re.sub(r"^## Description\n+", "", text.partition("\n\n")[2], flags=re.MULTILINE)
+        found[spec.name] = (
+            f"# {spec.name}: `{spec.env_id}`\n\n{text.partition(chr(10) * 2)[0]}\n\n"
+            f"`make docs` writes this page from the docstring of `{name}`.\n\n{shown}\n"
+        )
+    return found
 
 
 def mapping_reference() -> str:
@@ -148,12 +193,6 @@ def _members(value: type) -> list[str]:
             or callable(member)
         )
     ]
-
-
-def _member(value: type, name: str) -> str:
-    member = getattr(value, name)
-    text = textwrap.indent(str(inspect.getdoc(member)), "    ")
-    return f".{name}{_signature(member)}\n{text}"
 
 
 def _signature(value: Any) -> str:
@@ -264,6 +303,9 @@ def main() -> None:
     (DOCS / "cli.md").write_text(command_reference())
     (DOCS / "api.md").write_text(api_reference())
     (DOCS / "mapping.md").write_text(mapping_reference())
+    (DOCS / "cards").mkdir(exist_ok=True)
+    for name, card in cards().items():
+        (DOCS / "cards" / f"{name}.md").write_text(card)
     for name, sheet in SHEETS.items():
         for policy in SCRIPTED:
             path = IMAGES / f"{name}-{policy}.png"
@@ -271,7 +313,7 @@ def main() -> None:
     for name in ("comparison.png", "trajectories.png"):
         if (DEMO_REPORT / name).exists():
             shutil.copy(DEMO_REPORT / name, IMAGES / name)
-    print(f"wrote cli.md, api.md and mapping.md in {DOCS}, and {IMAGES}")
+    print(f"wrote cli.md, api.md, mapping.md and cards in {DOCS}, and {IMAGES}")
 
 
 if __name__ == "__main__":

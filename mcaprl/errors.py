@@ -72,6 +72,7 @@ class UnknownNameError(UsageError):
         near = difflib.get_close_matches(name, [*names, *more], n=3, cutoff=0.5)
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         super().__init__(f"unknown {kind} '{name}': {hint}known: {', '.join(names) or 'none'}")
+        self.kind = kind
         self._arguments = (kind, name, names, more)
 
     def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, str, list[str], list[str]]]:

@@ -39,6 +39,33 @@ def test_generated_references_are_up_to_date(page: str, generate: str) -> None:
     assert (ROOT / "docs" / f"{page}.md").read_text() == text, "stale: run `make docs`"
 
 
+def test_generated_cards_are_up_to_date() -> None:
+    pytest.importorskip("matplotlib")
+    cards = _generator().cards()
+    assert sorted(f"docs/cards/{name}.md" for name in cards) == [
+        page for page in PAGES if page.startswith("docs/cards/")
+    ]
+    for name, text in cards.items():
+        assert (ROOT / "docs" / "cards" / f"{name}.md").read_text() == text, "run `make docs`"
+        assert "## Action Space" in text
+        assert "## Arguments" in text
+
+
+def test_every_method_has_an_anchor_and_a_signature() -> None:
+    page = (ROOT / "docs" / "api.md").read_text()
+    assert "### Dataset.split\n\n```text\nsplit(" in page
+    assert "- `observations`: (N, *shape) array" in page
+
+
+def test_docstrings_become_markdown() -> None:
+    pytest.importorskip("matplotlib")
+    docstring = "Add.\n\nArgs:\n    a: A number\n        or None.\n    b: Another.\n\n>>> 1 + 1\n2"
+    assert _generator()._prose(docstring) == (
+        "Add.\n\n**Args**\n\n- `a`: A number\n  or None.\n- `b`: Another."
+        "\n\n```pycon\n>>> 1 + 1\n2\n```"
+    )
+
+
 @pytest.mark.parametrize("name", PAGES)
 def test_links_and_files_exist(name: str) -> None:
     page = ROOT / name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -11,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 
 from mcaprl.api.policies import SCRIPTED, load_policies
-from mcaprl.errors import UsageError
+from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.format.metadata import as_json, same_env
 from mcaprl.sims import SIMS, make_sim
@@ -150,8 +151,10 @@ def sim_of(
     name, given = sim or dataset.env_id, dict(sim_options or {})
     if not name:
         raise UsageError(f"{path} has no environment id: pass `sim=NAME`")
-    if sim is None and ":" in name and not trust_env:
-        module = name.partition(":")[0]
+    module, _, registered = name.rpartition(":")
+    # A module that this program has imported is no choice of the log.
+    is_imported = module in sys.modules and registered in gym.registry
+    if sim is None and module and not (trust_env or is_imported):
         raise UsageError(
             f"{path} names the environment {name}, so the module {module} would be imported: if you"
             f" trust the log, pass `trust_env=True` or `sim={name!r}`"
@@ -170,7 +173,15 @@ def sim_of(
             " `trust_env=True`"
         )
     others = {} if render_mode is None else {"render_mode": render_mode}
-    return make_sim(name, **{**logged, **given, **others})
+    try:
+        return make_sim(name, **{**logged, **given, **others})
+    except UnknownNameError as error:
+        if sim is not None or error.kind != "sim":
+            raise
+        raise UsageError(
+            f"{path} was recorded in {name}, which is not registered: pass"
+            f" `sim='MODULE:{registered}'` with the module that registers it"
+        ) from error
 
 
 def _needs_trust(name: str) -> bool:

@@ -305,7 +305,8 @@ def target_format(path: str | Path, name: str | None) -> Format:
     prefix, colon, _ = str(path).partition(":")
     suffix = Path(path).suffix
     found = [form for form in every if form.name == prefix] if colon else []
-    found = found or [form for form in every if form.suffix and form.suffix == suffix]
+    # A folder may have the name of its format as its suffix: `drives.parquet`.
+    found = found or [form for form in every if suffix == (form.suffix or f".{form.name}")]
     if len(found) != 1:
         raise UsageError(
             f"{path}: the format is not clear from the name; pass `to=` with one of"

@@ -43,16 +43,18 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, lru_cache
-from importlib.metadata import PackageNotFoundError, version
+from functools import cache, cached_property, lru_cache
+from importlib.metadata import PackageNotFoundError, entry_points, version
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 
 from mcaprl._version import __version__
 from mcaprl.errors import LogError, UsageError
@@ -504,19 +506,46 @@ def _env_id(env: Any) -> str:
         return ""
     # If the caller of `make_sim` named a module whose import registers the id, `make_sim` stores
     # the name of the module in `env_module`.
-    module = getattr(env.unwrapped, "env_module", "")
+    module = getattr(env.unwrapped, "env_module", "") or _registering_module(env.spec)
     return f"{module}:{env.spec.id}" if module else str(env.spec.id)
 
 
+def _registering_module(spec: EnvSpec) -> str:
+    """Return a module whose import registers an id; empty if none is needed, or none is known.
+
+    It is the module of the entry point: its import also imports the packages that contain it, one
+    of which usually registers the id.
+    """
+    entry = spec.entry_point
+    module = entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "")
+    found = sys.modules.get(module or "")
+    # A script and a notebook cannot be imported by their name.
+    if found is None or module == "__main__" or getattr(found, "__spec__", None) is None:
+        return ""
+    return "" if module.partition(".")[0] in _self_registering() else str(module)
+
+
+@cache
+def _self_registering() -> frozenset[str]:
+    """Return the packages whose ids Gymnasium or this package finds without an import."""
+    groups = [entry_points(group=group) for group in ("gymnasium.envs", "mcaprl.sims")]
+    packages = {one.module.partition(".")[0] for group in groups for one in group}
+    return frozenset({"gymnasium", "mcaprl", *packages})
+
+
 def same_env(first: str, second: str) -> bool:
-    """Return whether two ids name the same environment. The ids in older logs have no module.
+    """Return whether two ids name the same environment.
+
+    The ids in older logs have no module; others name a package, or a module in it.
 
     >>> same_env("highway_env:racetrack-v1", "racetrack-v1"), same_env("a:Env-v0", "b:Env-v0")
     (True, False)
+    >>> same_env("a:Env-v0", "a.envs:Env-v0"), same_env("a:Env-v0", "ab:Env-v0")
+    (True, False)
     """
-    if ":" in first and ":" in second:
-        return first == second
-    return first.rpartition(":")[2] == second.rpartition(":")[2]
+    (one, _, name), (other, _, same) = first.rpartition(":"), second.rpartition(":")
+    outer, inner = sorted([one, other], key=len)
+    return name == same and (not outer or f"{inner}.".startswith(f"{outer}."))
 
 
 def _object(strings: Mapping[str, str], name: str) -> dict[str, Any]:

@@ -259,6 +259,14 @@ class PolicyScore:
         return np.array([[episode.total_reward for episode in seed] for seed in self.results])
 
     @property
+    def has_interval(self) -> bool:
+        """Whether the interval is worth showing.
+
+        That of two seeds rests on one difference, and reaches far beyond all returns.
+        """
+        return len(self.results) != 2
+
+    @property
     def ends(self) -> dict[str, int]:
         """Number of episodes by the reason why they ended."""
         return dict(Counter(e.reason for seed in self.results for e in seed).most_common())

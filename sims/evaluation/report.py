@@ -85,7 +85,9 @@ def comparison_figure(
     axes.set_xlim(right=axes.get_xlim()[1] * 1.28)
     label = "mean return; line: 95 % interval; dots: training seeds"
     if any(_exceeds_returns(score) for score in scores):
-        label += "\narrow: the interval goes beyond all returns; evaluate more episodes"
+        label += "\narrow: bootstrap-t interval of few, skewed returns; evaluate more episodes"
+    if not all(score.has_interval for score in scores):
+        label += "\nno interval of 2 seeds, which have one difference; train 3 or more"
     axes.set_xlabel(label)
     axes.set_title(title)
     if behavior is not None:
@@ -96,7 +98,7 @@ def comparison_figure(
 def _exceeds_returns(score: PolicyScore) -> bool:
     """Return whether an interval contains means that no sample of the returns could have."""
     low, high = score.interval
-    return bool(low < score.returns.min() or high > score.returns.max())
+    return score.has_interval and bool(low < score.returns.min() or high > score.returns.max())
 
 
 def _draw_interval(axes: Any, row: int, score: PolicyScore) -> tuple[float, float]:
@@ -104,6 +106,8 @@ def _draw_interval(axes: Any, row: int, score: PolicyScore) -> tuple[float, floa
 
     The interval of few, skewed returns can be many times as wide as the returns.
     """
+    if not score.has_interval:
+        return (score.mean_return,) * 2
     limits = (float(score.returns.min()), float(score.returns.max()))
     low, high = np.clip(score.interval, *limits)
     axes.plot([low, high], [row, row], color=INK, lw=2, solid_capstyle="butt")
@@ -187,7 +191,9 @@ def _score_table(scores: Sequence[PolicyScore]) -> Table:
             f"{score.mean_return:.2f}",
             "" if score.normalized_score is None else f"{score.normalized_score:.3f}",
             "" if score.success_rate is None else f"{score.success_rate:.0%}",
-            f"{score.interval[0]:.2f} to {score.interval[1]:.2f}",
+            f"{score.interval[0]:.2f} to {score.interval[1]:.2f}"
+            if score.has_interval
+            else "none: 2 seeds",
             f"{float(interquartile_mean(score.returns)):.2f}",
             f"{float(median(score.returns)):.2f}",
             _ends(score),

@@ -78,6 +78,9 @@ def test_a_converted_bag_is_an_equal_log(bag: Path, tmp_path: Path) -> None:
         mcaprl.convert(out, tmp_path / "x.mcap", to="npz")
     with pytest.raises(UsageError, match="the format is not clear from the name"):
         mcaprl.convert(data, tmp_path / "robot.unknown")
+    pytest.importorskip("pyarrow")
+    mcaprl.convert(out, tmp_path / "robot.parquet")
+    assert mcaprl.open(tmp_path / "robot.parquet").fingerprint == data.fingerprint
 
 
 def test_every_form_of_bag_gives_the_same_log(bag: Path, tmp_path: Path) -> None:

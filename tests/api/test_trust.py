@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -24,9 +25,16 @@ MODULE = '''
 from pathlib import Path
 
 import gymnasium as gym
+from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 
 Path("imported").touch()
-gym.register("Foreign-v0", "gymnasium.envs.classic_control.cartpole:CartPoleEnv")
+
+
+class Foreign(CartPoleEnv):
+    """An environment of the module."""
+
+
+gym.register("Foreign-v0", "foreign_envs:Foreign")
 '''
 
 
@@ -89,6 +97,32 @@ def test_a_log_names_the_module_that_registers_its_environment(foreign: Path) ->
         assert LogMetadata.of_env(envs).env_id == "foreign_envs:Foreign-v0"
     with closing(make_sim("CartPole-v1")) as env:
         assert LogMetadata.of_env(env).env_id == "CartPole-v1"
+
+
+def test_gym_make_is_enough_to_name_the_module(foreign: Path) -> None:
+    importlib.import_module("foreign_envs")
+    log = foreign / "log.mcap"
+    with mcaprl.RecordMcap(gym.make("Foreign-v0"), log) as env:
+        env.reset(seed=0)
+        env.step(0)
+    assert mcaprl.open(log).env_id == "foreign_envs:Foreign-v0"
+    assert mcaprl.verify(log).difference is None, "the program has imported the module itself"
+    unload()
+    with pytest.raises(UsageError, match="module foreign_envs would be imported"):
+        mcaprl.verify(log)
+
+
+def test_an_id_without_its_module_is_reported(
+    foreign: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr("mcaprl.recorder.format.metadata._env_id", lambda env: env.spec.id)
+        log = recorded(foreign / "log.mcap")
+    unload()
+    assert run(["replay", str(log), "--verify"]) == 2
+    assert "Foreign-v0, which is not registered: pass --sim MODULE:Foreign-v0" in (
+        capsys.readouterr().err
+    )
 
 
 def test_the_options_of_the_command_line(foreign: Path, capsys: pytest.CaptureFixture[str]) -> None:

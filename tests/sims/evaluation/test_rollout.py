@@ -179,6 +179,8 @@ def test_scores_by_hand(env: gym.Env[Any, Any]) -> None:
     twice = evaluate(env, [AlwaysLeft(), AlwaysLeft()], name="twice", episodes=5, seed=0)
     assert [e.seed for e in left.results[0]] == [e.seed for e in random.results[0]]
     assert twice.returns.tolist() == [left.returns[0].tolist()] * 2, "greedy runs repeat"
+    assert left.has_interval
+    assert not twice.has_interval, "it would rest on one difference"
     assert normalize(left, random, None).normalized_score is None
     assert normalize(random, random, left).normalized_score == 0.0
     assert normalize(left, random, left).normalized_score == 1.0
