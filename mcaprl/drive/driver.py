@@ -165,7 +165,7 @@ def _check_fits(policy: BasePolicy, robot: Robot) -> None:
     """Check that the policy has the observations of the mapping, as far as they are known."""
     space = policy.observation_space
     state = space[STATE] if isinstance(space, spaces.Dict) and STATE in space.spaces else space
-    names = [n for n, each in robot.mapping.observation.items() if each.image is None]
+    names = [n for n, each in robot.mapping.observation.items() if each.pixels is None]
     if not isinstance(state, spaces.Box) or not all(name in robot.shapes for name in names):
         return
     count = sum(math.prod(robot.shapes[name]) for name in names) * robot.mapping.stack

@@ -362,7 +362,7 @@ def _put_vector(
     """Add all numeric quantities, if any, as one vector; return the names of its elements."""
     vectors, limits, names = [], list[tuple[float, float]](), list[str]()
     for name, quantity in plan.mapping.observation.items():
-        if quantity.image is None:
+        if quantity.pixels is None:
             values = np.concatenate([run.quantities[name].values for run in runs])[rows]
             with plan.place.named("observation", name):
                 numbers = _as_float32(as_numbers(values, name), name).reshape(len(rows), -1)
@@ -390,7 +390,7 @@ def vector_names(plan: Plan, runs: list[Steps]) -> list[str]:
     """Return the names of the elements of the observed vector."""
     names = []
     for name, quantity in plan.mapping.observation.items():
-        if quantity.image is None:
+        if quantity.pixels is None:
             shapes = [run.quantities[name].values.shape[1:] for run in runs]
             count = max((shape[0] for shape in shapes if shape), default=1)
             names += element_names(name, quantity, count)
@@ -402,7 +402,7 @@ def observed_names(mapping: Mapping, shapes: MappingOf[str, tuple[int, ...]]) ->
 
     With images, the vector is a part of the observation, and there are no names.
     """
-    if any(quantity.image is not None for quantity in mapping.observation.values()):
+    if any(quantity.pixels is not None for quantity in mapping.observation.values()):
         return ()
     names = [
         each

@@ -37,6 +37,7 @@ LARGEST = 3.4028234663852886e38
 Stored = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 CommandValue = int | Finite | str
 PosePart = Literal["x", "y", "z", "roll", "pitch", "yaw", "qx", "qy", "qz", "qw"]
+As = Literal["yaw", "count", "depth", "intensity", "range", "height", "density"]
 _Count = Annotated[int, Field(ge=1, le=2**16)]
 _MAX_RATE_HZ, _MAX_STACK = 1e9, 1024
 
@@ -125,6 +126,55 @@ class Quantity(_Part):
         description="Topic of images (Image, CompressedImage) or of a video (CompressedVideo,"
         " FFMPEGPacket).",
     )
+    scan: str | None = Field(
+        default=None,
+        description="Topic of lidar scans (LaserScan). A beam that is NaN or below `range_min`,"
+        " such as 0, has no value; above `range_max`, it is infinite; -infinity, too near to be"
+        " measured (REP 117), becomes `range_min`. `to` reduces the beams to sectors, by default by"
+        " `pool: min`; `missing: 30.0` replaces the beams and sectors that have no value or are infinite.",
+    )
+    cloud: str | None = Field(
+        default=None,
+        description="Topic of point clouds (PointCloud2), which become images of `size`; see `as`."
+        " Points that are not finite, or at the origin, are left out.",
+    )
+    grid: str | None = Field(
+        default=None,
+        description="Topic of occupancy grids (OccupancyGrid), which become images (uint8, 0 if"
+        " free, 255 if occupied). A pixel has the largest known value of the cells in it. As in a"
+        " bird's-eye view of a cloud, the first row has the largest x, the first column the largest"
+        " y.",
+    )
+    size: tuple[_Count, _Count] | None = Field(
+        default=None,
+        description="Width and height, pixels, of the image of a cloud or grid. Default for a grid:"
+        " its number of cells.",
+    )
+    x_m: tuple[Finite, Finite] | None = Field(
+        default=None,
+        description="Lowest and highest x, meters, of a bird's-eye view, in the frame of the"
+        " points, or of the window of a grid, in the grid's frame. Default for a grid: all of it.",
+    )
+    y_m: tuple[Finite, Finite] | None = Field(
+        default=None, description="Lowest and highest y, meters, as `x_m`."
+    )
+    z_m: tuple[Finite, Finite] | None = Field(
+        default=None,
+        description="Lowest and highest z, meters, of the points in a bird's-eye view.",
+    )
+    azimuth_deg: tuple[Finite, Finite] = Field(
+        default=(-180.0, 180.0),
+        description="Lowest and highest azimuth of a range image, degrees; 0 is x, 90 is y. Left is"
+        " the highest one.",
+    )
+    elevation_deg: tuple[Finite, Finite] | None = Field(
+        default=None,
+        description="Lowest and highest elevation of a range image, degrees, from below.",
+    )
+    unknown: Annotated[float, Field(ge=0, le=100)] = Field(
+        default=50.0,
+        description="Percent of occupancy of unknown (-1) and missing cells of a grid.",
+    )
     transform: str | None = Field(
         default=None,
         description="Frame whose pose is looked up in the transforms. A leading `/` of a frame is"
@@ -143,13 +193,16 @@ class Quantity(_Part):
         description="Topic of the transforms, such as `/robot1/tf`; `/robot1/tf_static` is used,"
         " too. Default: `/tf`, or else the only topic of transforms in the bag.",
     )
-    as_: Literal["yaw", "count", "depth", "intensity"] | None = Field(
+    as_: As | None = Field(
         default=None,
         alias="as",
         description="`yaw` converts a quaternion to its angle about z, radians; `count` counts the"
         " messages so far on the topic that `field` names, for example a topic of events. For"
         " images: `depth` are distances, `intensity` is brightness or temperature. Without it,"
-        " images of 16 bits per pixel (`mono16`, PNG) and of floats are depth.",
+        " images of 16 bits per pixel (`mono16`, PNG) and of floats are depth. For clouds: `range`"
+        " is an image of distances like depth, seen from the sensor; seen from above, `height` has"
+        " the highest point of each cell (uint8, 0 if there is none, 1 to 255 between the limits of"
+        " `z_m`), `density` the number of points (uint8).",
     )
     align: Alignment = Field(
         default="last",
@@ -198,14 +251,17 @@ class Quantity(_Part):
 
     @model_validator(mode="after")
     def _has_one_source(self) -> Quantity:
-        given = [name for name in ("field", "image", "transform") if getattr(self, name)]
+        sources = ("field", "image", "transform", "scan", "cloud", "grid")
+        given = [name for name in sources if getattr(self, name)]
         if len(given) != 1:
-            raise ValueError("give one of field, image and transform")
+            raise ValueError(f"give one of {', '.join(sources)}")
         for name in ("undistort", "crop", "resize", "range_m", "range", "gray"):
-            if getattr(self, name) and given != ["image"]:
+            is_range = name == "range_m" and self.as_ == "range"
+            if getattr(self, name) and given != ["image"] and not is_range:
                 raise ValueError(f"{name} is for images only")
-        if self.as_ is not None and (self.as_ in ("depth", "intensity")) != (given == ["image"]):
+        if self.as_ is not None and self.as_ not in _AS[given[0]]:
             raise ValueError(f"as: {self.as_} is not for {given[0]}")
+        self._check_space(given[0])
         for name in ("parts", "tf"):
             # A saved mapping has the default values of all keys.
             default = type(self).model_fields[name].default
@@ -213,7 +269,7 @@ class Quantity(_Part):
                 raise ValueError(f"{name} is for transforms only")
         if len(set(self.parts)) < len(self.parts):
             raise ValueError("parts has a part twice")
-        if given == ["image"] and self.align == "linear":
+        if self.pixels is not None and self.align == "linear":
             raise ValueError("images cannot be interpolated: use last or nearest")
         if self.range is not None and self.as_ != "intensity":
             raise ValueError("range is for images with `as: intensity`; for depth, use range_m")
@@ -228,10 +284,49 @@ class Quantity(_Part):
         self._check_elements(is_field=given == ["field"] and self.as_ is None)
         return self
 
+    @property
+    def pixels(self) -> str | None:
+        """Topic whose messages become images; None if they are numbers."""
+        return self.image or self.cloud or self.grid
+
+    def _check_space(self, given: str) -> None:
+        """Check the keys of clouds and grids."""
+        kind = self.as_ if given == "cloud" else given
+        uses = {
+            "size": ("range", "height", "density", "grid"),
+            "x_m": ("height", "density", "grid"),
+            "y_m": ("height", "density", "grid"),
+            "z_m": ("height", "density"),
+            "azimuth_deg": ("range",),
+            "elevation_deg": ("range",),
+            "unknown": ("grid",),
+        }
+        if given == "cloud" and kind is None:
+            raise ValueError("cloud needs `as`: range, height or density")
+        for name, kinds in uses.items():
+            value = getattr(self, name)
+            is_given = value != type(self).model_fields[name].default
+            if is_given and kind not in kinds:
+                raise ValueError(f"{name} is for {' and '.join(kinds)} of clouds and grids only")
+            is_needed = given == "cloud" and (name != "z_m" or kind == "height")
+            if value is None and kind in kinds and is_needed:
+                raise ValueError(f"cloud with `as: {kind}` needs `{name}`")
+            if name.endswith(("_m", "_deg")) and value is not None and not value[0] < value[1]:
+                raise ValueError(f"{name} must be the lowest value, then the highest value")
+        if (self.x_m is None) != (self.y_m is None):
+            raise ValueError("give both x_m and y_m")
+        if self.azimuth_deg[1] - self.azimuth_deg[0] > 360:
+            raise ValueError("azimuth_deg is limited to 360 degrees")
+        if self.size is not None and math.prod(self.size) > MAX_IMAGE_PIXELS:
+            raise ValueError(f"size is limited to {MAX_IMAGE_PIXELS} pixels")
+
     def _check_elements(self, *, is_field: bool) -> None:
         for name in ("names", "names_from", "pad", "pool", "to"):
-            if getattr(self, name) is not None and not is_field:
+            is_scan = self.scan is not None and name in ("pool", "to")
+            if getattr(self, name) is not None and not is_field and not is_scan:
                 raise ValueError(f"{name} is for a `field` without `as` only")
+        if self.scan is not None and self.to is not None and self.pool is None:
+            return
         if (self.pool is None) != (self.to is None):
             raise ValueError("give both pool and to")
         if sum(bool(each) for each in (self.names, self.pad, self.pool)) > 1:
@@ -239,6 +334,17 @@ class Quantity(_Part):
         if self.pad is not None and self.missing is None:
             raise ValueError("pad needs `missing`, the number that fills the array")
         _check_names(self.names, self.names_from)
+
+
+_AS: dict[str, tuple[As, ...]] = {
+    "field": ("yaw", "count"),
+    "image": ("depth", "intensity"),
+    "cloud": ("range", "height", "density"),
+    "transform": (),
+    "scan": (),
+    "grid": (),
+}
+"""Values of `as` by the source of a quantity."""
 
 
 def _are_stored(*numbers: float) -> bool:

@@ -30,6 +30,7 @@ from mcaprl.recorder.mapping.likely import (
     action_spec,
     candidates,
     command_of,
+    image_spec,
     is_never_observed,
     kind_of,
     likelihood,
@@ -39,6 +40,7 @@ from mcaprl.recorder.mapping.likely import (
 )
 from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.read import Blame
+from mcaprl.recorder.mapping.spatial import why_refused
 from mcaprl.recorder.mapping.steps import StepReader
 from mcaprl.texts import printable
 
@@ -157,20 +159,28 @@ class _Draft:
         return entries or self._cameras(active=True)
 
     def _cameras(self, *, active: bool = False) -> dict[str, _Entry]:
-        """Return the images by name; only the first one that can be read, if it is observed."""
+        """Return images, clouds and grids; only the first that can be read, if it is observed."""
         found: dict[str, _Entry] = {}
-        for topic in self._useful:
-            if kind_of(topic.info) in IMAGES:
-                spec = {"image": topic.info.name, "resize": [84, 84]}
-                entry = _Entry(spec, topic.info.name, str(topic))
-                if not active:
-                    found[f"camera{len(found) or ''}"] = entry
-                elif self._is_image(topic):
-                    return {"camera": entry}
+        usable = [
+            each
+            for each in self._topics.values()
+            if each in self._useful or (each.info.count and not each.info.problem)
+        ]
+        for topic in sorted(usable, key=lambda each: kind_of(each.info) not in IMAGES):
+            if (spec := image_spec(self._bag, topic.info)) is None:
+                continue
+            if kind_of(topic.info) in IMAGES and topic not in self._useful:
+                continue
+            entry, name = _Entry(spec, topic.info.name, str(topic)), next(iter(spec))
+            name = "camera" if name == "image" else name
+            if active and self._is_image(topic, spec):
+                return {name: entry}
+            if not active:
+                count = sum(each.startswith(name) for each in found)
+                found[f"{name}{count or ''}"] = entry
         return found
 
-    def _is_image(self, topic: TopicOverview) -> bool:
-        spec = {"image": topic.info.name, "resize": [84, 84]}
+    def _is_image(self, topic: TopicOverview, spec: dict[str, Any]) -> bool:
         mapping = parse_mapping(
             {"clock": {"rate_hz": 1}, "observation": {"camera": spec}, "action": _NOTHING}
         )
@@ -308,16 +318,20 @@ class _Draft:
         if first:
             lines += [f'  # terminated: "{first} > 1"', f'  # begin: "{first} != 0"']
         lines += [
-            f"# {topic.info.name} cannot be read: {topic.info.problem}"
+            f"# {topic.info.name} cannot be read: {why}"
             for topic in self._topics.values()
-            if topic.info.problem
+            if (why := topic.info.problem or why_refused(topic.info))
         ]
         return "".join(f"{_one_line(line)}\n" for line in lines)
 
     def _observation_lines(self) -> Iterator[str]:
         for name, entry in self.observed.items():
             yield f"  {name}: {_flow(entry.spec)}  # {entry.remark}"
-        used = {entry.topic for entry in self.observed.values() if "image" in entry.spec}
+        used = {
+            entry.topic
+            for entry in self.observed.values()
+            if not {"image", "cloud", "grid"}.isdisjoint(entry.spec)
+        }
         for name, entry in self._cameras().items():
             if entry.topic not in used:
                 yield f"  # {name}: {_flow(entry.spec)}  # {entry.remark}"

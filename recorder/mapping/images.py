@@ -57,6 +57,7 @@ from mcaprl.recorder.mapping.image_pixels import (
     one_line,
     raw_pixels,
 )
+from mcaprl.recorder.mapping.spatial import fields_of, image_of
 from mcaprl.recorder.mapping.video import Converter, Message, VideoStream
 from mcaprl.texts import counted, size
 
@@ -89,7 +90,13 @@ class ImageOptions:
     def to_json(self) -> str:
         """Return the options that determine the pixels."""
         names = {"undistort", "crop", "resize", "gray", "range_m", "range", "as_"}
+        if self._quantity.image is None:
+            names |= {"size", "x_m", "y_m", "z_m", "azimuth_deg", "elevation_deg", "unknown"}
         return self._quantity.model_dump_json(include=names)
+
+    def image(self, message: dict[str, Any]) -> Image:
+        """Return the image (H, W, C) of an observation for the fields of a message."""
+        return self.applied(pixels_of(self._quantity, message))
 
     def applied(self, pixels: Pixels) -> Image:
         """Return the image (H, W, C) of an observation."""
@@ -117,6 +124,8 @@ class ImageOptions:
     def _is_depth(self, pixels: Pixels) -> bool:
         """Return whether the pixels are read as depth."""
         wanted, kind = self._quantity.as_, one_line(pixels.encoding)
+        if self._quantity.image is None:
+            return pixels.units_per_m > 0
         if self.is_intensity:
             return False
         if pixels.has_lost_depth:
@@ -341,7 +350,11 @@ class ImageReader:
         self.bag, self.topic, self.name = bag, topic, name
         calibration = quantity.undistort and Calibration.of(bag, quantity.undistort)
         self.options, self._strict = ImageOptions(topic, quantity, calibration or None), strict
-        self.fields, is_stream = _image_fields(bag, bag.topics[topic])
+        self._quantity, is_stream = quantity, False
+        if quantity.image is None:
+            self.fields = fields_of(bag.topics[topic], quantity)
+        else:
+            self.fields, is_stream = _image_fields(bag, bag.topics[topic])
         self.failures: dict[int, Failure] = {}
         self._video: VideoStream | None = None
         if is_stream:
@@ -515,7 +528,7 @@ class ImageReader:
                 continue
             try:
                 # The full image is not kept: the next one is decoded into the same memory.
-                image = self.options.applied(pixels_of(message))
+                image = self.options.image(message)
             except LogError as error:
                 self._leave_out(row, str(error))
                 continue
@@ -572,8 +585,12 @@ class ImageReader:
         yield from sorted(messages.items(), key=lambda each: each[0])
 
 
-def pixels_of(message: dict[str, Any]) -> Pixels:
-    """Decode the fields of an image message."""
+def pixels_of(quantity: Quantity, message: dict[str, Any]) -> Pixels:
+    """Decode the fields of a message with an image, a scan, a cloud or a grid."""
+    if quantity.cloud is not None:
+        message = {**message, "data": _bytes_of(message["data"])}
+    if quantity.image is None:
+        return image_of(quantity, message)
     kind = _kind_of(message)
     if "encoding" in message:
         return raw_pixels({**message, "data": _bytes_of(message["data"])})

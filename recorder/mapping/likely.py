@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,8 +14,11 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.bags.bag import Bag, TopicInfo
 from mcaprl.recorder.bags.overview import TopicOverview, instants_of, is_fresh
+from mcaprl.recorder.bags.values import without_lacks
 from mcaprl.recorder.format.reading import full_name
+from mcaprl.recorder.mapping.align import pooled, rows_of
 from mcaprl.recorder.mapping.config import Quantity
+from mcaprl.recorder.mapping.spatial import cloud_points, fields_of
 from mcaprl.recorder.mapping.summary import needed_offset
 
 _SAMPLES = 200
@@ -33,6 +37,9 @@ IMAGES = {
     *("foxglove.RawImage", "foxglove.CompressedImage", "foxglove.CompressedVideo"),
     *("foxglove_msgs/msg/CompressedVideo", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"),
 }
+_SCANS = ("sensor_msgs/msg/LaserScan", "foxglove.LaserScan")
+_CLOUDS = ("sensor_msgs/msg/PointCloud2", "foxglove.PointCloud")
+_NO_POINTS = np.empty((0, 3))
 _NEVER_TOPICS = {
     *("rosout", "rosout_agg", "parameter_events", "tf", "tf_static", "diagnostics"),
     *("diagnostics_agg", "clock", "camera_info", "bond", "statistics", "events"),
@@ -112,6 +119,35 @@ def kind_of(info: TopicInfo) -> str:
     return name
 
 
+def image_spec(bag: Bag, info: TopicInfo) -> dict[str, Any] | None:
+    """Return the keys and values of an image, cloud or grid; None if the topic has none."""
+    kind, size = kind_of(info), [84, 84]
+    if kind in IMAGES:
+        return {"image": info.name, "resize": size}
+    if kind == "nav_msgs/msg/OccupancyGrid":
+        return {"grid": info.name, "size": size}
+    if kind not in _CLOUDS:
+        return None
+    spec = {"cloud": info.name, "as": "height", "size": size}
+    try:
+        fields = fields_of(info, Quantity.model_validate({**spec, **_limits_of_points(_NO_POINTS)}))
+        columns = bag.read(info.name, fields, np.array([info.count // 2])).columns
+        points = cloud_points({name: column[0] for name, column in columns.items()})
+    except (LogError, UsageError, IndexError, TypeError, ValueError):
+        points = _NO_POINTS
+    return {**spec, **_limits_of_points(points)}
+
+
+def _limits_of_points(points: NDArray[np.float64]) -> dict[str, list[int]]:
+    """Return limits around nearly all points: a square about the sensor, and heights."""
+    if not len(points):
+        return {"x_m": [-20, 20], "y_m": [-20, 20], "z_m": [-3, 3]}
+    half = max(1, math.ceil(min(1e4, float(np.quantile(np.abs(points[:, :2]), 0.95)))))
+    low, high = np.clip(np.quantile(points[:, 2], [0.02, 0.98]), -1e4, 1e4)
+    z_m = [math.floor(low), max(math.floor(low) + 1, math.ceil(high))]
+    return {"x_m": [-half, half], "y_m": [-half, half], "z_m": z_m}
+
+
 def is_never_observed(info: TopicInfo) -> bool:
     """Return whether a topic has log lines, transforms, or data that is not a quantity."""
     parts = info.name.strip("/").split("/")
@@ -156,9 +192,17 @@ def candidates(bag: Bag, topic: TopicOverview, share: float) -> list[Candidate]:
         columns = sampled(bag, info, [*names, *(each for each in extra if each in info.fields)])
     except (LogError, UsageError):
         return []
+    is_scan, ranges = kind in _SCANS and "ranges" in names, columns.get("ranges")
+    if is_scan and ranges is not None and ranges.dtype.kind == "O":
+        # The number of beams changes.
+        with suppress(UsageError):
+            columns["ranges"] = pooled(rows_of(without_lacks(ranges), info.name), "min", _ELEMENTS)
     found = []
     for name in names:
         if (spec := _spec(info, name, columns)) is not None:
+            if is_scan:
+                spec = {"scan": info.name, **_sectors(columns["ranges"], ranges), **spec}
+                del spec["field"]
             penalty, why = _penalty(name, columns[name], share, is_known=bool(likely))
             is_scalar = columns[name].ndim == 1
             found.append(Candidate(topic, name, spec, is_scalar, penalty, why))
@@ -169,6 +213,12 @@ def candidates(bag: Bag, topic: TopicOverview, share: float) -> list[Candidate]:
         spec = {"field": f"{info.name}.{yaw}", "as": "yaw"}
         found.append(Candidate(topic, f"{yaw}.yaw", spec, True, penalty, why))
     return sorted(found, key=lambda each: each.penalty)
+
+
+def _sectors(column: NDArray[Any], ranges: NDArray[Any] | None) -> dict[str, int]:
+    """Return the number of sectors of a scan, if it has many beams or a number that changes."""
+    is_long = column is not ranges or (column.ndim > 1 and column.shape[1] > _MAX_ELEMENTS)
+    return {"to": _ELEMENTS} if is_long else {}
 
 
 def _short_fields(bag: Bag, info: TopicInfo, names: list[str]) -> list[str]:
@@ -255,7 +305,7 @@ def _limits_of(columns: dict[str, NDArray[Any]]) -> dict[str, Any]:
         return found
     if low < high:
         found["clip"] = [_short(low), _short(high)]
-        if not is_number.all():
+        if not is_number.all() or (column < low).any():
             found["missing"] = _short(high)
     return found
 

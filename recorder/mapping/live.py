@@ -36,8 +36,15 @@ from mcaprl.recorder.bags.values import (
 )
 from mcaprl.recorder.mapping.align import NS_PER_S, padded, pooled
 from mcaprl.recorder.mapping.config import TimeSource
-from mcaprl.recorder.mapping.images import ImageReader, pixels_of
-from mcaprl.recorder.mapping.observe import Values, by_names, check_order, pose_of, shaped
+from mcaprl.recorder.mapping.images import ImageReader
+from mcaprl.recorder.mapping.observe import (
+    Values,
+    by_names,
+    check_order,
+    pose_of,
+    scan_columns,
+    shaped,
+)
 from mcaprl.recorder.mapping.plan import Plan, Wanted
 from mcaprl.recorder.mapping.runs import GAP, NO_ACTION, RESTARTED, TIME_LIMIT
 from mcaprl.recorder.mapping.transforms import (
@@ -186,6 +193,8 @@ class _Value:
         assert path is not None, "the quantity is a field"
         if quantity.as_ == "yaw":
             return yaw_of(np.column_stack([_number(part, str(path)) for part in raw]))
+        if quantity.scan is not None:
+            return self._scanned(raw)
         value = raw[0]
         if len(raw) > 1:
             self._check_names(raw)
@@ -203,6 +212,14 @@ class _Value:
         if quantity.pool is not None:
             return pooled([row], quantity.pool, quantity.to or 0)
         return self._fitted(row)
+
+    def _scanned(self, raw: Any) -> Floats:
+        source, quantity = self.wanted.source, self.wanted.quantity
+        assert source.path is not None, "a scan has a path"
+        (row,) = scan_columns(source.fields, [without_lacks([part]) for part in raw], source.path)
+        if quantity.to is not None:
+            return pooled([row], quantity.pool or "min", quantity.to)
+        return np.full((1, *(self.shape or ())), np.nan) if row is None else self._fitted(row)
 
     def _fitted(self, row: Floats) -> Floats:
         path = self.wanted.source.path
@@ -332,7 +349,7 @@ class _Image(_Value):
             if self.time_ns is not None and own_ns < self.time_ns:
                 break
             try:
-                image = self._reader.options.applied(pixels_of(raw))
+                image = self._reader.options.image(raw)
             except LogError:
                 continue
             if self.shape is not None and image.shape != self.shape:

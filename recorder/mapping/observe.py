@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,6 +45,7 @@ from mcaprl.recorder.mapping.align import (
 )
 from mcaprl.recorder.mapping.config import LARGEST, Quantity
 from mcaprl.recorder.mapping.runs import Messages
+from mcaprl.recorder.mapping.spatial import SCAN_LIMITS, beams
 from mcaprl.recorder.mapping.transforms import Transforms, transform_topic, yaw_of
 
 
@@ -289,8 +290,10 @@ class Source(NamedTuple):
 
 def source_of(bag: Bag, quantity: Quantity) -> Source:
     """Resolve the topic and fields of a quantity."""
-    if quantity.image is not None:
-        return Source(topic_of(bag, quantity.image), (), None)
+    if quantity.pixels is not None:
+        return Source(topic_of(bag, quantity.pixels), (), None)
+    if quantity.scan is not None:
+        return _scan_source(bag, topic_of(bag, quantity.scan))
     if quantity.transform is not None:
         return Source(transform_topic(bag, quantity.tf), (), None)
     assert quantity.field is not None, "the mapping was validated"
@@ -315,6 +318,30 @@ def source_of(bag: Bag, quantity: Quantity) -> Source:
         unknown_field(bag, path) if is_unlisted else None,
         [],
     )
+
+
+def _scan_source(bag: Bag, topic: str) -> Source:
+    info = bag.topics[topic]
+    if not info.may_have("ranges"):
+        raise UsageError(f"{topic} has {info.type_name}, not LaserScan: it has no `ranges`")
+    limits = [name for name in SCAN_LIMITS if info.lists(name)]
+    return Source(topic, ("ranges", *limits), FieldPath(topic, "ranges", None), cache=[])
+
+
+def scan_columns(fields: Sequence[str], columns: Sequence[Any], path: FieldPath) -> list[Any]:
+    """Return the beams of M scans by the columns of `Source.fields`."""
+    found = dict(zip(fields, columns, strict=True))
+    unknown = [None] * len(columns[0])
+    ranges = columns[0]
+    if isinstance(ranges, np.ndarray) and ranges.ndim == 1:
+        ranges = rows_of(without_lacks(ranges.tolist()), str(path))
+    limits = [[as_number(each) for each in found.get(name, unknown)] for name in SCAN_LIMITS]
+    return beams([None if row is None else np.atleast_1d(row) for row in ranges], *limits)
+
+
+def as_number(value: Any) -> float | None:
+    """Return a number, or None if there is none."""
+    return float(value) if isinstance(value, int | float | np.number) else None
 
 
 def pose_of(
@@ -360,7 +387,7 @@ def values_of(
         counts = np.searchsorted(run.times_ns, steps_ns, side="right").astype(np.float64)
         nothing = np.zeros(len(counts), bool)
         return shaped(quantity, counts, nothing, nothing.astype(np.float64))
-    if quantity.image is not None:
+    if quantity.pixels is not None:
         match = _match(quantity, run, steps_ns, ends_ns, gap_s)
         rows = _rows(run, match)
         places = np.where(rows == NONE, NONE, stream.rows[rows]) if len(stream.rows) else rows
@@ -469,6 +496,12 @@ def _new_updates(quantity: Quantity, source: Source, stream: TopicStream) -> Nam
             raise UsageError(f"{path} is not one quaternion; choose one of them by an index")
         present = ~np.logical_or.reduce(absent) if absent else None
         return Named(yaw_of(np.column_stack(parts)), present)
+    if quantity.scan is not None:
+        rows = scan_columns(source.fields, [stream.columns[name] for name in source.fields], path)
+        present = ~stream.absent["ranges"] if "ranges" in stream.absent else None
+        if quantity.to is not None:
+            return Named(pooled(rows, quantity.pool or "min", quantity.to), present)
+        return Named(as_numbers(without_lacks(rows), str(path)), present)
     column = stream.columns[path.field]
     present = ~stream.absent[path.field] if path.field in stream.absent else None
     if source.unlisted is not None and present is not None and not present.any():

@@ -80,7 +80,7 @@ class Plan:
         self.images = {
             name: self._image_reader(name)
             for name, quantity in mapping.observation.items()
-            if quantity.image is not None
+            if quantity.pixels is not None
         }
         action = mapping.action
         is_during = action.align == "during"
@@ -153,7 +153,7 @@ class Plan:
     def required(self) -> list[str]:
         """Names of the observed quantities without which there is no step."""
         found = self.mapping.observation.items()
-        return [name for name, each in found if each.missing is None or each.image is not None]
+        return [name for name, each in found if each.missing is None or each.pixels is not None]
 
     def transform_time(self, topic: str) -> TimeSource:
         """Return the time of the transforms of a topic."""

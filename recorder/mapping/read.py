@@ -441,7 +441,7 @@ def _rounded(plan: Plan, runs: list[Steps]) -> dict[str, Rounding]:
     for name, quantity in plan.mapping.observation.items():
         parts = [run.quantities[name] for run in runs]
         values = [each.values[~each.missing] for each in parts]
-        if quantity.image is None and all(each.dtype.kind == "f" for each in values):
+        if quantity.pixels is None and all(each.dtype.kind == "f" for each in values):
             names = element_names(name, quantity, math.prod(values[0].shape[1:]))
             topic = plan.quantities[name].source.topic
             found[name] = rounding_of(values, names, topic, quantity.offset)

@@ -259,7 +259,7 @@ class StepReader:
             **{
                 name: values.values
                 for name, values in quantities.items()
-                if plan.quantities[name].quantity.image is None
+                if plan.quantities[name].quantity.pixels is None
             },
         }
         following = np.minimum(np.arange(len(times_ns)) + 1, max(len(times_ns) - 1, 0))

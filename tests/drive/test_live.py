@@ -28,6 +28,8 @@ TYPES = {
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
     "/camera": "sensor_msgs/msg/Image",
+    "/points": "sensor_msgs/msg/PointCloud2",
+    "/map": "nav_msgs/msg/OccupancyGrid",
     "/tick": "std_msgs/msg/Header",
     "/cmd": "geometry_msgs/msg/Twist",
 }
@@ -57,7 +59,35 @@ def contents(draw: st.DrawFn, topic: str, time_ns: int) -> dict[str, Any]:
             position = [draw(numbers) for _ in names]
             return {"header": header, "name": names, "position": position}
         case "/scan":
-            return {"header": header, "ranges": draw(st.lists(odd, max_size=9))}
+            low = draw(st.sampled_from([0.0, 5.0]))
+            ranges = draw(st.lists(odd, max_size=9))
+            return {"header": header, "ranges": ranges, "range_min": low, "range_max": 500.0}
+        case "/points":
+            points = draw(st.lists(st.tuples(*[odd] * 3), min_size=1, max_size=4))
+            packed = list(np.array(points, "<f4").tobytes())
+            # Some clouds are damaged.
+            step = 12 if draw(st.integers(0, 4)) else 11
+            fields = [
+                {"name": axis, "offset": 4 * k, "datatype": 7, "count": 1}
+                for k, axis in enumerate("xyz")
+            ]
+            sizes = {"height": 1, "width": len(points), "point_step": step}
+            return {
+                "header": header,
+                **sizes,
+                "row_step": len(packed),
+                "fields": fields,
+                "data": packed,
+            }
+        case "/map":
+            info: dict[str, Any] = {
+                "width": 3,
+                "height": 2,
+                "resolution": draw(st.sampled_from([0.5, 0.5, 0.0])),
+            }
+            info["origin"] = {"position": {"x": draw(numbers)}, "orientation": {"w": 1.0}}
+            cells = draw(st.lists(st.integers(-1, 100), min_size=6, max_size=6))
+            return {"header": header, "info": info, "data": cells}
         case "/mode":
             return {"data": draw(st.sampled_from(["drive", "drive", "park"]))}
         case "/goal":
@@ -106,6 +136,14 @@ QUANTITIES: dict[str, dict[str, Any]] = {
     "first": {"field": "/scan.ranges[0]", "missing": 9, "clip": [0, 10]},
     "sectors": {"field": "/scan.ranges", "pool": "min", "to": 3, "missing": 9},
     "padded": {"field": "/scan.ranges[1:]", "pad": 4, "missing": -2, "offset": 1},
+    "beams": {"scan": "/scan", "to": 4, "missing": 30},
+    "near": {"scan": "/scan", "to": 2, "pool": "mean", "clip": [0, 30], "missing": 30},
+    "cloud": {"cloud": "/points", "as": "range", "size": [6, 4], "elevation_deg": [-60, 60]},
+    "top": {
+        **{"cloud": "/points", "as": "height", "size": [3, 3], "tolerance_s": 1.0},
+        **{"x_m": [-600, 600], "y_m": [-600, 600], "z_m": [-900, 900]},
+    },
+    "map": {"grid": "/map", "x_m": [-500, 500], "y_m": [-1, 1], "size": [4, 3]},
     "goal": {"field": "/goal.x", "tolerance_s": 0.5, "missing": 0},
     "side": {"field": "/goal.y"},
     "count": {"field": "/goal", "as": "count"},
@@ -171,7 +209,7 @@ def test_every_step_equals_that_of_the_bag(sent: list[Sent], tree: dict[str, Any
     frames = dict(zip(dataset._transitions.log_time_ns.tolist(), range(10**6), strict=False))
     plan = Plan(bag, mapping, Place(), trust_code=False)
     for name, reader in plan.images.items():
-        times = bag.times("/camera")
+        times = bag.times(reader.topic)
         list(reader._images(np.arange(len(times))))
         plan.streams[plan.quantities[name].stream].leave_out(reader.failures)
     (steps,) = [StepReader(plan).read(0)]

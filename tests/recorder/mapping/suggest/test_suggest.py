@@ -90,6 +90,6 @@ def test_types_of_ros_1_in_mcap_are_known_without_msg_in_their_names(tmp_path: P
     with pytest.warns(UserWarning, match="no topic looks like a command"):
         text = suggestion(tmp_path / "ros1.mcap")
     assert "# camera: {image: /camera, resize: [84, 84]}  # sensor_msgs/Image, 10 messages" in text
-    assert "{field: /scan.ranges, clip: [0, 19]}" in text
+    assert "{scan: /scan, clip: [0, 19]}" in text
     assert "{field: /joints.position}" in text
     assert "height" not in text

@@ -387,7 +387,7 @@ def test_types_have_two_forms_of_their_name(tmp_path: Path) -> None:
 
 def test_scans_with_infinite_beams_are_clipped(tmp_path: Path) -> None:
     scan = observed("scan only", tmp_path).observation["scan_ranges"]
-    assert (scan.field, scan.clip, scan.missing) == ("/scan.ranges[::10]", (0.1, 12.0), 12.0)
+    assert (scan.scan, scan.to, scan.clip, scan.missing) == ("/scan", 36, (0.1, 12.0), 12.0)
 
 
 def test_frames_of_tf_are_observed(tmp_path: Path) -> None:
