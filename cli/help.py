@@ -115,6 +115,7 @@ _BAGS: Final[dict[str, tuple[str, ...]]] = {
 }
 _RAY: Final[dict[str, tuple[str, ...]]] = {"Ray cluster": ("ray", "workers", "address")}
 OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
+    "label": {"Intervals": ("interval", "steps", "time")},
     "record": {
         "Policy and length": (
             "policy",

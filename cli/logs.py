@@ -356,7 +356,7 @@ def relabel(log: str, out: str, reward: str, overwrite: bool) -> None:
 @click.option("--steps", metavar="A:B", help="Steps of the interval; B is not included.")
 @click.option("--time", metavar="A:B", help="Seconds of the interval since the episode's start.")
 @click.option("--remove", is_flag=True, help="Remove the labels of --episode or --interval.")
-@click.option("--from", "file", metavar="FILE", type=PATH, help="CSV or JSON file of labels.")
+@click.option("--file", metavar="FILE", type=PATH, help="CSV or JSON file of labels.")
 @json_option
 def label(log: str, steps: str | None, time: str | None, as_json: bool, **request: Any) -> None:
     """Label episodes and intervals of LOG, which is not changed; without options, list the labels.

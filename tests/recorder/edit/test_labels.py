@@ -134,13 +134,13 @@ def test_a_file_of_labels_is_applied_whole_or_not_at_all(log: Path, suffix: str)
     ]
     lines = ["episode,success,note,interval,start,stop", "0,true,good,,,", "2,,,intervention,1,3"]
     file.write_text("\n".join(lines) if suffix == ".csv" else json.dumps(rows))
-    assert run(["label", str(log), "--from", str(file)]) == 0
+    assert run(["label", str(log), "--file", str(file)]) == 0
     found = mcaprl.label(log)
     assert found.rows() == [["0", "success", "good", ""], ["2", "", "", "intervention 1:3"]]
     lines += ["1,false,,,,", "9,true,,,,"]
     rows += [{"episode": 1, "success": False}, {"episode": 9, "success": True}]
     file.write_text("\n".join(lines) if suffix == ".csv" else json.dumps(rows))
-    assert run(["label", str(log), "--from", str(file)]) == 2
+    assert run(["label", str(log), "--file", str(file)]) == 2
     assert mcaprl.label(log) == found
 
 
