@@ -42,7 +42,7 @@ SECTIONS: Final[dict[str, tuple[str, ...]]] = {
     "Drive a robot": ("drive",),
     "Look at logs": ("info", "replay", "layout", "annotate"),
     "Check and repair logs": ("check", "recover"),
-    "Convert and edit logs": ("convert", "merge", "split", "filter", "slice", "relabel"),
+    "Convert and edit logs": ("convert", "merge", "split", "filter", "slice", "relabel", "label"),
     "Set up the shell": ("completion",),
 }
 """Commands in the order of the program's help."""
@@ -99,6 +99,10 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     "filter": ("mcaprl filter 'total_reward > 100' data/pilot.mcap good.mcap",),
     "slice": ("mcaprl slice data/pilot.mcap part.mcap --steps 0:1000",),
     "relabel": ("mcaprl relabel data/pilot.mcap faster.mcap --reward 'reward + 0.1 * speed'",),
+    "label": (
+        "mcaprl label data/pilot.mcap --episode 3 --failure --note 'hit the wall'",
+        "mcaprl label data/pilot.mcap --episode 3 --interval intervention --steps 40:60",
+    ),
     "completion": (
         "mcaprl completion bash >> ~/.bashrc",
         "mcaprl completion fish > ~/.config/fish/completions/mcaprl.fish",
@@ -111,6 +115,7 @@ _BAGS: Final[dict[str, tuple[str, ...]]] = {
 }
 _RAY: Final[dict[str, tuple[str, ...]]] = {"Ray cluster": ("ray", "workers", "address")}
 OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
+    "label": {"Intervals": ("interval", "steps", "time")},
     "record": {
         "Policy and length": (
             "policy",

@@ -314,7 +314,7 @@ def filter_(expression: str, log: str, out: str, overwrite: bool, as_json: bool)
 
     EXPRESSION is a condition such as "length > 100 and reason == 'crash'" on: episode, length,
     total_reward, terminated, truncated, reason, policy, epsilon, seed, options, start_s,
-    duration_s.
+    duration_s, and of labels: success, note.
     """
     with working("copying"):
         found = mcaprl.filter(expression, log, out, overwrite=overwrite)
@@ -345,6 +345,37 @@ def relabel(log: str, out: str, reward: str, overwrite: bool) -> None:
         f"{out}: {counted(statistics.episodes, 'episode')},"
         f" {counted(statistics.steps, 'step')}, mean return {statistics.mean_return:.4g}"
     )
+
+
+@click.command(cls=Command)
+@click.argument("log", type=PATH)
+@click.option("--episode", type=int, help="Index of the episode, from 0.")
+@click.option("--success/--failure", default=None, help="Whether the episode succeeded.")
+@click.option("--note", help="Note on the episode.")
+@click.option("--interval", metavar="NAME", help="Name of an interval, such as intervention.")
+@click.option("--steps", metavar="A:B", help="Steps of the interval; B is not included.")
+@click.option("--time", metavar="A:B", help="Seconds of the interval since the episode's start.")
+@click.option("--remove", is_flag=True, help="Remove the labels of --episode or --interval.")
+@click.option("--file", metavar="FILE", type=PATH, help="CSV or JSON file of labels.")
+@json_option
+def label(log: str, steps: str | None, time: str | None, as_json: bool, **request: Any) -> None:
+    """Label episodes and intervals of LOG, which is not changed; without options, list the labels.
+
+    Labels are kept in LOG.labels.json. filter and relabel can use them, and train-offline --mask
+    does not learn from labeled intervals.
+    """
+    bounds = {
+        "steps": None if steps is None else _bounds("steps", steps),
+        "time": None if time is None else _bounds("time", time),
+    }
+    with working("reading the log"):
+        found = mcaprl.label(log, **request, **bounds)
+    if as_json:
+        print_json(found.to_json())
+    elif rows := found.rows():
+        print_table(f"{log}", ["episode", "result", "note", "intervals"], rows)
+    else:
+        echo(f"{log}: no labels")
 
 
 @click.command("slice", cls=Command)

@@ -68,6 +68,12 @@ def _names() -> list[str]:
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--follow", is_flag=True, help="Use episodes added to DATA during training.")
 @click.option("--other-data", is_flag=True, help="With --resume: allow other DATA than in the run.")
+@click.option(
+    "--mask",
+    multiple=True,
+    metavar="NAME",
+    help="Do not learn from steps in intervals of this name (see `mcaprl label`); repeatable.",
+)
 @mapping_options
 @ray_options
 @click.option(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mcaprl.api.behavior import estimate_behavior
     from mcaprl.api.convert import convert, suggest_mapping
     from mcaprl.api.drive import drive_robot
-    from mcaprl.api.edit import annotate, filter, merge, relabel, slice, split
+    from mcaprl.api.edit import annotate, filter, label, merge, relabel, slice, split
     from mcaprl.api.estimate import estimate
     from mcaprl.api.evaluate import evaluate
     from mcaprl.api.logs import check, info, recover
@@ -73,6 +73,7 @@ __all__ = [
     "export",
     "filter",
     "info",
+    "label",
     "layout",
     "load_policy",
     "make_sim",
@@ -108,7 +109,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.api.behavior": ["estimate_behavior"],
         "mcaprl.api.convert": ["convert", "suggest_mapping"],
         "mcaprl.recorder.source": ["open_data as open"],
-        "mcaprl.api.edit": ["annotate", "filter", "merge", "relabel", "slice", "split"],
+        "mcaprl.api.edit": ["annotate", "filter", "label", "merge", "relabel", "slice", "split"],
         "mcaprl.api.logs": ["check", "info", "recover"],
         "mcaprl.api.policies": ["Run", "export", "load_policy"],
         "mcaprl.api.ranges": ["ClusterOptions"],

@@ -16,11 +16,12 @@ from mcaprl.files import check_log_name, check_target, temporary_folder
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.edit.join import merge_logs
+from mcaprl.recorder.edit.labels import Labels, change_labels, changes_in
 from mcaprl.recorder.edit.piece import Bounds, Edited, filter_log, slice_log, split_log
 from mcaprl.recorder.edit.relabel import relabeled
 from mcaprl.recorder.source import Paths, open_data
 from mcaprl.recorder.viewer.annotate import Verification, annotated_copy, values_topics
-from mcaprl.storage.remote import as_path
+from mcaprl.storage.remote import as_path, is_url
 
 
 def merge(data: Paths, out: str | Path, *, shift: bool = False, overwrite: bool = False) -> Edited:
@@ -168,6 +169,56 @@ def relabel(
     dataset = relabeled(data if isinstance(data, Dataset) else open_data(data), reward)
     dataset.save(path, overwrite=overwrite)
     return dataset
+
+
+def label(
+    data: str | Path,
+    *,
+    episode: int | None = None,
+    success: bool | None = None,
+    note: str | None = None,
+    interval: str | None = None,
+    steps: Bounds | None = None,
+    time: Bounds | None = None,
+    remove: bool = False,
+    file: str | Path | None = None,
+) -> Labels:
+    """Label episodes and intervals of a log; without arguments, return its labels.
+
+    The labels are in `LOG.labels.json` beside the log, which is not changed. The file names the
+    log's data by a hash: labels are never read for other data.
+
+    Args:
+        data: Path of the log.
+        episode: Index of the episode, from 0.
+        success: Whether the episode succeeded.
+        note: Note on the episode.
+        interval: Name of an interval to add, such as `intervention`.
+        steps: Half-open range (start, stop) of the interval's steps in the episode, from 0.
+        time: The range in seconds since the start of the episode, instead of `steps`. Without
+            both, the interval is the whole episode.
+        remove: Whether to remove labels: those of `episode`, the intervals named `interval`, or
+            these in `episode`; all labels without both.
+        file: CSV file with a header or JSON list of labels to add, with the keys `episode`,
+            `success`, `note`, `interval`, `start` and `stop` (steps); instead of other arguments.
+
+    Returns:
+        All labels of the log.
+
+    Raises:
+        UsageError: There is no such episode, the interval is not within it, or arguments exclude
+            each other. Nothing is saved.
+        LogError: The log or its labels cannot be read, or belong to different data.
+    """
+    if is_url(data):
+        raise UsageError(f"{data} cannot be labeled: copy the log to this machine")
+    given = {"episode": episode, "success": success, "note": note, "interval": interval}
+    given |= {"steps": steps, "time": time, "remove": remove or None}
+    change = {name: value for name, value in given.items() if value is not None}
+    if file is not None and change:
+        raise UsageError(f"`file=` and `{next(iter(change))}=` exclude each other")
+    changes = list(changes_in(Path(file))) if file is not None else [change] if change else []
+    return change_labels(Path(data), changes)
 
 
 @dataclass(frozen=True)

@@ -408,6 +408,28 @@ class Dataset(Conversions):
         """Return a copy with only the episodes for which `keep` returns true."""
         return self._take([episode.index for episode in self.episodes if keep(episode)])
 
+    def without(self, steps: Any) -> Dataset:
+        """Return a copy without some steps, such as those in which a human intervened.
+
+        An episode is divided at these steps, and the parts are episodes: no return of n steps,
+        stack of frames or sequence crosses the gap. A part that ends at a gap is truncated with the
+        reason `interrupted`, and a part that begins after a gap has no seed.
+
+        Args:
+            steps: (N,) bool; whether the transition is left out.
+
+        Raises:
+            SpaceError: `steps` is not one flag for each transition.
+            UsageError: No transition is left.
+        """
+        dropped = np.asarray(steps)
+        if dropped.shape != (len(self),) or dropped.dtype != np.bool_:
+            raise SpaceError(f"steps must be {len(self)} flags, one for each transition")
+        if dropped.all():
+            raise UsageError("no transition is left")
+        columns, old = self._transitions.without(dropped)
+        return self._changed(columns, weights=self.weights[old])
+
     def with_behavior_probs(self, probs: NDArray[Any], *, estimated: bool = False) -> Dataset:
         """Return the same transitions with other behavior probabilities.
 

@@ -22,7 +22,7 @@ from mcaprl.errors import SpaceError, UnknownNameError
 from mcaprl.recorder.dataset.images import Frames, joined, rows_of
 from mcaprl.recorder.format.behavior import BehaviorField
 from mcaprl.recorder.format.infos import Masked, is_exact, kind_of
-from mcaprl.recorder.format.messages import EpisodeSummary
+from mcaprl.recorder.format.messages import INTERRUPTED, EpisodeSummary, add_up_each
 from mcaprl.recorder.format.metadata import LogMetadata
 
 
@@ -137,6 +137,45 @@ class Transitions:
             infos={name: info[frames] for name, info in self.infos.items()},
             **self.at(steps),
         )
+
+    def without(self, dropped: NDArray[np.bool_]) -> tuple[Transitions, NDArray[np.int64]]:
+        """Return episodes without the dropped steps (N,), and the old index of each new episode.
+
+        An episode is divided at dropped steps. The parts before them are truncated.
+        """
+        old = np.repeat(np.arange(len(self.episodes)), self.lengths)
+        is_first, is_last = np.zeros(len(old), bool), np.zeros(len(old), bool)
+        is_first[self.first_steps] = is_last[np.cumsum(self.lengths) - 1] = True
+        starts = np.flatnonzero(~dropped & (is_first | np.roll(dropped, 1)))
+        stops = np.flatnonzero(~dropped & (is_last | np.roll(dropped, -1))) + 1
+        steps, places = ranges(starts, stops - starts), starts + old[starts]
+        frames = ranges(places, stops - starts + 1)
+        columns = self.at(steps)
+        ends = np.cumsum(stops - starts) - 1
+        columns["truncated"][ends] |= ~is_last[stops - 1]
+        totals = add_up_each(self.rewards, starts.tolist(), stops.tolist())
+        episodes = []
+        for start, stop, place, total in zip(starts, stops, places, totals, strict=True):
+            whole = self.episodes[old[start]]
+            part = whole._replace(
+                length=int(stop - start),
+                total_reward=total,
+                start_time_ns=int(self.log_time_ns[place]),
+                end_time_ns=int(self.log_time_ns[place + stop - start]),
+            )
+            if not is_first[start]:
+                part = part._replace(seed=None, options="")
+            if not is_last[stop - 1]:
+                part = part._replace(terminated=False, truncated=True, reason=INTERRUPTED)
+            episodes.append(part)
+        found = Transitions(
+            frames=tuple(rows_of(leaf, frames) for leaf in self.frames),
+            log_time_ns=self.log_time_ns[frames],
+            episodes=tuple(episodes),
+            infos={name: info[frames] for name, info in self.infos.items()},
+            **columns,
+        )
+        return found, old[starts]
 
     @classmethod
     def concatenate(cls, parts: Sequence[Transitions]) -> Transitions:

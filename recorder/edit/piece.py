@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import CorruptLogError, LogError, NoEpisodesError, NoStepsError, UsageError
 from mcaprl.files import replacing, replacing_folder
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
+from mcaprl.recorder.edit.labels import carry_labels, read_labels
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.messages import INTERRUPTED, EpisodeSummary, add_up
 from mcaprl.recorder.format.reading import McapReader
@@ -410,6 +411,8 @@ def filter_log(
         raise UsageError(f"'{expression}': next(...) has no meaning for episodes")
     log = FinishedLog(path)
     table = episode_columns(log.summaries(), condition.names)
+    if condition.names & {"success", "note"}:
+        table |= read_labels(log.path).columns(len(log.lengths))
     holds = condition.evaluate(table, np.arange(len(log.lengths)))
     if not condition.is_condition(table):
         raise UsageError(f"'{expression}' is not a condition: compare it, as in 'length > 10'")
@@ -420,7 +423,9 @@ def filter_log(
             f"{path}: '{expression}' is true for no episode ({len(log.lengths)} in the log)"
         )
     with replacing(Path(out), LogError, overwrite=overwrite) as unfinished:
-        return _copy_episodes(log, chosen, unfinished, Path(out))
+        found = _copy_episodes(log, chosen, unfinished, Path(out))
+    carry_labels(log.path, chosen, Path(out))
+    return found
 
 
 def split_log(
@@ -445,6 +450,7 @@ def split_log(
             name = f"{Path(str(log.path)).stem}-{number:05d}.mcap"
             chosen = np.sort(order[start:stop])
             found.append(_copy_episodes(log, chosen, folder / name, out / name))
+            carry_labels(log.path, chosen, folder / name)
     return found
 
 

@@ -131,7 +131,8 @@ class Quantity(_Part):
         description="Topic of lidar scans (LaserScan). A beam that is NaN or below `range_min`,"
         " such as 0, has no value; above `range_max`, it is infinite; -infinity, too near to be"
         " measured (REP 117), becomes `range_min`. `to` reduces the beams to sectors, by default by"
-        " `pool: min`; `missing: 30.0` replaces the beams and sectors that have no value or are infinite.",
+        " `pool: min`; `missing: 30.0` replaces the beams and sectors that have no value or are"
+        " infinite.",
     )
     cloud: str | None = Field(
         default=None,

@@ -32,6 +32,7 @@ COMMANDS = {
     "filter": (["filter", "length > 0", "log.mcap", "x.mcap"], "x.mcap"),
     "slice": (["slice", "log.mcap", "x.mcap", "--steps", "0:5"], "x.mcap"),
     "relabel": (["relabel", "log.mcap", "x.mcap", "--reward", "2 * reward"], "x.mcap"),
+    "label": (["label", "log.mcap", "--episode", "0", "--success"], "log.mcap.labels.json"),
     "split": (["split", "log.mcap", "x", "--episodes", "1"], "x"),
     "recover": (["recover", "log.mcap", "x.mcap"], "x.mcap"),
     "annotate": (["annotate", "log.mcap", "--policy", "bc", "--out", "x.mcap"], "x.mcap"),

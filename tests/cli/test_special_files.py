@@ -66,6 +66,7 @@ COMMANDS = {
     "recover": ["recover", "{}", "out.mcap"],
     "merge": ["merge", "{}", "{}", "out.mcap"],
     "slice": ["slice", "{}", "out.mcap", "--steps", "0:1"],
+    "label": ["label", "{}", "--episode", "0", "--success"],
     "relabel": ["relabel", "{}", "out.mcap", "--reward", "reward"],
     "train-offline": ["train-offline", "{}", "--out", "run"],
     "evaluate": ["evaluate", "random", "--data", "{}"],

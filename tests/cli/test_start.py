@@ -80,6 +80,7 @@ WAITING = {
     "split": ("split", "LOG", "OUT", "--ratio", "1:1"),
     "filter": ("filter", "length > 1", "LOG", "OUT.mcap"),
     "slice": ("slice", "LOG", "OUT.mcap", "--steps", "0:9"),
+    "label": ("label", "LOG"),
     "relabel": ("relabel", "LOG", "OUT.mcap", "--reward", "reward"),
 }
 """Arguments of each command that works; its name is the key's first word."""

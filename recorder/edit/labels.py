@@ -1,0 +1,311 @@
+"""Labels of a log's episodes and steps, in a file beside the log, which is not changed.
+
+`LOG.labels.json` names the log's data by the hash of its chunks, so that it is never read for
+another log. It is replaced as a whole.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, UnknownNameError, UsageError
+from mcaprl.files import locked_file, parse_json, read_file, read_json, write_json
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.log_reader import LogReader
+
+_VERSION: Final = 1
+_MAX_TEXT = 10_000
+_NS_PER_S = 1e9
+_KEYS = ("episode", "success", "note", "interval", "start", "stop")
+_SUCCESS = {"": None, "true": True, "1": True, "false": False, "0": False}
+Span = tuple[float | None, float | None]
+"""Start (included) and stop (excluded); None for the start or end of the episode."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Steps of an episode that have a name.
+
+    Attributes:
+        name: Name, such as `intervention`.
+        episode: Index of the episode in the log, from 0.
+        start: First step, from 0.
+        stop: Step after the last one.
+    """
+
+    name: str
+    episode: int
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Labels of a log.
+
+    Attributes:
+        log: Hash of the log's chunks.
+        success: Whether each labeled episode succeeded, by the episode's index as text.
+        notes: Note of each episode that has one, by the episode's index as text.
+        intervals: Named intervals, by episode and start.
+        version: Version of the file.
+    """
+
+    log: str
+    success: dict[str, bool] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
+    intervals: list[Interval] = field(default_factory=list)
+    version: int = _VERSION
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what `label --json` prints and what the file contains."""
+        return asdict(self)
+
+    def rows(self) -> list[list[str]]:
+        """Return episode, success, note and intervals of each labeled episode, as texts."""
+        named = {str(one.episode) for one in self.intervals}
+        return [
+            [
+                key,
+                {True: "success", False: "failure", None: ""}[self.success.get(key)],
+                self.notes.get(key, ""),
+                ", ".join(
+                    f"{one.name} {one.start}:{one.stop}"
+                    for one in self.intervals
+                    if str(one.episode) == key
+                ),
+            ]
+            for key in sorted({*self.success, *self.notes, *named}, key=int)
+        ]
+
+    def columns(self, episodes: int) -> dict[str, NDArray[Any]]:
+        """Return (E,) `success` (1, 0, or NaN without a label) and `note` (empty without one)."""
+        keys = [str(episode) for episode in range(episodes)]
+        return {
+            "success": np.array([self.success.get(key, np.nan) for key in keys], np.float64),
+            "note": np.array([self.notes.get(key, "") for key in keys], object),
+        }
+
+    def steps(self, lengths: NDArray[np.int64]) -> dict[str, NDArray[np.bool_]]:
+        """Return (N,) whether each step is in an interval, by the name of the intervals."""
+        first = np.cumsum(lengths) - lengths
+        found: dict[str, NDArray[np.bool_]] = {}
+        for one in self.intervals:
+            rows = found.setdefault(one.name, np.zeros(int(lengths.sum()), np.bool_))
+            rows[first[one.episode] + one.start : first[one.episode] + one.stop] = True
+        return found
+
+    def taken(self, log: str, chosen: NDArray[np.int64]) -> Labels:
+        """Return the labels of the chosen episodes, as labels of a log that has only these."""
+        new = {str(old): index for index, old in enumerate(chosen.tolist())}
+
+        def moved(given: Mapping[str, Any]) -> dict[str, Any]:
+            return {str(new[key]): value for key, value in given.items() if key in new}
+
+        kept = [one for one in self.intervals if str(one.episode) in new]
+        intervals = [replace(one, episode=new[str(one.episode)]) for one in kept]
+        return Labels(log, moved(self.success), moved(self.notes), intervals)
+
+    def without(self, episode: int | None, interval: str | None) -> Labels:
+        """Return the labels without those of an episode, of a name, or of a name in an episode."""
+
+        def stays(one: Interval) -> bool:
+            return episode not in (None, one.episode) or interval not in (None, one.name)
+
+        kept = [one for one in self.intervals if stays(one)]
+        if interval is not None:
+            return replace(self, intervals=kept)
+        success, notes = (
+            {key: value for key, value in given.items() if episode not in (None, int(key))}
+            for given in (self.success, self.notes)
+        )
+        return Labels(self.log, success, notes, kept)
+
+
+def labels_path(log: Path) -> Path:
+    """Return the path of a log's labels."""
+    return log.with_name(f"{log.name}.labels.json")
+
+
+def read_labels(log: Path, reader: LogReader | None = None) -> Labels:
+    """Return the labels of a log; empty if it has none.
+
+    Raises:
+        LogError: The file of labels is damaged, or belongs to other data.
+    """
+    reader, path = reader or LogReader(log), labels_path(log)
+    try:
+        found: Labels = read_json(path, LogError, Labels)
+    except FileNotFoundError:
+        return Labels(reader.checksum)
+    if found.version != _VERSION:
+        raise LogError(f"{path} has version {found.version}, expected {_VERSION}")
+    if found.log != reader.checksum:
+        raise LogError(
+            f"{path} has the labels of other data than {log}, which was replaced or continued:"
+            " move the file of labels away"
+        )
+    lengths = reader.lengths.tolist()
+    spans = [(str(one.episode), one.start, one.stop) for one in found.intervals]
+    known = {str(episode): length for episode, length in enumerate(lengths)}
+    for key, start, stop in [*((key, 0, 1) for key in {**found.success, **found.notes}), *spans]:
+        if key not in known or not 0 <= start < stop <= max(known[key], 1):
+            raise LogError(f"{path}: {log} has no episode {key} with steps {start}:{stop}")
+    return found
+
+
+def change_labels(log: Path, changes: Sequence[Mapping[str, Any]]) -> Labels:
+    """Apply changes, which have the arguments of `mcaprl.label`, to a log's labels, and save them.
+
+    Nothing is saved if one of the changes is refused.
+    """
+    with locked_file(log):
+        reader = LogReader(log)
+        labels = read_labels(log, reader)
+        for change in changes:
+            labels = _changed(labels, reader, **change)
+        if changes:
+            write_json(labels_path(log), labels.to_json(), LogError)
+    return labels
+
+
+def carry_labels(source: Path, chosen: NDArray[np.int64], target: Path) -> None:
+    """Write the labels of the chosen episodes beside a log that was made of them."""
+    if labels_path(source).exists():
+        labels = read_labels(source).taken(LogReader(target).checksum, chosen)
+        write_json(labels_path(target), labels.to_json(), LogError)
+
+
+def labels_of(dataset: Dataset) -> Labels | None:
+    """Return the labels of the logs that a dataset was read from; None if there are none.
+
+    Raises:
+        UsageError: The dataset has not exactly the episodes of its logs.
+    """
+    if not any(labels_path(source).is_file() for source in dataset.sources):
+        return None
+    readers = [LogReader(source) for source in dataset.sources]
+    lengths = np.concatenate([reader.lengths for reader in readers])
+    if not np.array_equal(lengths, dataset.episode_lengths):
+        raise UsageError("the labels of logs are known for all of their episodes only")
+    joined, first = Labels(""), 0
+    for source, reader in zip(dataset.sources, readers, strict=True):
+        labels, count = read_labels(source, reader), len(reader.lengths)
+        # Put the episodes at the place that they have in the dataset.
+        places = np.concatenate([np.full(first, -1, np.int64), np.arange(count)])
+        part = labels.taken("", places)
+        joined.success.update(part.success)
+        joined.notes.update(part.notes)
+        joined.intervals.extend(part.intervals)
+        first += count
+    return joined
+
+
+def without_intervals(dataset: Dataset, names: Sequence[str]) -> Dataset:
+    """Return a dataset without the steps in intervals of these names; see `Dataset.without`."""
+    if not names:
+        return dataset
+    labels = labels_of(dataset)
+    steps = {} if labels is None else labels.steps(dataset.episode_lengths)
+    for name in names:
+        if name not in steps:
+            raise UnknownNameError("name of intervals", name, steps)
+    return dataset.without(np.any([steps[name] for name in names], axis=0))
+
+
+def changes_in(path: Path) -> Iterator[dict[str, Any]]:
+    """Return the changes that a CSV or JSON file lists; see `mcaprl.label`."""
+    try:
+        text = read_file(path).decode("utf-8-sig")
+        rows = (
+            parse_json(text) if path.suffix == ".json" else list(csv.DictReader(io.StringIO(text)))
+        )
+    except (OSError, ValueError, csv.Error) as error:
+        raise UsageError(f"{path} cannot be read: {error}") from error
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise UsageError(f"{path} must be a list of objects with {', '.join(_KEYS)}")
+    for number, row in enumerate(rows, 1):
+        where = f"{path}: row {number}"
+        if unknown := [str(key) for key in row if key not in _KEYS]:
+            raise UsageError(f"{where} has '{unknown[0]}', expected {', '.join(_KEYS)}")
+        cells = {key: "" if row.get(key) is None else str(row[key]).strip() for key in _KEYS}
+        if cells["success"].lower() not in _SUCCESS:
+            raise UsageError(f"{where}: success is '{cells['success']}', expected true or false")
+        try:
+            bounds = [int(cells[key]) if cells[key] else None for key in ("start", "stop")]
+            episode = int(cells["episode"])
+        except ValueError as error:
+            raise UsageError(f"{where}: episode, start and stop are whole numbers") from error
+        yield {
+            "episode": episode,
+            "success": _SUCCESS[cells["success"].lower()],
+            "note": cells["note"] or None,
+            "interval": cells["interval"] or None,
+            "steps": tuple(bounds) if cells["interval"] else None,
+        }
+
+
+def _changed(
+    labels: Labels,
+    reader: LogReader,
+    episode: int | None = None,
+    success: bool | None = None,
+    note: str | None = None,
+    interval: str | None = None,
+    steps: Span | None = None,
+    time: Span | None = None,
+    remove: bool = False,
+) -> Labels:
+    lengths = reader.lengths
+    if episode is not None and not 0 <= episode < len(lengths):
+        raise UsageError(f"episode is {episode}; {reader.path} has {len(lengths)} episodes")
+    if remove:
+        if (success, note, steps, time) != (None, None, None, None):
+            raise UsageError("remove= takes only `episode=` and `interval=`")
+        return labels.without(episode, interval)
+    if episode is None:
+        raise UsageError("a label needs `episode=`, its index in the log")
+    if interval is None and (steps, time) != (None, None):
+        raise UsageError("`steps=` and `time=` need the name of the interval: `interval=`")
+    if any(text is not None and not 0 < len(text) <= _MAX_TEXT for text in (note, interval)):
+        raise UsageError(f"a note or name has 1 to {_MAX_TEXT} characters")
+    key, changed = str(episode), labels
+    if success is not None:
+        changed = replace(changed, success={**changed.success, key: success})
+    if note is not None:
+        changed = replace(changed, notes={**changed.notes, key: note})
+    if interval is not None:
+        start, stop = _steps_in(reader, episode, steps, time)
+        added = {*changed.intervals, Interval(interval, episode, start, stop)}
+        ordered = sorted(added, key=lambda one: (one.episode, one.start, one.stop, one.name))
+        changed = replace(changed, intervals=ordered)
+    return changed
+
+
+def _steps_in(
+    reader: LogReader, episode: int, steps: Span | None, time: Span | None
+) -> tuple[int, int]:
+    """Return the range of steps that a range of steps, or of seconds in the episode, selects."""
+    if steps is not None and time is not None:
+        raise UsageError("`steps=` and `time=` exclude each other")
+    length = int(reader.lengths[episode])
+    low, high = steps or time or (None, None)
+    if time is not None:
+        frame = int((reader.lengths[:episode] + 1).sum())
+        times = reader.record_times()[frame : frame + length]
+        seconds = (times - times[:1]) / _NS_PER_S
+        low, high = (None if at is None else np.searchsorted(seconds, at) for at in (low, high))
+    start, stop = int(low or 0), length if high is None else int(high)
+    if not 0 <= start < stop <= length:
+        raise UsageError(
+            f"the interval {start}:{stop} is not within the {length} steps of episode {episode}"
+        )
+    return start, stop

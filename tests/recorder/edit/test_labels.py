@@ -1,0 +1,195 @@
+"""Tests of labels beside a log: kept, refused, carried, and used in edits and training."""
+
+from __future__ import annotations
+
+import json
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.errors import LogError, UnknownNameError, UsageError
+from mcaprl.offline.batches.items import n_step_returns
+
+
+class Count(gym.Env[Any, Any]):
+    """Counts 5 steps, 10 per second; the reward is a power of 2 of the step."""
+
+    observation_space = spaces.Box(0, 99, (1,), np.float32)
+    action_space = spaces.Discrete(2)
+    metadata = {"render_fps": 10}  # noqa: RUF012
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+        super().reset(seed=seed)
+        self._k = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._k += 1
+        return np.full(1, self._k, np.float32), 2.0 ** (self._k - 1), self._k == 5, False, {}
+
+
+def _recorded(path: Path, episodes: int = 3) -> Path:
+    with closing(mcaprl.RecordMcap(Count(), path)) as env:
+        for seed in range(episodes):
+            env.reset(seed=seed)
+            for step in range(5):
+                env.step(step % 2)
+    return path
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return _recorded(tmp_path / "count.mcap")
+
+
+def test_labels_are_kept_beside_an_unchanged_log(log: Path) -> None:
+    before = log.read_bytes()
+    mcaprl.label(log, episode=0, success=True, note="clean")
+    mcaprl.label(log, episode=1, success=False)
+    mcaprl.label(log, episode=1, interval="intervention", steps=(2, 4))
+    found = mcaprl.label(log)
+    assert found.rows() == [
+        ["0", "success", "clean", ""],
+        ["1", "failure", "", "intervention 2:4"],
+    ]
+    assert log.read_bytes() == before
+    assert mcaprl.label(log, episode=1, interval="intervention", remove=True).intervals == []
+    assert mcaprl.label(log, episode=0, remove=True).rows() == [["1", "failure", "", ""]]
+    assert mcaprl.label(log, remove=True).rows() == []
+
+
+def test_a_time_range_selects_the_steps_that_begin_in_it(log: Path) -> None:
+    # Steps begin at 0, 0.1, 0.2, 0.3 and 0.4 s: those of 0.05 to 0.35 s are 1, 2 and 3.
+    found = mcaprl.label(log, episode=2, interval="bad data", time=(0.05, 0.35))
+    assert [(one.start, one.stop) for one in found.intervals] == [(1, 4)]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"episode": 3, "success": True},
+        {"episode": -1, "success": True},
+        {"success": True},
+        {"episode": 0, "steps": (1, 2)},
+        {"episode": 0, "interval": "x", "steps": (2, 2)},
+        {"episode": 0, "interval": "x", "steps": (0, 6)},
+        {"episode": 0, "interval": "x", "steps": (0, 1), "time": (0, 1)},
+        {"episode": 0, "interval": ""},
+        {"episode": 0, "remove": True, "note": "x"},
+    ],
+)
+def test_wrong_requests_save_nothing(log: Path, wrong: dict[str, Any]) -> None:
+    with pytest.raises(UsageError):
+        mcaprl.label(log, **wrong)
+    assert [path.name for path in log.parent.iterdir()] == [log.name]
+
+
+def test_labels_of_other_data_are_refused(log: Path, tmp_path: Path) -> None:
+    mcaprl.label(log, episode=0, success=True)
+    other = _recorded(tmp_path / "other.mcap", 2)
+    other.with_name("other.mcap.labels.json").write_bytes(
+        log.with_name("count.mcap.labels.json").read_bytes()
+    )
+    with pytest.raises(LogError, match="labels of other data"):
+        mcaprl.label(other)
+    # A copy of the log under another name has the same data.
+    copy = tmp_path / "copy.mcap"
+    copy.write_bytes(log.read_bytes())
+    copy.with_name("copy.mcap.labels.json").write_bytes(
+        log.with_name("count.mcap.labels.json").read_bytes()
+    )
+    assert mcaprl.label(copy).success == {"0": True}
+
+
+@pytest.mark.parametrize("change", ["{", "[]", '{"log": 3}', "x" * 20])
+def test_damaged_labels_are_one_error(log: Path, change: str) -> None:
+    log.with_name("count.mcap.labels.json").write_text(change)
+    with pytest.raises(LogError, match="labels"):
+        mcaprl.label(log)
+
+
+@pytest.mark.parametrize("key", ["7", "x", "-1"])
+def test_labels_of_missing_episodes_are_refused(log: Path, key: str) -> None:
+    path = log.with_name("count.mcap.labels.json")
+    mcaprl.label(log, episode=0, success=True)
+    found = json.loads(path.read_text())
+    path.write_text(json.dumps(found | {"success": {key: True}}))
+    with pytest.raises(LogError, match="no episode"):
+        mcaprl.label(log)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".json"])
+def test_a_file_of_labels_is_applied_whole_or_not_at_all(log: Path, suffix: str) -> None:
+    file = log.with_name(f"labels{suffix}")
+    rows = [
+        {"episode": 0, "success": True, "note": "good"},
+        {"episode": 2, "interval": "intervention", "start": 1, "stop": 3},
+    ]
+    lines = ["episode,success,note,interval,start,stop", "0,true,good,,,", "2,,,intervention,1,3"]
+    file.write_text("\n".join(lines) if suffix == ".csv" else json.dumps(rows))
+    assert run(["label", str(log), "--file", str(file)]) == 0
+    found = mcaprl.label(log)
+    assert found.rows() == [["0", "success", "good", ""], ["2", "", "", "intervention 1:3"]]
+    lines += ["1,false,,,,", "9,true,,,,"]
+    rows += [{"episode": 1, "success": False}, {"episode": 9, "success": True}]
+    file.write_text("\n".join(lines) if suffix == ".csv" else json.dumps(rows))
+    assert run(["label", str(log), "--file", str(file)]) == 2
+    assert mcaprl.label(log) == found
+
+
+def test_filter_and_split_use_and_carry_labels(log: Path, tmp_path: Path) -> None:
+    mcaprl.label(log, episode=0, success=False)
+    mcaprl.label(log, episode=2, success=True)
+    mcaprl.label(log, episode=2, interval="intervention", steps=(1, 2))
+    out = tmp_path / "good.mcap"
+    assert mcaprl.filter("success == 1", log, out).episodes == 1
+    assert mcaprl.label(out).rows() == [["0", "success", "", "intervention 1:2"]]
+    mcaprl.split(log, tmp_path / "parts", episodes=2)
+    first, second = (tmp_path / "parts" / f"count-0000{k}.mcap" for k in range(2))
+    assert mcaprl.label(first).success == {"0": False}
+    assert mcaprl.label(second).success == {"0": True}
+
+
+def test_rewards_from_labels(log: Path, tmp_path: Path) -> None:
+    for episode in range(3):
+        mcaprl.label(log, episode=episode, success=episode == 1)
+    mcaprl.label(log, episode=0, interval="bad-data", steps=(3, 5))
+    reward = "success * terminated - bad_data"
+    found = mcaprl.relabel(log, tmp_path / "new.mcap", reward=reward)
+    assert found.rewards.tolist() == [0, 0, 0, -1, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0]
+
+
+def test_returns_do_not_cross_masked_steps(log: Path) -> None:
+    """Rewards are 1, 2, 4, 8, 16; without step 2, the parts are (1, 2) and (8, 16)."""
+    data = mcaprl.open(log, episodes=0)
+    found = data.without(np.array([False, False, True, False, False]))
+    assert [episode.length for episode in found.episodes] == [2, 2]
+    assert found.observations.ravel().tolist() == [0, 1, 3, 4]
+    assert found.next_observations.ravel().tolist() == [1, 2, 4, 5]
+    assert found.truncated.tolist() == [False, True, False, False]
+    assert found.terminated.tolist() == [False, False, False, True]
+    assert [episode.total_reward for episode in found.episodes] == [3, 24]
+    # Two steps with a discount of 0.5: 1 + 0.5 * 2 = 2, 2, 8 + 0.5 * 16 = 16, 16.
+    returns = n_step_returns(found, 2, 0.5)[1]
+    assert np.asarray(returns)[0].tolist() == [2, 2, 16, 16]
+
+
+def test_training_leaves_out_the_intervals(log: Path, tmp_path: Path) -> None:
+    mcaprl.label(log, episode=0, interval="intervention", steps=(1, 3))
+    settings: dict[str, Any] = {"algo": "bc", "updates": 3}
+    data = mcaprl.open(log)
+    dropped = np.isin(np.arange(15), [1, 2])
+    mcaprl.train(data.without(dropped), tmp_path / "a", **settings)
+    mcaprl.train(log, tmp_path / "b", mask=["intervention"], **settings)
+    weights = [(tmp_path / name / "policy.safetensors") for name in "ab"]
+    weights = [path if path.exists() else path.parent / "seed-0" / path.name for path in weights]
+    assert weights[0].read_bytes() == weights[1].read_bytes()
+    with pytest.raises(UnknownNameError, match="intervention"):
+        mcaprl.train(log, tmp_path / "c", mask="interventions", **settings)
