@@ -364,12 +364,10 @@ def label(log: str, steps: str | None, time: str | None, as_json: bool, **reques
     Labels are kept in LOG.labels.json. filter and relabel can use them, and train-offline --mask
     does not learn from labeled intervals.
     """
-    bounds = {
-        "steps": None if steps is None else _bounds("steps", steps),
-        "time": None if time is None else _bounds("time", time),
-    }
+    request["steps"] = None if steps is None else _bounds("steps", steps)
+    request["time"] = None if time is None else _bounds("time", time)
     with working("reading the log"):
-        found = mcaprl.label(log, **request, **bounds)
+        found = mcaprl.label(log, **request)
     if as_json:
         print_json(found.to_json())
     elif rows := found.rows():

@@ -212,8 +212,8 @@ def label(
     """
     if is_url(data):
         raise UsageError(f"{data} cannot be labeled: copy the log to this machine")
-    given = {"episode": episode, "success": success, "note": note, "interval": interval}
-    given |= {"steps": steps, "time": time, "remove": remove or None}
+    given: dict[str, Any] = {"episode": episode, "success": success, "note": note}
+    given |= {"interval": interval, "steps": steps, "time": time, "remove": remove or None}
     change = {name: value for name, value in given.items() if value is not None}
     if file is not None and change:
         raise UsageError(f"`file=` and `{next(iter(change))}=` exclude each other")

@@ -123,11 +123,11 @@ class Labels:
         kept = [one for one in self.intervals if stays(one)]
         if interval is not None:
             return replace(self, intervals=kept)
-        success, notes = (
-            {key: value for key, value in given.items() if episode not in (None, int(key))}
-            for given in (self.success, self.notes)
-        )
-        return Labels(self.log, success, notes, kept)
+
+        def others(given: Mapping[str, Any]) -> dict[str, Any]:
+            return {key: one for key, one in given.items() if episode not in (None, int(key))}
+
+        return Labels(self.log, others(self.success), others(self.notes), kept)
 
 
 def labels_path(log: Path) -> Path:
@@ -302,7 +302,9 @@ def _steps_in(
         frame = int((reader.lengths[:episode] + 1).sum())
         times = reader.record_times()[frame : frame + length]
         seconds = (times - times[:1]) / _NS_PER_S
-        low, high = (None if at is None else np.searchsorted(seconds, at) for at in (low, high))
+        low, high = (
+            None if at is None else int(np.searchsorted(seconds, at)) for at in (low, high)
+        )
     start, stop = int(low or 0), length if high is None else int(high)
     if not 0 <= start < stop <= length:
         raise UsageError(

@@ -197,7 +197,7 @@ def test_damaged_clouds_are_clear_errors(change: dict[str, Any], expected: str) 
 
 
 def test_a_range_image_by_hand() -> None:
-    """Four columns of 90 degrees from behind on the left, two rows: up and down."""
+    """Four columns of 90 degrees from the back on the left, two rows: up and down."""
     quantity = Quantity.model_validate(
         {"cloud": "/points", "as": "range", "size": [4, 2], "elevation_deg": [-45, 45]}
     )
@@ -210,7 +210,7 @@ def test_a_range_image_by_hand() -> None:
     wanted[0, 1] = math.hypot(1, 0.1, 0.1)
     # To the right, below: azimuth -90 begins the last column.
     wanted[1, 3] = math.hypot(2, 0.5)
-    # Behind: 180 degrees is the first column, and just beyond it the last one.
+    # At the back: 180 degrees is the first column, and just beyond it the last one.
     wanted[0, 0], wanted[0, 3] = math.hypot(2, 0.2), math.hypot(1, 0.2)
     np.testing.assert_allclose(found, wanted, rtol=1e-6)
 
