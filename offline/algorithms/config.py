@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from mcaprl.architecture import Architecture, NetworkSettings
-from mcaprl.chunks import Chunks
 from mcaprl.lazy import installed
 from mcaprl.offline.batches.packing import Packing
+
+if TYPE_CHECKING:
+    # Help texts are shown without NumPy.
+    from mcaprl.chunks import Chunks
 
 ENTRY_POINT_GROUP: Final = "mcaprl.algorithms"
 HEADS: Final = ("deterministic", "gaussian", "mixture")
@@ -142,6 +145,8 @@ class BCConfig(TrainingConfig):
     @property
     def chunks(self) -> Chunks:
         """Length of the chunks and how they are executed."""
+        from mcaprl.chunks import Chunks
+
         return Chunks(self.chunk, self.execute or (self.chunk + 1) // 2)
 
     @property
@@ -177,6 +182,8 @@ class BoxBCConfig(BCConfig):
     @property
     def chunks(self) -> Chunks:
         """Length of the chunks and how they are executed."""
+        from mcaprl.chunks import Chunks
+
         return Chunks(self.chunk, 1, ACT_DECAY) if self.ensemble else super().chunks
 
     @property
