@@ -24,7 +24,7 @@ from mcaprl.page import COLORS, PAGE_NAME, Figure, Panel, Section, Table, write_
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.source import Data, named, opened
 from mcaprl.runs import CONFIG_NAME, read_config
-from mcaprl.texts import counted
+from mcaprl.texts import counted, shortened
 
 if TYPE_CHECKING:
     from mcaprl.offline.estimate.action_error import ActionError, Actor
@@ -39,6 +39,7 @@ _FUNCTION = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 _EPISODE = re.compile(r"episode-(\d{1,9})\.npy")
 _MAX_BYTES: Final = 2**31
 _SHOWN_PARTS: Final = 6
+_SHOWN_UNIT: Final = 30
 
 
 @dataclass(frozen=True)
@@ -359,9 +360,17 @@ def _write_report(path: Path, found: ActionErrors) -> None:
             panel = Panel("", partial(_by_horizon, one))
             figures.insert(0, Figure.of("Error by step of the chunk", panel.figure()))
         text = f"{counted(one.episodes, 'episode')} ({one.why}), {counted(one.steps, 'step')}."
-        sections.append(Section(one.policy, f"{text} {'. '.join(one.lines())}.", figures))
+        sections.append(
+            Section(
+                one.policy, f"{text} {'. '.join(_sentence(line) for line in one.lines())}.", figures
+            )
+        )
         sections.append(Section("", table=Table(columns, rows)))
     write_page(path, f"Action errors in {found.data}", CAVEAT, sections)
+
+
+def _sentence(line: str) -> str:
+    return line[:1].upper() + line[1:]
 
 
 def _window(one: ActionError, part: int, axes: Any) -> None:
@@ -369,7 +378,8 @@ def _window(one: ActionError, part: int, axes: Any) -> None:
     for rows, color, label in ((logged, COLORS[0], "log"), (own, COLORS[1], "policy")):
         axes.step(times, rows[:, part], where="post", color=color, label=label, lw=1.3)
     axes.set_xlabel("time since the start of the episode (s)")
-    axes.set_ylabel(one.parts[part].unit)
+    # Names of both ends of a part are longer than the axis.
+    axes.set_ylabel(shortened(one.parts[part].unit, _SHOWN_UNIT))
     axes.legend(loc="best")
 
 
