@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +33,7 @@ from mcaprl.texts import counted
 if TYPE_CHECKING:
     from mcaprl.api.estimate import LogEstimates
     from mcaprl.api.evaluate import Evaluation
+    from mcaprl.api.judge import ActionErrors
     from mcaprl.offline.estimate.off_policy import Estimate
 
 _OF_DATA = (
@@ -44,6 +46,7 @@ _OF_DATA = (
     "mapping",
     "trust_code",
     "definitions",
+    "report",
 )
 
 
@@ -135,6 +138,8 @@ def evaluate(
     """Evaluate each POLICY on the same episodes of SIM, or estimate its return from logs.
 
     POLICY is pilot, random, or a trained run; each seed of a run is evaluated. Actions are greedy.
+    With --data, it can also be an ONNX file, a Python function MODULE:FUNCTION (with --trust-code),
+    or a folder with episode-K.npy: its actions are compared with the logged ones.
     If the sim has a pilot, scores are normalized: the score of random is 0, and the score of pilot
     is 1. With --data, discounted returns are estimated: one line for each policy says what it is
     worth beside the log, how sure that is, and what to do next. --all shows all estimators, with
@@ -145,19 +150,33 @@ def evaluate(
     if data is not None and sim is None:
         _refuse_unused(given, [name for name in others if name not in _OF_DATA], "sim")
         # Compare with None, because 0 is a valid value of these options.
-        bag = bag_options(others)
+        from mcaprl.api.judge import is_estimable
+
+        bag, report = bag_options(others), others.pop("report")
         given = {name: others[name] for name in _OF_DATA if others.get(name) is not None}
         with working("reading data") as bar:
-            source = data if bag["mapping"] is None else mcaprl.open(data, **bag)
-            estimates = mcaprl.estimate(policies, source, seed=seed, progress=bar, **given)
+            read = {"threads": others["threads"] or 1} if bag["mapping"] is None else bag
+            source = mcaprl.open(data, **read)
+            errors = mcaprl.action_errors(
+                policies, source, trust_code=bag["trust_code"], seed=seed, report=report
+            )
+            known = [one for one in policies if is_estimable(one, source)]
+            estimates = None
+            if known:
+                estimates = mcaprl.estimate(known, source, seed=seed, progress=bar, **given)
         if as_json:
-            print_json(estimates.to_json())
-        else:
-            _print_answers(estimates)
+            values = {} if estimates is None else {**estimates.to_json(), "data": data}
+            print_json({**values, "action_errors": {**errors.to_json(), "data": data}})
+            return
+        if estimates is not None:
+            _print_answers(replace(estimates, data=data))
             if shows_all:
                 _print_estimates(estimates)
+        _print_errors(errors)
+        if report is not None:
+            echo(f"report: {report / PAGE_NAME}")
     elif sim is not None and data is None:
-        _refuse_unused(given, _OF_DATA, "data")
+        _refuse_unused(given, [name for name in _OF_DATA if name != "report"], "data")
         kept = nullcontext() if others["record"] is None else keeping("finished episodes are kept")
         with kept, working("loading the sim and the policies") as bar:
             found = mcaprl.evaluate(policies, sim, seed=seed, progress=bar, **given)
@@ -171,6 +190,15 @@ def evaluate(
             echo(f"log: {others['record']}")
     else:
         raise UsageError("evaluate needs either --sim SIM or --data DATA")
+
+
+def _print_errors(found: ActionErrors) -> None:
+    for one in found.policies:
+        title = f"action error of {one.policy}: {counted(one.episodes, 'episode')}, {one.why}"
+        print_table(title, *found.rows(one))
+        for line in one.lines():
+            echo(line)
+    echo(found.caveat)
 
 
 def _refuse_unused(given: dict[str, Any], names: Sequence[str], needed: str) -> None:

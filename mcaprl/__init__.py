@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from mcaprl.api.edit import annotate, filter, label, merge, relabel, slice, split
     from mcaprl.api.estimate import estimate
     from mcaprl.api.evaluate import evaluate
+    from mcaprl.api.judge import action_errors
     from mcaprl.api.logs import check, info, recover
     from mcaprl.api.policies import Run, export, load_policy
     from mcaprl.api.ranges import ClusterOptions
@@ -62,6 +63,7 @@ __all__ = [
     "Run",
     "UsageError",
     "__version__",
+    "action_errors",
     "annotate",
     "browse",
     "check",
@@ -110,6 +112,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.api.convert": ["convert", "suggest_mapping"],
         "mcaprl.recorder.source": ["open_data as open"],
         "mcaprl.api.edit": ["annotate", "filter", "label", "merge", "relabel", "slice", "split"],
+        "mcaprl.api.judge": ["action_errors"],
         "mcaprl.api.logs": ["check", "info", "recover"],
         "mcaprl.api.policies": ["Run", "export", "load_policy"],
         "mcaprl.api.ranges": ["ClusterOptions"],
