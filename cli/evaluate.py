@@ -31,9 +31,9 @@ from mcaprl.page import PAGE_NAME
 from mcaprl.texts import counted
 
 if TYPE_CHECKING:
+    from mcaprl.api.action_errors import ActionErrors
     from mcaprl.api.estimate import LogEstimates
     from mcaprl.api.evaluate import Evaluation
-    from mcaprl.api.judge import ActionErrors
     from mcaprl.offline.estimate.off_policy import Estimate
 
 _OF_DATA = (
@@ -150,7 +150,7 @@ def evaluate(
     if data is not None and sim is None:
         _refuse_unused(given, [name for name in others if name not in _OF_DATA], "sim")
         # Compare with None, because 0 is a valid value of these options.
-        from mcaprl.api.judge import is_estimable
+        from mcaprl.api.action_errors import is_estimable
 
         bag, report = bag_options(others), others.pop("report")
         given = {name: others[name] for name in _OF_DATA if others.get(name) is not None}

@@ -24,13 +24,13 @@ if not is_program():
 
 if TYPE_CHECKING:
     from mcaprl import ray, torch
+    from mcaprl.api.action_errors import action_errors
     from mcaprl.api.behavior import estimate_behavior
     from mcaprl.api.convert import convert, suggest_mapping
     from mcaprl.api.drive import drive_robot
     from mcaprl.api.edit import annotate, filter, label, merge, relabel, slice, split
     from mcaprl.api.estimate import estimate
     from mcaprl.api.evaluate import evaluate
-    from mcaprl.api.judge import action_errors
     from mcaprl.api.logs import check, info, recover
     from mcaprl.api.policies import Run, export, load_policy
     from mcaprl.api.ranges import ClusterOptions
@@ -112,7 +112,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.api.convert": ["convert", "suggest_mapping"],
         "mcaprl.recorder.source": ["open_data as open"],
         "mcaprl.api.edit": ["annotate", "filter", "label", "merge", "relabel", "slice", "split"],
-        "mcaprl.api.judge": ["action_errors"],
+        "mcaprl.api.action_errors": ["action_errors"],
         "mcaprl.api.logs": ["check", "info", "recover"],
         "mcaprl.api.policies": ["Run", "export", "load_policy"],
         "mcaprl.api.ranges": ["ClusterOptions"],

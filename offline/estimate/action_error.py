@@ -30,7 +30,7 @@ from mcaprl.recorder.format.spaces import part_names
 
 Floats = NDArray[np.float64]
 MAX_STEPS: Final = 10_000
-"""Number of judged steps, and of reference states, above which whole episodes are left out."""
+"""Number of compared steps, and of reference states, above which whole episodes are left out."""
 MAX_HORIZON: Final = 1_000
 BASELINES: Final = ("repeat", "mean", "nearest")
 WORST_S: Final = 10.0
@@ -40,7 +40,7 @@ _SHOWN_STATE: Final = 6
 
 @dataclass
 class Actor:
-    """What is judged.
+    """What is compared.
 
     Attributes:
         name: Name in tables.
@@ -49,16 +49,16 @@ class Actor:
         call: Function that selects the action of one step of an episode, for its latency; None if
             the actions were computed elsewhere.
         log_probs: Function of an episode that returns the log probabilities (T,) of its actions.
-        judged: Numbers of the episodes to judge; None for all.
+        compared: Numbers of the episodes to compare; None for all.
         trained_on: Numbers of the reference episodes; None for all.
-        why: Why these episodes are judged.
+        why: Why these episodes are compared.
     """
 
     name: str
     actions: Callable[[Episode], Any]
     call: Callable[[Episode, int], Any] | None = None
     log_probs: Callable[[Episode], NDArray[np.floating[Any]]] | None = None
-    judged: Sequence[int] | None = None
+    compared: Sequence[int] | None = None
     trained_on: Sequence[int] | None = None
     why: str = "all episodes"
 
@@ -121,9 +121,9 @@ class ActionError:
 
     Attributes:
         policy: Name of the policy.
-        episodes: Number of judged episodes.
+        episodes: Number of compared episodes.
         why: Why these episodes.
-        steps: Number of judged steps.
+        steps: Number of compared steps.
         horizon: Number H of actions of a chunk.
         total: Error of all parts.
         parts: Error of each part.
@@ -206,22 +206,24 @@ def as_chunks(actions: Any, count: int, shape: tuple[int, ...], who: str) -> NDA
     return found
 
 
-def judge(dataset: Dataset, actor: Actor, seed: int = 0) -> ActionError:
+def compare(dataset: Dataset, actor: Actor, seed: int = 0) -> ActionError:
     """Compute the errors of a policy's actions.
 
-    At most `MAX_STEPS` steps are judged, of whole episodes that are drawn by the seed.
+    At most `MAX_STEPS` steps are compared, of whole episodes that are drawn by the seed.
 
     Raises:
         PolicyError: The policy fails, or returns actions of another shape.
     """
     rng = np.random.default_rng(seed)
-    wanted = range(len(dataset.episodes)) if actor.judged is None else actor.judged
-    judged = _few(dataset, wanted, rng)
-    why = actor.why + (f", of which {len(judged)} were drawn" if len(judged) < len(wanted) else "")
+    wanted = range(len(dataset.episodes)) if actor.compared is None else actor.compared
+    compared = _few(dataset, wanted, rng)
+    why = actor.why + (
+        f", of which {len(compared)} were drawn" if len(compared) < len(wanted) else ""
+    )
     space, shape = dataset.action_space, tuple(dataset.action_space.shape or ())
     is_box = isinstance(space, spaces.Box)
     chunks, horizon = {}, 1
-    for number in judged:
+    for number in compared:
         episode = dataset.episodes[number]
         chunks[number] = as_chunks(actor.actions(episode), len(episode), shape, actor.name)
         if not is_box:
@@ -229,27 +231,29 @@ def judge(dataset: Dataset, actor: Actor, seed: int = 0) -> ActionError:
         horizon = max(horizon, chunks[number].shape[1])
     if any(found.shape[1] != horizon for found in chunks.values()):
         raise PolicyError(f"{actor.name} has chunks of different lengths")
-    logged = {number: _rows(dataset.episodes[number].actions) for number in judged}
+    logged = {number: _rows(dataset.episodes[number].actions) for number in compared}
     everything = _rows(dataset.actions)
     scale = everything.std(0) if is_box else np.ones(everything.shape[1])
     scale = np.where(scale > 0, scale, 1.0)
     reference = range(len(dataset.episodes)) if actor.trained_on is None else actor.trained_on
-    base = _baselines(dataset, judged, reference, horizon, is_box=is_box, rng=rng)
+    base = _baselines(dataset, compared, reference, horizon, is_box=is_box, rng=rng)
     # Errors (T, H, parts) by episode; NaN beyond the end of the episode.
     errors: dict[str, list[Floats]] = {name: [] for name in ("policy", *BASELINES)}
-    for number in judged:
+    for number in compared:
         truth = _ahead(logged[number], horizon)
         own = chunks[number].reshape(len(truth), horizon, -1).astype(np.float64)
         for name, guess in (("policy", own), *((name, base[name][number]) for name in BASELINES)):
             difference = np.where(np.isnan(own), np.nan, np.abs(guess - truth))
             errors[name].append(difference if is_box else _differs(difference))
     if not any(np.isfinite(one[:, 0]).any() for one in errors["policy"]):
-        raise PolicyError(f"{actor.name} has no action at a judged step of an episode")
-    draws = rng.multinomial(len(judged), np.full(len(judged), 1 / len(judged)), size=_RESAMPLES)
+        raise PolicyError(f"{actor.name} has no action at a compared step of an episode")
+    draws = rng.multinomial(
+        len(compared), np.full(len(compared), 1 / len(compared)), size=_RESAMPLES
+    )
     names = part_names(space, dataset.action_part_names)
     units = dataset.action_units if len(dataset.action_units) == len(names) else ("",) * len(names)
-    own_rows = [_first(chunks[number]) for number in judged]
-    logged_rows = [logged[number] for number in judged]
+    own_rows = [_first(chunks[number]) for number in compared]
+    logged_rows = [logged[number] for number in compared]
 
     def error(name: str, unit: str, reduce: Callable[[Floats], Floats]) -> Error:
         found = [
@@ -260,12 +264,12 @@ def judge(dataset: Dataset, actor: Actor, seed: int = 0) -> ActionError:
             for which in BASELINES
             if any(np.isfinite(one[:, 0]).any() for one in errors[which])
         }
-        changes = [
+        own, log = (
             _mean([reduce(_change(one, is_box=is_box)) for one in rows], draws)[0]
             for rows in (own_rows, logged_rows)
-        ]
+        )
         means, intervals = [one[0] for one in found], [one[1] for one in found]
-        return Error(name, unit, means[0], intervals[0], others, *changes, means, intervals)
+        return Error(name, unit, means[0], intervals[0], others, own, log, means, intervals)
 
     def total(values: Floats) -> Floats:
         found: Floats = (values / scale).mean(1)
@@ -288,20 +292,20 @@ def judge(dataset: Dataset, actor: Actor, seed: int = 0) -> ActionError:
     if interval is not None:
         beside = "below" if interval[1] < 0 else "above" if interval[0] > 0 else "as large as"
     totals = [total(one[:, 0]) for one in errors["policy"]]
-    worst, window = _worst(dataset, judged, totals, own_rows, logged_rows)
-    pauses = [np.diff(dataset.episodes[number].log_time_ns) for number in judged]
+    worst, window = _worst(dataset, compared, totals, own_rows, logged_rows)
+    pauses = [np.diff(dataset.episodes[number].log_time_ns) for number in compared]
     period_ms = float(np.median(np.concatenate(pauses))) / 1e6
-    calls = _latencies(dataset, judged, actor)
+    calls = _latencies(dataset, compared, actor)
     flags = np.concatenate(totals)
     return ActionError(
         actor.name,
-        len(judged),
+        len(compared),
         why,
         sum(int(np.isfinite(one).sum()) for one in totals),
         horizon,
         whole,
         parts,
-        None if is_box else _log_loss(dataset, judged, actor),
+        None if is_box else _log_loss(dataset, compared, actor),
         None if is_box else float((flags[np.isfinite(flags)] == 0).mean()),
         worst,
         None if calls is None else tuple(np.quantile(calls, (0.5, 0.99)).tolist()),
@@ -370,7 +374,7 @@ def _mean(
 
 def _baselines(
     dataset: Dataset,
-    judged: Sequence[int],
+    compared: Sequence[int],
     reference: Sequence[int],
     horizon: int,
     *,
@@ -384,11 +388,11 @@ def _baselines(
     known = np.concatenate([states_of(dataset, dataset.episodes[number]) for number in used])
     groups = np.repeat(used, [len(actions[number]) for number in used])
     ahead = np.concatenate([_ahead(actions[number], horizon) for number in used])
-    # The last action of an episode stands for those after its end.
+    # The last action of an episode is used for those after its end.
     for step in range(1, horizon):
         gone = np.isnan(ahead[:, step])
         ahead[:, step][gone] = ahead[:, step - 1][gone]
-    for number in judged:
+    for number in compared:
         episode = dataset.episodes[number]
         rows, shape = _rows(episode.actions), (len(episode), horizon, ahead.shape[2])
         others = ahead[:, 0][groups != number]
@@ -415,17 +419,17 @@ def _most_frequent(rows: Floats) -> Floats:
 
 def _worst(
     dataset: Dataset,
-    judged: Sequence[int],
+    compared: Sequence[int],
     totals: Sequence[Floats],
     own: Sequence[Floats],
     logged: Sequence[Floats],
 ) -> tuple[Worst, tuple[Floats, Floats, Floats]]:
     peaks = [np.nanmax(one) if np.isfinite(one).any() else -1.0 for one in totals]
     k = int(np.argmax(peaks))
-    episode, step = dataset.episodes[judged[k]], int(np.nanargmax(totals[k]))
+    episode, step = dataset.episodes[compared[k]], int(np.nanargmax(totals[k]))
     best = (-1.0, 0, 0, 1)
     for place, one in enumerate(totals):
-        seconds = _seconds(dataset.episodes[judged[place]])
+        seconds = _seconds(dataset.episodes[compared[place]])
         ends = np.searchsorted(seconds[:-1], seconds[:-1] + WORST_S)
         full = np.arange(len(ends))[seconds[:-1] + WORST_S <= seconds[-1]]
         sums = np.concatenate([[0.0], np.cumsum(np.nan_to_num(one))])
@@ -445,12 +449,12 @@ def _worst(
         float(_seconds(episode)[step]),
         float(peaks[k]),
         state,
-        judged[place],
+        compared[place],
         first,
         last,
     )
     rows = slice(first, last)
-    times = _seconds(dataset.episodes[judged[place]])[rows]
+    times = _seconds(dataset.episodes[compared[place]])[rows]
     return worst, (times, own[place][rows], logged[place][rows])
 
 
@@ -463,12 +467,12 @@ def _seconds(episode: Episode) -> Floats:
 _TIMED: Final = 300
 
 
-def _latencies(dataset: Dataset, judged: Sequence[int], actor: Actor) -> Floats | None:
+def _latencies(dataset: Dataset, compared: Sequence[int], actor: Actor) -> Floats | None:
     """Return the times (ms) of single calls, after three that are not counted."""
     if actor.call is None:
         return None
     found: list[float] = []
-    for number in judged:
+    for number in compared:
         for step in range(len(dataset.episodes[number])):
             began = time.perf_counter()
             actor.call(dataset.episodes[number], step)
@@ -478,11 +482,11 @@ def _latencies(dataset: Dataset, judged: Sequence[int], actor: Actor) -> Floats 
     return np.array(found[3:] or found)
 
 
-def _log_loss(dataset: Dataset, judged: Sequence[int], actor: Actor) -> float | None:
+def _log_loss(dataset: Dataset, compared: Sequence[int], actor: Actor) -> float | None:
     if actor.log_probs is None:
         return None
     try:
-        found = [actor.log_probs(dataset.episodes[number]) for number in judged]
+        found = [actor.log_probs(dataset.episodes[number]) for number in compared]
     except PolicyError:
         return None
     loss = -float(np.concatenate(found).mean())

@@ -59,12 +59,12 @@ def test_the_errors_by_hand(code: str) -> None:
     x, y = one.parts
     assert (one.episodes, one.steps, one.horizon, one.why) == (2, 5, 1, "all episodes")
     # |1 - x| is 1, 0, 1, 3, 3, and |1 - y| is always 1.
-    assert (x.mean, y.mean) == (pytest.approx(8 / 5), 1)
+    assert [x.mean, y.mean] == pytest.approx([8 / 5, 1])
     # Before an episode's first command, `repeat` has the mean of the other episode: 4 and 1.
     assert x.baselines == pytest.approx({"repeat": 9 / 5, "mean": 15 / 5, "nearest": 13 / 5})
     # The standard deviations are 1.6 and sqrt(0.96).
     assert one.total.mean == pytest.approx((1 + 1 / np.sqrt(0.96)) / 2)
-    assert (x.change, x.logged_change) == (0, pytest.approx(2 / 3))
+    assert [x.change, x.logged_change] == pytest.approx([0, 2 / 3])
     # The interval is that of two episodes, with the means 2/3 and 3.
     assert x.interval == pytest.approx((2 / 3, 3))
     assert (one.worst.episode, one.worst.step, one.worst.state) == (1, 0, {})
@@ -140,14 +140,14 @@ def test_a_log_of_one_episode_has_no_other_commands(code: str) -> None:
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Return a log of CartPole, and a run that held out some of its episodes."""
-    folder = tmp_path_factory.mktemp("judged")
+    folder = tmp_path_factory.mktemp("compared")
     log = folder / "log.mcap"
     mcaprl.record("CartPole-v1", log, policy="random", episodes=20, seed=3)
     mcaprl.train(log, folder / "run", algo="bc", updates=50, held_out=0.2)
     return log, folder / "run"
 
 
-def test_a_run_is_judged_on_what_it_held_out(trained: tuple[Path, Path]) -> None:
+def test_a_run_is_compared_on_what_it_held_out(trained: tuple[Path, Path]) -> None:
     log, folder = trained
     (one,) = mcaprl.action_errors(folder, log).policies
     data = mcaprl.open(log)

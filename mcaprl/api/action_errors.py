@@ -98,7 +98,7 @@ def action_errors(
     """Compare the actions of policies with the logged ones, beside three baselines.
 
     The episodes are those that a run held out of its training on this log, otherwise all. At most
-    10,000 steps are judged. See `mcaprl.offline.estimate.action_error` for what is computed.
+    10,000 steps are compared. See `mcaprl.offline.estimate.action_error` for what is computed.
 
     Args:
         policies: One or more of: `random`; path of a trained run or of a `.zip` file of
@@ -118,7 +118,7 @@ def action_errors(
         PolicyError: A policy fits another space, fails, or returns other shapes.
         LogError: The logs cannot be read.
     """
-    from mcaprl.offline.estimate.action_error import judge
+    from mcaprl.offline.estimate.action_error import compare
 
     check_least(0, seed=seed)
     if report is not None:
@@ -126,7 +126,7 @@ def action_errors(
         import_extra("jinja2", "report")
     dataset = opened(data, threads=threads)
     actors = actors_of(policies, dataset, trust_code=trust_code, seed=seed)
-    found = ActionErrors(named(data), tuple(judge(dataset, actor, seed) for actor in actors))
+    found = ActionErrors(named(data), tuple(compare(dataset, actor, seed) for actor in actors))
     if report is not None:
         _write_report(Path(report) / PAGE_NAME, found)
     return found
@@ -151,7 +151,7 @@ def _is_foreign(name: str) -> bool:
 
 
 def actors_of(policies: Any, dataset: Dataset, *, trust_code: bool, seed: int = 0) -> list[Actor]:
-    """Return what `action_errors` judges."""
+    """Return what `action_errors` compares."""
     is_one = isinstance(policies, str | Path) or not isinstance(policies, Sequence)
     found: list[Actor] = []
     given = [policies] if is_one or hasattr(policies, "__fspath__") else policies
@@ -196,7 +196,7 @@ def _split_of(path: Path, dataset: Dataset) -> dict[str, Any]:
             held_out = choose_held_out(len(dataset.episodes), share).tolist()
             if held_out:
                 rest = sorted({*range(len(dataset.episodes))} - {*held_out})
-                return {"judged": held_out, "trained_on": rest, "why": "held out of the training"}
+                return {"compared": held_out, "trained_on": rest, "why": "held out of the training"}
             return {"why": "all episodes, which the run was trained on: it held none out"}
     return {}
 
@@ -224,7 +224,7 @@ def _of_policy(policy: BasePolicy, name: str, **split: Any) -> Actor:
 
 
 def _of_function(function: Callable[[Any], Any], name: str) -> Actor:
-    """Judge a function of one observation."""
+    """Compare a function of one observation."""
     from mcaprl.offline.estimate.action_error import Actor
 
     def call(episode: Episode, step: int) -> Any:
@@ -268,7 +268,8 @@ class _OnnxModel:
         check_regular(path)
         options = runtime.SessionOptions()
         options.intra_op_num_threads = 1
-        self._path, self._seen = path, {}
+        self._path = path
+        self._seen: dict[str, list[NDArray[Any]]] = {}
         try:
             self._session = runtime.InferenceSession(
                 str(path), options, providers=["CPUExecutionProvider"]
@@ -288,7 +289,6 @@ class _OnnxModel:
         self._inputs = [(one, leaves[one.name]) for one in inputs]
         outputs = [one.name for one in self._session.get_outputs()]
         self._output = "action" if "action" in outputs else outputs[0]
-        self._seen: dict[str, list[NDArray[Any]]]
 
     def begin(self) -> None:
         """Drop the frames of the episode before."""
@@ -319,7 +319,7 @@ def _predictions_in(folder: Path) -> dict[int, Path]:
 
 
 def _of_predictions(folder: Path, dataset: Dataset) -> Actor:
-    """Judge actions that were computed elsewhere."""
+    """Compare actions that were computed elsewhere."""
     from mcaprl.offline.estimate.action_error import Actor
 
     files = _predictions_in(folder)
@@ -330,7 +330,7 @@ def _of_predictions(folder: Path, dataset: Dataset) -> Actor:
             raise PolicyError(f"{files[number]}: the data has no episode {number}, but {episodes}")
     why = "all episodes" if len(files) == count else f"those in the folder, of {count}"
     return Actor(
-        folder.name, lambda episode: _read(files[episode.index]), judged=sorted(files), why=why
+        folder.name, lambda episode: _read(files[episode.index]), compared=sorted(files), why=why
     )
 
 
