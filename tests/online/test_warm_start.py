@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 import mcaprl
 from mcaprl.api.policies import load_policy
+from mcaprl.chunks import Chunks
 from mcaprl.cli import run
 from mcaprl.errors import PolicyError, SpaceError, UsageError
 from mcaprl.frames import mapped
@@ -275,7 +276,7 @@ def test_weights_of_other_outputs_are_refused(tmp_path: Path) -> None:
 
         class Doubled:
             name, algo, frame_stack, encoder = "doubled", "", 1, None
-            head = SimpleNamespace(networks={"q": network})
+            head, chunk = SimpleNamespace(networks={"q": network}), Chunks()
 
             def q_values(self, observations: Any) -> Any:
                 return 2 * begun.policy.q_values(observations)
