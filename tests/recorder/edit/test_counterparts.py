@@ -157,7 +157,7 @@ def test_commands_of_the_page(
             step_duration_s=1.0,
         )
     page = (ROOT / "docs" / "editing.md").read_text()
-    (block,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    block, labels = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     for command in block.splitlines():
         assert run(shlex.split(command)[1:]) == 0, command
     lines = capsys.readouterr().out.splitlines()
@@ -170,6 +170,10 @@ def test_commands_of_the_page(
     # The part has the records from 60 s to 119 s: 30 transitions of the first episode and 28 of the
     # second, 58 steps in total.
     assert minute == ["minute.mcap: 2 episodes", "58 steps"]
+    for command in labels.splitlines():
+        # Rewards of these logs are infinite, from which nothing learns.
+        if not command.startswith(("mcaprl relabel", "mcaprl train")):
+            assert run(shlex.split(command, comments=True)[1:]) == 0, command
 
 
 def test_recover_reports_the_episodes_that_a_part_does_not_have(tmp_path: Path) -> None:
