@@ -150,11 +150,11 @@ def evaluate(
     if data is not None and sim is None:
         _refuse_unused(given, [name for name in others if name not in _OF_DATA], "sim")
         # Compare with None, because 0 is a valid value of these options.
-        from mcaprl.api.action_errors import is_estimable
-
         bag, report = bag_options(others), others.pop("report")
         given = {name: others[name] for name in _OF_DATA if others.get(name) is not None}
         with working("reading data") as bar:
+            from mcaprl.api.action_errors import is_estimable
+
             read = {"threads": others["threads"] or 1} if bag["mapping"] is None else bag
             source = mcaprl.open(data, **read)
             errors = mcaprl.action_errors(

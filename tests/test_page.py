@@ -187,8 +187,8 @@ def test_the_colors_of_an_evaluation_figure_fit_both_color_schemes() -> None:
 
 def test_an_interval_is_drawn_within_the_returns() -> None:
     """Intervals of few returns can be far beyond all of them."""
-    episodes = tuple((EpisodeResult(k, 3.0 + k, 1, "", np.empty((0, 2))),) for k in range(2))
-    for interval, line, has_arrows in (((3.2, 3.9), [3.2, 3.9], False), ((-9, 20), [3, 4], True)):
+    episodes = tuple((EpisodeResult(k, 3.0 + k, 1, "", np.empty((0, 2))),) for k in range(3))
+    for interval, line, has_arrows in (((3.2, 3.9), [3.2, 3.9], False), ((-9, 20), [3, 5], True)):
         score = PolicyScore("cql", episodes, 3.5, interval)
         axes = comparison_figure([score], "", None).axes[0]
         drawn = [each.get_xdata().tolist() for each in axes.lines if len(each.get_xdata()) == 2]

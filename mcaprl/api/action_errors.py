@@ -205,12 +205,14 @@ def _of_policy(policy: BasePolicy, name: str, **split: Any) -> Actor:
     from mcaprl.offline.estimate.action_error import Actor
     from mcaprl.offline.estimate.values import by_rows
 
+    has_chunks = policy.chunk.length > 1
+
     def inputs(episode: Episode) -> Any:
         return stacked_frames(episode.observations, policy.frame_stack)
 
     def actions(episode: Episode) -> Any:
         policy.begin()
-        return by_rows(getattr(policy, "act_chunk", policy.act), inputs(episode))
+        return by_rows(policy.act_chunk if has_chunks else policy.act, inputs(episode))
 
     def call(episode: Episode, step: int) -> Any:
         if step == 0:

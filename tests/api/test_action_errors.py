@@ -180,7 +180,7 @@ def test_the_command(
     trained: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, folder = trained
-    ask = ["evaluate", str(folder), "--data", str(log), "--updates", "5"]
+    ask = ["evaluate", str(folder), "random", "--data", str(log), "--updates", "5"]
     assert run([*ask, "--report", str(tmp_path / "report")]) == 0
     shown = capsys.readouterr().out
     assert "action error of run: 4 episodes, held out of the training" in shown

@@ -562,7 +562,7 @@ def test_stopped_recording_is_readable(number: signal.Signals) -> None:
     [
         (["record", "lane", "--steps", "5", "--out", "x.mcap"], "record", "; finished episodes ar"),
         (["evaluate", "pilot", "--sim", "lane"], "evaluate", "\n"),
-        (["evaluate", "run", "--data", "x"], "estimate", "\n"),
+        (["evaluate", "random", "--data", str(LANE_LOG)], "estimate", "\n"),
         (["train-offline", str(LANE_LOG), "--out", "new"], "train", "\n"),
         (["train-offline", str(LANE_LOG), "--out", "run"], "train", "; continue with --resume\n"),
         pytest.param(

@@ -112,7 +112,7 @@ class DdsTransport:
         before = udp_sockets()
         if is_local and before is None:
             raise UsageError(
-                "this system cannot keep DDS on this machine: choose the network by --interface"
+                "this system cannot keep DDS on this machine: choose a network by `interface`"
             )
         try:
             self._domain = domains.Domain(self._id, config)

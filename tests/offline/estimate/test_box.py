@@ -338,6 +338,7 @@ def test_the_command_prints_the_four_parts_in_order(
     assert found["coverage"] == {}
     assert found["behavior_check"]["text"].startswith("FQE predicts")
     again = mcaprl.estimate("random", log, updates=20, gamma=0.9)
+    assert found.pop("action_errors")["policies"][0]["policy"] == "random"
     assert json.loads(json.dumps(again.to_json())) == found
     assert again.behavior_check is not None
 
