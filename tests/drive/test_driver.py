@@ -360,9 +360,7 @@ REWARD = "next(total) - total + 10 * terminated"
 
 
 @pytest.mark.filterwarnings("ignore:.*cannot be decoded")
-# At random, a few examples in a hundred differ: those of `docs/driver.md`, and others that are not
-# explained yet.
-@settings(max_examples=10, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
+@settings(max_examples=10, deadline=None, suppress_health_check=list(HealthCheck))
 @given(sent=streams(), tree=mappings())
 def test_the_log_equals_what_its_topics_give(
     sent: list[Sent], tree: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
@@ -378,6 +376,11 @@ def test_the_log_equals_what_its_topics_give(
     # No command fits between steps that are a nanosecond apart, as those of equal times are.
     ticks = [each.time_ns for each in sent if each.topic == tree["clock"].get("topic")]
     assume(len(set(ticks)) == len(ticks))
+    if tree["episodes"].keys() - {"gap_s", "min_steps"}:
+        # A bag has no steps after the last transform. A robot has them, and an episode that ends or
+        # begins there is in the log before it turns out that no transform follows.
+        last = max(k for k, each in enumerate(sent) if each.topic == "/tf")
+        sent = [each for each in sent if each.time_ns <= sent[last].time_ns]
     path = tmp_path_factory.mktemp("drive") / "drive.mcap"
     bag = StreamBag(TYPES, sent)
     try:
