@@ -61,7 +61,9 @@ _OF_DATA = (
 @click.option(
     "--sim", type=Name(sims), help="lane, powerline, racer, highway-lane, or any Gymnasium id."
 )
-@click.option("--data", help="Logs to estimate returns from, instead of --sim.")
+@click.option(
+    "--data", help="Logs to estimate returns from and to compare actions with, instead of --sim."
+)
 @click.option(
     "--episodes",
     type=click.IntRange(1),

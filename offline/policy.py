@@ -328,23 +328,8 @@ def save_policy(
     for name in {"q", TWIN} & networks.keys():
         # Saved values are in units of the logged rewards.
         networks[name].scale_outputs(buffer.reward_scale)
-    weights = {
-        f"{name}.{key}": value
-        for name, network in networks.items()
-        for key, value in network.state_dict().items()
-    }
-    if LOG_STD in learner.scalars:
-        numbers = learner.scalars[LOG_STD].detach()[learner.seeds.index(seed), : buffer.n_actions]
-        weights[LOG_STD] = numbers.clone()
-    weights["observation.shift"] = torch.from_numpy(buffer.encoder.shift)
-    weights["observation.scale"] = torch.from_numpy(buffer.encoder.scale)
-    for number, image in enumerate(buffer.encoder.image_inputs):
-        if image.shift is not None:
-            weights[_IMAGE_SHIFT.format(number)] = torch.from_numpy(image.shift)
-            weights[_IMAGE_SCALE.format(number)] = torch.tensor(image.scale)
     relative = buffer.relative
-    if relative is not None:
-        weights |= dict(zip(_RELATIVE, (relative.low.cpu(), relative.high.cpu()), strict=True))
+    weights = _weights_of(learner, seed, networks)
     write_tensors(folder / _WEIGHTS_NAME, weights, {"updates": learner.step})
     chunks = getattr(learner.config, "chunks", Chunks())
     has_chunks = chunks.length > 1
@@ -369,6 +354,28 @@ def save_policy(
         **({"action_commands": action_commands.to_json()} if action_commands else {}),
     }
     write_json(folder / POLICY_NAME, description, TrainingError)
+
+
+def _weights_of(learner: Learner, seed: int, networks: dict[str, Network]) -> dict[str, Tensor]:
+    """Return all tensors of a policy by name."""
+    weights = {
+        f"{name}.{key}": value
+        for name, network in networks.items()
+        for key, value in network.state_dict().items()
+    }
+    buffer, relative = learner.buffer, learner.buffer.relative
+    if LOG_STD in learner.scalars:
+        numbers = learner.scalars[LOG_STD].detach()[learner.seeds.index(seed), : buffer.n_actions]
+        weights[LOG_STD] = numbers.clone()
+    weights["observation.shift"] = torch.from_numpy(buffer.encoder.shift)
+    weights["observation.scale"] = torch.from_numpy(buffer.encoder.scale)
+    for number, image in enumerate(buffer.encoder.image_inputs):
+        if image.shift is not None:
+            weights[_IMAGE_SHIFT.format(number)] = torch.from_numpy(image.shift)
+            weights[_IMAGE_SCALE.format(number)] = torch.tensor(image.scale)
+    if relative is not None:
+        weights |= dict(zip(_RELATIVE, (relative.low.cpu(), relative.high.cpu()), strict=True))
+    return weights
 
 
 def _box_description(learner: Learner) -> dict[str, Any]:

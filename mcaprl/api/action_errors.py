@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import re
 from collections.abc import Callable, Sequence
@@ -162,8 +163,9 @@ def actors_of(policies: Any, dataset: Dataset, *, trust_code: bool, seed: int = 
             policy = as_policy(one)
             found.append(_of_policy(policy, policy.name))
         elif name == "random":
-            dataset.action_space.seed(seed)
-            found.append(_of_policy(RandomPolicy(dataset.action_space), name))
+            space = copy.deepcopy(dataset.action_space)
+            space.seed(seed)
+            found.append(_of_policy(RandomPolicy(space), name))
         elif not _is_foreign(name):
             loaded = trained_policies(name, dataset)
             split = _split_of(Path(name), dataset)

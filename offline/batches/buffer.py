@@ -148,13 +148,7 @@ class TransitionBuffer:
         packing = packing or Packing()
         is_box = isinstance(dataset.action_space, spaces.Box)
         joint = None if is_box else discrete_actions(dataset.action_space)
-        if encoder is None:
-            n_actions = joint.count if joint else 0
-            encoder = ObservationEncoder(dataset.observation_space, n_actions)
-            if packing.normalize and len(dataset):
-                encoder.normalize_to(dataset.frames)
-            elif packing.center_images and len(dataset):
-                encoder.center_images(dataset.frames)
+        encoder = encoder or _new_encoder(dataset, packing, joint.count if joint else 0)
         if len(dataset) == 0:
             raise TrainingError("the dataset has no transitions to learn from")
         lengths = dataset.episode_lengths
@@ -176,18 +170,11 @@ class TransitionBuffer:
         ends = torch.from_numpy(np.repeat(np.cumsum(lengths), lengths))
         if is_relative and relative is None:
             assert box is not None, "only actions of a Box are relative"
-            used = (
-                np.ones(len(dataset), bool) if weights is None else np.repeat(weights, lengths) > 0
-            )
+            used = np.ones(len(dataset)) if weights is None else np.repeat(weights, lengths)
+            rows = torch.from_numpy(np.flatnonzero(used > 0))
+            states = frames.vector.index_select(0, torch.from_numpy(places[0]))
             relative = RelativeActions.fitted(
-                dataset.relative_to,
-                encoder,
-                box,
-                actions,
-                frames.vector.index_select(0, torch.from_numpy(places[0])),
-                ends,
-                torch.from_numpy(np.flatnonzero(used)),
-                packing.chunk,
+                dataset.relative_to, encoder, box, actions, states, ends, rows, packing.chunk
             )
         buffer = cls(
             encoder=encoder,
@@ -362,6 +349,15 @@ def _numbered(dataset: Dataset, joint: JointActions) -> NDArray[np.int64]:
             f" but its action space is {dataset.action_space}"
         )
     return joint.indexes(dataset.actions)
+
+
+def _new_encoder(dataset: Dataset, packing: Packing, n_actions: int) -> ObservationEncoder:
+    encoder = ObservationEncoder(dataset.observation_space, n_actions)
+    if packing.normalize and len(dataset):
+        encoder.normalize_to(dataset.frames)
+    elif packing.center_images and len(dataset):
+        encoder.center_images(dataset.frames)
+    return encoder
 
 
 def _box_of(dataset: Dataset, packing: Packing) -> BoxActions:

@@ -217,82 +217,22 @@ def compare(dataset: Dataset, actor: Actor, seed: int = 0) -> ActionError:
     rng = np.random.default_rng(seed)
     wanted = range(len(dataset.episodes)) if actor.compared is None else actor.compared
     compared = _few(dataset, wanted, rng)
-    why = actor.why + (
-        f", of which {len(compared)} were drawn" if len(compared) < len(wanted) else ""
-    )
-    space, shape = dataset.action_space, tuple(dataset.action_space.shape or ())
-    is_box = isinstance(space, spaces.Box)
-    chunks, horizon = {}, 1
-    for number in compared:
-        episode = dataset.episodes[number]
-        chunks[number] = as_chunks(actor.actions(episode), len(episode), shape, actor.name)
-        if not is_box:
-            _check_whole(chunks[number], actor.name)
-        horizon = max(horizon, chunks[number].shape[1])
-    if any(found.shape[1] != horizon for found in chunks.values()):
-        raise PolicyError(f"{actor.name} has chunks of different lengths")
-    logged = {number: _rows(dataset.episodes[number].actions) for number in compared}
-    everything = _rows(dataset.actions)
-    scale = everything.std(0) if is_box else np.ones(everything.shape[1])
-    scale = np.where(scale > 0, scale, 1.0)
+    drawn = f", of which {len(compared)} were drawn" if len(compared) < len(wanted) else ""
+    chunks, horizon = _predicted(dataset, actor, compared)
+    found = _Errors(dataset, compared, chunks, horizon)
     reference = range(len(dataset.episodes)) if actor.trained_on is None else actor.trained_on
-    base = _baselines(dataset, compared, reference, horizon, is_box=is_box, rng=rng)
-    # Errors (T, H, parts) by episode; NaN beyond the end of the episode.
-    errors: dict[str, list[Floats]] = {name: [] for name in ("policy", *BASELINES)}
-    for number in compared:
-        truth = _ahead(logged[number], horizon)
-        own = chunks[number].reshape(len(truth), horizon, -1).astype(np.float64)
-        for name, guess in (("policy", own), *((name, base[name][number]) for name in BASELINES)):
-            difference = np.where(np.isnan(own), np.nan, np.abs(guess - truth))
-            errors[name].append(difference if is_box else _differs(difference))
-    if not any(np.isfinite(one[:, 0]).any() for one in errors["policy"]):
+    for name, guess in _baselines(
+        dataset, compared, reference, horizon, is_box=found.is_box, rng=rng
+    ).items():
+        found.add(name, [guess[number] for number in compared])
+    if not any(np.isfinite(one[:, 0]).any() for one in found.errors["policy"]):
         raise PolicyError(f"{actor.name} has no action at a compared step of an episode")
     draws = rng.multinomial(
         len(compared), np.full(len(compared), 1 / len(compared)), size=_RESAMPLES
     )
-    names = part_names(space, dataset.action_part_names)
-    units = dataset.action_units if len(dataset.action_units) == len(names) else ("",) * len(names)
-    own_rows = [_first(chunks[number]) for number in compared]
-    logged_rows = [logged[number] for number in compared]
-
-    def error(name: str, unit: str, reduce: Callable[[Floats], Floats]) -> Error:
-        found = [
-            _mean([reduce(one[:, h]) for one in errors["policy"]], draws) for h in range(horizon)
-        ]
-        others = {
-            which: _mean([reduce(one[:, 0]) for one in errors[which]], draws)[0]
-            for which in BASELINES
-            if any(np.isfinite(one[:, 0]).any() for one in errors[which])
-        }
-        own, log = (
-            _mean([reduce(_change(one, is_box=is_box)) for one in rows], draws)[0]
-            for rows in (own_rows, logged_rows)
-        )
-        means, intervals = [one[0] for one in found], [one[1] for one in found]
-        return Error(name, unit, means[0], intervals[0], others, own, log, means, intervals)
-
-    def total(values: Floats) -> Floats:
-        found: Floats = (values / scale).mean(1)
-        return found
-
-    whole = error("all parts", "sd" if is_box else "", total)
-    parts = tuple(
-        error(name, unit, lambda values, k=k: values[:, k])  # type: ignore[misc]
-        for k, (name, unit) in enumerate(zip(names, units, strict=True))
-    )
-    best = min(whole.baselines, key=lambda name: whole.baselines[name])
-    _, interval = _mean(
-        [
-            total(own[:, 0]) - total(other[:, 0])
-            for own, other in zip(errors["policy"], errors[best], strict=True)
-        ],
-        draws,
-    )
-    beside = ""
-    if interval is not None:
-        beside = "below" if interval[1] < 0 else "above" if interval[0] > 0 else "as large as"
-    totals = [total(one[:, 0]) for one in errors["policy"]]
-    worst, window = _worst(dataset, compared, totals, own_rows, logged_rows)
+    whole, parts = found.all_parts(draws)
+    totals = [found.total(one[:, 0]) for one in found.errors["policy"]]
+    worst, window = _worst(dataset, compared, totals, found.own, found.logged)
     pauses = [np.diff(dataset.episodes[number].log_time_ns) for number in compared]
     period_ms = float(np.median(np.concatenate(pauses))) / 1e6
     calls = _latencies(dataset, compared, actor)
@@ -300,20 +240,114 @@ def compare(dataset: Dataset, actor: Actor, seed: int = 0) -> ActionError:
     return ActionError(
         actor.name,
         len(compared),
-        why,
+        actor.why + drawn,
         sum(int(np.isfinite(one).sum()) for one in totals),
         horizon,
         whole,
         parts,
-        None if is_box else _log_loss(dataset, compared, actor),
-        None if is_box else float((flags[np.isfinite(flags)] == 0).mean()),
+        None if found.is_box else _log_loss(dataset, compared, actor),
+        None if found.is_box else float((flags[np.isfinite(flags)] == 0).mean()),
         worst,
         None if calls is None else tuple(np.quantile(calls, (0.5, 0.99)).tolist()),
         None if calls is None or period_ms <= 0 else float((calls > period_ms).mean()),
         period_ms,
-        beside,
+        found.beside(whole, draws),
         window,
     )
+
+
+def _predicted(
+    dataset: Dataset, actor: Actor, compared: Sequence[int]
+) -> tuple[list[NDArray[Any]], int]:
+    """Return the chunks (T, H, *shape) of each episode, and H."""
+    space, shape = dataset.action_space, tuple(dataset.action_space.shape or ())
+    chunks = []
+    for episode in (dataset.episodes[number] for number in compared):
+        chunks.append(as_chunks(actor.actions(episode), len(episode), shape, actor.name))
+        if not isinstance(space, spaces.Box):
+            _check_whole(chunks[-1], actor.name)
+    horizons = {found.shape[1] for found in chunks}
+    if len(horizons) > 1:
+        raise PolicyError(f"{actor.name} has chunks of different lengths")
+    return chunks, horizons.pop()
+
+
+class _Errors:
+    """Errors (T, H, parts) of a policy and of the baselines by episode; NaN beyond its end."""
+
+    def __init__(
+        self, dataset: Dataset, compared: Sequence[int], chunks: list[NDArray[Any]], horizon: int
+    ) -> None:
+        """Compute the errors of the policy."""
+        space, everything = dataset.action_space, _rows(dataset.actions)
+        self.is_box, self._horizon = isinstance(space, spaces.Box), horizon
+        scale = everything.std(0) if self.is_box else np.ones(everything.shape[1])
+        self._scale = np.where(scale > 0, scale, 1.0)
+        self.own = [_first(chunk) for chunk in chunks]
+        self.logged = [_rows(dataset.episodes[number].actions) for number in compared]
+        self._truth = [_ahead(rows, horizon) for rows in self.logged]
+        self._known = [
+            chunk.reshape(len(chunk), horizon, -1).astype(np.float64) for chunk in chunks
+        ]
+        self.errors: dict[str, list[Floats]] = {}
+        self.add("policy", self._known)
+        self._names = part_names(space, dataset.action_part_names)
+        units = dataset.action_units
+        self._units = units if len(units) == len(self._names) else ("",) * len(self._names)
+
+    def add(self, name: str, guesses: Sequence[Floats]) -> None:
+        """Compute the errors of actions (T, H, parts) at the steps that the policy has."""
+        self.errors[name] = []
+        for guess, truth, own in zip(guesses, self._truth, self._known, strict=True):
+            difference = np.where(np.isnan(own), np.nan, np.abs(guess - truth))
+            self.errors[name].append(difference if self.is_box else _differs(difference))
+
+    def total(self, values: Floats) -> Floats:
+        """Return the mean (T,) of the parts (T, n), in standard deviations of the log."""
+        found: Floats = (values / self._scale).mean(1)
+        return found
+
+    def all_parts(self, draws: NDArray[np.int64]) -> tuple[Error, tuple[Error, ...]]:
+        """Return the error of all parts, and of each part."""
+        whole = self._error("all parts", "sd" if self.is_box else "", self.total, draws)
+        return whole, tuple(
+            self._error(name, unit, lambda values, k=k: values[:, k], draws)  # type: ignore[misc]
+            for k, (name, unit) in enumerate(zip(self._names, self._units, strict=True))
+        )
+
+    def beside(self, whole: Error, draws: NDArray[np.int64]) -> str:
+        """Compare the total error with that of the best baseline; see `ActionError`."""
+        best = min(whole.baselines, key=lambda name: whole.baselines[name])
+        pairs = zip(self.errors["policy"], self.errors[best], strict=True)
+        _, interval = _mean(
+            [self.total(own[:, 0]) - self.total(other[:, 0]) for own, other in pairs], draws
+        )
+        if interval is None:
+            return ""
+        return "below" if interval[1] < 0 else "above" if interval[0] > 0 else "as large as"
+
+    def _error(
+        self,
+        name: str,
+        unit: str,
+        reduce: Callable[[Floats], Floats],
+        draws: NDArray[np.int64],
+    ) -> Error:
+        def mean(which: str, step: int) -> tuple[float, tuple[float, float] | None]:
+            return _mean([reduce(one[:, step]) for one in self.errors[which]], draws)
+
+        steps = [mean("policy", step) for step in range(self._horizon)]
+        others = {
+            which: mean(which, 0)[0]
+            for which in BASELINES
+            if any(np.isfinite(one[:, 0]).any() for one in self.errors[which])
+        }
+        own, log = (
+            _mean([reduce(_change(one, is_box=self.is_box)) for one in rows], draws)[0]
+            for rows in (self.own, self.logged)
+        )
+        means, intervals = [one[0] for one in steps], [one[1] for one in steps]
+        return Error(name, unit, means[0], intervals[0], others, own, log, means, intervals)
 
 
 def _few(dataset: Dataset, wanted: Sequence[int], rng: np.random.Generator) -> list[int]:

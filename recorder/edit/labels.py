@@ -177,11 +177,16 @@ def change_labels(log: Path, changes: Sequence[Mapping[str, Any]]) -> Labels:
     return labels
 
 
-def carry_labels(source: Path, chosen: NDArray[np.int64], target: Path) -> None:
+def labels_to_carry(source: Path) -> Labels | None:
+    """Return the labels of a log of which others will be made; None if it has no file of labels."""
+    return read_labels(source) if labels_path(source).exists() else None
+
+
+def carry_labels(labels: Labels | None, chosen: NDArray[np.int64], target: Path) -> None:
     """Write the labels of the chosen episodes beside a log that was made of them."""
-    if labels_path(source).exists():
-        labels = read_labels(source).taken(LogReader(target).checksum, chosen)
-        write_json(labels_path(target), labels.to_json(), LogError)
+    if labels is not None:
+        taken = labels.taken(LogReader(target).checksum, chosen)
+        write_json(labels_path(target), taken.to_json(), LogError)
 
 
 def labels_of(dataset: Dataset) -> Labels | None:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import CorruptLogError, LogError, NoEpisodesError, NoStepsError, UsageError
 from mcaprl.files import replacing, replacing_folder
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
-from mcaprl.recorder.edit.labels import carry_labels, read_labels
+from mcaprl.recorder.edit.labels import Labels, carry_labels, labels_to_carry
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.messages import INTERRUPTED, EpisodeSummary, add_up
 from mcaprl.recorder.format.reading import McapReader
@@ -410,9 +410,10 @@ def filter_log(
     if condition.uses_next:
         raise UsageError(f"'{expression}': next(...) has no meaning for episodes")
     log = FinishedLog(path)
+    labels = labels_to_carry(log.path)
     table = episode_columns(log.summaries(), condition.names)
     if condition.names & {"success", "note"}:
-        table |= read_labels(log.path).columns(len(log.lengths))
+        table |= (labels or Labels("")).columns(len(log.lengths))
     holds = condition.evaluate(table, np.arange(len(log.lengths)))
     if not condition.is_condition(table):
         raise UsageError(f"'{expression}' is not a condition: compare it, as in 'length > 10'")
@@ -424,7 +425,7 @@ def filter_log(
         )
     with replacing(Path(out), LogError, overwrite=overwrite) as unfinished:
         found = _copy_episodes(log, chosen, unfinished, Path(out))
-    carry_labels(log.path, chosen, Path(out))
+    carry_labels(labels, chosen, Path(out))
     return found
 
 
@@ -440,6 +441,7 @@ def split_log(
     """Copy the episodes of a log to several logs in a folder; see `mcaprl.split`."""
     log, out = FinishedLog(path), Path(out)
     log.need_steps()
+    labels = labels_to_carry(log.path)
     parts = _parts(len(log.lengths), episodes, ratio)
     order = np.arange(len(log.lengths))
     if seed is not None:
@@ -450,7 +452,7 @@ def split_log(
             name = f"{Path(str(log.path)).stem}-{number:05d}.mcap"
             chosen = np.sort(order[start:stop])
             found.append(_copy_episodes(log, chosen, folder / name, out / name))
-            carry_labels(log.path, chosen, folder / name)
+            carry_labels(labels, chosen, folder / name)
     return found
 
 

@@ -157,6 +157,17 @@ def test_filter_and_split_use_and_carry_labels(log: Path, tmp_path: Path) -> Non
     assert mcaprl.label(second).success == {"0": True}
 
 
+def test_labels_of_other_data_stop_a_copy_before_it_begins(log: Path, tmp_path: Path) -> None:
+    mcaprl.label(log, episode=0, success=True)
+    _recorded(tmp_path / "other.mcap", 2).replace(log)
+    with pytest.raises(LogError, match="labels of other data"):
+        mcaprl.filter("length > 0", log, tmp_path / "new.mcap")
+    with pytest.raises(LogError, match="labels of other data"):
+        mcaprl.split(log, tmp_path / "parts", episodes=1)
+    assert not (tmp_path / "new.mcap").exists()
+    assert not (tmp_path / "parts").exists()
+
+
 def test_rewards_from_labels(log: Path, tmp_path: Path) -> None:
     for episode in range(3):
         mcaprl.label(log, episode=episode, success=episode == 1)
