@@ -135,7 +135,7 @@ class LogInfo:
             *([("action parts", ", ".join(self.action_parts))] if self.action_parts else []),
             ("action counts", _counts(self.action_counts) or "-"),
             (self.behavior_field, self._behavior()),
-            ("policies", ", ".join(self.policies) or "unknown"),
+            ("policies", "; ".join(self.policies) or "unknown"),
             ("ends", _counts(self.ends)),
         ]
 

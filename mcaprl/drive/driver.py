@@ -107,7 +107,7 @@ class Driver(DriverCore):
             overwrite: Whether an existing file is replaced.
 
         Raises:
-            UsageError: The command that stops the robot is no action of the mapping.
+            UsageError: The command that stops the robot is not an action of the mapping.
             OutputExistsError: The file exists.
         """
         self.close()

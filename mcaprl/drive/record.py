@@ -64,7 +64,7 @@ class DriveLog:
         """Create the file; `is_late` is that of the episodes.
 
         Raises:
-            UsageError: The command that stops the robot is no action of the mapping.
+            UsageError: The command that stops the robot is not an action of the mapping.
         """
         assert policy.observation_space is not None, "trained policies have spaces"
         assert policy.action_space is not None, "trained policies have spaces"

@@ -535,7 +535,7 @@ class Dataset(Conversions):
                 by names or numbers, in the same units. The others, such as grippers, are absolute.
 
         Raises:
-            SpaceError: The actions are no Box, or there is no such element.
+            SpaceError: The action space is not a Box, or there is no such element.
         """
         if not isinstance(self.action_space, spaces.Box):
             raise SpaceError(f"relative actions need a Box, not {self.action_space}")

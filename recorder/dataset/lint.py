@@ -251,7 +251,7 @@ def _mixed_policies(dataset: Dataset) -> Iterator[Problem]:
     if len(policies) > 1:
         yield _note(
             f"{len(policies)} behavior policies",
-            ", ".join(f"{count} by {name}" for name, count in policies.most_common(_SHOWN)),
+            "; ".join(f"{count} by {name}" for name, count in policies.most_common(_SHOWN)),
             "behavior cloning learns a mixture of these policies",
         )
 

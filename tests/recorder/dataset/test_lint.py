@@ -224,4 +224,4 @@ def test_several_policies_are_reported(tmp_path: Path) -> None:
             ended = recorder.step(int(policy == "one"))[2]
     recorder.close()
     found = [str(finding) for finding in lint(mcaprl.open(tmp_path / "mixed.mcap"))]
-    assert any("2 behavior policies (1 by one, 1 by other)" in text for text in found)
+    assert any("2 behavior policies (1 by one; 1 by other)" in text for text in found)
