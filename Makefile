@@ -129,9 +129,11 @@ $(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
 	  | sed -n 's/^Collecting \([[:alnum:]_.-]*\).*/  \1/p; s/^Installing collected.*/  .../p'
 	@test -f $@
 
+# rliable's bootstrap, which the tests do not use, requires a version of arch that breaks with pandas 3.
 $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
 	@echo "installing into $(VENV): the package with its extras and the tools of the tests, about 3.3 GB, some minutes"
 	$(PIP) -e '.[$(EXTRAS)]' --group dev
+	$(PIP) --no-deps rliable
 	@touch $@
 
 $(VENV)/.core: $(SETTINGS) | $(VENV)/bin/python

@@ -68,15 +68,17 @@ def log_path(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def python_sigint() -> Iterator[None]:
-    """Install Python's SIGINT handler.
+def python_signals() -> Iterator[None]:
+    """Handle SIGINT and SIGTERM as Python does by default.
 
     A process that a shell starts in the background ignores SIGINT, and libraries that other tests
-    use replace the handler.
+    use replace the handlers.
     """
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    defaults = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in defaults.items()}
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.hookimpl(optionalhook=True)

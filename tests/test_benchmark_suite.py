@@ -53,16 +53,12 @@ def test_improvement_is_the_mean_over_tasks_and_a_tie_is_half_a_win() -> None:
 
 def test_the_statistics_are_those_of_rliable() -> None:
     metrics = pytest.importorskip("rliable.metrics")
-    library = pytest.importorskip("rliable.library")
     random = np.random.default_rng(0)
     first, second = random.normal(size=(5, 3)), random.normal(0.4, size=(4, 3)).round(1)
     second[0, 0] = first[1, 0]
     assert interquartile_mean(first) == pytest.approx(metrics.aggregate_iqm(first))
     theirs = metrics.probability_of_improvement(first, second)
     assert statistics.improvement(first, second) == pytest.approx(theirs)
-    thresholds = np.linspace(-1, 1, 9)
-    wanted = [library.run_score_deviation(first, each) for each in thresholds]
-    assert statistics.profile(first, thresholds) == pytest.approx(wanted)
 
 
 def test_behaviors_are_small_and_load() -> None:

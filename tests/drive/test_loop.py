@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -226,16 +227,34 @@ def test_an_image_of_another_size_stops_the_robot(bag: Path) -> None:
     assert turns[:2] == [TURN, STOP]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_stops_the_robot(bag: Path, number: int) -> None:
+def interrupted(bag: Path, number: int, error: type[BaseException]) -> None:
+    """Drive until a signal comes, which raises an error, and check that the robot is stopped."""
+
     def script(robot: MemoryTransport) -> None:
         robot.send(0, *ALL)
         time.sleep(0.05)
         os.kill(os.getpid(), number)
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(error):
         drive(bag, script, duration_s=5)
     assert drive.turns == [TURN] + [STOP] * 5  # type: ignore[attr-defined]
+
+
+@pytest.mark.usefixtures("python_signals")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_stops_the_robot(bag: Path, number: int) -> None:
+    interrupted(bag, number, KeyboardInterrupt)
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@pytest.mark.usefixtures("python_signals")
+def test_a_signal_that_the_program_handles_stops_the_robot(bag: Path) -> None:
+    def leave(number: int, _: object) -> None:
+        sys.exit(number)
+
+    signal.signal(signal.SIGTERM, leave)
+    interrupted(bag, signal.SIGTERM, SystemExit)
+    assert signal.getsignal(signal.SIGTERM) is leave
 
 
 def test_messages_that_come_too_fast_are_dropped(bag: Path) -> None:

@@ -17,7 +17,7 @@ from mcaprl.recorder.columns.records import message_rows
 from mcaprl.recorder.columns.writer import McapWriter
 from mcaprl.sims import make_sim
 
-pytestmark = pytest.mark.usefixtures("python_sigint")
+pytestmark = pytest.mark.usefixtures("python_signals")
 START_NS = 10**18
 
 

@@ -492,7 +492,7 @@ def test_the_working_folder_may_change_while_recording(
     assert len(mcaprl.open(log_path).episodes) == 1
 
 
-@pytest.mark.usefixtures("python_sigint")
+@pytest.mark.usefixtures("python_signals")
 def test_interrupts_at_any_moment_leave_whole_episodes(log_path: Path) -> None:
     """Interrupt a hundred recordings, each at a different time."""
     main = threading.get_ident()
@@ -593,7 +593,7 @@ def test_killed_recorder_loses_only_the_open_episode(log_path: Path) -> None:
     assert math.isclose(data.episodes[0].total_reward, data.episodes[0].length)
 
 
-@pytest.mark.usefixtures("python_sigint")
+@pytest.mark.usefixtures("python_signals")
 def test_an_interruption_while_a_log_is_created_leaves_a_log_without_episodes(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -610,7 +610,7 @@ def test_an_interruption_while_a_log_is_created_leaves_a_log_without_episodes(
         mcaprl.open(log_path)
 
 
-@pytest.mark.usefixtures("python_sigint")
+@pytest.mark.usefixtures("python_signals")
 def test_a_deferred_signal_keeps_no_references() -> None:
     """A pending signal keeps no references to buffers.
 

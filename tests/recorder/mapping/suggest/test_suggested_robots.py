@@ -141,6 +141,11 @@ def modes(values: list[int]) -> Callable[[float], dict[str, Any]]:
     return lambda t: {"data": values[int(t) % len(values)]}
 
 
+IMPOSSIBLE = frozenset(
+    {"only one message each", "camera and lidar without command", "command after everything"}
+)
+"""Robots whose bags have no steps."""
+
 ROBOTS: dict[str, Callable[[], Robot]] = {
     "diff drive": base,
     "diff drive with scan": lambda: base().add("/scan", "sensor_msgs/msg/LaserScan", 8, scan),
@@ -319,13 +324,12 @@ def test_each_suggestion_finds_an_episode_or_says_why_not(
 ) -> None:
     bag = FORMATS[form](ROBOTS[name](), tmp_path / "robot.mcap")
     _, found = holds(bag, tmp_path)
-    impossible = {"only one message each", "camera and lidar without command"}
-    impossible |= {"command after everything"}
+    impossible = IMPOSSIBLE
     with mcaprl.open_bag(bag) as opened:
         fields = [each for info in opened.topics.values() for each in info.fields]
     if not any(each.startswith("points[].") for each in fields):
         # The trajectories are arrays of messages, whose fields the bag does not list.
-        impossible |= {"arm"}
+        impossible = impossible | {"arm"}
     assert (found is None) == (name in impossible)
 
 
