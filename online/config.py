@@ -215,11 +215,17 @@ class ActorCriticConfig(ReplayConfig):
     """fraction of each batch that is drawn from given logs; 0 copies them to the replay buffer"""
     smoothness: float = 0.0
     """weight of the mean change of the actions in [-1, 1] from a state to the next one"""
+    actor_starts: int = 1_000
+    """updates of the critics before the first one of the actor of a policy that is continued"""
+    actor_rate: float = 0.1
+    """learning rate of the actor of a policy that is continued, as a multiple of the critics'"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
         super().__post_init__()
         self._require("polyak", 0 < self.polyak <= 1, "within (0, 1]")
+        self._require("actor_starts", self.actor_starts >= 0, "at least 0")
+        self._require("actor_rate", 0 < self.actor_rate < math.inf, "above 0 and finite")
         self._require_fraction("data_fraction")
         self._require("smoothness", 0 <= self.smoothness < math.inf, "at least 0 and finite")
 

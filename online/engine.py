@@ -16,6 +16,7 @@ from gymnasium import spaces
 from torch import Tensor
 
 from mcaprl.offline.algorithms import config as learners
+from mcaprl.offline.algorithms.actor_critic import ActorCritic
 from mcaprl.offline.algorithms.cql import CQL
 from mcaprl.offline.algorithms.dqn import DoubleDQN
 from mcaprl.offline.algorithms.learner import Learner
@@ -114,6 +115,13 @@ class Agents:
         """Let the agents act in these environments; call `collector.begin` before `step`."""
         self.collector = Collector(environments, self.buffer, self.behavior)
 
+    def continue_policy(self) -> None:
+        """Explore and learn as agents do that start with the networks of a policy."""
+        self.is_pretrained = True
+        if isinstance(self.learner, ActorCritic):
+            assert isinstance(self.config, ActorCriticConfig)
+            self.learner.continue_actor(self.config.actor_starts, self.config.actor_rate)
+
     @property
     def epsilon(self) -> float:
         """Probability of a random action in the next step."""
@@ -180,12 +188,13 @@ class Agents:
             RuntimeError, IndexError: A tensor has another shape.
         """
         (seed,) = self.learner.seeds
+        if counters["is_pretrained"]:
+            self.continue_policy()
         self.learner.load_state(seed, below(tensors, "learner"), int(counters["updates"]))
         self.buffer.load_state(below(tensors, "buffer"))
         self.generator.set_state(torch.tensor(counters["generator"], dtype=torch.uint8))
         self.steps, self._episodes = int(counters["steps"]), int(counters["episodes"])
         self.learning_starts = int(counters["learning_starts"])
-        self.is_pretrained = bool(counters["is_pretrained"])
         self.terms = {name: torch.tensor([term]) for name, term in counters["terms"].items()}
 
     def means(self) -> dict[str, float]:

@@ -154,7 +154,7 @@ class LearningAgent(Agent):
             self.agents.learning_starts = 0
         if policy is not None:
             self.agents.learning_starts = self.agents.config.learning_starts
-            self.agents.is_pretrained = True
+            self.agents.continue_policy()
 
     def _take_values(self, policy: Policy) -> None:
         """Copy the Q-network of a policy."""

@@ -37,7 +37,21 @@ class ActorCritic(Learner):
     continuous = True
     critics = ("q",)
     shares_encoder: ClassVar[bool] = False
+    actor_starts = 0
     config: ActorCriticConfig
+
+    def continue_actor(self, starts: int, rate: float) -> None:
+        """Train critics alone at first, and then the actor more slowly, of a given policy.
+
+        Critics of other data overestimate actions near those of the policy, which an actor that
+        learns with them would take at once.
+
+        Args:
+            starts: Number of updates before the first one of the actor.
+            rate: Learning rate of the actor, as a multiple of the critics'.
+        """
+        self.actor_starts = starts
+        self.set_rate_factor("actor", rate)
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shapes of the actor's outputs, and of one value per critic."""

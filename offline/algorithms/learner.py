@@ -312,6 +312,15 @@ class Learner(ABC):
         self.scalars[name] = scalar
         return scalar
 
+    def set_rate_factor(self, name: str, factor: float) -> None:
+        """Set the learning rate of a model, as a multiple of that of the others; once a model."""
+        weights = self.models[name].weights
+        shared = self.optimizer.param_groups[0]
+        shared["params"] = [each for each in shared["params"] if each is not weights]
+        self.optimizer.add_param_group(
+            {**shared, "params": [weights], "lr": self._new_rate(), "rate_factor": factor}
+        )
+
     def scalar_rows(self, name: str, batch: Batch, size: int | None = None) -> Tensor:
         """Return a learned number of `add_scalar` for each row of a batch, (R,) or (R, size)."""
         rows = len(batch.actions) // len(self.seeds)

@@ -65,13 +65,16 @@ class SAC(ActorCritic):
         policy_loss = alpha * log_pi - q.amin(0)
         smoothness_loss = self.smoothness_loss(batch, self.config.smoothness)
         entropy_loss = temperature_loss(log_alpha, log_pi.detach(), self._target_entropy)
+        loss = td_loss
+        if self.step >= self.actor_starts:
+            loss = td_loss + policy_loss + smoothness_loss + entropy_loss
         return {
             "mean_q": self.in_reward_units(q_tm1.detach().mean(0)),
             "td_loss": td_loss,
             "policy_loss": policy_loss,
             "entropy": -log_pi,
             "temperature": alpha,
-            "loss": td_loss + policy_loss + smoothness_loss + entropy_loss,
+            "loss": loss,
         }
 
     @torch.no_grad()

@@ -52,7 +52,7 @@ class TD3(ActorCritic):
         q_tm1 = self.models["q"](batch.observations.with_actions(batch.actions))
         td_loss = twin_regression(q_tm1, target_tm1)
         terms = {"mean_q": self.in_reward_units(q_tm1.detach().mean(0)), "td_loss": td_loss}
-        is_due = self.is_due(self.config.policy_interval)
+        is_due = self.step >= self.actor_starts and self.is_due(self.config.policy_interval)
         if not is_due and not self.is_reported:
             return {**terms, "loss": td_loss}
         with torch.set_grad_enabled(is_due):

@@ -22,7 +22,7 @@ from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.collector import NoisyActions, SquashedSamples
 from mcaprl.online.config import SACConfig, TD3Config
 from mcaprl.online.engine import Agents
-from mcaprl.online.learning import LearningAgent
+from mcaprl.online.learning import LearningAgent, fill_buffer
 from mcaprl.online.replay import MixedBuffer, packed_log
 from mcaprl.online.task import Task, check_spaces, choose_engine, choose_task
 from mcaprl.online.train import train
@@ -260,6 +260,35 @@ def test_an_agent_continues_an_offline_policy(tmp_path: Path, offline: str, algo
         assert agent.agents.epsilon == 0
     finally:
         agent.close()
+
+
+@pytest.mark.parametrize("algo", ["sac", "td3"])
+def test_the_actor_of_a_continued_policy_learns_later_and_more_slowly(
+    tmp_path: Path, algo: str
+) -> None:
+    changes = {}
+    for rate in (0.01, 1.0):
+        settings = {**SHORT, "actor_starts": 3, "actor_rate": rate}
+        agent = LearningAgent(
+            Task.for_sim(PENDULUM, algo, **settings), PENDULUM, tmp_path, 0, Scale(0, 1)
+        )
+        try:
+            agents = agent.agents
+            fill_buffer(agents, logged())
+            agents.continue_policy()
+            models = agents.learner.models
+            start = {name: model.weights.detach().clone() for name, model in models.items()}
+            for _ in range(3):
+                agents.learner.update()
+            assert torch.equal(models["actor"].weights, start["actor"])
+            assert not torch.equal(models["q"].weights, start["q"])
+            for _ in range(2):
+                agents.learner.update()
+            changes[rate] = (models["actor"].weights - start["actor"]).abs().max().item()
+        finally:
+            agent.close()
+    # The first steps of Adam are as long as the learning rate.
+    assert 0 < changes[0.01] < 0.03 * changes[1.0]
 
 
 def test_a_missing_package_is_named_before_the_training(
