@@ -195,7 +195,7 @@ def _split_of(path: Path, dataset: Dataset) -> dict[str, Any]:
         case {"data": str(data), "config": {"held_out": float(share) | int(share)}}:
             if data != dataset.fingerprint:
                 return {"why": "all episodes; the run was trained on other data"}
-            held_out = choose_held_out(len(dataset.episodes), share).tolist()
+            held_out = choose_held_out(dataset.wholes, share).tolist()
             if held_out:
                 rest = sorted({*range(len(dataset.episodes))} - {*held_out})
                 return {"compared": held_out, "trained_on": rest, "why": "held out of the training"}

@@ -221,7 +221,7 @@ def _prepared(
     """Pack the data of a run; with other data and `reuses`, in the scales of its policies."""
     config = algorithm.config
     source, dataset = dataset, with_source(dataset, config.mask_from)
-    held_out = choose_held_out(len(dataset.weights), config.held_out)
+    held_out = choose_held_out(dataset.wholes, config.held_out)
     scales = earlier_scales(folder) if reuses and identity.other_data else Scales()
     buffer = _packed(dataset, config, scales, held_out).to(choose_device(device))
     gamma = buffer.packing.gamma

@@ -61,18 +61,26 @@ class HeldOut:
         return [{**mine, **known} for mine in means]
 
 
-def choose_held_out(n_episodes: int, fraction: float) -> NDArray[np.int64]:
+def choose_held_out(wholes: NDArray[np.int64], fraction: float) -> NDArray[np.int64]:
     """Choose about `fraction` of the episodes, but never all of them.
 
     If `fraction` is above 0 and there are ten or more episodes, at least one is chosen.
 
-    The choice depends only on the number of episodes, so it is the same for all seeds.
+    The choice depends only on the number of episodes, so it is the same for all seeds. Of an
+    episode that was divided, all parts are chosen or none.
+
+    Args:
+        wholes: (E,) numbers of the episodes; see `Dataset`.
+        fraction: Fraction to choose.
     """
+    found, number = np.unique(wholes, return_inverse=True)
+    n_episodes = len(found)
     count = round(fraction * n_episodes)
     if fraction > 0 and n_episodes >= 10:
         count = max(count, 1)
     count = max(0, min(count, n_episodes - 1))
-    return np.sort(np.random.default_rng(0).permutation(n_episodes)[:count])
+    chosen = np.random.default_rng(0).permutation(n_episodes)[:count]
+    return np.flatnonzero(np.isin(number, chosen))
 
 
 def monte_carlo_returns(

@@ -45,6 +45,7 @@ class Dataset(Conversions):
         weights: (E,) weight of each episode in training: a transition of weight 2 is drawn twice as
             often as one of weight 1. Statistics and estimates do not use the weights, and `save`
             does not write them.
+        wholes: (E,) number of each episode, which parts of one episode share; see `without`.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class Dataset(Conversions):
         *,
         origin: Origin = Origin(),  # noqa: B008  (frozen)
         weights: NDArray[np.float64] | None = None,
+        wholes: NDArray[np.int64] | None = None,
     ) -> None:
         """Create a dataset; use `mcaprl.open` or `Dataset.from_arrays` instead."""
         self._transitions = transitions
@@ -61,6 +63,7 @@ class Dataset(Conversions):
         self._leaves = description.leaves
         self.origin = origin
         self.weights = np.ones(len(transitions.episodes)) if weights is None else weights
+        self.wholes = np.arange(len(transitions.episodes)) if wholes is None else wholes
 
     @classmethod
     def from_arrays(
@@ -134,7 +137,10 @@ class Dataset(Conversions):
         """
         if not parts:
             raise LogError("no data: the list of datasets or files is empty")
-        first = parts[0]
+        first, numbers = (
+            parts[0],
+            np.cumsum([0, *(part.wholes.max(initial=-1) + 1 for part in parts)]),
+        )
         for other in parts[1:]:
             for role in ("observation_space", "action_space"):
                 if getattr(first, role) != getattr(other, role):
@@ -149,6 +155,7 @@ class Dataset(Conversions):
             LogMetadata.common([part._description for part in parts]),
             origin=Origin.common([part.origin for part in parts]),
             weights=np.concatenate([part.weights for part in parts]),
+            wholes=np.concatenate([p.wholes + k for p, k in zip(parts, numbers[:-1], strict=True)]),
         )
 
     @property
@@ -413,7 +420,8 @@ class Dataset(Conversions):
 
         An episode is divided at these steps, and the parts are episodes: no return of n steps,
         stack of frames or sequence crosses the gap. A part that ends at a gap is truncated with the
-        reason `interrupted`, and a part that begins after a gap has no seed.
+        reason `interrupted`, and a part that begins after a gap has no seed. Parts of one episode
+        share a number in `wholes`, so that training holds out all of them or none.
 
         Args:
             steps: (N,) bool; whether the transition is left out.
@@ -428,7 +436,7 @@ class Dataset(Conversions):
         if dropped.all():
             raise UsageError("no transition is left")
         columns, old = self._transitions.without(dropped)
-        return self._changed(columns, weights=self.weights[old])
+        return self._changed(columns, kept=old)
 
     def with_behavior_probs(self, probs: NDArray[Any], *, estimated: bool = False) -> Dataset:
         """Return the same transitions with other behavior probabilities.
@@ -672,19 +680,21 @@ class Dataset(Conversions):
         )
 
     def _take(self, chosen: Sequence[int]) -> Dataset:
-        return self._changed(self._transitions.take(chosen), weights=self.weights[list(chosen)])
+        return self._changed(self._transitions.take(chosen), kept=np.array(chosen, np.int64))
 
     def _changed(
         self,
         transitions: Transitions,
         description: LogMetadata | None = None,
         weights: NDArray[np.float64] | None = None,
+        kept: NDArray[np.int64] | slice = slice(None),
     ) -> Dataset:
         return Dataset(
             transitions,
             description or self._description,
             origin=self.origin.changed(),
-            weights=self.weights if weights is None else weights,
+            weights=self.weights[kept] if weights is None else weights,
+            wholes=self.wholes[kept],
         )
 
     def _frames(self, rows: Any) -> Any:

@@ -18,7 +18,7 @@ from tests.support.offline_tasks import corridor, crossing
 
 def test_held_out_episodes_are_evaluated_but_not_trained_on(tmp_path: Path) -> None:
     # Rewards are 1 in the 12 held-out episodes, and 0 in the other 12 episodes.
-    held_out = choose_held_out(24, 0.5)
+    held_out = choose_held_out(np.arange(24), 0.5)
     data = crossing((10,) * 24)
     paid = np.isin(np.arange(24), held_out).repeat(10)
     columns = {
@@ -58,7 +58,7 @@ def test_returns_of_short_truncated_episodes_are_unknown() -> None:
 
 @pytest.mark.parametrize(("episodes", "count"), [(1, 0), (9, 0), (10, 1), (200, 10)])
 def test_about_a_twentieth_of_the_episodes_is_held_out(episodes: int, count: int) -> None:
-    assert len(choose_held_out(episodes, 0.05)) == count
+    assert len(choose_held_out(np.arange(episodes), 0.05)) == count
 
 
 def test_too_few_target_syncs_for_the_horizon_are_reported(tmp_path: Path) -> None:

@@ -16,6 +16,8 @@ import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.offline.batches.items import n_step_returns
+from mcaprl.offline.training.watch import choose_held_out
+from mcaprl.recorder.edit.labels import without_intervals
 
 
 class Count(gym.Env[Any, Any]):
@@ -204,3 +206,20 @@ def test_training_leaves_out_the_intervals(log: Path, tmp_path: Path) -> None:
     assert weights[0].read_bytes() == weights[1].read_bytes()
     with pytest.raises(UnknownNameError, match="intervention"):
         mcaprl.train(log, tmp_path / "c", mask="interventions", **settings)
+
+
+def test_parts_of_an_episode_are_held_out_together(tmp_path: Path) -> None:
+    log = _recorded(tmp_path / "many.mcap", 12)
+    for episode in range(12):
+        mcaprl.label(log, episode=episode, interval="cut", steps=(2, 3))
+    data = mcaprl.open(log)
+    parts = without_intervals(data, ["cut"])
+    assert parts.wholes.tolist() == np.repeat(np.arange(12), 2).tolist()
+    assert parts.filter(lambda one: one.index > 2).wholes.tolist()[:3] == [1, 2, 2]
+    joined = mcaprl.Dataset.concatenate([parts, parts])
+    assert joined.wholes.tolist() == np.repeat(np.arange(24), 2).tolist()
+    # The same episodes are held out as without the cuts.
+    chosen = choose_held_out(data.wholes, 0.25)
+    assert len(chosen) == 3
+    expected = np.stack([2 * chosen, 2 * chosen + 1], 1).ravel()
+    assert choose_held_out(parts.wholes, 0.25).tolist() == expected.tolist()
