@@ -157,7 +157,7 @@ def layout(source: str, out: Path, **request: Any) -> None:
 
 @click.command(cls=Command)
 @click.argument("file", metavar="LOG", type=PATH)
-@click.option("--policy", multiple=True, help="Path of a trained run; may be repeated.")
+@click.option("--policy", multiple=True, help="Policy as for evaluate --data; may be repeated.")
 @click.option("--gamma", type=click.FloatRange(0, 1), help="Discount. [default: that of the run]")
 @click.option("--scene", is_flag=True, help="Step the sim again and add its scene.")
 @click.option("--camera", is_flag=True, help="With --scene: add metric depth images.")
@@ -168,10 +168,11 @@ def layout(source: str, out: Path, **request: Any) -> None:
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="File to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def annotate(file: str, out: Path, **request: Any) -> None:
-    """Copy LOG and add a policy's values or the scene of the sim to each step."""
+    """Copy LOG and add a policy's actions and values or the scene of the sim to each step."""
     bag = bag_options(request)
     with working("reading the log") as bar:
         data = file if bag["mapping"] is None else mcaprl.open(file, **bag)
+        request["trust_code"] = bag["trust_code"]
         found = mcaprl.annotate(data, out, progress=bar, **request)
     for name, topic in found.topics.items():
         echo(f"{out}: {topic} has the values of {name} for {counted(found.steps, 'step')}")

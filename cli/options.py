@@ -52,7 +52,7 @@ def mapping_options(command: F, *, has_strict: bool = True) -> F:
     code = click.option(
         "--trust-code",
         is_flag=True,
-        help="Trust the mapping: import the Python function that it names.",
+        help="Import the Python functions that the mapping or a policy's name names.",
     )
     definitions = click.option(
         "--definitions",

@@ -137,14 +137,15 @@ def is_estimable(policy: str, data: Dataset) -> bool:
     """Return whether `mcaprl.estimate` can evaluate a policy: its actions depend on the state."""
     if policy == "random":
         return True
-    if _is_foreign(policy):
+    if is_foreign(policy):
         return False
     loaded = trained_policies(policy, data) if is_policy(Path(policy)) else []
     # A missing path is reported by `estimate`.
     return not any(one.chunk.has_memory for one in loaded if hasattr(one, "chunk"))
 
 
-def _is_foreign(name: str) -> bool:
+def is_foreign(name: str) -> bool:
+    """Return whether a name is an ONNX file, a function, or a folder of predictions."""
     path = Path(name)
     if path.exists():
         return path.suffix == ".onnx" or (path.is_dir() and bool(_predictions_in(path)))
@@ -166,7 +167,7 @@ def actors_of(policies: Any, dataset: Dataset, *, trust_code: bool, seed: int = 
             space = copy.deepcopy(dataset.action_space)
             space.seed(seed)
             found.append(_of_policy(RandomPolicy(space), name))
-        elif not _is_foreign(name):
+        elif not is_foreign(name):
             loaded = trained_policies(name, dataset)
             split = _split_of(Path(name), dataset)
             for policy in loaded:

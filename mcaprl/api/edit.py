@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from mcaprl.api.action_errors import actors_of, is_foreign
 from mcaprl.api.environments import sim_of
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
 from mcaprl.api.ranges import check_fraction
@@ -249,6 +252,7 @@ def annotate(
     camera: bool = False,
     sim: str | None = None,
     trust_env: bool = False,
+    trust_code: bool = False,
     sim_options: Mapping[str, Any] | None = None,
     overwrite: bool = False,
     progress: ProgressBar = no_progress,
@@ -259,22 +263,26 @@ def annotate(
         data: Path of the log; or a dataset that `open` read from a bag by a mapping, which is first
             saved as a log.
         out: Path of the copy.
-        policy: Path of a trained run, or several paths.
+        policy: Path of a trained run, or any other policy of `mcaprl.action_errors`, or several. Of
+            an ONNX file, a function and predictions, the first action of each step is added; their
+            values are unknown.
         gamma: Discount of the TD errors; None for the discount of the run.
         scene: Whether to repeat the logged actions in the sim and add its scene.
         camera: Whether to add metric depth images to the scene.
         sim: Short name or Gymnasium id to use instead of the logged one.
         trust_env: Whether to import the module that the logged id names, and to pass the logged
             arguments to environments other than the sims of `SIMS`.
+        trust_code: Whether a policy `module:function` is imported.
         sim_options: With `scene`, arguments of the environment that replace the logged ones.
         overwrite: Whether an existing file is replaced.
         progress: Function that opens a progress bar.
 
     Raises:
-        UsageError: Nothing is requested, the log already has a requested topic, or `gamma` is out
-            of range.
+        UsageError: Nothing is requested, the log already has a requested topic, `gamma` is out of
+            range, or `module:function` is not trusted or cannot be imported.
         UnknownNameError: There is no such policy.
-        PolicyError: A policy was trained on other spaces than those of the log.
+        PolicyError: A policy was trained on other spaces than those of the log, fails, or returns
+            other shapes.
         LogError: The log cannot be read, or the sim does not reproduce it.
         OutputExistsError: `out` exists.
     """
@@ -291,14 +299,17 @@ def annotate(
             log = folder / "converted.mcap"
             data.save(log)
             options: Any = {"gamma": gamma, "overwrite": overwrite, "progress": progress}
-            return annotate(log, out, policy=policy, **options)
+            return annotate(log, out, policy=policy, trust_code=trust_code, **options)
     path = as_path(data, whole=True)
     dataset = open_data(path)
     found = values_topics(list(policy_names(names).values()))
     topics = dict(zip(dict.fromkeys(names), found.values(), strict=True))
     with annotated_copy(path, Path(out), overwrite=overwrite) as copy:
         for name, topic in topics.items():
-            copy.add_values(topic, _values(dataset, name, gamma, progress))
+            if is_foreign(name):
+                copy.add_values(topic, _actions(dataset, name, progress, trust_code=trust_code))
+            else:
+                copy.add_values(topic, _values(dataset, name, gamma, progress))
         if scene:
             trust: Any = {"trust_env": trust_env, "sim_options": sim_options}
             with closing(sim_of(dataset, path, sim, **trust)) as env:
@@ -317,6 +328,30 @@ def _values(
     found = []
     with progress(f"evaluating {name}", len(dataset.episodes)) as advance:
         for episode in dataset.episodes:
-            found.append((episode, value_columns(policy, episode, dataset.action_space, discount)))
+            columns = value_columns(policy, episode, dataset.action_space, discount)
+            found.append((episode.log_time_ns[:-1], columns))
             advance(1)
+    return found
+
+
+def _actions(
+    dataset: Dataset, name: str, progress: ProgressBar, *, trust_code: bool
+) -> list[tuple[Any, Any]]:
+    """Return the first action that any policy has at the steps of each episode."""
+    from mcaprl.offline.estimate.action_error import predicted
+    from mcaprl.offline.estimate.values import action_columns
+
+    (actor,) = actors_of(name, dataset, trust_code=trust_code)
+    numbers = range(len(dataset.episodes)) if actor.compared is None else actor.compared
+    found = []
+    with progress(f"evaluating {name}", len(numbers)) as advance:
+        for number in numbers:
+            episode = dataset.episodes[number]
+            actions = predicted(dataset, actor, [number])[0][0][:, 0]
+            known = np.isfinite(actions.reshape(len(actions), -1)).all(1)
+            advance(1)
+            if known.any():
+                taken, times_ns = episode.actions[known], episode.log_time_ns[:-1][known]
+                columns = action_columns(actions[known], taken, dataset.action_space)
+                found.append((times_ns, columns))
     return found

@@ -218,7 +218,7 @@ def compare(dataset: Dataset, actor: Actor, seed: int = 0) -> ActionError:
     wanted = range(len(dataset.episodes)) if actor.compared is None else actor.compared
     compared = _few(dataset, wanted, rng)
     drawn = f", of which {len(compared)} were drawn" if len(compared) < len(wanted) else ""
-    chunks, horizon = _predicted(dataset, actor, compared)
+    chunks, horizon = predicted(dataset, actor, compared)
     found = _Errors(dataset, compared, chunks, horizon)
     reference = range(len(dataset.episodes)) if actor.trained_on is None else actor.trained_on
     for name, guess in _baselines(
@@ -256,10 +256,14 @@ def compare(dataset: Dataset, actor: Actor, seed: int = 0) -> ActionError:
     )
 
 
-def _predicted(
+def predicted(
     dataset: Dataset, actor: Actor, compared: Sequence[int]
 ) -> tuple[list[NDArray[Any]], int]:
-    """Return the chunks (T, H, *shape) of each episode, and H."""
+    """Return the chunks (T, H, *shape) of each episode, and H.
+
+    Raises:
+        PolicyError: The policy fails, or returns actions of another shape.
+    """
     space, shape = dataset.action_space, tuple(dataset.action_space.shape or ())
     chunks = []
     for episode in (dataset.episodes[number] for number in compared):

@@ -67,6 +67,37 @@ def value_columns(
     }
 
 
+def action_columns(
+    actions: NDArray[Any], taken: NDArray[Any], action_space: spaces.Space[Any]
+) -> Columns:
+    """Return the fields (T, ...) of `recorder.format.schema.values_schema` of actions alone.
+
+    Args:
+        actions: (T, *shape) actions of a policy whose values and probabilities are unknown.
+        taken: (T, *shape) logged actions.
+        action_space: Action space.
+
+    Raises:
+        PolicyError: An action is not in a finite action space.
+    """
+    unknown = np.full(len(taken), np.nan, np.float32)
+    joint = joint_actions(action_space)
+    if joint is None:
+        names = ("q", "value", "advantage", "td_error", "log_prob")
+        return command_columns(actions, taken, action_space) | dict.fromkeys(names, unknown)
+    if not joint.contain(actions).all():
+        raise PolicyError(f"an action is not in {action_space}")
+    own, logged = joint.indexes(actions.astype(np.int64)), joint.indexes(taken)
+    return {
+        **dict.fromkeys(("value", "advantage", "td_error"), unknown),
+        "q": np.full((len(own), joint.count), np.nan, np.float32),
+        "preference": np.eye(joint.count, dtype=np.float32)[own],
+        "entropy": np.zeros(len(own), np.float32),
+        "policy_action": own + joint.first,
+        "agrees": own == logged,
+    }
+
+
 def _of_commands(
     policy: BasePolicy,
     observations: Any,

@@ -416,19 +416,22 @@ class AnnotatedCopy:
         self._display: Display | None = None
         self._without_q: set[str] = set()
 
-    def add_values(self, topic: str, episodes: Sequence[tuple[Episode, Mapping[str, Any]]]) -> None:
+    def add_values(
+        self, topic: str, episodes: Sequence[tuple[NDArray[np.int64], Mapping[str, Any]]]
+    ) -> None:
         """Write a topic with schema `schema.values_schema` and one message per step.
 
         Args:
             topic: Topic to write; see `values_topics`.
-            episodes: Pairs of an episode and its columns (T, ...) by field name.
+            episodes: Of each episode, log_times (T,) of steps and the columns (T, ...) by field
+                name.
         """
         self._refuse(topic)
         rows = self._log.values_rows(topic)
         if not any(np.isfinite(columns["q"]).any() for _, columns in episodes):
             self._without_q.add(topic)
-        for episode, columns in episodes:
-            rows.write_columns(episode.log_time_ns[:-1], columns)
+        for times_ns, columns in episodes:
+            rows.write_columns(times_ns, columns)
 
     def add_scene(self, dataset: Dataset, env: gym.Env[Any, Any], *, camera: bool) -> Verification:
         """Replay the log in the environment, and write the scene."""

@@ -15,6 +15,8 @@ from gymnasium import spaces
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import McaprlError, PolicyError, UsageError
+from mcaprl.recorder.format.reading import McapReader, Topic
+from tests.support.bags import START_NS, STEP_NS, write_rosbag2
 
 X, Y = [0, 1, 2, 4, 4], [0, 2, 0, 2, 2]
 ENDS = np.array([0, 0, 1, 0, 1], bool)
@@ -28,6 +30,17 @@ def fails(observation):
     raise RuntimeError("no battery")
 def wrong(observation):
     return np.ones(3)
+def turn(observation):
+    return np.array([0.5, observation[0]], np.float32)
+def push(observation):
+    return int(observation[2] > 0)
+"""
+MAPPING = """
+clock: {topic: /joints}
+observation:
+  speed: {field: /odom.twist.twist.linear.x}
+action: {fields: [/cmd_vel.linear.x, /cmd_vel.angular.z], box: {low: -2, high: 2}}
+episodes: {max_steps: 4}
 """
 
 
@@ -203,3 +216,77 @@ def test_a_chunked_run_has_errors_by_step(tmp_path: Path) -> None:
     (one,) = mcaprl.action_errors(tmp_path / "run", data).policies
     assert one.horizon == 2
     assert one.why == "all episodes, which the run was trained on: it held none out"
+
+
+def test_a_bag_by_its_mapping(
+    code: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag, mapping = write_rosbag2(tmp_path / "bag"), tmp_path / "robot.yaml"
+    mapping.write_text(MAPPING)
+    ask = [f"{code}:turn", str(bag), "--mapping", str(mapping), "--trust-code"]
+    assert run(["evaluate", ask[0], "--data", *ask[1:], "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["action_errors"]["policies"]
+    linear, angular = found["parts"]
+    # Steps 0 to 3 and 5 to 8, with the speeds 0, 0.5, 1, 1.5 and 2.5, 3, 3.5, 4 as commands. Those
+    # of the log are 1 in even steps, otherwise -1.
+    assert (found["episodes"], found["steps"]) == (2, 8)
+    assert found["period_ms"] == pytest.approx(100)
+    assert angular["mean"] == pytest.approx((1 + 1.5 + 0 + 2.5 + 3.5 + 2 + 4.5 + 3) / 8)
+    assert linear["mean"] == pytest.approx(0.5)
+    # The mean of the other episode is 0; the nearest states are those of step 5 and of step 3.
+    assert angular["baselines"] == pytest.approx({"repeat": 14 / 8, "mean": 1, "nearest": 1})
+    out = tmp_path / "beside.mcap"
+    assert run(["annotate", *ask[1:], "--policy", ask[0], "--out", str(out)]) == 0
+    values = Topic(McapReader(out), "/rl/values")
+    shown = values.read(("policy_action", "difference", "distance", "q"))
+    assert ((values.times - START_NS) // STEP_NS).tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
+    assert shown["policy_action"][:, 1].tolist() == [0, 0.5, 1, 1.5, 2.5, 3, 3.5, 4]
+    assert shown["difference"][:2].tolist() == [[-0.5, -1], [-0.5, 1.5]]
+    # Half of the range of both parts is 2.
+    assert shown["distance"][0] == pytest.approx(np.sqrt((0.25**2 + 0.5**2) / 2))
+    assert np.isnan(shown["q"]).all()
+
+
+def test_any_policy_is_shown_beside_the_log(
+    code: str, trained: tuple[Path, Path], tmp_path: Path
+) -> None:
+    log, folder = trained
+    data, model, predicted = mcaprl.open(log), tmp_path / "run.onnx", tmp_path / "chunks"
+    mcaprl.export(folder, model)
+    predicted.mkdir()
+    # Chunks, of which the first action is shown; two steps have none.
+    chunks = np.tile([1.0, 0.0], (data.episodes[3].length, 1))
+    chunks[:2] = np.nan
+    np.save(predicted / "episode-3.npy", chunks)
+    names = [str(folder), str(model), f"{code}:push", str(predicted)]
+    out = tmp_path / "out.mcap"
+    topics = mcaprl.annotate(log, out, policy=names, trust_code=True).topics
+    reader = McapReader(out)
+    own, exported, pushed, given = (
+        Topic(reader, topics[name]).read(("policy_action", "agrees", "preference"))
+        for name in names
+    )
+    np.testing.assert_array_equal(exported["policy_action"], own["policy_action"])
+    expected = data.observations[:, 2] > 0
+    np.testing.assert_array_equal(pushed["policy_action"], expected)
+    np.testing.assert_array_equal(pushed["agrees"], expected == data.actions)
+    assert pushed["preference"].sum(1).tolist() == [1] * len(data)
+    times = Topic(reader, topics[names[3]]).times
+    np.testing.assert_array_equal(times, data.episodes[3].log_time_ns[2:-1])
+    assert set(given["policy_action"]) == {1}
+    np.save(predicted / "episode-3.npy", np.full(len(chunks), 2))
+    with pytest.raises(PolicyError, match=r"an action is not in Discrete\(2\)"):
+        mcaprl.annotate(log, tmp_path / "bad.mcap", policy=predicted)
+    assert not (tmp_path / "bad.mcap").exists()
+    with pytest.raises(UsageError, match="is Python code"):
+        mcaprl.annotate(log, tmp_path / "bad.mcap", policy=names[2])
+
+
+def test_a_policy_of_stable_baselines3_is_shown(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    model = sb3.PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8, device="cpu", seed=0)
+    model.save(tmp_path / "sb3.zip")
+    mcaprl.annotate(trained[0], tmp_path / "out.mcap", policy=tmp_path / "sb3.zip")
+    shown = Topic(McapReader(tmp_path / "out.mcap"), "/rl/values").read(("policy_action",))
+    actions, _ = model.predict(mcaprl.open(trained[0]).observations, deterministic=True)
+    np.testing.assert_array_equal(shown["policy_action"], actions)

@@ -191,7 +191,9 @@ def test_viewers_find_the_names_of_the_actions(scene_log: Path, tmp_path: Path) 
     values |= {name: np.zeros(3) for name in ("value", "advantage", "td_error", "entropy")}
     values |= {"policy_action": np.zeros(3, np.int64), "agrees": np.zeros(3, bool)}
     with annotated_copy(scene_log, annotated) as copy:
-        copy.add_values("/rl/values", [(mcaprl.open(scene_log).episodes[0], values)])
+        copy.add_values(
+            "/rl/values", [(mcaprl.open(scene_log).episodes[0].log_time_ns[:-1], values)]
+        )
     actions = [["BRAKE", 0], ["STRAIGHT", 1], ["RIGHT", 2], ["LEFT", 3]]
     actions += [["SLIGHTLY_RIGHT", 4], ["SLIGHTLY_LEFT", 5]]
     found = {each["topic"]: each["constants"] for each in node_lines("constants.mjs", annotated)}

@@ -217,7 +217,10 @@ def test_annotated_commands_are_logged_and_the_farthest_are_listed(
     commanded.save(log)
     episode = mcaprl.open(log).episodes[0]
     with annotated_copy(log, out) as copy:
-        copy.add_values("/rl/values", [(episode, value_columns(Line(), episode, COMMANDS, 0.5))])
+        copy.add_values(
+            "/rl/values",
+            [(episode.log_time_ns[:-1], value_columns(Line(), episode, COMMANDS, 0.5))],
+        )
     columns = Topic(McapReader(out), "/rl/values").read(["policy_action", "value", "log_prob"])
     assert columns["policy_action"].tolist() == [[0, 0], [0.5, 0.5], [1, 1]]
     assert columns["value"].tolist() == [0.0, 0.5, 0.0]
@@ -243,7 +246,7 @@ def test_annotating_keeps_all_messages_and_adds_values(plain: Path, tmp_path: Pa
     data = mcaprl.open(plain)
     columns = [
         (
-            episode,
+            episode.log_time_ns[:-1],
             {
                 "q": np.full((episode.length, 6), episode.index, np.float32),
                 "td_error": np.arange(episode.length, dtype=np.float32),
@@ -379,7 +382,7 @@ def test_layouts_of_annotated_logs_refer_to_paths_in_the_log(tmp_path: Path) -> 
     columns |= {"policy_action": np.zeros(4, np.int64), "agrees": np.ones(4, bool)}
     with annotated_copy(path, out) as copy:
         for topic in ("/rl/values/a", "/rl/values/b"):
-            copy.add_values(topic, [(episode, columns)])
+            copy.add_values(topic, [(episode.log_time_ns[:-1], columns)])
     layout = check_layout(out)
     tabs = layout["configById"]["Tab!policies"]["tabs"]
     assert [tab["title"] for tab in tabs] == ["values/a", "values/b"]

@@ -130,7 +130,7 @@ def with_values(path: Path) -> Path:
     columns["agrees"] = np.zeros(STEPS, bool)
     with annotated_copy(path, out) as copy:
         for topic in ("/rl/values/cql", "/rl/values/iql"):
-            copy.add_values(topic, [(episode, columns) for episode in episodes])
+            copy.add_values(topic, [(episode.log_time_ns[:-1], columns) for episode in episodes])
     return out
 
 
@@ -332,7 +332,7 @@ def commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
     values = {"policy_action": actions[::-1], "difference": actions[::-1] - actions}
     values |= {name: np.arange(5.0) for name in COMMAND_VALUES}
     with annotated_copy(folder / "plain.mcap", folder / "log.mcap") as copy:
-        copy.add_values("/rl/values", [(data.episodes[0], values)])
+        copy.add_values("/rl/values", [(data.episodes[0].log_time_ns[:-1], values)])
     return folder / "log.mcap"
 
 

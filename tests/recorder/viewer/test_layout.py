@@ -70,7 +70,7 @@ def annotated(source: Path, out: Path, names: list[str]) -> Path:
                 }
                 columns |= dict.fromkeys(("value", "advantage", "td_error", "entropy"), zeros)
                 columns |= {"policy_action": zeros.astype(np.int64), "agrees": zeros.astype(bool)}
-                found.append((episode, columns))
+                found.append((episode.log_time_ns[:-1], columns))
             copy.add_values(name, found)
     return out
 
