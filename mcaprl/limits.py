@@ -19,6 +19,8 @@ MAX_FIXED_MESSAGES: Final = 1_000
 MAX_MESSAGES_PER_BYTE: Final = 16
 """Nested messages for each byte of a message, beyond 64: empty messages take memory, but no bytes
 of the file."""
+MAX_LABEL_BYTES: Final = 2**16
+"""Size of a request of the page that saves a label: a note has at most 10,000 characters."""
 MAX_TIME_NS: Final = 2**62
 """Time of a message in nanoseconds, until the year 2116: differences of times fit into 64 bits."""
 MAX_DEFINITION_BYTES: Final = 2**20

@@ -26,6 +26,7 @@ from mcaprl.progress import Advance, ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import find_logs
 from mcaprl.recorder.dataset.transitions import Episode
+from mcaprl.recorder.edit.labels import Labels, label_by_json, read_labels
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.display import SCENE
@@ -432,6 +433,8 @@ def browse(
 ) -> None:
     """Serve a page with a log's episodes on 127.0.0.1 until `stop` is set or Ctrl-C is pressed.
 
+    The page also labels episodes and steps; it saves what `mcaprl.label` saves, beside the log.
+
     Args:
         data: Path of the log.
         episode: Index of the episode that the page shows first.
@@ -449,7 +452,10 @@ def browse(
     check_positive(speed=speed)
     check_port(port)
     page = _page(data, episode)
-    with closing(PageServer(page, port=port, first=episode, speed=speed, loop=loop)) as server:
+    settings: dict[str, Any] = {"first": episode, "speed": speed, "loop": loop}
+    label = None if is_url(data) else partial(label_by_json, Path(data))
+    labels = partial(_labels, data)
+    with closing(PageServer(page, port=port, labels=labels, label=label, **settings)) as server:
         on_open(server.url)
         if show and _has_display():
             webbrowser.open(server.url)
@@ -491,7 +497,8 @@ def save_page(
         raise UnknownNameError("kind of output", out.suffix or out.name, _KINDS)
     check_target(out, overwrite=overwrite)
     log = _page(data, episode)
-    index = log.index(only=episode, first=episode, speed=speed, loop=loop)
+    settings = {"first": episode, "speed": speed, "loop": loop, **_labels(data)}
+    index = log.index(only=episode, **settings)
     html = page_html(index, log.episode(episode)).encode()
     with replacing(out, ReportError, overwrite=overwrite) as unfinished:
         unfinished.write_bytes(html)
@@ -503,6 +510,16 @@ def _page(data: str | Path, episode: int) -> LogPage:
     page = LogPage(path)
     check_episode(page.dataset, episode, path)
     return page
+
+
+def _labels(data: str | Path) -> dict[str, Any]:
+    """Return the labels of a log, and why they cannot be read, as settings of a page."""
+    if is_url(data):
+        return {"labels": Labels("").to_json(), "problem": ""}
+    try:
+        return {"labels": read_labels(Path(data)).to_json(), "problem": ""}
+    except LogError as error:
+        return {"labels": Labels("").to_json(), "problem": str(error)}
 
 
 def _has_display() -> bool:

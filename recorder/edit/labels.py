@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, UnknownNameError, UsageError
-from mcaprl.files import locked_file, parse_json, read_file, read_json, write_json
+from mcaprl.files import as_type, locked_file, parse_json, read_file, read_json, write_json
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader
 
@@ -175,6 +175,31 @@ def change_labels(log: Path, changes: Sequence[Mapping[str, Any]]) -> Labels:
         if changes:
             write_json(labels_path(log), labels.to_json(), LogError)
     return labels
+
+
+@dataclass(frozen=True)
+class _Change:
+    """Change that a page sends; see `mcaprl.label`."""
+
+    episode: int
+    success: bool | None = None
+    note: str | None = None
+    interval: str | None = None
+    steps: tuple[int, int] | None = None
+    remove: bool = False
+
+
+def label_by_json(log: Path, text: bytes) -> dict[str, Any]:
+    """Apply a change that is a JSON object with arguments of `mcaprl.label`; return the labels.
+
+    Raises:
+        UsageError: It is not such an object, or the change is refused.
+    """
+    try:
+        change: _Change = as_type(_Change, parse_json(text))
+    except ValueError as error:
+        raise UsageError(f"the label cannot be read: {error}") from error
+    return change_labels(log, [asdict(change)]).to_json()
 
 
 def labels_to_carry(source: Path) -> Labels | None:

@@ -1,10 +1,11 @@
 """The page of one log: data of its episodes, an HTML text without references, and an HTTP server.
 
-The server on 127.0.0.1 answers two kinds of requests: `/` returns the page, and `/episode/K` the
-packed data of an episode. No request names a file. A web page of another site cannot read the
-answers, because the server checks the origin and the host name that browsers send with a request.
+The server on 127.0.0.1 answers three kinds of requests: `/` returns the page, `/episode/K` the
+packed data of an episode, and a POST to `/label` saves a label. No request names a file. A web page
+of another site cannot read the answers, because the server checks the origin and the host name that
+browsers send with a request. A label also needs the origin of the page, and the token in the page.
 
-They are compressed by gzip and contain: the length of the header (uint32, little-endian), the
+The packed data are compressed by gzip: the length of the header (uint32, little-endian), the
 header as JSON, padding to a multiple of 8 bytes, and the arrays. In the header, an array is an
 object with its `dtype`, its `shape` and its offset `at` in bytes; each array starts at a multiple
 of 8 bytes.
@@ -18,10 +19,11 @@ import hashlib
 import json
 import math
 import re
+import secrets
 import socket
 import sys
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import lru_cache, reduce
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -464,7 +466,7 @@ def _thinning(size: int) -> int:
     return max(1, math.ceil(size / _MOST_IMAGE_BYTES))
 
 
-_SCRIPTS = ("data.js", "scene.js", "plots.js", "images.js", "main.js")
+_SCRIPTS = ("data.js", "scene.js", "plots.js", "images.js", "labels.js", "main.js")
 
 
 def page_html(log: bytes, episode: bytes = b"") -> str:
@@ -507,6 +509,8 @@ def _hash(text: str) -> str:
 _EPISODE = re.compile(r"/episode/(\d{1,9})")
 _EPISODES_KEPT = 4
 _BLOCK_BYTES = 2**20
+_MOST_DIGITS = 12
+_REFUSED = 403, "text/plain; charset=utf-8", b"this page may not connect"
 _HEADERS = {
     "Cache-Control": "no-store",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -523,12 +527,32 @@ class PageServer:
         url: Address of the page.
     """
 
-    def __init__(self, page: LogPage, *, port: int, **settings: Any) -> None:
-        """Start to listen."""
-        self._html = page_html(page.index(**settings)).encode()
+    def __init__(
+        self,
+        page: LogPage,
+        *,
+        port: int,
+        labels: Callable[[], dict[str, Any]],
+        label: Callable[[bytes], dict[str, Any]] | None = None,
+        **settings: Any,
+    ) -> None:
+        """Start to listen.
+
+        Args:
+            page: Log.
+            port: Port; 0 for any free port.
+            labels: Function that returns the labels, settings of `LogPage.index`.
+            label: Function that changes the labels as a JSON object says, and returns them; None if
+                they cannot be saved.
+            settings: Other settings of `LogPage.index`.
+        """
+        self._token = "" if label is None else secrets.token_urlsafe()
+        settings["token"] = self._token
+        self._html = lambda: page_html(page.index(**settings, **labels())).encode()
+        self._label = label
         self._count = len(page.dataset.episodes)
         self._episode = lru_cache(_EPISODES_KEPT)(page.episode)
-        handler = type("_Handler", (_Handler,), {"respond": self._respond})
+        handler = type("_Handler", (_Handler,), {"respond": self._respond, "save": self._save})
         try:
             self._server = _Server(("127.0.0.1", port), handler)
         except OSError as error:
@@ -553,13 +577,25 @@ class PageServer:
         """Return status, type and body of the answer to a request."""
         found = _EPISODE.fullmatch(path)
         if path == "/":
-            return 200, "text/html; charset=utf-8", self._html
+            return 200, "text/html; charset=utf-8", self._html()
         if found is None or int(found[1]) >= self._count:
             return 404, "text/plain; charset=utf-8", b"there is no such page"
         try:
             return 200, "application/octet-stream", self._episode(int(found[1]))
         except McaprlError as error:
             return 500, "text/plain; charset=utf-8", str(error).encode(errors="backslashreplace")
+
+    def _save(self, path: str, token: str, body: bytes) -> tuple[int, str, bytes]:
+        """Change the labels; return status, type and body of the answer."""
+        plain = "text/plain; charset=utf-8"
+        if path != "/label" or self._label is None:
+            return 404, plain, b"this page saves no labels"
+        if not secrets.compare_digest(token.encode(), self._token.encode()):
+            return 403, plain, b"the page is of an earlier server: reload it"
+        try:
+            return 200, "application/json", json.dumps(self._label(body)).encode()
+        except McaprlError as error:
+            return 400, plain, str(error).encode(errors="backslashreplace")
 
 
 class _Server(ThreadingHTTPServer):
@@ -573,6 +609,7 @@ class _Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     respond: Any
+    save: Any
 
     def setup(self) -> None:
         """Limit the time for the request and for each block of the answer."""
@@ -598,7 +635,26 @@ class _Handler(BaseHTTPRequestHandler):
         if self._is_allowed():
             status, kind, body = self.respond(self.path)
         else:
-            status, kind, body = 403, "text/plain; charset=utf-8", b"this page may not connect"
+            status, kind, body = _REFUSED
+        self._answer(status, kind, body)
+
+    def do_POST(self) -> None:
+        """Save a label that the page sends."""
+        length = self.headers.get("Content-Length", "")
+        is_bounded = length.isascii() and length.isdigit() and len(length) < _MOST_DIGITS
+        if not (self._is_allowed() and self.headers.get("Origin")):
+            answer = _REFUSED
+        elif self.headers.get_content_type() != "application/json":
+            answer = 415, "text/plain; charset=utf-8", b"a label is application/json"
+        elif not is_bounded or int(length) > limits.MAX_LABEL_BYTES:
+            answer = 413, "text/plain; charset=utf-8", b"a label has a length, and at most 64 KiB"
+        else:
+            body = self.rfile.read(int(length))
+            self._hang_up.cancel()
+            answer = self.save(self.path, self.headers.get("X-Label-Token", ""), body)
+        self._answer(*answer)
+
+    def _answer(self, status: int, kind: str, body: bytes) -> None:
         self.send_response(status)
         for name, value in {"Content-Type": kind, **_HEADERS}.items():
             self.send_header(name, value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import gzip
 import json
 import re
@@ -652,13 +653,141 @@ def test_a_damaged_episode_is_reported(browser: Browser, tmp_path: Path) -> None
         assert str(path) in browser.run("get('problem').innerText")
 
 
-def answer(url: str, path: str = "/", **headers: str) -> tuple[int, dict[str, str], bytes]:
+@pytest.fixture
+def labeled(log: Path, tmp_path: Path) -> Path:
+    """A log of two episodes, of which the second has an interval."""
+    copy = tmp_path / "labeled.mcap"
+    copy.write_bytes(log.read_bytes())
+    mcaprl.label(copy, episode=1, interval="bad data", steps=(0, 2))
+    return copy
+
+
+def test_keys_label_episodes_and_steps(browser: Browser, labeled: Path) -> None:
+    with served(labeled) as url:
+        browser.show(url)
+        wait_for_episode(browser)
+        browser.press("s")
+        browser.wait("log.labels.success[0] === true")
+        # The interval is from step 3 to the last one, 4, also if the replay is after the last step.
+        browser.run("seek(episode.times[3])")
+        browser.press("b")
+        browser.press("End")
+        browser.press("e")
+        browser.wait("log.labels.intervals.length === 2")
+        browser.press("n")
+        browser.run("get('note').value = '<b>clean</b>'")
+        # Letters in the field of the note are no keys of the replay.
+        browser.press("x")
+        browser.press("Enter")
+        browser.wait("log.labels.notes[0]")
+        assert mcaprl.label(labeled).rows() == [
+            ["0", "success", "<b>clean</b>x", "intervention 3:5"],
+            ["1", "", "", "bad data 0:2"],
+        ]
+        listed = browser.run(
+            "[...document.querySelectorAll('#list button')].map((e) => e.innerText)"
+        )
+        assert "label: success, <b>clean</b>x, 1 interval" in listed[0]
+        assert "label: 1 interval" in listed[1]
+        marks = "[...get('marks').children].map(({ style }) => [style.left, style.width])"
+        assert browser.run(marks) == [["60%", "40%"]]
+        browser.press("PageDown")
+        browser.wait(
+            "state.index === 1 && state.step === 0 && get('marks').innerText === 'bad data'"
+        )
+        assert browser.run(marks) == [["0%", "40%"]]
+        browser.press("x")
+        browser.wait("log.labels.success[1] === false")
+        browser.run("get('unlabel').click()")
+        browser.wait("log.labels.intervals.length === 1")
+        assert browser.run("get('failure').getAttribute('aria-pressed')") == "false"
+        browser.press("e")
+        assert "begins with the key B" in browser.run("get('problem').innerText")
+        browser.show(url)
+        wait_for_episode(browser)
+        assert browser.run("get('success').getAttribute('aria-pressed')") == "true"
+        assert browser.problems == []
+
+
+def test_a_page_without_its_server_shows_labels(
+    browser: Browser, labeled: Path, tmp_path: Path
+) -> None:
+    mcaprl.save_page(labeled, tmp_path / "page.html", episode=1)
+    browser.show((tmp_path / "page.html").as_uri())
+    wait_for_episode(browser)
+    assert browser.run("get('marks').innerText") == "bad data"
+    text = browser.run("get('labels').innerText")
+    assert "To save labels, open the log by: mcaprl replay LOG --browser" in text
+    assert browser.run("get('label-tools').hidden") is True
+    browser.press("s")
+    assert "To save labels" in browser.run("get('problem').innerText")
+    assert browser.problems == []
+
+
+def test_labels_of_other_data_are_not_shown(browser: Browser, labeled: Path, log: Path) -> None:
+    labeled.write_bytes(log.with_name("log.mcap").read_bytes())
+    with served(labeled) as url:
+        browser.show(url)
+        wait_for_episode(browser)
+        assert "labels of other data" in browser.run("get('problem').innerText")
+        browser.press("s")
+        browser.wait("get('problem').innerText.includes('was not saved')")
+
+
+def test_only_the_page_saves_labels(labeled: Path) -> None:
+    """A request needs the origin and the token of the page, a small body, and a valid change."""
+    file = labeled.with_name("labeled.mcap.labels.json")
+    before = file.read_bytes()
+    with served(labeled) as url:
+        html = answer(url)[2].decode()
+        embedded = re.search(r'id="log-data">([^<]*)<', html)
+        assert embedded is not None
+        token = unpacked(base64.b64decode(embedded[1]))["token"]
+        good = {
+            "Origin": url.removesuffix("/"),
+            "X-Label-Token": token,
+            "Content-Type": "application/json",
+        }
+        change = json.dumps({"episode": 0, "success": True}).encode()
+        for status, changed, body in (
+            (403, {"Origin": "http://evil.example"}, change),
+            (403, {"Origin": ""}, change),
+            (403, {"Host": "evil.example"}, change),
+            (403, {"X-Label-Token": token + "x"}, change),
+            (403, {"X-Label-Token": "é"}, change),
+            (415, {"Content-Type": "text/plain"}, change),
+            (413, {"Content-Length": str(limits.MAX_LABEL_BYTES + 1)}, change),
+            (413, {"Content-Length": "-1"}, change),
+            (413, {"Content-Length": "9" * 30}, change),
+            (400, {}, b"{"),
+            (400, {}, b"[]"),
+            (400, {}, b'{"success": true}'),
+            (400, {}, b'{"episode": 9, "success": true}'),
+            (400, {}, b'{"episode": 0, "interval": "x", "steps": [3, 99]}'),
+            (400, {}, b'{"episode": 0, "success": "yes"}'),
+        ):
+            found = answer(url, "/label", body=body, **{**good, **changed})
+            assert found[0] == status, (changed, body, found)
+            assert b"\n" not in found[2]
+        assert answer(url, "/episode/0", body=change, **good)[0] == 404
+        assert file.read_bytes() == before
+        # Further keys of the object, such as a file to read, have no effect.
+        change = json.dumps({"episode": 0, "success": True, "file": "/etc/passwd"}).encode()
+        status, _, body = answer(url, "/label", body=change, **good)
+        assert (status, json.loads(body)["success"]) == (200, {"0": True})
+    assert mcaprl.label(labeled).success == {"0": True}
+
+
+def answer(
+    url: str, path: str = "/", body: bytes | None = None, **headers: str
+) -> tuple[int, dict[str, str], bytes]:
     host, port = url.removeprefix("http://").removesuffix("/").split(":")
     with closing(HTTPConnection(host, int(port), timeout=30)) as connection:
-        connection.putrequest("GET", path, skip_host="Host" in headers)
-        for name, value in headers.items():
+        connection.putrequest("GET" if body is None else "POST", path, skip_host="Host" in headers)
+        lengths = {} if body is None else {"Content-Length": str(len(body))}
+        for name, value in {**lengths, **headers}.items():
             connection.putheader(name, value)
-        connection.endheaders()
+        connection.endheaders(body)
         found = connection.getresponse()
         return found.status, dict(found.getheaders()), found.read()
 

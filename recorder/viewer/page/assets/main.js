@@ -20,6 +20,7 @@ async function start() {
   document.querySelector("main").classList.toggle("single", log.numbers.length === 1);
   listen();
   await choose(Math.max(0, log.numbers.indexOf(log.first)));
+  if (log.problem) report(log.problem);
 }
 
 /** Load and show the episode at an index of the log's columns. */
@@ -65,6 +66,8 @@ function show(data) {
   get("lines").append(...data.lines.texts.map((text, k) => lineOf(data.lines, text, k)));
   get("time").max = duration();
   if (data.scene) showScene(data.scene);
+  begun = -1;
+  showLabels();
   state.step = -1;
   seek(0);
 }
@@ -233,6 +236,11 @@ function list() {
       element("span", { textContent: log.numbers[index] }),
       element("span", { textContent: `return ${short(log.returns[index])}` }),
       element("span", { textContent: `${log.lengths[index]} steps` }), end);
+    const label = labelOf(log.numbers[index]);
+    if (label.text) {
+      const className = { true: "end succeeded", false: "end failed" }[label.success] ?? "end";
+      button.append(element("span", { className, textContent: `label: ${label.text}` }));
+    }
     if (index === state.index) button.setAttribute("aria-current", "true");
     return element("li", {}, button);
   }));
@@ -330,11 +338,13 @@ const KEYS = {
   End: () => seek(duration()),
   PageUp: () => turn(-1),
   PageDown: () => turn(1),
+  ...LABEL_KEYS,
   f: () => follow(get("follow").getAttribute("aria-pressed") !== "true"),
   a: () => above(get("above").getAttribute("aria-pressed") !== "true"),
 };
 
 function listen() {
+  listenLabels();
   get("play").onclick = () => play(!state.playing);
   get("back").onclick = () => stepBy(-1);
   get("forth").onclick = () => stepBy(1);
@@ -350,7 +360,7 @@ function listen() {
   };
   document.addEventListener("keydown", (event) => {
     const { target, key } = event;
-    const isText = target.matches("select, input[type=number]");
+    const isText = target.matches("select, input[type=number], input[type=text]");
     const isPressed = key === " " && target.matches("button, input[type=checkbox]");
     if (!episode || isText || isPressed || event.ctrlKey || event.metaKey || event.altKey || !KEYS[key]) return;
     event.preventDefault();
