@@ -168,7 +168,10 @@ def layout(source: str, out: Path, **request: Any) -> None:
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="File to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def annotate(file: str, out: Path, **request: Any) -> None:
-    """Copy LOG and add a policy's actions and values or the scene of the sim to each step."""
+    """Copy LOG and add a policy's actions and values, labels, or the scene of the sim to each step.
+
+    The labels of a labeled log are added always; see `mcaprl label`.
+    """
     bag = bag_options(request)
     with working("reading the log") as bar:
         data = file if bag["mapping"] is None else mcaprl.open(file, **bag)
@@ -176,6 +179,8 @@ def annotate(file: str, out: Path, **request: Any) -> None:
         found = mcaprl.annotate(data, out, progress=bar, **request)
     for name, topic in found.topics.items():
         echo(f"{out}: {topic} has the values of {name} for {counted(found.steps, 'step')}")
+    if found.labels:
+        echo(f"{out}: /rl/labels has the labels")
     if found.scene is not None:
         episodes, steps = found.scene.episodes, found.scene.steps
         echo(f"{out}: the scene of {counted(episodes, 'episode')}, {counted(steps, 'step')}")

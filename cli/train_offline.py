@@ -69,6 +69,12 @@ def _names() -> list[str]:
 @click.option("--follow", is_flag=True, help="Use episodes added to DATA during training.")
 @click.option("--other-data", is_flag=True, help="With --resume: allow other DATA than in the run.")
 @click.option(
+    "--only",
+    metavar="EXPR",
+    help="Learn from the episodes for which EXPR is true, such as 'success == 1'; see `mcaprl"
+    " filter`.",
+)
+@click.option(
     "--mask",
     multiple=True,
     metavar="NAME",

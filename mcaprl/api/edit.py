@@ -19,7 +19,13 @@ from mcaprl.files import check_log_name, check_target, temporary_folder
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.edit.join import merge_logs
-from mcaprl.recorder.edit.labels import Labels, change_labels, changes_in
+from mcaprl.recorder.edit.labels import (
+    Labels,
+    carry_labels,
+    change_labels,
+    changes_in,
+    labels_to_carry,
+)
 from mcaprl.recorder.edit.piece import Bounds, Edited, filter_log, slice_log, split_log
 from mcaprl.recorder.edit.relabel import relabeled
 from mcaprl.recorder.source import Paths, open_data
@@ -234,12 +240,14 @@ class Annotation:
         topics: Topic of each policy's values, by the policy's path.
         scene: Number of episodes and number of steps to which the scene was added; None without a
             scene.
+        labels: Whether the log has labels, which were added as `/rl/labels` and beside the copy.
     """
 
     out: Path
     steps: int
     topics: dict[str, str]
     scene: Verification | None
+    labels: bool = False
 
 
 def annotate(
@@ -257,7 +265,7 @@ def annotate(
     overwrite: bool = False,
     progress: ProgressBar = no_progress,
 ) -> Annotation:
-    """Copy a log, and add values of policies or the scene of the sim to each step.
+    """Copy a log, and add values of policies, its labels, or the scene of the sim to each step.
 
     Args:
         data: Path of the log; or a dataset that `open` read from a bag by a mapping, which is first
@@ -289,8 +297,6 @@ def annotate(
     check_fraction(gamma=gamma)
     names, added = as_names(policy), None
     check_log_name(out)
-    if not names and not scene:
-        raise UsageError("annotate needs `policy=POLICY`, `scene=True`, or both")
     if isinstance(data, Dataset):
         if scene:
             raise UsageError("the scene of a bag cannot be added: there is no sim to step")
@@ -301,7 +307,9 @@ def annotate(
             options: Any = {"gamma": gamma, "overwrite": overwrite, "progress": progress}
             return annotate(log, out, policy=policy, trust_code=trust_code, **options)
     path = as_path(data, whole=True)
-    dataset = open_data(path)
+    dataset, labels = open_data(path), None if is_url(data) else labels_to_carry(Path(data))
+    if not names and not scene and labels is None:
+        raise UsageError("annotate needs `policy=POLICY`, `scene=True`, or a log with labels")
     found = values_topics(list(policy_names(names).values()))
     topics = dict(zip(dict.fromkeys(names), found.values(), strict=True))
     with annotated_copy(path, Path(out), overwrite=overwrite) as copy:
@@ -310,11 +318,14 @@ def annotate(
                 copy.add_values(topic, _actions(dataset, name, progress, trust_code=trust_code))
             else:
                 copy.add_values(topic, _values(dataset, name, gamma, progress))
+        if labels is not None:
+            copy.add_labels(labels.texts(dataset))
         if scene:
             trust: Any = {"trust_env": trust_env, "sim_options": sim_options}
             with closing(sim_of(dataset, path, sim, **trust)) as env:
                 added = copy.add_scene(dataset, env, camera=camera)
-    return Annotation(Path(out), len(dataset), topics, added)
+    carry_labels(labels, np.arange(len(dataset.episodes)), Path(out))
+    return Annotation(Path(out), len(dataset), topics, added, labels is not None)
 
 
 def _values(

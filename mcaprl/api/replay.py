@@ -7,7 +7,7 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,16 +26,22 @@ from mcaprl.progress import Advance, ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import find_logs
 from mcaprl.recorder.dataset.transitions import Episode
-from mcaprl.recorder.edit.labels import Labels, label_by_json, read_labels
+from mcaprl.recorder.edit.labels import Labels, label_by_json, labels_to_carry, read_labels
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.format.schema import LABELS_TOPIC
 from mcaprl.recorder.record.display import SCENE
 from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.record.panels import bounded_actions
 from mcaprl.recorder.record.scene import DepthSource
 from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.recorder.source import Paths, open_data
-from mcaprl.recorder.viewer.annotate import Comparison, Verification, attached_layout
+from mcaprl.recorder.viewer.annotate import (
+    Comparison,
+    Verification,
+    attached_layout,
+    write_labels,
+)
 from mcaprl.recorder.viewer.annotate import verify as verify_dataset
 from mcaprl.recorder.viewer.foxglove_server import (
     DEFAULT_PORT,
@@ -123,24 +129,39 @@ def replay(
         windows.append((int(chosen[0].log_time_ns[0]), int(chosen[-1].log_time_ns[-1])))
     readers = [McapReader(path) for path in paths]
     tracks = [Track(*pair) for pair in zip(readers, windows, strict=True)]
-    player = Player(tracks, speed=speed, loops=loop)
     starts = [int(e.log_time_ns[0]) for e in datasets[0].episodes] if episode is None else []
     prefixes = prefixes_of(paths)
     layout = side_by_side([attached_layout(reader) for reader in readers], prefixes)
-    server = LiveServer(
-        player,
-        prefixes=prefixes,
-        episode_starts_ns=starts,
-        name=", ".join(path.name for path in paths),
-        port=port,
-        origins=as_names(allow_origin),
-    )
-    with temporary_folder() as folder, closing(server):
+    with temporary_folder() as folder, ExitStack() as opened:
+        for number, path in enumerate(paths):
+            if labels := _label_track(path, windows[number], folder / f"labels-{number}.mcap"):
+                tracks.append(labels)
+                prefixes.append(prefixes[number])
+        server = LiveServer(
+            Player(tracks, speed=speed, loops=loop),
+            prefixes=prefixes,
+            episode_starts_ns=starts,
+            name=", ".join(path.name for path in paths),
+            port=port,
+            origins=as_names(allow_origin),
+        )
+        opened.enter_context(closing(server))
         layout_path = folder / LAYOUT_NAME
         write_json(layout_path, layout)
         on_open(LiveAddress(server.app_url, server.url, layout_path))
         with suppress(KeyboardInterrupt):
             server.run(stop or threading.Event())
+
+
+def _label_track(path: Path, window_ns: tuple[int, int], out: Path) -> Track | None:
+    """Return what shows the labels of a log beside it; None without labels."""
+    if is_url(path) or LABELS_TOPIC in {one.topic for one in McapReader(path).channels.values()}:
+        return None
+    labels = labels_to_carry(path)
+    if labels is None or not (texts := labels.texts(open_data(path, columns=[]))):
+        return None
+    write_labels(out, texts)
+    return Track(McapReader(out), window_ns)
 
 
 def verify(

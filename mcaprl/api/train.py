@@ -15,7 +15,7 @@ from mcaprl.errors import MissingExtraError, TrainingError, UsageError
 from mcaprl.files import write_json
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.edit.labels import without_intervals
+from mcaprl.recorder.edit.piece import selected
 from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.source import Source, open_data, opened
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
@@ -48,6 +48,7 @@ def train(
     device: str = "cpu",
     resume: bool = False,
     other_data: bool = False,
+    only: str | None = None,
     mask: Sequence[str] = (),
     ray: bool | ClusterOptions = False,
     progress: ProgressCallback = lambda now: None,
@@ -77,6 +78,7 @@ def train(
         resume: Whether training continues from the checkpoints in `out`. A number of `updates`
             above that of the run continues the run to this number, also if it has finished.
         other_data: Whether `resume` accepts checkpoints trained on other data.
+        only: Condition on the episodes to learn from, such as `"success == 1"`; see `filter`.
         mask: Names of labeled intervals, whose steps are not learned from; see `label` and
             `Dataset.without`.
         ray: Whether Ray workers train, each of them one seed after the other; or the workers and
@@ -125,9 +127,7 @@ def train(
     request: dict[str, Any] = {"resume": resume, "device": device, "progress": progress}
     with cluster.connected(), torch_threads(threads):
         dataset = opened(data, weighted=True, threads=threads)
-        if mask and dataset.origin.grow is not None:
-            raise UsageError("`mask=` and `follow=`: a log that is being written has no labels")
-        dataset = without_intervals(dataset, as_names(mask))
+        dataset = selected(dataset, only, as_names(mask))
         if not isinstance(chosen, AutoConfig):
             chosen = configured(algo, settings, space=dataset.action_space)
         if cluster.ray:

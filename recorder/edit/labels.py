@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, UnknownNameError, UsageError
+from mcaprl.errors import LogError, UsageError
 from mcaprl.files import as_type, locked_file, parse_json, read_file, read_json, write_json
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader
@@ -101,6 +101,25 @@ class Labels:
         for one in self.intervals:
             rows = found.setdefault(one.name, np.zeros(int(lengths.sum()), np.bool_))
             rows[first[one.episode] + one.start : first[one.episode] + one.stop] = True
+        return found
+
+    def texts(self, dataset: Dataset) -> list[tuple[int, str]]:
+        """Return log_time and text of each change of the labels along a log.
+
+        A text has result and note of the episode and the names of the step's intervals, such as
+        `success: clean lap, intervention`; it is empty without labels.
+        """
+        found: list[tuple[int, str]] = []
+        for episode in dataset.episodes:
+            key = str(episode.index)
+            result = {True: "success", False: "failure", None: ""}[self.success.get(key)]
+            whole = ": ".join(filter(None, (result, self.notes.get(key))))
+            parts = [one for one in self.intervals if one.episode == episode.index]
+            for step in sorted({0, *(at for one in parts for at in (one.start, one.stop))}):
+                names = [one.name for one in parts if one.start <= step < one.stop]
+                text = ", ".join(filter(None, (whole, *dict.fromkeys(names))))
+                if text != (found[-1][1] if found else None):
+                    found.append((int(episode.log_time_ns[step]), text))
         return found
 
     def taken(self, log: str, chosen: NDArray[np.int64]) -> Labels:
@@ -237,18 +256,6 @@ def labels_of(dataset: Dataset) -> Labels | None:
         joined.intervals.extend(part.intervals)
         first += count
     return joined
-
-
-def without_intervals(dataset: Dataset, names: Sequence[str]) -> Dataset:
-    """Return a dataset without the steps in intervals of these names; see `Dataset.without`."""
-    if not names:
-        return dataset
-    labels = labels_of(dataset)
-    steps = {} if labels is None else labels.steps(dataset.episode_lengths)
-    for name in names:
-        if name not in steps:
-            raise UnknownNameError("name of intervals", name, steps)
-    return dataset.without(np.any([steps[name] for name in names], axis=0))
 
 
 def changes_in(path: Path) -> Iterator[dict[str, Any]]:

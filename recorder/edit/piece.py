@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,18 @@ import numpy as np
 from mcap.records import Attachment, Channel, Metadata
 from numpy.typing import NDArray
 
-from mcaprl.errors import CorruptLogError, LogError, NoEpisodesError, NoStepsError, UsageError
+from mcaprl.errors import (
+    CorruptLogError,
+    LogError,
+    NoEpisodesError,
+    NoStepsError,
+    UnknownNameError,
+    UsageError,
+)
 from mcaprl.files import replacing, replacing_folder
+from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
-from mcaprl.recorder.edit.labels import Labels, carry_labels, labels_to_carry
+from mcaprl.recorder.edit.labels import Labels, carry_labels, labels_of, labels_to_carry
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.messages import INTERRUPTED, EpisodeSummary, add_up
 from mcaprl.recorder.format.reading import McapReader
@@ -406,27 +414,66 @@ def filter_log(
     expression: str, path: str | Path, out: str | Path, *, overwrite: bool = False
 ) -> Edited:
     """Copy the episodes for which an expression is true; see `mcaprl.filter`."""
-    condition = Expression(expression)
-    if condition.uses_next:
-        raise UsageError(f"'{expression}': next(...) has no meaning for episodes")
     log = FinishedLog(path)
     labels = labels_to_carry(log.path)
-    table = episode_columns(log.summaries(), condition.names)
+    chosen = _chosen(expression, log.summaries(), lambda: labels, str(path))
+    with replacing(Path(out), LogError, overwrite=overwrite) as unfinished:
+        found = _copy_episodes(log, chosen, unfinished, Path(out))
+    carry_labels(labels, chosen, Path(out))
+    return found
+
+
+def _chosen(
+    expression: str,
+    summaries: Sequence[EpisodeSummary],
+    labels: Callable[[], Labels | None],
+    name: str,
+) -> NDArray[np.int64]:
+    """Return the indexes of the episodes for which an expression is true."""
+    condition, count = Expression(expression), len(summaries)
+    if condition.uses_next:
+        raise UsageError(f"'{expression}': next(...) has no meaning for episodes")
+    table = episode_columns(summaries, condition.names)
     if condition.names & {"success", "note"}:
-        table |= (labels or Labels("")).columns(len(log.lengths))
-    holds = condition.evaluate(table, np.arange(len(log.lengths)))
+        table |= (labels() or Labels("")).columns(count)
+    holds = condition.evaluate(table, np.arange(count))
     if not condition.is_condition(table):
         raise UsageError(f"'{expression}' is not a condition: compare it, as in 'length > 10'")
     # A condition on a missing value (NaN) is false.
     chosen = np.flatnonzero(np.nan_to_num(holds.astype(np.float64)))
     if not len(chosen):
-        raise NoEpisodesError(
-            f"{path}: '{expression}' is true for no episode ({len(log.lengths)} in the log)"
-        )
-    with replacing(Path(out), LogError, overwrite=overwrite) as unfinished:
-        found = _copy_episodes(log, chosen, unfinished, Path(out))
-    carry_labels(labels, chosen, Path(out))
-    return found
+        raise NoEpisodesError(f"{name}: '{expression}' is true for no episode ({count} in the log)")
+    return chosen
+
+
+def selected(dataset: Dataset, only: str | None = None, mask: Sequence[str] = ()) -> Dataset:
+    """Return the episodes for which an expression of `mcaprl.filter` is true.
+
+    The steps in intervals of the names in `mask` are left out; see `Dataset.without`.
+
+    Raises:
+        UsageError: The dataset grows, or has not exactly the episodes of its logs.
+        NoEpisodesError: The expression is true for no episode.
+        UnknownNameError: There are no intervals of such a name.
+    """
+    if only is None and not mask:
+        return dataset
+    if dataset.origin.grow is not None:
+        name = "mask" if mask else "only"
+        raise UsageError(f"`{name}=` and `follow=`: a log that is being written has no labels")
+    labels, lengths = cache(lambda: labels_of(dataset)), dataset.episode_lengths
+    dropped = np.zeros(len(dataset), np.bool_)
+    if mask:
+        steps = (labels() or Labels("")).steps(lengths)
+        for name in mask:
+            if name not in steps:
+                raise UnknownNameError("name of intervals", name, steps)
+            dropped |= steps[name]
+    if only is not None:
+        summaries = [episode.summary for episode in dataset.episodes]
+        chosen = _chosen(only, summaries, labels, "the data")
+        dropped |= np.repeat(~np.isin(np.arange(len(lengths)), chosen), lengths)
+    return dataset.without(dropped)
 
 
 def split_log(

@@ -32,10 +32,11 @@ from mcaprl.recorder.dataset.log_reader import describe
 from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.log_writer import LogWriter
-from mcaprl.recorder.format.messages import INTERRUPTED
+from mcaprl.recorder.format.messages import INTERRUPTED, TEXT_TYPE
 from mcaprl.recorder.format.reading import McapReader, Topic
-from mcaprl.recorder.format.schema import EPISODE_TOPIC, LOG_TOPIC
+from mcaprl.recorder.format.schema import EPISODE_TOPIC, LABELS_TOPIC, LOG_TOPIC
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
+from mcaprl.recorder.format.writing import McapWriter
 from mcaprl.recorder.record.display import SCENE, TELEMETRY, TF, Display, ShownTopics
 from mcaprl.recorder.record.layout import (
     LAYOUT_NAME,
@@ -46,7 +47,7 @@ from mcaprl.recorder.record.layout import (
 )
 from mcaprl.recorder.record.recordable import recorded_like, value_at
 from mcaprl.recorder.record.step_rows import as_declared
-from mcaprl.texts import counted
+from mcaprl.texts import counted, encodable
 
 _MOST_FIELDS = 8
 _MOST_EPISODES = 10
@@ -433,6 +434,11 @@ class AnnotatedCopy:
         for times_ns, columns in episodes:
             rows.write_columns(times_ns, columns)
 
+    def add_labels(self, texts: Sequence[tuple[int, str]]) -> None:
+        """Write `/rl/labels`, pairs of log_time and text."""
+        self._refuse(LABELS_TOPIC)
+        _write_labels(self._log.mcap, texts)
+
     def add_scene(self, dataset: Dataset, env: gym.Env[Any, Any], *, camera: bool) -> Verification:
         """Replay the log in the environment, and write the scene."""
         self._refuse(SCENE)
@@ -475,6 +481,20 @@ class AnnotatedCopy:
         layout = layout_of_log(self._source, topics, shown, self._without_q)
         data, time_ns = layout_bytes(layout), mcap.end_time_ns
         mcap.announce(Attachment(time_ns, time_ns, LAYOUT_NAME, "application/json", data))
+
+
+def write_labels(path: Path, texts: Sequence[tuple[int, str]]) -> None:
+    """Write a file that has `/rl/labels` alone, to be played beside a log."""
+    mcap = McapWriter(path)
+    _write_labels(mcap, texts)
+    mcap.close()
+
+
+def _write_labels(mcap: McapWriter, texts: Sequence[tuple[int, str]]) -> None:
+    channel = mcap.add_channel(LABELS_TOPIC, TEXT_TYPE, messages.definition(TEXT_TYPE))
+    mcap.write_messages(
+        [(channel, at, messages.text_message(encodable(text))) for at, text in texts]
+    )
 
 
 def values_topics(names: Sequence[str]) -> dict[str, str]:

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import sys
 from contextlib import closing
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +21,8 @@ from mcaprl.cli import run
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.offline.batches.items import n_step_returns
 from mcaprl.offline.training.watch import choose_held_out
-from mcaprl.recorder.edit.labels import without_intervals
+from mcaprl.recorder.edit.piece import selected
+from mcaprl.recorder.format.reading import McapReader, Topic
 
 
 class Count(gym.Env[Any, Any]):
@@ -213,7 +218,7 @@ def test_parts_of_an_episode_are_held_out_together(tmp_path: Path) -> None:
     for episode in range(12):
         mcaprl.label(log, episode=episode, interval="cut", steps=(2, 3))
     data = mcaprl.open(log)
-    parts = without_intervals(data, ["cut"])
+    parts = selected(data, mask=["cut"])
     assert parts.wholes.tolist() == np.repeat(np.arange(12), 2).tolist()
     assert parts.filter(lambda one: one.index > 2).wholes.tolist()[:3] == [1, 2, 2]
     joined = mcaprl.Dataset.concatenate([parts, parts])
@@ -223,3 +228,87 @@ def test_parts_of_an_episode_are_held_out_together(tmp_path: Path) -> None:
     assert len(chosen) == 3
     expected = np.stack([2 * chosen, 2 * chosen + 1], 1).ravel()
     assert choose_held_out(parts.wholes, 0.25).tolist() == expected.tolist()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_killed_command_leaves_the_old_or_the_new_labels(log: Path) -> None:
+    """The process is killed before each of its operations on files, one after the other."""
+    file = log.with_name("count.mcap.labels.json")
+    old = mcaprl.label(log, episode=0, success=True)
+    before, found = file.read_bytes(), []
+    for limit in range(1, 500):
+        if _finishes(log, limit):
+            break
+        found.append(mcaprl.label(log))
+        # Neither a lock nor an unfinished file keeps others from saving.
+        assert mcaprl.label(log, episode=2, success=True).success["2"]
+        file.write_bytes(before)
+    new = mcaprl.label(log)
+    assert new.rows() == [["0", "success", "", ""], ["1", "failure", "killed", ""]]
+    # All that were killed before the rename left the old labels, all others the new ones.
+    changes = found.index(new)
+    assert changes > 5
+    assert found == [old] * changes + [new] * (len(found) - changes)
+
+
+def _finishes(log: Path, limit: int) -> bool:
+    """Save labels in a process that is killed at its operation number `limit` on files."""
+    pid = os.fork()
+    if pid == 0:
+        operations = count()
+
+        def hook(event: str, _: Any) -> None:
+            is_of_files = event == "open" or event.startswith(("os.", "fcntl.", "shutil."))
+            if is_of_files and event != "os.kill" and next(operations) == limit:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+        sys.addaudithook(hook)
+        try:
+            mcaprl.label(log, episode=1, success=False, note="killed")
+        finally:
+            os._exit(0)
+    return os.waitpid(pid, 0)[1] == 0
+
+
+def test_labels_are_a_topic_of_annotated_logs(log: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="or a log with labels"):
+        mcaprl.annotate(log, tmp_path / "none.mcap")
+    mcaprl.label(log, episode=0, success=True, note="clean \ud800")
+    mcaprl.label(log, episode=2, interval="bad data", steps=(1, 3))
+    mcaprl.label(log, episode=2, interval="intervention", steps=(2, 5))
+    out = tmp_path / "out.mcap"
+    assert mcaprl.annotate(log, out).labels
+    assert mcaprl.label(out).rows() == mcaprl.label(log).rows()
+    topic = Topic(McapReader(out), "/rl/labels")
+    texts = [str(text) for text in topic.read(("data",))["data"]]
+    first, second, third = (one.log_time_ns for one in mcaprl.open(log).episodes)
+    assert list(zip(topic.times.tolist(), texts, strict=True)) == [
+        (first[0], r"success: clean \ud800"),
+        (second[0], ""),
+        (third[1], "bad data"),
+        (third[2], "bad data, intervention"),
+        (third[3], "intervention"),
+        (third[5], ""),
+    ]
+
+
+def test_training_uses_the_successes(log: Path, tmp_path: Path) -> None:
+    for episode in range(3):
+        mcaprl.label(log, episode=episode, success=episode != 1)
+    mcaprl.label(log, episode=0, interval="cut", steps=(2, 3))
+    data = mcaprl.open(log)
+    both = selected(data, "success == 1", ["cut"])
+    assert both.episode_lengths.tolist() == [2, 2, 5]
+    assert both.wholes.tolist() == [0, 0, 2]
+    assert (
+        selected(data, "success == 1").fingerprint
+        == data.filter(lambda e: e.index != 1).fingerprint
+    )
+    assert selected(data) is data
+    settings = ["--algo", "bc", "--updates", "3"]
+    ask = ["train-offline", str(log), *settings, "--only"]
+    assert run([*ask, "success == 1", "--out", str(tmp_path / "a")]) == 0
+    mcaprl.train(data.filter(lambda e: e.index != 1), tmp_path / "b", algo="bc", updates=3)
+    first, second = (next((tmp_path / name).rglob("policy.safetensors")) for name in "ab")
+    assert first.read_bytes() == second.read_bytes()
+    assert run([*ask, "success == 3", "--out", str(tmp_path / "c")]) == 1

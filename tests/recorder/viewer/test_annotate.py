@@ -356,7 +356,7 @@ def test_commands(
     assert "/rl/values/cql td_error" in printed
     assert "/rl/values/bc disagreement" in printed
     for wrong, why in (
-        (["annotate", str(plain), "--out", "b.mcap"], "needs --policy POLICY, --scene, or both"),
+        (["annotate", str(plain), "--out", "b.mcap"], "--scene, or a log with labels"),
         (
             ["annotate", str(plain), "--policy", "pilot", "--out", "b.mcap"],
             "no network to evaluate",

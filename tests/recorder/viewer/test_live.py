@@ -12,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from contextlib import closing
@@ -351,6 +352,37 @@ def test_a_second_viewer_gets_the_current_messages_and_the_first_one_no_line_twi
     topics = {m["topic"] for m in second.seen()["messages"]}
     assert {"/scene", "/scene/static", "/tf", "/tf_static", "/telemetry", "/rl/phase"} <= topics
     assert not topics & {"/rosout", "/rl/episode"}
+
+
+def test_labels_are_played_beside_the_log(log: Path, tmp_path: Path) -> None:
+    viewer_is_there()
+    labeled = tmp_path / "lane.mcap"
+    labeled.write_bytes(log.read_bytes())
+    mcaprl.label(labeled, episode=1, success=False, note="left the lane")
+    stop, addresses = threading.Event(), list[Any]()
+    is_open = threading.Event()
+
+    def opened(address: Any) -> None:
+        addresses.append(address)
+        is_open.set()
+
+    playing = threading.Thread(
+        target=mcaprl.replay,
+        args=(labeled,),
+        kwargs={"port": 0, "episode": 1, "on_open": opened, "stop": stop},
+    )
+    playing.start()
+    try:
+        assert is_open.wait(30)
+        viewer = Watcher(addresses[0].url)
+        time.sleep(0.5)
+    finally:
+        stop.set()
+        playing.join()
+    seen = viewer.seen()["messages"]
+    text = messages.decode(bytes_of(seen, "/rl/labels"), messages.TEXT_TYPE).data
+    assert text == "failure: left the lane"
+    assert "/scene" in {message["topic"] for message in seen}
 
 
 def test_two_logs_are_played_side_by_side(log: Path, tmp_path: Path) -> None:
