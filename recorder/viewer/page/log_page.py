@@ -548,8 +548,8 @@ class PageServer:
         """
         self._token = "" if label is None else secrets.token_urlsafe()
         settings["token"] = self._token
-        self._html = lambda: page_html(page.index(**settings, **labels())).encode()
-        self._label = label
+        self._page, self._settings = page, settings
+        self._labels, self._label = labels, label
         self._count = len(page.dataset.episodes)
         self._episode = lru_cache(_EPISODES_KEPT)(page.episode)
         handler = type("_Handler", (_Handler,), {"respond": self._respond, "save": self._save})
@@ -572,6 +572,9 @@ class PageServer:
     def close(self) -> None:
         """Stop listening."""
         self._server.server_close()
+
+    def _html(self) -> bytes:
+        return page_html(self._page.index(**self._settings, **self._labels())).encode()
 
     def _respond(self, path: str) -> tuple[int, str, bytes]:
         """Return status, type and body of the answer to a request."""
