@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
-from contextlib import nullcontext
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -15,6 +16,7 @@ from mcaprl.cli.options import PATH
 from mcaprl.cli.progress import is_quiet
 from mcaprl.cli.show import echo, print_table, print_wide
 from mcaprl.errors import UsageError
+from mcaprl.progress import printed_lines
 from mcaprl.texts import counted
 
 if TYPE_CHECKING:
@@ -86,7 +88,7 @@ def drive(run: str, dds: bool, ros1: bool, ros2: bool, bag: str | None, **reques
         raise UsageError("choose one of --dds, --ros1, --ros2 and --bag")
     status: list[DriveStatus] = []
     try:
-        with _table() as live:
+        with _table() as live, _lines(status):
 
             def show(found: DriveStatus) -> None:
                 status[:] = [found]
@@ -109,6 +111,13 @@ def _table() -> Any:
     from rich.live import Live
 
     return Live(console=Console(stderr=True), transient=True)
+
+
+def _lines(status: Sequence[DriveStatus]) -> AbstractContextManager[None]:
+    """Return a context manager that prints the last status each 10 s, if there is no terminal."""
+    if is_quiet() or sys.stderr.isatty():
+        return nullcontext()
+    return printed_lines(lambda: _summary(status[0]) if status else "loading the policy")
 
 
 def _drawn(status: DriveStatus) -> Any:

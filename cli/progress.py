@@ -49,21 +49,33 @@ def training_progress(unit: str, *terms: str) -> AbstractContextManager[Progress
 
 
 @contextmanager
-def keeping(text: str, proof: Path | None = None) -> Iterator[None]:
+def keeping(text: str) -> Iterator[None]:
     """Context manager that adds what is kept to the message of an interruption."""
     try:
         yield
     except KeyboardInterrupt as error:
-        if proof is None or proof.exists():
-            error.add_note(text)
+        error.add_note(text)
         raise
 
 
-def checkpoints_kept(run: Path) -> AbstractContextManager[None]:
-    """Return a context manager that names `--resume` if a training is interrupted."""
-    from mcaprl.runs import CONFIG_NAME
+@contextmanager
+def checkpoints_kept(run: Path, resumed: bool) -> Iterator[None]:
+    """Context manager that says what `--resume` does, of an interrupted or resumed training."""
+    from mcaprl.runs import CHECKPOINT_NAME, CONFIG_NAME
 
-    return keeping("continue with --resume", run / CONFIG_NAME)
+    def has_checkpoint() -> bool:
+        return next(run.rglob(CHECKPOINT_NAME), None) is not None
+
+    if resumed and (run / CONFIG_NAME).exists() and not has_checkpoint():
+        hint(f"{run} has no checkpoint: the training begins again")
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        if has_checkpoint():
+            error.add_note("continue with --resume")
+        elif (run / CONFIG_NAME).exists():
+            error.add_note("there was no checkpoint yet; --resume begins again")
+        raise
 
 
 def is_quiet() -> bool:

@@ -112,7 +112,7 @@ def train_offline(data: tuple[str, ...], out: Path, sweep: Path | None, **reques
         facts.append(_facts(dataset))
         return dataset
 
-    with training_progress("updates", "loss") as progress, checkpoints_kept(out):
+    with training_progress("updates", "loss") as progress, checkpoints_kept(out, given["resume"]):
 
         def report(now: TrainingProgress) -> None:
             while facts:

@@ -124,7 +124,7 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
     on_device = request["device"] is not None
     with (
         training_progress("steps", "score", "mean_return", "mean_reward") as progress,
-        nullcontext() if on_device else checkpoints_kept(out),
+        nullcontext() if on_device else checkpoints_kept(out, given["resume"]),
     ):
         found = mcaprl.train_online(sim, out, on_live=print_address, progress=progress, **given)
     rows = [

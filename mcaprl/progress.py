@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -23,9 +24,7 @@ shows a progress bar, and yields an `Advance`."""
 FIRST_LINE_S: Final = 5.0
 """Time until the first line of progress if stderr is not a terminal."""
 LINE_INTERVAL_S: Final = 10.0
-"""Shortest time between two lines of progress if stderr is not a terminal."""
-LINE_INTERVAL_SHARE: Final = 0.1
-"""Shortest time between two such lines as a share of the elapsed time."""
+"""Time between two such lines."""
 LEAST_SHARE: Final = 0.02
 """Share of the work from which on the remaining time is estimated before `FIRST_LINE_S`."""
 
@@ -38,9 +37,11 @@ def no_progress(description: str, total: int | None) -> Iterator[Advance]:
 
 @contextmanager
 def terminal_bar(description: str, total: int | None) -> Iterator[Advance]:
-    """Show a progress bar if stderr is a terminal; otherwise, print a line at long intervals."""
+    """Show a progress bar if stderr is a terminal; otherwise, print a line each 10 s."""
     if not _stderr_is_terminal():
-        yield _ProgressLines(printable(description), total).advance
+        work = Work(printable(description), total)
+        with printed_lines(work.line):
+            yield work.advance
         return
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
@@ -57,22 +58,29 @@ def terminal_wait(description: str) -> Iterator[ProgressBar]:
     """Show that a command is working: a bar without a total, and the elapsed time.
 
     Yields:
-        Function that hides this bar and opens another one, as `terminal_bar` does.
+        Function that opens another bar, as `terminal_bar` does, and hides this one until it ends.
     """
     if not _stderr_is_terminal():
-        yield terminal_bar
+        with printed_lines(Work(printable(description), None).line):
+            yield terminal_bar
         return
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
     text = TextColumn("{task.description}", markup=False)
-    bar = _bars(text, BarColumn(), TimeElapsedColumn(), transient=True)
     with ExitStack() as shown:
-        shown.enter_context(bar).add_task(printable(description), total=None)
 
-        def opened(description: str, total: int | None) -> AbstractContextManager[Advance]:
+        def wait() -> None:
+            bar = _bars(text, BarColumn(), TimeElapsedColumn(), transient=True)
+            shown.enter_context(bar).add_task(printable(description), total=None)
+
+        @contextmanager
+        def opened(description: str, total: int | None) -> Iterator[Advance]:
             shown.close()
-            return terminal_bar(description, total)
+            with terminal_bar(description, total) as advance:
+                yield advance
+            wait()
 
+        wait()
         yield opened
 
 
@@ -92,42 +100,74 @@ def _bars(*columns: ProgressColumn, transient: bool = False) -> Progress:
     return Progress(*columns, console=console, transient=transient, redirect_stdout=redirects)
 
 
-class _ProgressLines:
-    """Progress that is printed to stderr line by line; short operations print nothing."""
+class Work:
+    """A long operation, and the line that says how far it is.
+
+    Args:
+        description: What is done.
+        total: Amount of work; None if it is unknown.
+    """
 
     def __init__(self, description: str, total: int | None) -> None:
+        """Begin the operation."""
         self._description, self._total = description, total
-        self._lines, self._done = _LineTimes(), 0
+        self._began_s, self._done = time.monotonic(), 0
         # Time and progress after the first unit, which may include a compilation.
         self._first: tuple[float, int] | None = None
 
     def advance(self, amount: int) -> None:
+        """Add an amount of completed work."""
         self._done += amount
         if self._first is None:
             self._first = (time.monotonic(), self._done)
-        if not self._lines.is_due():
-            return
+
+    def line(self) -> str:
+        """Return the amount of completed work, or the elapsed time before the first unit."""
+        if self._first is None:
+            return f"{self._description}: {time.monotonic() - self._began_s:.0f} s"
         text = f"{self._description}: {self._done}"
         if self._total is not None:
             text += f" of {self._total}{_text_of_time_left(*self._first, self._done, self._total)}"
-        print(text, file=sys.stderr, flush=True)
+        return text
 
 
-class _LineTimes:
-    """Moments at which lines of progress are printed: often at first, less often later."""
+# Functions that return the lines of nested operations; the innermost one is shown.
+_shown: list[Callable[[], str]] = []
 
-    def __init__(self) -> None:
-        self._began = time.monotonic()
-        self._next_s = FIRST_LINE_S
-        self.elapsed_s = 0.0
 
-    def is_due(self) -> bool:
-        """Return whether to print a line now."""
-        self.elapsed_s = time.monotonic() - self._began
-        if self.elapsed_s < self._next_s:
-            return False
-        self._next_s = self.elapsed_s + max(LINE_INTERVAL_S, LINE_INTERVAL_SHARE * self.elapsed_s)
-        return True
+@contextmanager
+def printed_lines(line: Callable[[], str]) -> Iterator[None]:
+    """Print what a function returns to stderr after 5 s and then each 10 s, by a thread.
+
+    A unit of work, such as a compilation, may take minutes.
+    """
+    ended = threading.Event()
+    thread = threading.Thread(target=_print_lines, args=(ended,), daemon=True)
+    is_outermost = not _shown
+    _shown.append(line)
+    if is_outermost:
+        thread.start()
+    try:
+        yield
+    finally:
+        _shown.remove(line)
+        ended.set()
+        if is_outermost:
+            thread.join()
+
+
+def _print_lines(ended: threading.Event) -> None:
+    pause_s = FIRST_LINE_S
+    while not ended.wait(pause_s) and sys.stderr is not None:
+        pause_s = LINE_INTERVAL_S
+        for line in _shown[-1:]:
+            _print(line())
+
+
+def _print(line: str) -> None:
+    # Nobody may read stderr.
+    with suppress(OSError, ValueError):
+        print(line, file=sys.stderr, flush=True)
 
 
 def _text_of_time_left(began_s: float, first: int, done: int, total: int) -> str:
@@ -139,6 +179,10 @@ def _text_of_time_left(began_s: float, first: int, done: int, total: int) -> str
     return f", about {max(elapsed_s * (total - done) / measured, 0.0):.0f} s left"
 
 
+class Pause(Exception):
+    """Exception that a `ProgressCallback` raises to stop a training after a checkpoint."""
+
+
 @dataclass(frozen=True)
 class TrainingProgress:
     """Progress of one seed, reported after its files are written.
@@ -147,7 +191,7 @@ class TrainingProgress:
         seed: Seed of the run.
         done: Number of completed updates or steps.
         total: Total number of updates or steps.
-        terms: Measured values, such as the loss.
+        terms: Measured values, such as the loss; empty where a resumed training continues.
     """
 
     seed: int
@@ -164,10 +208,12 @@ ProgressCallback = Callable[[TrainingProgress], None]
 def terminal_progress(unit: str, *terms: str) -> Iterator[ProgressCallback]:
     """Show a progress bar for each seed on a terminal: rate, one term and remaining time.
 
-    If stderr is not a terminal, print a line about one seed at long intervals.
+    If stderr is not a terminal, print a line about the seeds that are being trained each 10 s.
     """
     if not _stderr_is_terminal():
-        yield _training_lines(unit, terms)
+        training = Training(unit, terms)
+        with printed_lines(training.line):
+            yield training.report
         return
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
@@ -190,6 +236,8 @@ def terminal_progress(unit: str, *terms: str) -> Iterator[ProgressCallback]:
             if now.seed not in started:
                 bar = bars.add_task("", total=now.total, seed=now.seed, rate=0.0, shown="")
                 started[now.seed] = bar, time.perf_counter(), now.done
+                if resumed := _text_of_resumed(now, unit):
+                    bars.console.print(resumed, markup=False, highlight=False)
             bar, began, first = started[now.seed]
             rate = (now.done - first) / max(time.perf_counter() - began, 1e-9)
             bars.update(bar, completed=now.done, rate=rate, shown=_shown_term(now, terms))
@@ -197,23 +245,45 @@ def terminal_progress(unit: str, *terms: str) -> Iterator[ProgressCallback]:
         yield show
 
 
-def _training_lines(unit: str, terms: Sequence[str]) -> ProgressCallback:
-    """Return a callback that prints lines to stderr."""
-    lines = _LineTimes()
-    # Time and progress at the first report of each seed.
-    started: dict[int, tuple[float, int]] = {}
+class Training:
+    """The training of seeds, and the line that says how far it is.
 
-    def show(now: TrainingProgress) -> None:
-        began, first = started.setdefault(now.seed, (time.monotonic(), now.done))
-        if not lines.is_due():
-            return
-        text = f"seed {now.seed}: {now.done} of {now.total} {unit}"
-        if shown := _shown_term(now, terms):
+    Args:
+        unit: What is counted, such as `updates`.
+        terms: Names of terms, of which the first with a value is shown.
+    """
+
+    def __init__(self, unit: str, terms: Sequence[str]) -> None:
+        """Begin the training."""
+        self._unit, self._terms = unit, terms
+        self._preparing = Work("preparing", None)
+        # Last report of each seed, and time and progress at its first one.
+        self._last: dict[int, TrainingProgress] = {}
+        self._first: dict[int, tuple[float, int]] = {}
+
+    def report(self, now: TrainingProgress) -> None:
+        """Accept the progress of a seed; print where it is resumed."""
+        if resumed := _text_of_resumed(now, self._unit):
+            _print(resumed)
+        self._first.setdefault(now.seed, (time.monotonic(), now.done))
+        self._last[now.seed] = now
+
+    def line(self) -> str:
+        """Return the progress of the seeds that are trained in parallel with the last reported."""
+        last = list(self._last.values())
+        if not last:
+            return self._preparing.line()
+        now = next((each for each in last if each.done < each.total), last[-1])
+        seeds = [str(each.seed) for each in last if each.done == now.done]
+        text = f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {', '.join(seeds)}"
+        text += f": {now.done} of {now.total} {self._unit}"
+        if shown := _shown_term(now, self._terms):
             text += f", {shown}"
-        text += _text_of_time_left(began, first, now.done, now.total)
-        print(text, file=sys.stderr, flush=True)
+        return text + _text_of_time_left(*self._first[now.seed], now.done, now.total)
 
-    return show
+
+def _text_of_resumed(now: TrainingProgress, unit: str) -> str:
+    return f"seed {now.seed}: resumed at {now.done} of {now.total} {unit}" if not now.terms else ""
 
 
 def _shown_term(now: TrainingProgress, terms: Sequence[str]) -> str:

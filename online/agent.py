@@ -182,7 +182,8 @@ class Agent(ABC):
         """Train and evaluate until all steps are done.
 
         Args:
-            report: Callback for progress, called every `LOG_INTERVAL` steps.
+            report: Callback for progress, called every `LOG_INTERVAL` steps, and where a resumed
+                training continues.
 
         Raises:
             TrainingError: The loss is not finite, or a file cannot be written.
@@ -191,6 +192,8 @@ class Agent(ABC):
         if self.steps >= self._task.config.steps:
             return
         self._began_s = time.perf_counter()
+        if self.resumed_at:
+            report(TrainingProgress(self._seed, self.resumed_at, self._task.config.steps, {}))
         path = self._folder / PROGRESS_NAME
         with closing(ScalarsWriter(path, STEPS_COLUMN, self.steps)) as self._scalars:
             self._train(report)

@@ -17,6 +17,7 @@ from robot import PAUSE_S, Drive, Message
 from writers import WRITERS
 
 import mcaprl
+from mcaprl.progress import terminal_bar
 from mcaprl.sims import CarCamera
 
 START_NS = 1_700_000_000 * 10**9
@@ -38,12 +39,14 @@ def make_bag(log: str | Path, out: str | Path, form: str = "ros2") -> int:
 def _recorded(log: str | Path) -> Iterator[tuple[int, Message]]:
     data, camera, start_ns = mcaprl.open(log), CarCamera(), START_NS
     env = mcaprl.make_sim("lane", **data.env_kwargs)
-    for episode in data.episodes:
-        assert episode.seed is not None, f"{log} has no seeds"
-        drive = Drive(env, episode.seed, episode.actions)
-        for message in drive.messages(camera, start_ns):
-            yield start_ns + round(message.time_s * 1e9), message
-        start_ns += round((drive.duration_s + PAUSE_S) * 1e9)
+    with terminal_bar("driving", len(data.episodes)) as advance:
+        for episode in data.episodes:
+            assert episode.seed is not None, f"{log} has no seeds"
+            drive = Drive(env, episode.seed, episode.actions)
+            for message in drive.messages(camera, start_ns):
+                yield start_ns + round(message.time_s * 1e9), message
+            start_ns += round((drive.duration_s + PAUSE_S) * 1e9)
+            advance(1)
 
 
 def main() -> None:

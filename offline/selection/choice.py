@@ -11,7 +11,7 @@ from mcaprl.errors import TrainingError
 from mcaprl.files import read_json, write_json
 from mcaprl.offline.estimate.box import BehaviorCheck
 from mcaprl.offline.estimate.off_policy import LEAST_SAMPLE_SIZE
-from mcaprl.page import Section, Table, write_page
+from mcaprl.page import COLORS, PALE, Figure, Section, Table, new_figure, tick_labels, write_page
 from mcaprl.texts import counted
 
 CHOICE_NAME: Final = "choice.json"
@@ -27,12 +27,27 @@ COLUMNS: Final = (
 )
 EXPLANATION: Final = (
     "Estimates are discounted returns from the first states of the logged episodes, by pessimistic"
-    " FQE; those of candidates that were stopped early are from the first evaluation. best:"
-    " fraction of the resamplings in which the candidate is the best in the last evaluation. as"
-    " logged: fraction of the states in which the candidate takes the logged action. WPDIS:"
+    " FQE. best: fraction of the resamplings in which the candidate is the best in the last"
+    " evaluation. as logged: fraction of the states in which the candidate takes the logged action."
+    " Bellman error: root mean square of r + gamma max Q(s', a) - Q(s, a), divided by the standard"
+    " deviation of Q. WPDIS:"
     " estimate by weighted importance sampling, or the effective number of episodes if there are"
     " too few."
 )
+_OTHERS: Final = (
+    "Their estimates are from the first evaluation, after a part of the updates, and cannot be"
+    " compared with those of the finalists."
+)
+FINALISTS: Final = ("chosen", "runner-up", "")
+"""Outcomes of the candidates of the last evaluation."""
+_MEANINGS: Final = {
+    "return_spread": "standard deviation of the returns of the episodes",
+    "terminated": "fraction of the episodes that end in a terminal state",
+    "entropy": "how random the behavior is: 0 takes always the same action, 1 any of them",
+    "coverage": "fraction of the actions that are likely in the log, over the states",
+    "probabilities": "whether the log has the probabilities of its actions",
+    "problems": "what mcaprl info reports",
+}
 STOPPED_EARLY: Final = "stopped early"
 """Outcome of a candidate that was not trained with all updates, or cannot be chosen."""
 DETERMINISTIC: Final = 0.05
@@ -203,7 +218,7 @@ class Choice:
         complete: bool,
     ) -> Choice:
         """Put a choice among this number of evaluated candidates into words."""
-        reason, confidence = _words(chosen, rule, tried[chosen], evaluated, traits)
+        reason, confidence = _words(chosen, rule, tried[chosen], evaluated, traits, complete)
         advice = _advice(traits, tried, complete)
         return cls(chosen, reason, confidence, advice, complete, traits, tried, rule)
 
@@ -218,16 +233,43 @@ class Choice:
 
     def write_report(self, folder: Path, title: str) -> Path:
         """Write the choice as an HTML page; return its path."""
-        log = [(name.replace("_", " "), _shown(one)) for name, one in asdict(self.traits).items()]
+        traits = asdict(self.traits)
+        log = [
+            (name.replace("_", " "), _shown(one), _MEANINGS.get(name, ""))
+            for name, one in traits.items()
+        ]
+        stopped = [row for row in self.rows if row[-1] not in FINALISTS]
+        finalists = [row for row in self.rows if row[-1] in FINALISTS]
+        figures = [Figure.of("Estimates, with 95 % intervals", self._figure())]
         sections = [
             Section("Confidence", self.confidence),
-            Section("Candidates", EXPLANATION, table=Table(COLUMNS, self.rows)),
-            Section("The log", table=Table(("", ""), log)),
+            Section(
+                "Finalists",
+                EXPLANATION,
+                figures if any(one.rating for one in self.tried.values()) else (),
+                Table(COLUMNS, finalists),
+            ),
+            Section("Other candidates", _OTHERS, table=Table(COLUMNS, stopped)),
+            Section("The log", table=Table(("", "value", "meaning"), log)),
             Section("How to raise the confidence", " ".join(self.advice)),
         ]
         path = folder / "index.html"
-        write_page(path, title, self.reason, sections)
+        shown = [each for each in sections if each.table is None or each.table.rows]
+        write_page(path, title, self.reason, shown)
         return path
+
+    def _figure(self) -> Any:
+        """Draw the estimates of the finalists, and those of the others below them, in gray."""
+        rated = [(name, one, one.rating) for name, one in self.tried.items() if one.rating]
+        figure, axes = new_figure((4.8, 0.6 + 0.3 * len(rated)))
+        for row, (_, one, rating) in enumerate(rated):
+            color = COLORS[0] if one.outcome in FINALISTS else PALE
+            axes.plot(rating.interval, (row, row), color=color)
+            axes.plot(rating.value, row, "o", color=color)
+        axes.set_yticks(range(len(rated)), tick_labels(name for name, *_ in rated))
+        axes.set_ylim(len(rated) - 0.5, -0.5)
+        axes.set_xlabel("estimated discounted return; gray: stopped early")
+        return figure
 
 
 def read_choice(run: Path) -> Choice:
@@ -240,14 +282,14 @@ def read_choice(run: Path) -> Choice:
 
 
 def _words(
-    chosen: str, rule: str, tried: Tried, evaluated: int, traits: LogTraits
+    chosen: str, rule: str, tried: Tried, evaluated: int, traits: LogTraits, complete: bool
 ) -> tuple[str, str]:
     """Return why the rule chose a candidate, and the confidence in the choice."""
     rating, check = tried.rating, tried.check
     if rating is None:
         reason = f"{chosen} is used because the budget ended before any candidate was evaluated."
         return reason, "Unknown, because no candidate was evaluated."
-    count = counted(evaluated, "candidate")
+    count = f"the {counted(evaluated, 'finalist' if complete else 'rated candidate')}"
     confidence = (
         f"In {rating.best_chance:.0%} of the resamplings of episodes, networks and models, {chosen}"
         f" is the best of {count}. This does not include the bias of the models, which a log does"
@@ -276,7 +318,7 @@ def _words(
 
 def _advice(traits: LogTraits, tried: Mapping[str, Tried], complete: bool) -> tuple[str, ...]:
     """Return what data, or which budget, would raise the confidence in the choice."""
-    names = [name for name, one in tried.items() if one.outcome in ("chosen", "runner-up")]
+    names = [name for name, one in tried.items() if one.outcome in FINALISTS[:2]]
     advice = {
         "Resume with a larger time budget: the budget ended early.": not complete,
         f"Record more episodes: {traits.episodes} are few for an interval.": (

@@ -73,7 +73,7 @@ from mcaprl.offline.selection.config import ALL, AUTO, AutoConfig
 from mcaprl.offline.training.metrics import OfflineSummary
 from mcaprl.offline.training.train import train, with_source
 from mcaprl.offline.training.watch import SHORT_HORIZON, horizon_warning
-from mcaprl.progress import ProgressCallback, TrainingProgress
+from mcaprl.progress import Pause, ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.format.behavior import PROBABILITY
 from mcaprl.runs import (
@@ -103,7 +103,6 @@ CLONE_UPDATES: Final = 2_000
 """Maximum number of updates of the clone of the behavior policy."""
 _IQL_INTERVAL: Final = 50
 _OWN: Final = ("finalists", "survivors", "short_fraction", "model_updates")
-_NO_TIME: Final = "the budget ended before {} had a checkpoint: give more minutes"
 _PROBE_UPDATES: Final = 10
 _LEAST_MODEL_UPDATES: Final = 100
 
@@ -263,10 +262,6 @@ def select(
     return choice, summaries
 
 
-class _Pause(Exception):
-    """Exception that a callback raises to stop a training or an evaluation."""
-
-
 class _Race:
     """State of one run of `select`."""
 
@@ -305,8 +300,6 @@ class _Race:
         _warn_about_short_horizons(trying.values(), self._config)
         self._train(list(trying.values()), short, SHARES[0])
         names = [name for name in trying if self._updates(name)]
-        if not names:
-            raise TrainingError(_NO_TIME.format(next(iter(trying))))
         imitate = traits.is_deterministic
         first = self._evaluate("short", names, clone, imitate, 0.5, SHARES[1])
         going = finalists(names)
@@ -364,10 +357,10 @@ class _Race:
         return max(0.0, self._began + share * self._budget_s - time.perf_counter())
 
     def _stop_after(self, ends: float) -> None:
-        """Raise `_Pause` if the time is up."""
+        """Raise `Pause` if the time is up."""
         if time.perf_counter() > ends:
             self._in_time = False
-            raise _Pause
+            raise Pause
 
     def _clone(self) -> Policy:
         """Clone the behavior policy."""
@@ -385,18 +378,18 @@ class _Race:
             range(1),
             lambda now: self._stop_after(ends),
         )
-        files = policy_files(folder)
-        if not files:
-            raise TrainingError(_NO_TIME.format("the clone of the behavior"))
-        return read_policy(files[0].parent)
+        return read_policy(policy_files(folder)[0].parent)
 
     def _train(self, candidates: Sequence[Candidate], until: int, share: float) -> None:
-        """Train candidates until they have `until` updates or their equal times are used."""
+        """Train candidates until they have `until` updates or their equal times are used.
+
+        The first one is trained even if no time is left, so that there is a policy.
+        """
         for k, candidate in enumerate(candidates):
             left_s = self._left_s(share) / (len(candidates) - k)
             if self._updates(candidate.name) >= until:
                 pass
-            elif left_s > 0:
+            elif left_s > 0 or not (k or self._updates(candidate.name)):
                 progress = self._until(candidate.name, until, time.perf_counter() + left_s)
                 config = candidate.config(self._config)
                 self._train_into(self._folder(candidate.name), config, self._seeds, progress)
@@ -409,12 +402,14 @@ class _Race:
 
         def report(now: TrainingProgress) -> None:
             self._done[name, now.seed] = now.done
+            if not now.terms:
+                return
             done = sum(count for (_, seed), count in self._done.items() if seed == now.seed)
             total = self._total
             self._progress(TrainingProgress(now.seed, min(done, total), total, now.terms))
             if now.seed == self._seeds[-1]:
                 if now.done >= until:
-                    raise _Pause
+                    raise Pause
                 self._stop_after(ends)
 
         return report
@@ -424,7 +419,7 @@ class _Race:
     ) -> None:
         """Start or resume a run. Return when it ends, or when the callback pauses it."""
         subfolder(folder.parent)
-        with suppress(_Pause), warnings.catch_warnings():
+        with suppress(Pause), warnings.catch_warnings():
             # `_warn_about_short_horizons` names the candidates, once for both stages.
             warnings.filterwarnings("ignore", SHORT_HORIZON)
             train(
@@ -482,7 +477,7 @@ class _Race:
             return collector.collect([one for each in policies.values() for one in each], check)
 
         evidence: dict[str, list[Evidence]] = {}
-        with suppress(_Pause):
+        with suppress(Pause):
             if math.isfinite(ends):
                 # A few updates show how many fit into the time.
                 evaluate(_PROBE_UPDATES, 0)

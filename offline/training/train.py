@@ -37,7 +37,7 @@ from mcaprl.offline.training.watch import (
     largest_return,
     schedule_warning,
 )
-from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
+from mcaprl.progress import Pause, ProgressCallback, TrainingProgress, terminal_progress
 from mcaprl.runs import (
     CHECKPOINT_NAME,
     RunIdentity,
@@ -279,6 +279,8 @@ class _Run:
         updates, seeds = learner.config.updates, learner.seeds
         terms: list[dict[str, float]] = [{} for _ in seeds]
         warned = False
+        for seed in seeds if resumed_at else ():
+            report(TrainingProgress(seed, resumed_at, updates, {}))
         with ExitStack() as stack:
             metrics = [
                 stack.enter_context(
@@ -290,8 +292,12 @@ class _Run:
                 learner = self._with_new_episodes(learner)
                 before, terms = terms, self._train_to_next_stop(learner, metrics)
                 warned = warned or self._warn(before, terms)
-                for seed, mine in zip(seeds, terms, strict=True):
-                    report(TrainingProgress(seed, learner.step, updates, mine))
+                try:
+                    for seed, mine in zip(seeds, terms, strict=True):
+                        report(TrainingProgress(seed, learner.step, updates, mine))
+                except Pause:
+                    self._save(learner)
+                    raise
         seconds = time.perf_counter() - began
         folders = [seed_folder(self.folder, seed) for seed in seeds]
         return [

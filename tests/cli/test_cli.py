@@ -565,6 +565,11 @@ def test_stopped_recording_is_readable(number: signal.Signals) -> None:
         (["evaluate", "random", "--data", str(LANE_LOG)], "estimate", "\n"),
         (["train-offline", str(LANE_LOG), "--out", "new"], "train", "\n"),
         (["train-offline", str(LANE_LOG), "--out", "run"], "train", "; continue with --resume\n"),
+        (
+            ["train-offline", str(LANE_LOG), "--out", "begun"],
+            "train",
+            "; there was no checkpoint yet; --resume begins again\n",
+        ),
         pytest.param(
             ["train-online", "lane", "--out", "run"],
             "train_online",
@@ -583,8 +588,11 @@ def test_an_interruption_says_what_is_kept(
     def stopped(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    Path("run").mkdir()
-    Path("run/config.json").touch()
+    for folder in ("run", "begun"):
+        Path(folder).mkdir()
+        Path(folder, "config.json").touch()
+    Path("run/seed-0").mkdir()
+    Path("run/seed-0/checkpoint.safetensors").touch()
     monkeypatch.setattr(mcaprl, function, stopped)
     assert run(arguments) == 130
     assert f"mcaprl: interrupted{kept}" in capsys.readouterr().err

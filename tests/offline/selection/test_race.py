@@ -13,7 +13,7 @@ import pytest
 import mcaprl
 from mcaprl.errors import OutputExistsError, TrainingError, UsageError
 from mcaprl.offline.policy import read_policy
-from mcaprl.offline.selection.choice import COLUMNS, read_choice
+from mcaprl.offline.selection.choice import COLUMNS, UNTESTED, read_choice
 from mcaprl.offline.selection.config import AutoConfig
 from mcaprl.offline.selection.race import PORTFOLIO, eligible, select
 from mcaprl.progress import TrainingProgress
@@ -227,10 +227,18 @@ def test_checkpoints_meet_the_end_of_the_short_training() -> None:
     assert AutoConfig(updates=1).short_updates == 1
 
 
-def test_a_budget_without_time_for_a_checkpoint_is_one_line(data: Dataset, tmp_path: Path) -> None:
-    with pytest.raises(TrainingError, match="give more minutes") as caught:
-        select(data, replace(CONFIG, budget_minutes=1e-9), tmp_path / "run")
-    assert "\n" not in str(caught.value)
+def test_a_budget_without_time_for_a_checkpoint_keeps_the_first_candidate(
+    data: Dataset, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    choice, (summary,) = select(data, replace(CONFIG, budget_minutes=1e-9), run)
+    assert (choice.chosen, choice.rule, choice.complete) == ("iql", UNTESTED, False)
+    assert 0 < summary.steps == updates(run)["iql"] < CONFIG.short_updates
+    assert choice.tried["bc"].outcome == "no checkpoint within the budget"
+    assert mcaprl.load_policy(run).act(np.eye(2, dtype=np.float32)).shape == (2,)
+    assert read_choice(run).advice[0] == (
+        "Resume with a larger time budget: the budget ended early."
+    )
 
 
 def test_other_settings_or_data_cannot_resume(data: Dataset, finished: Path) -> None:
@@ -288,6 +296,18 @@ def test_mistakes_are_one_line(
     with pytest.raises(UsageError, match=message):
         mcaprl.train(data, tmp_path / "run", **given)
     assert not (tmp_path / "run").exists()
+
+
+def test_the_page_shows_the_finalists_first_with_a_figure(finished: Path, tmp_path: Path) -> None:
+    choice = read_choice(finished)
+    text = choice.write_report(tmp_path, "Choice").read_text()
+    finalists, _, others = text.partition("<h2>Other candidates</h2>")
+    for name, one in choice.tried.items():
+        cell = f">{name}</td>"
+        assert (cell in finalists) == (one.outcome in ("chosen", "runner-up")) != (cell in others)
+    assert "of the 2 finalists" in finalists
+    assert "<svg" in finalists.partition("<h2>Finalists</h2>")[2]
+    assert "1 any of them" in others
 
 
 def test_a_run_of_another_algorithm_has_no_choice(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ from mcaprl.offline.algorithms.config import (
 from mcaprl.offline.policy import read_policy
 from mcaprl.offline.training.metrics import OfflineSummary, describe_seeds, draw_curves
 from mcaprl.offline.training.train import train
-from mcaprl.progress import TrainingProgress
+from mcaprl.progress import Pause, TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import read_curve
 from tests.support.offline_tasks import corridor, crossing
@@ -253,6 +253,22 @@ def test_a_run_killed_at_random_moments_resumes_bit_for_bit(tmp_path: Path) -> N
     train(corridor(), LONG_CQL, tmp_path / "whole", seeds=2, progress=silent)
     for seed in (0, 1):
         assert_same_result(tmp_path / "cut", tmp_path / "whole", seed)
+
+
+def test_a_paused_run_has_a_checkpoint_and_says_where_it_resumes(
+    whole: OfflineSummary, tmp_path: Path
+) -> None:
+    def pause(now: TrainingProgress) -> None:
+        if now.done == 50:
+            raise Pause
+
+    with pytest.raises(Pause):
+        train(corridor(), SHORT_CQL, tmp_path / "cut", progress=pause)
+    reported: list[TrainingProgress] = []
+    train(corridor(), SHORT_CQL, tmp_path / "cut", resume=True, progress=reported.append)
+    assert reported[0] == TrainingProgress(0, 50, 100, {})
+    assert [now.done for now in reported[1:]] == [60, 70, 80, 90, 100]
+    assert_same_result(tmp_path / "cut", whole.folder.parent)
 
 
 def test_incomplete_and_damaged_rows_are_dropped(whole: OfflineSummary, tmp_path: Path) -> None:
