@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from mcaprl.cli.help import Command
+from mcaprl.errors import is_help
 from mcaprl.settings import Settings, field_help, flag
 
 
@@ -24,6 +25,14 @@ class SettingsCommand(Command):
         """Create the command."""
         super().__init__(*arguments, **others)
         self._configs, self._tuned = configs, tuned
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the options, or print the help, which also lists the settings without the extra."""
+        token = is_help.set(not {"-h", "--help"}.isdisjoint(args))
+        try:
+            return super().parse_args(ctx, args)
+        finally:
+            is_help.reset(token)
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         """Return the options of the command and of the algorithms."""

@@ -27,7 +27,9 @@ import importlib
 import re
 from collections import Counter
 from collections.abc import Iterable
+from contextvars import ContextVar
 from dataclasses import dataclass
+from importlib.util import find_spec
 from types import ModuleType
 from typing import ClassVar, Final, Literal, Protocol, TypeVar
 
@@ -146,6 +148,21 @@ def import_extra(module: str, extra: str) -> ModuleType:
         raise MissingExtraError(
             f"{module.split('.')[0]} is not installed: pip install 'mcaprl[{extra}]'"
         ) from error
+
+
+is_help: Final = ContextVar("is_help", default=False)
+"""Whether only the help of a command is printed, which needs no extra."""
+
+
+def require_extra(extra: str, *packages: str) -> None:
+    """Check without importing them that the packages of an extra are installed.
+
+    Raises:
+        MissingExtraError: One is missing, and not only help is printed.
+    """
+    for name in packages:
+        if find_spec(name) is None and not is_help.get():
+            raise MissingExtraError(f"{name} is not installed: pip install 'mcaprl[{extra}]'")
 
 
 Severity = Literal["problem", "note"]

@@ -14,10 +14,9 @@ Raises:
     MissingExtraError: The packages of the `offline` extra are not installed.
 """
 
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from mcaprl.errors import MissingExtraError
+from mcaprl.errors import require_extra
 from mcaprl.lazy import lazy_attributes
 
 if TYPE_CHECKING:
@@ -42,9 +41,7 @@ if TYPE_CHECKING:
     from mcaprl.offline.selection.choice import DETERMINISTIC
     from mcaprl.offline.training.train import train
 
-for _package in ("torch", "safetensors", "tensorboard"):
-    if find_spec(_package) is None:
-        raise MissingExtraError(f"{_package} is not installed: pip install 'mcaprl[offline]'")
+require_extra("offline", "torch", "safetensors", "tensorboard")
 
 __all__ = [
     "ALGORITHMS",

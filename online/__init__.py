@@ -10,10 +10,9 @@ Raises:
     MissingExtraError: The packages of the `online` extra are not installed.
 """
 
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from mcaprl.errors import MissingExtraError
+from mcaprl.errors import require_extra
 from mcaprl.lazy import lazy_attributes
 
 if TYPE_CHECKING:
@@ -28,9 +27,7 @@ if TYPE_CHECKING:
     from mcaprl.online.task import Task
     from mcaprl.online.zip_file import describe_run, read_policy, save_policy
 
-for _package in ("stable_baselines3", "tensorboard"):
-    if find_spec(_package) is None:
-        raise MissingExtraError(f"{_package} is not installed: pip install 'mcaprl[online]'")
+require_extra("online", "stable_baselines3", "tensorboard")
 
 __all__ = [
     "FRESH_SEED",

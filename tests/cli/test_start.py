@@ -12,6 +12,7 @@ import pytest
 
 from mcaprl.cli import cli
 from mcaprl.cli.help import OPTION_GROUPS
+from tests.support.extras import packages_of_extras
 from tests.support.paths import GOLDEN
 
 LANE_LOG = GOLDEN / "lane-1.mcap"
@@ -36,6 +37,27 @@ def loaded_by(*code: str, run: str = RUN) -> set[str]:
 def test_no_help_imports_an_engine_or_reads_logs() -> None:
     loaded = loaded_by(*(f"assert run([{name!r}, '--help']) == 0" for name in cli.commands))
     assert not loaded & (ENGINES | READING)
+
+
+def test_help_needs_no_extra() -> None:
+    """Packages that only extras install are not found, as after an installation without any."""
+    code = f"""import sys
+from importlib.machinery import PathFinder
+class Installed(PathFinder):
+    def find_spec(name, *others):
+        is_missing = name.partition(".")[0] in {sorted(packages_of_extras())!r}
+        return None if is_missing else PathFinder.find_spec(name, *others)
+sys.meta_path = [Installed if one is PathFinder else one for one in sys.meta_path]
+sys.argv = ["mcaprl"]
+from mcaprl.cli import cli, run
+for name in cli.commands:
+    assert run([name, "--help"]) == 0, name
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not done.stderr
+    for name in ("train-online", "train-offline"):
+        assert f"mcaprl {name} " in done.stdout
+        assert "--gamma" in done.stdout
 
 
 @pytest.mark.parametrize(
