@@ -230,11 +230,12 @@ def _binned(
     An action is a combination of bins, one for each element; `words` are the elements' names.
     """
     values = np.zeros(len(commands), np.int64)
-    names = []
+    names = list[list[str]]()
     for word, edges, column in zip(words, action.edges, commands.T, strict=True):
         values = values * (len(edges) + 1) + np.digitize(column, edges)
         limits = [f"{edge:g}" for edge in edges]
         between = [f"{low} to {high}" for low, high in itertools.pairwise(limits)]
         parts = [f"below {limits[0]}", *between, f"from {limits[-1]}"] if limits else ["any"]
         names.append([f"{word} {part}" for part in parts])
-    return values, tuple(" and ".join(parts) for parts in itertools.product(*names))
+    joined, named = (", ", action.bins) if action.bins else (" and ", names)
+    return values, tuple(joined.join(parts) for parts in itertools.product(*named))

@@ -430,6 +430,11 @@ class Action(_Part):
         description="Bin edges of each element of the command, increasing. An action is a"
         " combination of bins, one for each element.",
     )
+    bins: list[list[str]] = Field(
+        default=[],
+        description="With `edges`: names of the bins of each element, such as `[[slow, fast],"
+        " [right, left]]`. An action is then called `slow, left`. Default: the limits of the bins.",
+    )
     box: Limits | None = Field(
         default=None,
         description="Limits of a Box action; commands are clipped to them. `{}` takes the limits"
@@ -508,6 +513,10 @@ class Action(_Part):
                 raise ValueError(f"{name} needs {least} entries, one for each of {given[0]}")
         if any(sorted(set(each)) != each for each in self.edges):
             raise ValueError("edges must rise")
+        if self.bins and [len(each) - 1 for each in self.bins] != list(map(len, self.edges)):
+            raise ValueError("bins need one name more than edges, for each element of the command")
+        if any(len(set(each)) < len(each) for each in self.bins):
+            raise ValueError("bins of an element need different names")
         count = math.prod(len(each) + 1 for each in self.edges)
         if count > MAX_ACTIONS:
             raise ValueError(f"edges have {count} combinations; at most {MAX_ACTIONS} are possible")

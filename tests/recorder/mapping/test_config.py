@@ -49,6 +49,16 @@ def test_a_good_mapping_has_defaults(tmp_path: Path) -> None:
         ("{field: /mode.data}", "{fields: [/a.b]}", "action: fields need one of actions, edges"),
         ("{field: /mode.data}", "{fields: [/a.b, /a.c], edges: [[1]]}", "needs 2 entries, one"),
         ("{field: /mode.data}", "{fields: [/a.b], edges: [[2, 1]]}", "action: edges must rise"),
+        (
+            "{field: /mode.data}",
+            "{fields: [/a.b], edges: [[1, 2]], bins: [[slow, fast]]}",
+            "action: bins need one name more than edges, for each element of the command",
+        ),
+        (
+            "{field: /mode.data}",
+            "{fields: [/a.b], edges: [[1]], bins: [[slow, slow]]}",
+            "action: bins of an element need different names",
+        ),
         ("  speed:", "  a-b:", "observation has"),
         ("speed:", "action:", "'action' has another meaning in expressions: use another name"),
         ("speed:", "truncated:", "'truncated' has another meaning in expressions"),

@@ -158,6 +158,10 @@ def test_commands_become_named_actions_and_bins_and_boxes() -> None:
     data = read(bag, action=binned).dataset
     assert data.actions.tolist() == [5, 1, 2]
     assert data.action_names[2] == "v 0.3 to 0.8 and w below 0"
+    named = {**binned, "bins": [["stopped", "slow", "fast"], ["right", "left"]]}
+    data = read(bag, action=named).dataset
+    assert data.actions.tolist() == [5, 1, 2]
+    assert data.action_names[2] == "slow, right"
     data, report = read(bag, action={"fields": fields, "box": {"low": [0, -0.5], "high": [1, 1]}})
     np.testing.assert_allclose(data.actions, [[0.9, 0.05], [0.0, 0.0], [0.4, -0.5]], rtol=1e-6)
     assert report.far_actions == pytest.approx(1 / 3)

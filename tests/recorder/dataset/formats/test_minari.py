@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import sys
 import warnings
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,12 +18,13 @@ from hypothesis import assume, given, settings
 
 import mcaprl
 from mcaprl import Dataset
-from mcaprl.errors import LogError, OutputExistsError, SpaceError, UsageError
+from mcaprl.errors import LogError, MissingExtraError, OutputExistsError, SpaceError, UsageError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.dataset.formats.minari_metadata import local_path, space_to_text
 from mcaprl.recorder.format.metadata import LogMetadata
 from tests.conftest import need
 from tests.recorder.dataset.formats.minari_sets import Cameras, collect
+from tests.support.paths import GOLDEN
 from tests.support.recordings import assert_same_bits
 from tests.support.strategies import transitions
 from tests.support.transitions import same_transitions
@@ -609,3 +611,11 @@ def test_damaged_datasets_give_one_clear_line(tmp_path: Path) -> None:
     fails("not a readable HDF5 file")
     (path / "data/metadata.json").write_text("{")
     fails("metadata.json cannot be read")
+
+
+def test_without_h5py_nothing_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = mcaprl.open(GOLDEN / "lane-1.mcap")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(MissingExtraError, match=r"h5py is not installed: .*mcaprl\[interop\]"):
+        data.to_minari(tmp_path / "collect-v0", lossy=True)
+    assert not list(tmp_path.iterdir())
