@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterable
+from functools import cache
 from importlib.metadata import packages_distributions
 
 from tests.support.paths import ROOT
@@ -47,6 +48,7 @@ def _import_name(requirement: str) -> str:
     return _IMPORTS.get(name) or _modules().get(name, name)
 
 
+@cache
 def _modules() -> dict[str, str]:
     """Return the module of each installed distribution that has a single public one."""
     modules: dict[str, list[str]] = {}
