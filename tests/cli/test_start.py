@@ -12,7 +12,7 @@ import pytest
 
 from mcaprl.cli import cli
 from mcaprl.cli.help import OPTION_GROUPS
-from tests.support.extras import packages_of_extras
+from tests.cli.extras import packages_of_extras
 from tests.support.paths import GOLDEN
 
 LANE_LOG = GOLDEN / "lane-1.mcap"
