@@ -285,8 +285,10 @@ class DriverCore:
                 stop command is returned and recorded instead.
         """
         time_ns = now_ns if self.clock_topic is None else self._live.clock_ns
-        if time_ns is None:
-            return self._stopped(now_ns, f"no message of {self.clock_topic} yet")
+        lack = self._live.lack
+        if time_ns is None or (lack and self.clock_topic is not None):
+            self.policy.interrupt()
+            return self._stopped(now_ns, lack or f"no message of {self.clock_topic} yet")
         step, state = None, None
         try:
             step = self._live.step(time_ns)

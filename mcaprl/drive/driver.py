@@ -80,13 +80,13 @@ class Driver(DriverCore):
         policy, found = _loaded(run)
         robot, place = _robot_of(run, found, mapping, bag)
         self._topics = Topics(robot.topics)
-        for name, each in robot.mapping.observation.items():
-            if each.undistort is not None:
-                raise UsageError(
-                    f"{place.of('observation', name, 'undistort')}: a driver cannot rectify images"
-                    " yet: rectify them on the robot, and train with those"
-                )
-        self._plan = Plan(self._topics, robot.mapping, place, trust_code=trust_code)
+        self._plan = Plan(
+            self._topics,
+            robot.mapping,
+            place,
+            trust_code=trust_code,
+            packets_ns=robot.packets_ns,
+        )
         live = LiveSteps(self._plan, robot.shapes)
         commands = Commands(self._plan, policy)
         self._robot_commands = commands

@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from mcaprl.drive.driver import Driver
-from mcaprl.errors import PolicyError
+from mcaprl.errors import PolicyError, UsageError
 from mcaprl.files import replacing
 
 _MAIN = "mcaprl.drive.node_main"
@@ -42,8 +42,15 @@ def export_node(driver: Driver, path: Path, *, overwrite: bool = False) -> None:
     """Write the node of a driver.
 
     Raises:
+        UsageError: The policy observes a video.
         OutputExistsError: The file exists.
     """
+    for name, reader in driver._plan.images.items():
+        if reader.packets_ns is not None:
+            raise UsageError(
+                f"{name}: a node of one file cannot decode the video of {reader.topic}: train with"
+                " a topic of images, or use `mcaprl drive`"
+            )
     from mcaprl.offline.export import export_onnx
 
     with TemporaryDirectory() as folder:

@@ -86,7 +86,7 @@ class NodePlan:
         topic = wanted.source.topic
         options = ImageOptions(topic, wanted.quantity)
         own = {"bag": self.bag, "topic": topic, "fields": fields, "options": options}
-        return SimpleNamespace(**own, is_video=False)
+        return SimpleNamespace(**own, packets_ns=None)
 
     def transform_time(self, topic: str) -> str:
         """Return the time of the transforms of a topic."""

@@ -8,13 +8,16 @@ those of OpenCV: `plumb_bob` (D has 4 or 5 numbers), `rational_polynomial` (8) a
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, UsageError
-from mcaprl.recorder.bags.bag import Bag
+from mcaprl.limits import MAX_IMAGE_PIXELS
+from mcaprl.recorder.bags.bag import Bag, TopicInfo
+from mcaprl.recorder.bags.values import value_at
 
 Floats = NDArray[np.float64]
 
@@ -58,24 +61,38 @@ class Calibration(NamedTuple):
         """
         if topic not in bag.topics:
             raise UsageError(f"undistort: the bag has no topic {topic}")
-        info = bag.topics[topic]
-        names = "dkrp" if info.may_have("k") and not info.may_have("K") else "DKRP"
-        if not all(map(info.may_have, (*_FIELDS, *names))):
-            raise UsageError(f"undistort: {topic} has {info.type_name}, not CameraInfo")
+        info, fields = bag.topics[topic], calibration_fields(bag.topics[topic])
         ends = np.unique([0, max(0, info.count - 1)])
-        found = bag.read(topic, (*_FIELDS, *names), ends if info.count else ends[:0]).columns
+        found = bag.read(topic, fields, ends if info.count else ends[:0]).columns
         count = len(found["width"])
         if not count:
             raise LogError(f"undistort: {topic} has no message that can be read")
-        first, last = (cls._parsed(topic, found, names, row) for row in (0, count - 1))
+        first, last = (
+            cls.parsed(topic, *(found[name][row] for name in fields)) for row in (0, count - 1)
+        )
         if str(first) != str(last):
             raise LogError(f"undistort: the calibration on {topic} changes: split the bag")
         return first
 
     @classmethod
-    def _parsed(cls, topic: str, found: Any, names: str, row: int) -> Calibration:
-        d, k, r, p = (np.asarray(found[name][row], np.float64).ravel() for name in names)
-        model = str(found["distortion_model"][row])
+    def parsed(cls, topic: str, width: Any, height: Any, kind: Any, *arrays: Any) -> Calibration:
+        """Return the calibration of the values of `calibration_fields`.
+
+        Raises:
+            UsageError: It cannot be used.
+        """
+        try:
+            d, k, r, p = (np.asarray(each, np.float64).ravel() for each in arrays)
+            width, height, sizes = int(width), int(height), (len(k), len(r), len(p))
+        except (TypeError, ValueError, OverflowError) as error:
+            raise UsageError(f"undistort: {topic} has no calibration: {error}") from error
+        if sizes != (9, 9, 12) or not 0 < width * height <= MAX_IMAGE_PIXELS or width < 0:
+            raise UsageError(
+                f"undistort: {topic} has {', '.join(map(str, sizes))} numbers in K, R and P for"
+                f" {width} x {height} pixels; expected 9, 9 and 12, for at most"
+                f" {MAX_IMAGE_PIXELS} pixels"
+            )
+        model = str(kind)
         # Without a model, the images are not distorted.
         counts = _COUNTS.get(model, (0,) if not model else ())
         if len(d) not in (0, *counts) or not counts:
@@ -89,9 +106,7 @@ class Calibration(NamedTuple):
             raise UsageError(
                 f"undistort: the camera of {topic} is not calibrated: K is {camera.tolist()}"
             )
-        return cls(
-            int(found["width"][row]), int(found["height"][row]), model, d, camera, turn, wanted
-        )
+        return cls(width, height, model, d, camera, turn, wanted)
 
     def places(self) -> tuple[Floats, Floats]:
         """Return where the pixels of the rectified image are in the recorded one: x, y (H, W)."""
@@ -102,6 +117,51 @@ class Calibration(NamedTuple):
         x, y = (_fisheye if self.model in ("equidistant", "fisheye") else _polynomial)(x, y, self.d)
         k = self.k
         return k[0, 0] * x + k[0, 1] * y + k[0, 2], k[1, 1] * y + k[1, 2]
+
+
+def calibration_fields(info: TopicInfo) -> tuple[str, ...]:
+    """Return the fields of a topic with the calibration: size, model, D, K, R and P."""
+    names = "dkrp" if info.may_have("k") and not info.may_have("K") else "DKRP"
+    if not all(map(info.may_have, (*_FIELDS, *names))):
+        raise UsageError(f"undistort: {info.name} has {info.type_name}, not CameraInfo")
+    return (*_FIELDS, *names)
+
+
+class HeldCalibration:
+    """Calibration of a camera that is running: that of the first message.
+
+    Attributes:
+        fields: Fields of a message that are used.
+        rectifier: Rectification of the images; None before the first message.
+    """
+
+    def __init__(self, topics: Mapping[str, TopicInfo], topic: str) -> None:
+        """Find the fields of the topic."""
+        if topic not in topics:
+            raise UsageError(f"undistort: the type of {topic} is not known: train again")
+        self.fields, self._topic = calibration_fields(topics[topic]), topic
+        self.rectifier: Rectifier | None = None
+        self._held: Calibration | None = None
+        self._key: Any = None
+
+    def push(self, message: Any) -> None:
+        """Use a message.
+
+        Raises:
+            UsageError: It has no calibration, or another one than the first message.
+        """
+        values = [value_at(message, name) for name in self.fields]
+        key = [each.tobytes() if isinstance(each, np.ndarray) else each for each in values]
+        if key == self._key:
+            return
+        found = Calibration.parsed(self._topic, *values)
+        if self._held is None:
+            self._held, self.rectifier = found, Rectifier(found)
+        elif str(found) != str(self._held):
+            raise UsageError(
+                f"undistort: the calibration on {self._topic} changes: start again with the new one"
+            )
+        self._key = key
 
 
 def _polynomial(x: Floats, y: Floats, d: Floats) -> tuple[Floats, Floats]:

@@ -20,7 +20,7 @@ import json
 import math
 import shutil
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, Problem, UsageError, import_extra
 from mcaprl.files import parse_json
 from mcaprl.recorder.bags.bag import Bag, Failure, TopicInfo
+from mcaprl.recorder.bags.values import converted, kind_at, value_at
 from mcaprl.recorder.dataset.images import (
     CACHE_NOTES,
     Blocks,
@@ -58,7 +59,13 @@ from mcaprl.recorder.mapping.image_pixels import (
     raw_pixels,
 )
 from mcaprl.recorder.mapping.spatial import fields_of, image_of
-from mcaprl.recorder.mapping.video import Converter, Message, VideoStream
+from mcaprl.recorder.mapping.video import (
+    NO_FRAME,
+    Converter,
+    Message,
+    VideoDecoder,
+    VideoStream,
+)
 from mcaprl.texts import counted, size
 
 Image = NDArray[Any]
@@ -77,14 +84,13 @@ class ImageOptions:
         ambiguous: Encoding of images that were read as depth, although it does not say that they
             are; empty if there were none.
         is_intensity: Whether numbers are no depth.
+        rectifier: Rectification of the images; None if there is none.
     """
 
-    def __init__(
-        self, topic: str, quantity: Quantity, calibration: Calibration | None = None
-    ) -> None:
+    def __init__(self, topic: str, quantity: Quantity) -> None:
         """Store the options; `topic` is for error messages."""
         self._topic, self._quantity = topic, quantity
-        self._rectifier = None if calibration is None else Rectifier(calibration)
+        self.rectifier: Rectifier | None = None
         self.ambiguous, self.is_intensity = "", quantity.as_ == "intensity"
 
     def to_json(self) -> str:
@@ -104,8 +110,8 @@ class ImageOptions:
         image, is_number = pixels.image, pixels.units_per_m > 0
         if is_number:
             image = _meters(image, pixels.units_per_m) if is_depth else _finite(image)
-        if self._rectifier is not None:
-            image = self._rectifier.rectified(np.asarray(image), nearest=is_depth)
+        if self.rectifier is not None:
+            image = self.rectifier.rectified(np.asarray(image), nearest=is_depth)
         if quantity.crop is not None:
             image = self._cropped(image, *quantity.crop)
         if quantity.resize is not None:
@@ -335,6 +341,7 @@ class ImageReader:
         fields: Fields of a message to read.
         failures: Messages without a readable image, by their index in the topic, as far as `read`
             found any. They are to be treated as if they did not exist.
+        packets_ns: Typical interval of the packets of a video; None for images.
     """
 
     def __init__(
@@ -345,35 +352,54 @@ class ImageReader:
         *,
         name: str = "image",
         strict: bool = False,
+        packets_ns: Mapping[str, float] | None = None,
     ) -> None:
-        """Find out whether the images are raw, compressed, or frames of a video."""
+        """Find out whether the images are raw, compressed, or frames of a video.
+
+        For a robot that is running, whose messages come later, `packets_ns` has the typical
+        interval of each topic of packets.
+        """
         self.bag, self.topic, self.name = bag, topic, name
-        calibration = quantity.undistort and Calibration.of(bag, quantity.undistort)
-        self.options, self._strict = ImageOptions(topic, quantity, calibration or None), strict
-        self._quantity, is_stream = quantity, False
+        self.options, self._strict = ImageOptions(topic, quantity), strict
+        if quantity.undistort is not None and packets_ns is None:
+            self.options.rectifier = Rectifier(Calibration.of(bag, quantity.undistort))
+        self._quantity, is_stream = quantity, topic in (packets_ns or ())
         if quantity.image is None:
             self.fields = fields_of(bag.topics[topic], quantity)
         else:
-            self.fields, is_stream = _image_fields(bag, bag.topics[topic])
+            self.fields, is_stream = _image_fields(bag, bag.topics[topic], is_stream=is_stream)
         self.failures: dict[int, Failure] = {}
+        self.packets_ns: float | None = None
         self._video: VideoStream | None = None
         if is_stream:
             # A frame is averaged as it is decoded, unless a part of it is wanted.
-            is_whole = quantity.crop is None and calibration is None
+            is_whole = quantity.crop is None and quantity.undistort is None
             self._converter = Converter(quantity.resize if is_whole else None)
+        if is_stream and packets_ns is not None:
+            if topic not in packets_ns:
+                raise UsageError(
+                    f"{topic}: the run does not contain the interval of its packets: train again"
+                )
+            self.packets_ns = packets_ns[topic]
+        elif is_stream:
             files = np.array(bag.recordings)[bag.places(topic)[:, 0]]
             begins = np.flatnonzero(np.diff(files, prepend=-1))
             self._video = VideoStream(self._packets, begins, bag.times(topic))
+            self.packets_ns = self._video.typical_ns
             if not strict:
                 for row, reason in self._video.before_keyframes():
                     self._leave_out(row, reason)
             if len(self.failures) == len(files) > 0:
                 raise LogError(f"{topic}: no frame can be decoded: {self.failures[0].reason}")
 
-    @property
-    def is_video(self) -> bool:
-        """Whether the messages are packets of a video, which depend on each other."""
-        return self._video is not None
+    def of_frame(self, frame: Any) -> Image:
+        """Return the image (H, W, C) of an observation for a frame of a video."""
+        return self.options.applied(Pixels(self._converter.pixels(frame), "video"))
+
+    def live_video(self) -> LiveVideo:
+        """Return a decoder of the packets of a robot that is running."""
+        kinds = kinds_of(self.bag.topics[self.topic], self.fields)
+        return LiveVideo(self.topic, kinds, self.packets_ns or 0.0)
 
     def read(self, rows: NDArray[np.int64], storage: Storage = "memory") -> Frames | None:
         """Return the images of N messages as (N, H, W, C); repeated messages are decoded only once.
@@ -544,7 +570,7 @@ class ImageReader:
                     self._leave_out(row, frame)
             elif row in wanted:
                 try:
-                    image = self.options.applied(Pixels(self._converter.pixels(frame), "video"))
+                    image = self.of_frame(frame)
                 except LogError as error:
                     self._leave_out(row, str(error))
                     continue
@@ -556,13 +582,7 @@ class ImageReader:
             if isinstance(message, Failure):
                 yield row, message.reason
                 continue
-            stamps = [message[name] for name in _STAMPS if name in message]
-            times_ns = [int(each) for each in stamps if isinstance(each, int | np.integer)]
-            times_ns.insert(0, int(self.bag.times(self.topic)[row]))
-            try:
-                yield row, (_kind_of(message), _bytes_of(message["data"]), tuple(times_ns))
-            except LogError as error:
-                yield row, str(error)
+            yield row, _packet(message, int(self.bag.times(self.topic)[row]))
 
     def _in_blocks(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, dict[str, Any] | Failure]]:
         """Yield the fields of each message, a few MB of which are in memory at a time."""
@@ -583,6 +603,66 @@ class ImageReader:
         for k, row in enumerate(found.rows.tolist()):
             messages[row] = {name: column[k] for name, column in found.columns.items()}
         yield from sorted(messages.items(), key=lambda each: each[0])
+
+
+class LiveVideo:
+    """Frames of a topic whose packets come one by one; several quantities may use them.
+
+    Attributes:
+        frame: Frame of the last packet (`av.VideoFrame`).
+        lack: Why it has none; empty if it has one.
+    """
+
+    def __init__(self, topic: str, kinds: Mapping[str, str], packets_ns: float) -> None:
+        """Prepare the decoder; see `ImageReader.packets_ns`."""
+        self._topic, self._kinds = topic, kinds
+        self._row, self._decoder = 0, VideoDecoder(packets_ns)
+        self.frame: Any = None
+        self.lack = ""
+
+    def push(self, message: Any, log_time_ns: int) -> None:
+        """Decode the next packet.
+
+        Raises:
+            UsageError: The codec is not supported, or frames are complete with later packets only.
+        """
+        packet = _packet(parts_of(message, self._kinds), log_time_ns)
+        decoder, self._row, found = self._decoder, self._row + 1, NO_FRAME
+        for row, frame in (
+            decoder.lose(self._row, packet)
+            if isinstance(packet, str)
+            else decoder.feed(self._row, *packet)
+        ):
+            if row == self._row:
+                found = frame
+            elif not isinstance(frame, str):
+                raise UsageError(
+                    f"{self._topic}: its frames are complete with later packets only (B-frames),"
+                    " which a robot does not have yet: encode without B-frames, and train again"
+                )
+        is_lost = isinstance(found, str)
+        self.frame = None if is_lost else found
+        self.lack = f"the last packet of {self._topic} has no frame: {found}" if is_lost else ""
+
+
+def kinds_of(topic: TopicInfo, fields: Iterable[str]) -> dict[str, str]:
+    """Return the kind of each field of a topic; see `kind_at`."""
+    return {name: kind_at(topic.fields, name) for name in fields}
+
+
+def parts_of(message: Any, kinds: Mapping[str, str]) -> dict[str, Any]:
+    """Return fields of a decoded message."""
+    return {name: converted(value_at(message, name), kind) for name, kind in kinds.items()}
+
+
+def _packet(message: dict[str, Any], log_time_ns: int) -> Message:
+    """Return the packet in the fields of a message."""
+    stamps = [message[name] for name in _STAMPS if name in message]
+    times_ns = [int(each) for each in stamps if isinstance(each, int | np.integer)]
+    try:
+        return _kind_of(message), _bytes_of(message["data"]), (log_time_ns, *times_ns)
+    except LogError as error:
+        return str(error)
 
 
 def pixels_of(quantity: Quantity, message: dict[str, Any]) -> Pixels:
@@ -607,7 +687,7 @@ def _kind_of(message: dict[str, Any]) -> str:
     return str(message["encoding" if "encoding" in message else "format"])
 
 
-def _image_fields(bag: Bag, topic: TopicInfo) -> tuple[tuple[str, ...], bool]:
+def _image_fields(bag: Bag, topic: TopicInfo, *, is_stream: bool) -> tuple[tuple[str, ...], bool]:
     """Return the fields of an image message to read, and whether they are packets of a video."""
     every = (*_RAW_FIELDS, _BIG_ENDIAN, *_COMPRESSED_FIELDS, *_STAMPS)
     known = {name.split("[")[0] for name in topic.fields}
@@ -620,7 +700,7 @@ def _image_fields(bag: Bag, topic: TopicInfo) -> tuple[tuple[str, ...], bool]:
         return (*_RAW_FIELDS, *({_BIG_ENDIAN} & known)), False
     if known.issuperset(_COMPRESSED_FIELDS):
         found = bag.read(topic.name, ("format",), np.arange(min(1, topic.count))).columns["format"]
-        is_stream = is_video(topic.type_name) or any(is_video(str(each)) for each in found)
+        is_stream |= is_video(topic.type_name) or any(is_video(str(each)) for each in found)
         return (*_COMPRESSED_FIELDS, *(stamps if is_stream else ())), is_stream
     if known.issuperset(_PACKET_FIELDS):
         return (*_PACKET_FIELDS, *stamps), True

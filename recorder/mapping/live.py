@@ -35,8 +35,9 @@ from mcaprl.recorder.bags.values import (
     without_lacks,
 )
 from mcaprl.recorder.mapping.align import NS_PER_S, padded, pooled
+from mcaprl.recorder.mapping.calibration import HeldCalibration
 from mcaprl.recorder.mapping.config import TimeSource
-from mcaprl.recorder.mapping.images import ImageReader
+from mcaprl.recorder.mapping.images import ImageReader, LiveVideo, kinds_of, parts_of
 from mcaprl.recorder.mapping.observe import (
     Values,
     by_names,
@@ -321,18 +322,29 @@ class _Count(_Value):
 class _Image(_Value):
     """Last image that can be decoded."""
 
-    def __init__(self, wanted: Wanted, reader: ImageReader, shape: tuple[int, ...] | None) -> None:
+    def __init__(
+        self,
+        wanted: Wanted,
+        reader: ImageReader,
+        shape: tuple[int, ...] | None,
+        video: LiveVideo | None,
+        camera: HeldCalibration | None,
+    ) -> None:
         super().__init__(wanted, {}, shape)
-        info = reader.bag.topics[reader.topic]
-        self._kinds = {name: kind_at(info.fields, name) for name in reader.fields}
-        self._reader = reader
-        self._waiting: list[tuple[int, dict[str, Any]]] = []
+        self._kinds = kinds_of(reader.bag.topics[reader.topic], reader.fields)
+        self._reader, self.video, self._camera = reader, video, camera
+        self._waiting: list[tuple[int, Any]] = []
         self.image: NDArray[Any] | None = None
 
     def raw(self, message: Any) -> Any:
-        return {
-            name: converted(value_at(message, name), kind) for name, kind in self._kinds.items()
-        }
+        return parts_of(message, self._kinds) if self.video is None else self.video.frame
+
+    @property
+    def lack(self) -> str:
+        """Why there may be no image: no calibration, or no frame; empty if nothing lacks."""
+        if self._camera is not None and self._camera.rectifier is None:
+            return f"no message of {self.wanted.quantity.undistort} yet"
+        return "" if self.video is None else self.video.lack
 
     def take(self, time_ns: int, raw: Any) -> None:
         bisect.insort(self._waiting, (time_ns, raw), key=_first)
@@ -342,6 +354,11 @@ class _Image(_Value):
         self._waiting, self.time_ns, self.image = [], None, None
 
     def at(self, time_ns: int) -> Values:
+        reader, camera, video = self._reader, self._camera, self.video
+        if camera is not None:
+            reader.options.rectifier = camera.rectifier
+            if camera.rectifier is None:
+                return Values(_ROW, np.ones(1, np.bool_), np.full(1, np.nan))
         while self._waiting:
             own_ns, raw = self._waiting.pop()
             if own_ns > time_ns:
@@ -349,10 +366,13 @@ class _Image(_Value):
             if self.time_ns is not None and own_ns < self.time_ns:
                 break
             try:
-                image = self._reader.options.image(raw)
+                image = reader.options.image(raw) if video is None else reader.of_frame(raw)
             except LogError:
                 continue
             if self.shape is not None and image.shape != self.shape:
+                # Like in a bag, a video may have other frames between those of this size.
+                if video is not None:
+                    continue
                 raise UsageError(
                     f"{self.wanted.source.topic} has an image of {image.shape} after crop and"
                     f" resize, but the policy was trained with {self.shape}"
@@ -362,8 +382,9 @@ class _Image(_Value):
         self._waiting = []
         tolerance_s = self.wanted.quantity.tolerance_s
         age_s = math.nan if self.time_ns is None else (time_ns - self.time_ns) / NS_PER_S
-        is_missing = math.isnan(age_s) or (tolerance_s is not None and age_s > tolerance_s)
-        return Values(_ROW, np.array([is_missing]), np.array([age_s]))
+        if tolerance_s is not None and age_s > tolerance_s:
+            age_s = math.nan
+        return Values(_ROW, np.array([math.isnan(age_s)]), np.array([age_s]))
 
 
 def _first(pair: tuple[int, Any]) -> int:
@@ -526,6 +547,7 @@ class LiveSteps:
     Attributes:
         topics: Topics whose messages are used.
         clock_ns: Time of the last message of the clock's topic; None before the first.
+        lack: Why the last message of the clock's topic is no step; empty if it is.
         fields: Paths of the fields of each topic.
     """
 
@@ -541,6 +563,8 @@ class LiveSteps:
         """
         _check_looks_back(plan)
         self._plan, self._gap_ns = plan, plan.mapping.episodes.gap_s * NS_PER_S
+        self._videos: dict[str, LiveVideo] = {}
+        self._cameras: dict[str, HeldCalibration] = {}
         self._frames = {
             topic: _Frames(topic, plan.transform_time(topic), self._gap_ns) for topic in plan.frames
         }
@@ -548,27 +572,32 @@ class LiveSteps:
         self._members: dict[str, list[_Value]] = {name: [] for name in plan.streams}
         for name, wanted in plan.quantities.items():
             if wanted.quantity.transform is None:
-                kinds, reader = plan.bag.topics[wanted.source.topic].fields, plan.images.get(name)
-                self._values[name] = _value_of(wanted, kinds, reader, (shapes or {}).get(name))
+                self._values[name] = self._value_of(name, wanted, (shapes or {}).get(name))
                 self._members[wanted.stream].append(self._values[name])
         self._streams: dict[str, _Waiting] = {}
+        self._filmed: set[str] = set()
         self._any = _Waiting(lambda *_: None, self._gap_ns)
         self._of_topic: dict[str, list[str]] = {}
         used = {wanted.stream for wanted in plan.quantities.values()} | {plan.clock or ""}
         # The messages of the clock come first, because they shift those of the other streams.
         for name in sorted(used & plan.streams.keys(), key=lambda each: each != plan.clock):
             members = self._members[name]
-            has_images = any(isinstance(each, _Image) for each in members)
-            most = _MOST_IMAGES if has_images else _MOST_PENDING
+            images = [each for each in members if isinstance(each, _Image)]
+            self._filmed |= {name} if any(each.video for each in images) else set()
+            most = _MOST_IMAGES if images else _MOST_PENDING
             self._streams[name] = _Waiting(_taker(members), self._gap_ns, most)
             self._of_topic.setdefault(plan.streams[name].topic, []).append(name)
         tf = [each for one in self._frames.values() for each in (one.topic, one.topic + STATIC)]
-        self.topics = (*self._of_topic, *(each for each in tf if each in plan.bag.topics))
+        others = (*(each for each in tf if each in plan.bag.topics), *self._cameras)
+        self.topics = tuple(dict.fromkeys((*self._of_topic, *others)))
         self.fields = {
             topic: sorted({path for name in names for path in plan.streams[name].fields})
             for topic, names in self._of_topic.items()
         }
+        for topic, camera in self._cameras.items():
+            self.fields[topic] = sorted({*self.fields.get(topic, ()), *camera.fields})
         self.clock_ns: int | None = None
+        self.lack = ""
         self._raw_ns: int | None = None
         self._last_ns: int | None = None
         self._nth, self._problem = 0, ""
@@ -578,9 +607,17 @@ class LiveSteps:
     ) -> None:
         """Use a decoded message of one of the `topics`."""
         publish_ns = log_time_ns if publish_time_ns is None else publish_time_ns
+        if topic in self._cameras:
+            self._cameras[topic].push(message)
+        if (video := self._videos.get(topic)) is not None:
+            video.push(message, log_time_ns)
         for name in self._of_topic.get(topic, ()):
             time_ns = self._plan.streams[name].time_of(message, log_time_ns, publish_ns)
-            if time_ns is None:
+            lack = "" if video is None or name not in self._filmed else video.lack
+            if name == self._plan.clock:
+                self.lack = lack
+            # A packet without a frame is left out, as in a bag.
+            if time_ns is None or lack:
                 continue
             if name == self._plan.clock:
                 time_ns = self._tick(time_ns)
@@ -640,12 +677,12 @@ class LiveSteps:
         return max((each for each in found if each is not None), default=None)
 
     def reset(self) -> None:
-        """Drop all values, as at the start of a recording."""
+        """Drop all values, as at the start of a recording; videos and calibrations go on."""
         parts: list[_Value | _Waiting | _Frames] = [*self._values.values(), *self._frames.values()]
         for part in [*parts, *self._streams.values(), self._any]:
             part.drop()
         self.clock_ns = self._raw_ns = self._last_ns = None
-        self._nth, self._problem = 0, ""
+        self._nth, self._problem, self.lack = 0, "", ""
 
     def step(self, time_ns: int) -> LiveStep:
         """Return the quantities and the observation at a time after that of the last step.
@@ -689,6 +726,24 @@ class LiveSteps:
             is_late or bool(ended),
             min([*(low for low, _ in ended), *silent], default=None),
         )
+
+    def _value_of(self, name: str, wanted: Wanted, shape: tuple[int, ...] | None) -> _Value:
+        topics, topic = self._plan.bag.topics, wanted.source.topic
+        kinds, quantity = topics[topic].fields, wanted.quantity
+        if (reader := self._plan.images.get(name)) is not None:
+            camera = None
+            if quantity.undistort is not None:
+                with self._plan.place.named(*wanted.keys):
+                    camera = HeldCalibration(topics, quantity.undistort)
+                camera = self._cameras.setdefault(quantity.undistort, camera)
+            video = None
+            if reader.packets_ns is not None:
+                video = self._videos.setdefault(topic, reader.live_video())
+            return _Image(wanted, reader, shape, video, camera)
+        if quantity.as_ == "count":
+            return _Count(wanted, {}, ())
+        has_names = bool(quantity.names and wanted.source.names)
+        return (_NamedValue if has_names else _Value)(wanted, kinds, shape)
 
     def _streams_of(self, names: Iterable[str]) -> list[_Waiting]:
         """Return the streams of quantities."""
@@ -738,8 +793,10 @@ class LiveSteps:
         return "", False
 
     def _waits_for(self, name: str, time_ns: int) -> str:
-        wanted = self._plan.quantities[name]
+        wanted, image = self._plan.quantities[name], self._values.get(name)
         topic, quantity = wanted.source.topic, wanted.quantity
+        if isinstance(image, _Image) and image.lack:
+            return image.lack
         if quantity.transform is not None:
             return f"{topic} has no new pose of '{quantity.transform}' in '{quantity.in_}'"
         last_ns, newest_ns = self._values[name].time_ns, self._streams[wanted.stream].newest_ns
@@ -769,17 +826,6 @@ def _taker(values: list[_Value]) -> Callable[[int, Any], None]:
     return take
 
 
-def _value_of(
-    wanted: Wanted, kinds: Mapping[str, str], reader: ImageReader | None, shape: Any
-) -> _Value:
-    if reader is not None:
-        return _Image(wanted, reader, shape)
-    if wanted.quantity.as_ == "count":
-        return _Count(wanted, {}, ())
-    has_names = bool(wanted.quantity.names and wanted.source.names)
-    return (_NamedValue if has_names else _Value)(wanted, kinds, shape)
-
-
 def _check_looks_back(plan: Plan) -> None:
     """Check that no quantity needs messages after the step."""
     for wanted in plan.quantities.values():
@@ -787,12 +833,6 @@ def _check_looks_back(plan: Plan) -> None:
             raise UsageError(
                 f"{plan.place.of(*wanted.keys, 'align')}: `{wanted.quantity.align}` looks ahead,"
                 " and a robot lacks the messages after the step: use `last`, and train again"
-            )
-    for name, reader in plan.images.items():
-        if reader.is_video:
-            raise UsageError(
-                f"{name}: a driver cannot decode the video of {reader.topic} yet: use a topic of"
-                " images"
             )
 
 

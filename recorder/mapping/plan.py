@@ -69,8 +69,17 @@ class Plan:
         constants: Constants of the message types, by name; names with several values are omitted.
     """
 
-    def __init__(self, bag: Bag, mapping: Mapping, place: Place, *, trust_code: bool) -> None:
-        """Resolve all paths and parse all expressions."""
+    def __init__(
+        self,
+        bag: Bag,
+        mapping: Mapping,
+        place: Place,
+        *,
+        trust_code: bool,
+        packets_ns: MappingOf[str, float] | None = None,
+    ) -> None:
+        """Resolve all paths and parse all expressions; for `packets_ns`, see `ImageReader`."""
+        self._packets_ns = packets_ns
         self.bag, self.mapping, self.place = bag, mapping, place
         self.quantities = {
             name: self._wanted((section, name), quantity)
@@ -179,7 +188,12 @@ class Plan:
         keys, quantity, source, *_ = self.quantities[name]
         with self.place.named(*keys):
             return ImageReader(
-                self.bag, source.topic, quantity, name=name, strict=self.mapping.strict
+                self.bag,
+                source.topic,
+                quantity,
+                name=name,
+                strict=self.mapping.strict,
+                packets_ns=self._packets_ns,
             )
 
     def _expression(self, keys: tuple[str | int, ...], text: str) -> Expression:

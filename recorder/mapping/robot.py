@@ -23,12 +23,14 @@ class Robot(NamedTuple):
         topics: Definition of the type of each topic that the mapping uses.
         shapes: Shape of each quantity at a step: `()`, `(K,)`, or that of an image (H, W, C).
         step_ns: Typical time between two steps.
+        packets_ns: Typical interval of the packets of each topic with a video.
     """
 
     mapping: RobotMapping
     topics: Mapping[str, Definition]
     shapes: Mapping[str, tuple[int, ...]]
     step_ns: int
+    packets_ns: Mapping[str, float] = {}
 
     @classmethod
     def of_plan(cls, plan: Plan, shapes: Mapping[str, tuple[int, ...]], step_ns: int) -> Robot:
@@ -41,8 +43,12 @@ class Robot(NamedTuple):
         for topic in plan.frames:
             base = topic.removesuffix(STATIC)
             used |= {base, base + STATIC} & plan.bag.topics.keys()
+        images = plan.mapping.observation.values()
+        used |= {each.undistort for each in images if each.undistort is not None}
         topics = {topic: plan.bag.definition(topic) for topic in sorted(used)}
-        return cls(plan.mapping, topics, shapes, step_ns)
+        readers = plan.images.values()
+        packets = {each.topic: each.packets_ns for each in readers if each.packets_ns is not None}
+        return cls(plan.mapping, topics, shapes, step_ns, packets)
 
     def to_json(self) -> dict[str, Any]:
         """Return the robot as JSON types."""
@@ -51,6 +57,7 @@ class Robot(NamedTuple):
             "topics": {name: _to_json(each) for name, each in self.topics.items()},
             "shapes": {name: list(shape) for name, shape in self.shapes.items()},
             "step_ns": self.step_ns,
+            "packets_ns": dict(self.packets_ns),
         }
 
     @classmethod
@@ -60,7 +67,8 @@ class Robot(NamedTuple):
             topics = {str(name): _from_json(each) for name, each in found["topics"].items()}
             shapes = {str(name): tuple(map(int, shape)) for name, shape in found["shapes"].items()}
             mapping = parse_mapping(found["mapping"], Place(where))
-            return cls(mapping, topics, shapes, int(found["step_ns"]))
+            packets = {str(name): float(ns) for name, ns in found.get("packets_ns", {}).items()}
+            return cls(mapping, topics, shapes, int(found["step_ns"]), packets)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise LogError(f"{where} does not describe a robot ({error!r}): train again") from error
 

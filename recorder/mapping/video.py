@@ -31,8 +31,10 @@ from mcaprl.limits import MAX_IMAGE_PIXELS
 NO_KEYFRAME: Final = "there is no keyframe before it"
 LOST: Final = "a packet between it and the keyframe before it is lost"
 DAMAGED: Final = "a packet between it and the keyframe before it cannot be decoded"
-_NO_FRAME: Final = "the decoder returns no frame"
+NO_FRAME: Final = "the decoder returns no frame"
 _PAUSE: Final = 1.5
+_DELAYED: Final = 64
+"""More packets than a decoder reads before it returns a frame: 16 in H.264 and H.265."""
 _SEARCHED: Final = 64
 """Packets that are decoded although no frame of them is wanted, before a keyframe is searched; and
 packets that are read at a time to find one."""
@@ -390,6 +392,10 @@ class VideoDecoder:
         packet = self._av.Packet(data)
         packet.pts = row
         self._waiting[row] = None
+        if len(self._waiting) > _DELAYED:
+            # A packet of parameter sets alone.
+            self._waiting.pop(oldest := next(iter(self._waiting)))
+            yield oldest, NO_FRAME
         try:
             frames = self._context.decode(packet)
         except self._av.FFmpegError as error:
@@ -412,7 +418,7 @@ class VideoDecoder:
             self._context.flush_buffers()
         waiting, self._waiting, self._broken = list(self._waiting), {}, reason
         for row in waiting:
-            yield row, _NO_FRAME
+            yield row, NO_FRAME
 
     def _open(self, codec: _Codec) -> None:
         if codec is not self._codec:
@@ -463,7 +469,11 @@ Message = tuple[str, bytes, tuple[int, ...]] | str
 
 
 class VideoStream:
-    """Packets of a topic, of which the wanted frames are decoded."""
+    """Packets of a topic, of which the wanted frames are decoded.
+
+    Attributes:
+        typical_ns: Typical interval of the packets, nanoseconds; 0 if it is unknown.
+    """
 
     def __init__(
         self,
@@ -480,7 +490,7 @@ class VideoStream:
         """
         self._read, self._begins, self._count = read, begins, len(times_ns)
         steps_ns = np.diff(times_ns)
-        self._typical_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
+        self.typical_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
 
     def before_keyframes(self) -> Iterator[tuple[int, str]]:
         """Yield the first rows of each recording, up to its first keyframe."""
@@ -497,7 +507,7 @@ class VideoStream:
 
         Of a group of frames, from keyframe to keyframe, without a wanted one, nothing is decoded.
         """
-        decoder, stop, recording = VideoDecoder(self._typical_ns), 0, -1
+        decoder, stop, recording = VideoDecoder(self.typical_ns), 0, -1
         numbers = np.searchsorted(self._begins, wanted, side="right") - 1
         is_apart = (np.diff(wanted) > _SEARCHED) | (np.diff(numbers) > 0)
         parts = np.split(wanted, np.flatnonzero(is_apart) + 1) if len(wanted) else []
@@ -506,7 +516,7 @@ class VideoStream:
             number = int(np.searchsorted(self._begins, first, side="right")) - 1
             if number != recording:
                 yield from decoder.end()
-                decoder, recording = VideoDecoder(self._typical_ns), number
+                decoder, recording = VideoDecoder(self.typical_ns), number
                 stop = int(self._begins[number])
                 self._learn(decoder, stop, first)
             start = self._start(decoder, stop, first)

@@ -24,11 +24,25 @@ from mcaprl.errors import LogError, McaprlError, UsageError
 from mcaprl.recorder.bags.decoders import decoder_of
 from mcaprl.recorder.mapping.config import parse_mapping
 from mcaprl.recorder.mapping.read import read_open_bag
+from mcaprl.recorder.mapping.video import LOST
 from mcaprl.sims.evaluation.rollout import EpsilonGreedy
-from tests.drive.test_live import QUANTITIES, START_NS, TYPES, mappings, odom, streams
+from tests.drive.test_live import (
+    INFO,
+    QUANTITIES,
+    START_NS,
+    TYPES,
+    VIDEO_TYPES,
+    film,
+    films,
+    mappings,
+    odom,
+    stamp,
+    streams,
+)
 from tests.recorder.mapping.suggest.test_suggested_robots import IMPOSSIBLE, ROBOTS
 from tests.support.robots import FORMATS, Robot, vector
 from tests.support.stream_bag import Sent, StreamBag
+from tests.support.videos import packets
 
 MS = 10**6
 SPEED = {"speed": {"field": "/odom.twist.twist.linear.x"}}
@@ -338,6 +352,94 @@ def test_bad_numbers_and_sizes_are_fatal() -> None:
     command = driver.command(START_NS)
     assert command.is_fatal
     assert "/camera has an image of (2, 2, 1)" in command.reason
+
+
+SEEN = {"image": "/film", "resize": [16, 12]}
+STEER = {"fields": ["/cmd.linear.x"], "box": {"low": -1, "high": 1}}
+
+
+def filmed(image: dict[str, Any], **tree: Any) -> tuple[list[Sent], mcaprl.Dataset]:
+    """Return messages of a video, and the data that a mapping makes of them."""
+    sent = films("h264", 0, {23}, set())
+    mapping = {"observation": {"camera": image}, "action": STEER, "time": "log_time", **tree}
+    bag = StreamBag({**TYPES, **VIDEO_TYPES}, sent)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return sent, read_open_bag(bag, parse_mapping(mapping)).dataset
+
+
+def test_the_log_of_a_video_equals_what_its_topics_give(tmp_path: Path) -> None:
+    """Packets are lost and come at each step: no step is taken without a frame."""
+    image = {**SEEN, "undistort": "/info"}
+    sent, data = filmed(image, clock={"topic": "/film"}, stack=2)
+    assert data.robot["packets_ns"] == {"/film": 33 * MS}
+    driver = mcaprl.Driver(Fixed(data), mapping=data.robot)
+    assert [*driver.inputs] == ["/film", "/info"]
+    driver.record(tmp_path / "drive.mcap")
+    found = list[str]()
+    with driver:
+        for each in sent:
+            if each.topic in driver.inputs:
+                driver.push(each.topic, each.message, each.time_ns)
+            if each.topic == "/film":
+                found.append(driver.command(each.time_ns).reason)
+    lost = [k for k, reason in enumerate(found) if LOST in reason]
+    # Packet 23 is lost, and frames 20 to 29 have another size than the calibration.
+    assert lost == [*range(23, 29)]
+    assert found[0] == ""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mapping = data.robot["mapping"]
+        raw = mcaprl.open(tmp_path / "drive.mcap", mapping=mapping)
+    own = mcaprl.open(tmp_path / "drive.mcap")
+    assert len(own) > 30
+    np.testing.assert_array_equal(own._transitions.frames[0][:10], raw._transitions.frames[0][:10])
+
+
+def test_a_video_with_frames_that_come_later_is_refused() -> None:
+    _, data = filmed(SEEN, clock={"rate_hz": 10})
+    driver = mcaprl.Driver(Fixed(data), mapping=data.robot)
+    reason = ""
+    for k, packet in enumerate(packets("h264 with B-frames")[:6]):
+        try:
+            driver.push("/film", film("h264", packet, START_NS).message, START_NS + k * MS)
+        except UsageError as error:
+            reason = str(error)
+            break
+        # Nothing moves before it is known.
+        assert driver.command(START_NS + k * MS).reason
+    assert reason.startswith("/film: its frames are complete with later packets only (B-frames)")
+    data.robot["packets_ns"].clear()
+    data.robot["topics"]["/film"]["type_name"] = "foxglove_msgs/msg/CompressedVideo"
+    with pytest.raises(UsageError, match=r"/film: the run does not contain the interval of its pa"):
+        mcaprl.Driver(Fixed(data), mapping=data.robot)
+
+
+def test_a_driver_waits_for_the_calibration_and_holds_it() -> None:
+    sent, data = filmed({**SEEN, "undistort": "/info"}, clock={"rate_hz": 10})
+    driver = mcaprl.Driver(Fixed(data), mapping=data.robot)
+    packet = next(each for each in sent if each.topic == "/film")
+    driver.push("/film", packet.message, START_NS)
+    waiting = driver.command(START_NS)
+    assert (waiting.reason, waiting.is_fatal) == ("camera: no message of /info yet", False)
+    driver.push("/info", INFO, START_NS + MS)
+    assert not driver.command(START_NS + 2 * MS).reason
+    driver.begin()
+    driver.push("/info", {**INFO, "header": stamp(START_NS)}, START_NS + 3 * MS)
+    driver.push("/film", packet.message, START_NS + 3 * MS)
+    assert not driver.command(START_NS + 4 * MS).reason
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({**INFO, "k": [51.0, *INFO["k"][1:]]}, "undistort: the calibration on /info changes: st"),
+        ({**INFO, "k": [1.0]}, "/info has 1, 9, 12 numbers in K, R and P for 64 x 48 pixels"),
+        ({**INFO, "width": 10**6, "height": 10**6}, "for 1000000 x 1000000 pixels; expected"),
+        ({"width": 64}, r"a message of /info \(sensor_msgs/msg/CameraInfo\) has no field"),
+    ]
+    for message, text in cases:
+        with pytest.raises(UsageError, match=text):
+            driver.push("/info", message, START_NS + 5 * MS)
+    del data.robot["topics"]["/info"]
+    with pytest.raises(UsageError, match=r"camera.*undistort: the type of /info is not known"):
+        mcaprl.Driver(Fixed(data), mapping=data.robot)
 
 
 def episodes_of(data: mcaprl.Dataset) -> list[Any]:

@@ -7,17 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.mapping.config import Place, parse_mapping
-from mcaprl.recorder.mapping.live import STATE, LiveEpisodes, LiveSteps
+from mcaprl.recorder.mapping.images import LiveVideo
+from mcaprl.recorder.mapping.live import STATE, LiveEpisodes, LiveSteps, Topics
 from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.read import read_open_bag
 from mcaprl.recorder.mapping.robot import Robot
 from mcaprl.recorder.mapping.steps import StepReader
+from mcaprl.recorder.mapping.video import _h265
 from tests.support.stream_bag import Sent, StreamBag
+from tests.support.videos import packets
 
 TYPES = {
     "/odom": "nav_msgs/msg/Odometry",
@@ -32,6 +35,10 @@ TYPES = {
     "/map": "nav_msgs/msg/OccupancyGrid",
     "/tick": "std_msgs/msg/Header",
     "/cmd": "geometry_msgs/msg/Twist",
+}
+VIDEO_TYPES = {
+    "/film": "sensor_msgs/msg/CompressedImage",
+    "/info": "sensor_msgs/msg/CameraInfo",
 }
 START_NS, MS = 1_700_000_000 * 10**9, 10**6
 GAP_S = 2.0
@@ -201,20 +208,28 @@ def sent_until(bag: StreamBag, time_ns: int, live: LiveSteps, at: int, clock: st
 @settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
 @given(streams(), mappings())
 def test_every_step_equals_that_of_the_bag(sent: list[Sent], tree: dict[str, Any]) -> None:
-    bag, mapping = StreamBag(TYPES, sent), parse_mapping(tree)
+    compare(sent, tree)
+
+
+def compare(sent: list[Sent], tree: dict[str, Any]) -> int:
+    """Compare all steps with those of a bag, and return how many observations are equal."""
+    bag, mapping = StreamBag({**TYPES, **VIDEO_TYPES}, sent), parse_mapping(tree)
     try:
         dataset = read_open_bag(bag, mapping).dataset
     except (LogError, UsageError):
-        return
+        return 0
     frames = dict(zip(dataset._transitions.log_time_ns.tolist(), range(10**6), strict=False))
     plan = Plan(bag, mapping, Place(), trust_code=False)
     for name, reader in plan.images.items():
-        times = bag.times(reader.topic)
-        list(reader._images(np.arange(len(times))))
+        rows = np.arange(len(bag.times(reader.topic)))
+        list(reader._images(rows))
+        if reader.packets_ns is not None:
+            # Frames of another size are found as they are put into an array.
+            reader.read(rows)
         plan.streams[plan.quantities[name].stream].leave_out(reader.failures)
     (steps,) = [StepReader(plan).read(0)]
     robot = Robot.from_json(dataset.robot, "robot")
-    live = LiveSteps(Plan(bag, robot.mapping, Place(), trust_code=False), robot.shapes)
+    live = LiveSteps(running(robot), robot.shapes)
     episodes, at, compared = LiveEpisodes(live._plan), 0, 0
     for row, time_ns in enumerate(steps.times_ns.tolist()):
         at = sent_until(bag, time_ns, live, at, mapping.clock.topic)
@@ -239,6 +254,78 @@ def test_every_step_equals_that_of_the_bag(sent: list[Sent], tree: dict[str, Any
                 assert part.dtype == column.dtype
                 np.testing.assert_array_equal(part, column[place])
     assert compared == len(frames)
+    return compared
+
+
+def running(robot: Robot) -> Plan:
+    """Return the plan of a robot without a bag."""
+    options: dict[str, Any] = {"trust_code": False, "packets_ns": robot.packets_ns}
+    return Plan(Topics(robot.topics), robot.mapping, Place(), **options)
+
+
+INFO: dict[str, Any] = {
+    **{"width": 64, "height": 48, "distortion_model": "plumb_bob", "d": [-0.3, 0.1, 0, 0, 0]},
+    **{
+        "k": [50.0, 0, 31.5, 0, 52, 23.5, 0, 0, 1],
+        "r": [0.0] * 9,
+        "p": [48.0, 0, 32, 0, 0, 49, 24, 0, 0, 0, 1, 0],
+    },
+}
+FILMS: dict[str, dict[str, Any]] = {
+    "film": {"image": "/film"},
+    "tiny": {"image": "/film", "resize": [8, 6]},
+    "part": {"image": "/film", "crop": [8, 4, 32, 24], "resize": [8, 6], "gray": True},
+    "flat": {"image": "/film", "undistort": "/info", "resize": [16, 12]},
+    "turned": {"image": "/film", "undistort": "/info", "tolerance_s": 0.2},
+}
+
+
+def film(codec: str, data: bytes, time_ns: int) -> Sent:
+    message = {"header": stamp(time_ns), "format": codec, "data": list(data)}
+    return Sent(time_ns, "/film", message)
+
+
+def films(codec: str, first: int, lost: set[int], damaged: set[int]) -> list[Sent]:
+    """Return a video of two sizes from a packet on, and what is beside it."""
+    stream = [*packets(codec, 20), *packets(codec, 10, 96, 80), *packets(codec, 10)]
+    sent = []
+    for k in range(first, 40):
+        time_ns = START_NS + k * 33 * MS
+        sent += [Sent(time_ns, "/odom", odom(k)), Sent(time_ns, "/info", INFO)]
+        sent += [Sent(time_ns, "/cmd", {"linear": {"x": k / 40}})]
+        data = stream[k][:9] if k in damaged else stream[k]
+        sent += [] if k in lost else [film(codec, data, time_ns)]
+    return sent
+
+
+@settings(max_examples=6, deadline=None, phases=[Phase.generate])
+@given(
+    codec=st.sampled_from(["h264", "vp9"]),
+    first=st.integers(0, 6),
+    lost=st.sets(st.integers(11, 39), max_size=4),
+    damaged=st.sets(st.integers(11, 39), max_size=2),
+    # Images of one topic whose frames may have the same sizes.
+    names=st.sampled_from([["film", "turned"], ["tiny", "part"], ["flat"], ["film"]]),
+    clock=st.sampled_from([{"rate_hz": 20}, {"topic": "/film"}]),
+)
+def test_frames_of_a_video_equal_those_of_the_bag(
+    codec: str,
+    first: int,
+    lost: set[int],
+    damaged: set[int],
+    names: list[str],
+    clock: dict[str, Any],
+) -> None:
+    mapping = {
+        "clock": clock,
+        "time": "log_time",
+        "observation": {**SPEED, **{name: FILMS[name] for name in names}},
+        "stack": 2,
+        "action": {"fields": ["/cmd.linear.x"], "box": {"low": -1, "high": 1}},
+        "episodes": {"gap_s": GAP_S},
+    }
+    found = compare(films(codec, first, lost, damaged), mapping)
+    assert found > 5 or len(lost | damaged) > 2
 
 
 def plan_of(observation: dict[str, Any], **tree: Any) -> Plan:
@@ -300,6 +387,16 @@ def test_a_clock_that_goes_back_drops_all_messages() -> None:
     assert (step.reason, step.is_fatal) == ("the clock of /odom went back by 5 s", True)
     assert live.step(START_NS + 5200 * MS).reason == "speed: no message of /odom yet"
     assert live.step(START_NS + 5200 * MS).reason == "the clock went back by 0 s"
+
+
+def test_packets_of_parameter_sets_alone_are_forgotten() -> None:
+    stream = packets("h265", 10)
+    video = LiveVideo("/film", {"format": "string", "data": "uint8[]"}, 0.0)
+    sets = _h265(stream[0], b"").parameters
+    for k, data in enumerate([*stream[:5], *[sets] * 200, *stream[5:]]):
+        video.push({"format": "h265", "data": data}, START_NS + k * MS)
+        assert bool(video.lack) == (5 <= k < 205)
+    assert len(video._decoder._waiting) <= 64
 
 
 def test_memory_is_bounded() -> None:

@@ -18,6 +18,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 import mcaprl
+from mcaprl.drive.node import export_node
 from mcaprl.drive.node_main import node_import
 from mcaprl.errors import UsageError
 from tests.support.robots import Robot, odometry, transform, twist, write_mcap
@@ -138,7 +139,7 @@ def rclpy(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.setitem(sys.modules, "rclpy.qos", qos)
     for package, names in {
         "nav_msgs": ["Odometry"],
-        "sensor_msgs": ["Image", "CompressedImage"],
+        "sensor_msgs": ["CameraInfo", "CompressedImage", "Image"],
         "geometry_msgs": ["Twist", "TransformStamped"],
         "tf2_msgs": ["TFMessage"],
     }.items():
@@ -173,6 +174,9 @@ def robot() -> Robot:
     for topic, kind in (("/camera", ("bgr8", 3)), ("/depth", ("32FC1", 4))):
         found.add(topic, RAW, 10, partial(image, kind), last_s=6)
     found.add("/photo", "sensor_msgs/msg/CompressedImage", 10, photo, last_s=6)
+    info = {"width": 8, "height": 6, "distortion_model": "plumb_bob", "d": [-0.1, 0, 0, 0, 0]}
+    info |= {"k": [5.0, 0, 3, 0, 5, 2, 0, 0, 1], "r": [0.0] * 9, "p": [0.0] * 12}
+    found.add("/info", "sensor_msgs/msg/CameraInfo", 10, lambda _: info, last_s=6)
     found.add("/tf", TF, 20, lambda t: {"transforms": [transform(*f, t) for f in frames]}, last_s=6)
     return found
 
@@ -198,7 +202,7 @@ SIGHT = {
     "observation": {
         "speed": {"field": "/odom.twist.twist.linear.x", "scale": 0.5},
         "camera": {"image": "/camera", "gray": True},
-        "small": {"image": "/camera", "resize": [4, 3]},
+        "small": {"image": "/camera", "undistort": "/info", "resize": [4, 3]},
         "depth": {"image": "/depth", "range_m": [0, 10]},
         "photo": {"image": "/photo", "crop": [1, 1, 4, 3]},
     },
@@ -283,6 +287,14 @@ def test_a_node_names_the_package_that_its_images_need(monkeypatch: pytest.Monke
     monkeypatch.delitem(sys.modules, "PIL.Image")
     with pytest.raises(UsageError, match="Pillow is not installed, which the images need"):
         node_import("PIL.Image", "bags")
+
+
+def test_a_node_does_not_decode_videos(tmp_path: Path) -> None:
+    reader = SimpleNamespace(packets_ns=0.0, topic="/film")
+    driver: Any = SimpleNamespace(_plan=SimpleNamespace(images={"camera": reader}))
+    with pytest.raises(UsageError, match="camera: a node of one file cannot decode the video of /"):
+        export_node(driver, tmp_path / "drive.py")
+    assert not [*tmp_path.iterdir()]
 
 
 def test_an_export_needs_a_file_to_write(tmp_path: Path) -> None:
