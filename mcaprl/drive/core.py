@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Callable
 from copy import deepcopy
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -398,6 +399,7 @@ def type_of(message: Any) -> str:
     return ""
 
 
+@lru_cache(maxsize=256)
 def _plain(name: str) -> tuple[str, str]:
     """Return package and name of a type, whose form depends on the library."""
     parts = [part for part in name.replace("::", "/").replace(".", "/").split("/") if part]

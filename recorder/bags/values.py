@@ -183,9 +183,10 @@ def value_at(message: Any, path: str) -> Any:
 def _walked(value: Any, steps: Sequence[Step]) -> Any:
     for number, step in enumerate(steps):
         if isinstance(step, str):
-            if _is_array(value) and not _are_entries(value, step):
+            is_array = _is_array(value)
+            if is_array and not _are_entries(value, step):
                 return _joined([_walked(each, steps[number:]) for each in value])
-            value = _entry_of(value, step) if _is_array(value) else _member(value, step)
+            value = _entry_of(value, step) if is_array else _member(value, step)
         else:
             value = element_of(value, step)
             if is_mapped(steps, number) and not isinstance(value, Lack):
@@ -196,15 +197,25 @@ def _walked(value: Any, steps: Sequence[Step]) -> Any:
 
 
 def _is_array(value: Any) -> bool:
-    if isinstance(value, list | np.ndarray):
-        return True
-    return isinstance(value, Sequence) and not isinstance(value, str)
+    return _are_arrays(type(value))
+
+
+# Checks of abstract types take most of the time of reading a field.
+@lru_cache(maxsize=1024)
+def _are_arrays(kind: type) -> bool:
+    is_plain = issubclass(kind, list | np.ndarray)
+    return is_plain or (issubclass(kind, Sequence) and not issubclass(kind, str))
+
+
+@lru_cache(maxsize=1024)
+def _are_maps(kind: type) -> bool:
+    return issubclass(kind, Mapping)
 
 
 def _member(value: Any, name: str) -> Any:
     if isinstance(value, dict):
         return value.get(name, ABSENT)
-    if isinstance(value, Mapping):
+    if _are_maps(type(value)):
         return _entry(value, name)
     return None if name.startswith("__") else getattr(value, name, None)
 

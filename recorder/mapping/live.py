@@ -575,7 +575,7 @@ class LiveSteps:
                 self._values[name] = self._value_of(name, wanted, (shapes or {}).get(name))
                 self._members[wanted.stream].append(self._values[name])
         self._streams: dict[str, _Waiting] = {}
-        self._filmed: set[str] = set()
+        self._with_frames: set[str] = set()
         self._any = _Waiting(lambda *_: None, self._gap_ns)
         self._of_topic: dict[str, list[str]] = {}
         used = {wanted.stream for wanted in plan.quantities.values()} | {plan.clock or ""}
@@ -583,7 +583,7 @@ class LiveSteps:
         for name in sorted(used & plan.streams.keys(), key=lambda each: each != plan.clock):
             members = self._members[name]
             images = [each for each in members if isinstance(each, _Image)]
-            self._filmed |= {name} if any(each.video for each in images) else set()
+            self._with_frames |= {name} if any(each.video for each in images) else set()
             most = _MOST_IMAGES if images else _MOST_PENDING
             self._streams[name] = _Waiting(_taker(members), self._gap_ns, most)
             self._of_topic.setdefault(plan.streams[name].topic, []).append(name)
@@ -613,7 +613,7 @@ class LiveSteps:
             video.push(message, log_time_ns)
         for name in self._of_topic.get(topic, ()):
             time_ns = self._plan.streams[name].time_of(message, log_time_ns, publish_ns)
-            lack = "" if video is None or name not in self._filmed else video.lack
+            lack = "" if video is None or name not in self._with_frames else video.lack
             if name == self._plan.clock:
                 self.lack = lack
             # A packet without a frame is left out, as in a bag.

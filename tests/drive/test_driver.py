@@ -32,12 +32,12 @@ from tests.drive.test_live import (
     START_NS,
     TYPES,
     VIDEO_TYPES,
-    film,
-    films,
     mappings,
     odom,
+    packet_sent,
     stamp,
     streams,
+    videos,
 )
 from tests.recorder.mapping.suggest.test_suggested_robots import IMPOSSIBLE, ROBOTS
 from tests.support.robots import FORMATS, Robot, vector
@@ -354,13 +354,13 @@ def test_bad_numbers_and_sizes_are_fatal() -> None:
     assert "/camera has an image of (2, 2, 1)" in command.reason
 
 
-SEEN = {"image": "/film", "resize": [16, 12]}
+SEEN = {"image": "/video", "resize": [16, 12]}
 STEER = {"fields": ["/cmd.linear.x"], "box": {"low": -1, "high": 1}}
 
 
-def filmed(image: dict[str, Any], **tree: Any) -> tuple[list[Sent], mcaprl.Dataset]:
+def driven_by_video(image: dict[str, Any], **tree: Any) -> tuple[list[Sent], mcaprl.Dataset]:
     """Return messages of a video, and the data that a mapping makes of them."""
-    sent = films("h264", 0, {23}, set())
+    sent = videos("h264", 0, {23}, set())
     mapping = {"observation": {"camera": image}, "action": STEER, "time": "log_time", **tree}
     bag = StreamBag({**TYPES, **VIDEO_TYPES}, sent)
     with warnings.catch_warnings():
@@ -371,17 +371,17 @@ def filmed(image: dict[str, Any], **tree: Any) -> tuple[list[Sent], mcaprl.Datas
 def test_the_log_of_a_video_equals_what_its_topics_give(tmp_path: Path) -> None:
     """Packets are lost and come at each step: no step is taken without a frame."""
     image = {**SEEN, "undistort": "/info"}
-    sent, data = filmed(image, clock={"topic": "/film"}, stack=2)
-    assert data.robot["packets_ns"] == {"/film": 33 * MS}
+    sent, data = driven_by_video(image, clock={"topic": "/video"}, stack=2)
+    assert data.robot["packets_ns"] == {"/video": 33 * MS}
     driver = mcaprl.Driver(Fixed(data), mapping=data.robot)
-    assert [*driver.inputs] == ["/film", "/info"]
+    assert [*driver.inputs] == ["/video", "/info"]
     driver.record(tmp_path / "drive.mcap")
     found = list[str]()
     with driver:
         for each in sent:
             if each.topic in driver.inputs:
                 driver.push(each.topic, each.message, each.time_ns)
-            if each.topic == "/film":
+            if each.topic == "/video":
                 found.append(driver.command(each.time_ns).reason)
     lost = [k for k, reason in enumerate(found) if LOST in reason]
     # Packet 23 is lost, and frames 20 to 29 have another size than the calibration.
@@ -397,36 +397,38 @@ def test_the_log_of_a_video_equals_what_its_topics_give(tmp_path: Path) -> None:
 
 
 def test_a_video_with_frames_that_come_later_is_refused() -> None:
-    _, data = filmed(SEEN, clock={"rate_hz": 10})
+    _, data = driven_by_video(SEEN, clock={"rate_hz": 10})
     driver = mcaprl.Driver(Fixed(data), mapping=data.robot)
     reason = ""
     for k, packet in enumerate(packets("h264 with B-frames")[:6]):
         try:
-            driver.push("/film", film("h264", packet, START_NS).message, START_NS + k * MS)
+            driver.push("/video", packet_sent("h264", packet, START_NS).message, START_NS + k * MS)
         except UsageError as error:
             reason = str(error)
             break
         # Nothing moves before it is known.
         assert driver.command(START_NS + k * MS).reason
-    assert reason.startswith("/film: its frames are complete with later packets only (B-frames)")
+    assert reason.startswith("/video: its frames are complete with later packets only (B-frames)")
     data.robot["packets_ns"].clear()
-    data.robot["topics"]["/film"]["type_name"] = "foxglove_msgs/msg/CompressedVideo"
-    with pytest.raises(UsageError, match=r"/film: the run does not contain the interval of its pa"):
+    data.robot["topics"]["/video"]["type_name"] = "foxglove_msgs/msg/CompressedVideo"
+    with pytest.raises(
+        UsageError, match=r"/video: the run does not contain the interval of its pa"
+    ):
         mcaprl.Driver(Fixed(data), mapping=data.robot)
 
 
 def test_a_driver_waits_for_the_calibration_and_holds_it() -> None:
-    sent, data = filmed({**SEEN, "undistort": "/info"}, clock={"rate_hz": 10})
+    sent, data = driven_by_video({**SEEN, "undistort": "/info"}, clock={"rate_hz": 10})
     driver = mcaprl.Driver(Fixed(data), mapping=data.robot)
-    packet = next(each for each in sent if each.topic == "/film")
-    driver.push("/film", packet.message, START_NS)
+    packet = next(each for each in sent if each.topic == "/video")
+    driver.push("/video", packet.message, START_NS)
     waiting = driver.command(START_NS)
     assert (waiting.reason, waiting.is_fatal) == ("camera: no message of /info yet", False)
     driver.push("/info", INFO, START_NS + MS)
     assert not driver.command(START_NS + 2 * MS).reason
     driver.begin()
     driver.push("/info", {**INFO, "header": stamp(START_NS)}, START_NS + 3 * MS)
-    driver.push("/film", packet.message, START_NS + 3 * MS)
+    driver.push("/video", packet.message, START_NS + 3 * MS)
     assert not driver.command(START_NS + 4 * MS).reason
     cases: list[tuple[dict[str, Any], str]] = [
         ({**INFO, "k": [51.0, *INFO["k"][1:]]}, "undistort: the calibration on /info changes: st"),

@@ -37,7 +37,7 @@ TYPES = {
     "/cmd": "geometry_msgs/msg/Twist",
 }
 VIDEO_TYPES = {
-    "/film": "sensor_msgs/msg/CompressedImage",
+    "/video": "sensor_msgs/msg/CompressedImage",
     "/info": "sensor_msgs/msg/CameraInfo",
 }
 START_NS, MS = 1_700_000_000 * 10**9, 10**6
@@ -271,21 +271,21 @@ INFO: dict[str, Any] = {
         "p": [48.0, 0, 32, 0, 0, 49, 24, 0, 0, 0, 1, 0],
     },
 }
-FILMS: dict[str, dict[str, Any]] = {
-    "film": {"image": "/film"},
-    "tiny": {"image": "/film", "resize": [8, 6]},
-    "part": {"image": "/film", "crop": [8, 4, 32, 24], "resize": [8, 6], "gray": True},
-    "flat": {"image": "/film", "undistort": "/info", "resize": [16, 12]},
-    "turned": {"image": "/film", "undistort": "/info", "tolerance_s": 0.2},
+VIEWS: dict[str, dict[str, Any]] = {
+    "whole": {"image": "/video"},
+    "tiny": {"image": "/video", "resize": [8, 6]},
+    "part": {"image": "/video", "crop": [8, 4, 32, 24], "resize": [8, 6], "gray": True},
+    "flat": {"image": "/video", "undistort": "/info", "resize": [16, 12]},
+    "turned": {"image": "/video", "undistort": "/info", "tolerance_s": 0.2},
 }
 
 
-def film(codec: str, data: bytes, time_ns: int) -> Sent:
+def packet_sent(codec: str, data: bytes, time_ns: int) -> Sent:
     message = {"header": stamp(time_ns), "format": codec, "data": list(data)}
-    return Sent(time_ns, "/film", message)
+    return Sent(time_ns, "/video", message)
 
 
-def films(codec: str, first: int, lost: set[int], damaged: set[int]) -> list[Sent]:
+def videos(codec: str, first: int, lost: set[int], damaged: set[int]) -> list[Sent]:
     """Return a video of two sizes from a packet on, and what is beside it."""
     stream = [*packets(codec, 20), *packets(codec, 10, 96, 80), *packets(codec, 10)]
     sent = []
@@ -294,7 +294,7 @@ def films(codec: str, first: int, lost: set[int], damaged: set[int]) -> list[Sen
         sent += [Sent(time_ns, "/odom", odom(k)), Sent(time_ns, "/info", INFO)]
         sent += [Sent(time_ns, "/cmd", {"linear": {"x": k / 40}})]
         data = stream[k][:9] if k in damaged else stream[k]
-        sent += [] if k in lost else [film(codec, data, time_ns)]
+        sent += [] if k in lost else [packet_sent(codec, data, time_ns)]
     return sent
 
 
@@ -305,8 +305,8 @@ def films(codec: str, first: int, lost: set[int], damaged: set[int]) -> list[Sen
     lost=st.sets(st.integers(11, 39), max_size=4),
     damaged=st.sets(st.integers(11, 39), max_size=2),
     # Images of one topic whose frames may have the same sizes.
-    names=st.sampled_from([["film", "turned"], ["tiny", "part"], ["flat"], ["film"]]),
-    clock=st.sampled_from([{"rate_hz": 20}, {"topic": "/film"}]),
+    names=st.sampled_from([["whole", "turned"], ["tiny", "part"], ["flat"], ["whole"]]),
+    clock=st.sampled_from([{"rate_hz": 20}, {"topic": "/video"}]),
 )
 def test_frames_of_a_video_equal_those_of_the_bag(
     codec: str,
@@ -319,12 +319,12 @@ def test_frames_of_a_video_equal_those_of_the_bag(
     mapping = {
         "clock": clock,
         "time": "log_time",
-        "observation": {**SPEED, **{name: FILMS[name] for name in names}},
+        "observation": {**SPEED, **{name: VIEWS[name] for name in names}},
         "stack": 2,
         "action": {"fields": ["/cmd.linear.x"], "box": {"low": -1, "high": 1}},
         "episodes": {"gap_s": GAP_S},
     }
-    found = compare(films(codec, first, lost, damaged), mapping)
+    found = compare(videos(codec, first, lost, damaged), mapping)
     assert found > 5 or len(lost | damaged) > 2
 
 
@@ -391,7 +391,7 @@ def test_a_clock_that_goes_back_drops_all_messages() -> None:
 
 def test_packets_of_parameter_sets_alone_are_forgotten() -> None:
     stream = packets("h265", 10)
-    video = LiveVideo("/film", {"format": "string", "data": "uint8[]"}, 0.0)
+    video = LiveVideo("/video", {"format": "string", "data": "uint8[]"}, 0.0)
     sets = _h265(stream[0], b"").parameters
     for k, data in enumerate([*stream[:5], *[sets] * 200, *stream[5:]]):
         video.push({"format": "h265", "data": data}, START_NS + k * MS)

@@ -290,7 +290,7 @@ def test_a_node_names_the_package_that_its_images_need(monkeypatch: pytest.Monke
 
 
 def test_a_node_does_not_decode_videos(tmp_path: Path) -> None:
-    reader = SimpleNamespace(packets_ns=0.0, topic="/film")
+    reader = SimpleNamespace(packets_ns=0.0, topic="/video")
     driver: Any = SimpleNamespace(_plan=SimpleNamespace(images={"camera": reader}))
     with pytest.raises(UsageError, match="camera: a node of one file cannot decode the video of /"):
         export_node(driver, tmp_path / "drive.py")
