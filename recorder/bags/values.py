@@ -197,7 +197,8 @@ def _walked(value: Any, steps: Sequence[Step]) -> Any:
 
 
 def _is_array(value: Any) -> bool:
-    return _are_arrays(type(value))
+    kind: Any = type(value)
+    return _are_arrays(kind)
 
 
 # Checks of abstract types take most of the time of reading a field.
@@ -215,7 +216,8 @@ def _are_maps(kind: type) -> bool:
 def _member(value: Any, name: str) -> Any:
     if isinstance(value, dict):
         return value.get(name, ABSENT)
-    if _are_maps(type(value)):
+    kind: Any = type(value)
+    if _are_maps(kind):
         return _entry(value, name)
     return None if name.startswith("__") else getattr(value, name, None)
 
