@@ -20,6 +20,7 @@ from mcaprl.cli.options import (
     env_arg_option,
     integer_option,
     json_option,
+    keep_options,
     keys_option,
     mapping_options,
     trust_option,
@@ -165,6 +166,7 @@ def layout(source: str, out: Path, **request: Any) -> None:
 @env_arg_option
 @trust_option
 @mapping_options
+@keep_options
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="File to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def annotate(file: str, out: Path, **request: Any) -> None:
@@ -201,6 +203,7 @@ def annotate(file: str, out: Path, **request: Any) -> None:
     help="Kind of the ends of episodes in SRC if SRC does not say it.",
 )
 @click.option("--to", metavar="FORMAT", help="Format of DST if not clear from its name.")
+@keep_options
 @click.option("--lossy", is_flag=True, help="Convert or omit data that DST or a log cannot store.")
 @click.option("--suggest", is_flag=True, help="Print a draft of a mapping for SRC; takes no DST.")
 @click.option(

@@ -76,6 +76,25 @@ def bag_options(request: dict[str, Any]) -> dict[str, Any]:
     return {name: request.pop(name) for name in ("mapping", "trust_code", "definitions")}
 
 
+def keep_options(command: F) -> F:
+    """Add the options for the topics of a bag that are kept, as the parameter `keep_topics`."""
+
+    @functools.wraps(command)
+    def with_topics(*args: Any, keep_all: bool, keep_topic: tuple[str, ...], **given: Any) -> Any:
+        return command(*args, keep_topics=keep_all or keep_topic, **given)
+
+    every = click.option(
+        "--keep-topics", "keep_all", is_flag=True, help="Keep the bag's own topics beside /rl/*."
+    )
+    some = click.option(
+        "--keep-topic",
+        multiple=True,
+        metavar="PATTERN",
+        help="Keep these topics, such as '/camera/*'; may be repeated.",
+    )
+    return every(some(cast(F, with_topics)))
+
+
 def bag_reader(data: tuple[str, ...], bag: dict[str, Any]) -> Any:
     """Return a function that reads a bag by these options; without a mapping, return `data`.
 

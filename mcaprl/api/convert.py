@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -117,6 +118,7 @@ def convert(
     lossy: bool = False,
     overwrite: bool = False,
     upload: str | None = None,
+    keep_topics: bool | str | Sequence[str] = False,
 ) -> Conversion:
     """Read logs, a bag, or a dataset of another tool, and write a log or a dataset.
 
@@ -129,9 +131,12 @@ def convert(
         lossy: Whether data that the format, or a log, cannot store may be dropped or converted.
         overwrite: Whether an existing file or folder is replaced.
         upload: URL to which the written file is copied when it is complete.
+        keep_topics: Topics of the bag that are copied to the log, beside `/rl/*`: True for all, or
+            names and patterns such as `/camera/*`.
 
     Raises:
-        UsageError: The format to write is not clear.
+        UsageError: The format to write is not clear, or topics are kept without a bag or a log.
+        UnknownNameError: The bag has no such topic.
         LogError: The source cannot be read, it has no episode, or `out` cannot be written.
         SpaceError: The format cannot hold a space or dtype, and `lossy` is not set.
         OutputExistsError: `out` exists.
@@ -139,6 +144,8 @@ def convert(
     """
     is_log = out is not None and to is None and Path(out).suffix == ".mcap"
     form = None if out is None or is_log else target_format(out, to)
+    if keep_topics and not is_log:
+        raise UsageError("the topics of a bag are kept in a log: name an output that ends in .mcap")
     if out is not None and is_log:
         check_target(Path(out), overwrite=overwrite)
     if upload is not None:
@@ -150,7 +157,7 @@ def convert(
     if out is not None and form is not None:
         lost = write_format(dataset, out, form, lossy=lossy, overwrite=overwrite)
     elif out is not None:
-        dataset.save(out, overwrite=overwrite)
+        dataset.save(out, overwrite=overwrite, keep_topics=keep_topics)
     if upload is not None and out is not None:
         upload_all([Path(out)], upload)
     return Conversion(dataset, dataset.origin.report, None if out is None else Path(out), lost)

@@ -262,10 +262,11 @@ def annotate(
     trust_env: bool = False,
     trust_code: bool = False,
     sim_options: Mapping[str, Any] | None = None,
+    keep_topics: bool | str | Sequence[str] = False,
     overwrite: bool = False,
     progress: ProgressBar = no_progress,
 ) -> Annotation:
-    """Copy a log, and add values of policies, its labels, or the scene of the sim to each step.
+    """Copy a log with all of its topics; add values of policies, its labels, or the sim's scene.
 
     Args:
         data: Path of the log; or a dataset that `open` read from a bag by a mapping, which is first
@@ -282,6 +283,7 @@ def annotate(
             arguments to environments other than the sims of `SIMS`.
         trust_code: Whether a policy `module:function` is imported.
         sim_options: With `scene`, arguments of the environment that replace the logged ones.
+        keep_topics: With the dataset of a bag, its topics that are kept; see `convert`.
         overwrite: Whether an existing file is replaced.
         progress: Function that opens a progress bar.
 
@@ -303,9 +305,11 @@ def annotate(
         check_target(Path(out), overwrite=overwrite)
         with temporary_folder() as folder:
             log = folder / "converted.mcap"
-            data.save(log)
+            data.save(log, keep_topics=keep_topics)
             options: Any = {"gamma": gamma, "overwrite": overwrite, "progress": progress}
             return annotate(log, out, policy=policy, trust_code=trust_code, **options)
+    if keep_topics:
+        raise UsageError("keep_topics is for bags: annotate keeps all topics of a log")
     path = as_path(data, whole=True)
     dataset, labels = open_data(path), None if is_url(data) else labels_to_carry(Path(data))
     if not names and not scene and labels is None:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from mcaprl.base_policy import BasePolicy
@@ -156,13 +155,7 @@ class DriveLog:
         mcap, name = self._log.mcap, definition.type_name
         if (definition.encoding, definition.schema_encoding) == ("cdr", "ros2msg"):
             return mcap.add_channel(topic, name, definition.schema.decode(errors="replace"))
-        schema = 0
-        if definition.schema_encoding:
-            schema = max(mcap.schemas, default=0) + 1
-            mcap.announce(Schema(schema, definition.schema, definition.schema_encoding, name))
-        channel = max(mcap.channels, default=0) + 1
-        mcap.announce(Channel(channel, topic, definition.encoding, {}, schema))
-        return channel
+        return mcap.add_topic(topic, definition.encoding, definition.described)
 
     def _write_messages(self) -> None:
         self._log.sink.write_messages(self._messages)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import fnmatch
 import heapq
 import itertools
 import operator
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +36,13 @@ from mcaprl.recorder.bags.values import (
 from mcaprl.recorder.format.reading import ROS1
 from mcaprl.texts import counted, printable
 
+if TYPE_CHECKING:
+    from mcaprl.recorder.format.writing import McapWriter
+
 _PUBLISH_TIME = "publish_time"
+_OWN_TOPICS = "/rl/"
+_COPIED_BYTES = 2**20
+"""Size at which copied messages are written as a chunk."""
 _SHOWN = 8
 """Number of topics and files that the text of a bag shows."""
 
@@ -208,6 +216,11 @@ class _Topic:
         self.name = name
         self._given, self._others = sources, others
 
+    @property
+    def sources(self) -> list[TopicSource]:
+        """Sources with messages."""
+        return [source for _, source in self._used]
+
     @cached_property
     def _used(self) -> list[tuple[int, TopicSource]]:
         """Sources with messages, each with the index of its file."""
@@ -335,26 +348,30 @@ class _Topic:
                     failures.append(Failure(number, int(self.times_ns[number]), str(error)))
         return values, sorted(failures)
 
-    def messages(self) -> Iterator[BagMessage]:
-        """Yield the messages that can be decoded, in the order of recording."""
-        sources = [
-            zip(
-                source.times_ns.tolist(),
-                source.raw(np.arange(len(source.times_ns))),
-                itertools.repeat(self._decoders[source.definition]),
-                strict=False,
-            )
-            for _, source in self._used
+    def raw(self) -> Iterator[tuple[int, TopicSource, RawMessage]]:
+        """Yield log_time, source and bytes of each message, in the order of recording."""
+        sources = self.sources
+        messages = [
+            zip(source.times_ns.tolist(), source.raw(np.arange(len(source.times_ns))), strict=False)
+            for source in sources
         ]
         for k in self._order[:, 2].tolist():
-            time_ns, raw, decoder = next(sources[k])
+            time_ns, raw = next(messages[k])
+            yield time_ns, sources[k], raw
+
+    def messages(self) -> Iterator[BagMessage]:
+        """Yield the messages that can be decoded, in the order of recording."""
+        for time_ns, source, raw in self.raw():
+            decoder = self._decoders[source.definition]
             with suppress(LogError):
                 yield BagMessage(self.name, time_ns, raw.publish_ns, _decoded(decoder, raw))
 
-    def definition(self) -> Definition:
-        found = self._used[0][1].definition
+    def definition(self, source: TopicSource | None = None) -> Definition:
+        found = (source or self._used[0][1]).definition
+        if found.schema or found.encoding not in ("cdr", "ros1"):
+            return found
         decoder = self._decoders[found]
-        if found.schema or not isinstance(decoder, RosDecoder):
+        if not isinstance(decoder, RosDecoder):
             return found
         encoding = ROS1 if found.encoding == "ros1" else "ros2msg"
         return replace(found, schema_encoding=encoding, schema=decoder.text().encode())
@@ -569,8 +586,73 @@ class OpenBag:
             raise UnknownNameError("topic", name, self._topics)
         return self._topics[name]
 
+    def copy_topics(self, patterns: Sequence[str], mcap: McapWriter) -> None:
+        """Copy topics to another file; see `copy_topics`."""
+        names = [name for name in self._topics if not name.startswith(_OWN_TOPICS)]
+        chosen = {pattern: fnmatch.filter(names, pattern) for pattern in patterns}
+        for pattern, found in chosen.items():
+            if not found:
+                raise UnknownNameError("topic", pattern, names)
+        topics = [self._topics[name] for name in sorted({*itertools.chain(*chosen.values())})]
+        ids, undone = dict[TopicSource, int](), 0
+        for topic in topics:
+            for source in topic.sources:
+                try:
+                    kind = topic.definition(source)
+                except LogError as error:
+                    raise LogError(f"{topic.name} cannot be kept: {error}") from error
+                if len(topic.times_ns) and topic.times_ns.min() < 0:
+                    raise LogError(f"{topic.name} cannot be kept: it has times before 1970")
+                ids[source] = mcap.add_topic(
+                    topic.name, kind.encoding, kind.described, source.metadata
+                )
+        messages: list[tuple[int, int, bytes]] = []
+        published, size = list[int](), 0
+        for time_ns, source, raw in heapq.merge(
+            *(topic.raw() for topic in topics), key=operator.itemgetter(0)
+        ):
+            if raw.problem:
+                undone += 1
+                continue
+            messages.append((ids[source], time_ns, raw.data))
+            published.append(raw.publish_ns)
+            size += len(raw.data)
+            if size > _COPIED_BYTES:
+                mcap.write_messages(messages, published)
+                messages, published, size = [], [], 0
+        mcap.write_messages(messages, published)
+        if undone:
+            warnings.warn(
+                f"{counted(undone, 'message')} cannot be decompressed, and are not kept",
+                stacklevel=2,
+            )
+
 
 OpenBag.__module__ = "mcaprl"
+
+
+def copy_topics(
+    paths: Sequence[Path],
+    definitions: Sequence[str | Path],
+    patterns: Sequence[str],
+    mcap: McapWriter,
+) -> None:
+    """Copy topics of a bag to another file: bytes, schemas and times, in the order of log_time.
+
+    Topics that a log has of its own, `/rl/*`, are left out. Memory is bounded, but for the index.
+
+    Args:
+        paths: Files of the bag.
+        definitions: Files and folders with definitions of ROS types that the bag lacks.
+        patterns: Names of topics, or patterns such as `/camera/*`.
+        mcap: Writer of the file.
+
+    Raises:
+        UnknownNameError: A pattern has no topic.
+        LogError: The bag cannot be read, or the type of a topic is not known.
+    """
+    with open_bag(paths, definitions=definitions) as bag:
+        bag.copy_topics(patterns, mcap)
 
 
 def _first_ns(file: McapFile | RosbagFile) -> int:

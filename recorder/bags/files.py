@@ -305,7 +305,7 @@ class CompressedTopic:
 
     def __init__(self, source: TopicSource) -> None:
         """Store the topic with the compressed messages."""
-        self._source, self.definition = source, source.definition
+        self._source, self.definition, self.metadata = source, source.definition, source.metadata
 
     @property
     def times_ns(self) -> NDArray[np.int64]:

@@ -51,6 +51,11 @@ class Definition:
     schema: bytes = b""
     distribution: str = ""
 
+    @property
+    def described(self) -> tuple[str, str, bytes]:
+        """Encoding, name and data of the schema."""
+        return self.schema_encoding, self.type_name, self.schema
+
 
 class RawMessage(NamedTuple):
     """A message as the bytes that the file contains, or why they cannot be decompressed."""
@@ -65,12 +70,14 @@ class TopicSource(Protocol):
 
     Attributes:
         definition: Type of the messages.
+        metadata: Metadata of the channel, such as the quality of service.
         times_ns: (N,) log_times in file order.
         positions: (N,) positions in the file, which can be compared with those of other sources of
             the file.
     """
 
     definition: Definition
+    metadata: dict[str, str]
 
     @property
     def times_ns(self) -> NDArray[np.int64]:
@@ -94,7 +101,7 @@ class SequentialTopic(ABC):
 
     def __init__(self, path: Path, topic: str, definition: Definition) -> None:
         """Store the path of the file and the name of the topic, for error messages."""
-        self.definition = definition
+        self.definition, self.metadata = definition, dict[str, str]()
         self._where = f"{path}: messages of {topic} cannot be read"
         # Position of the next message, and the iterator that will yield this message.
         self._next = 0
@@ -189,7 +196,7 @@ class _McapTopic:
     """Messages of one channel."""
 
     def __init__(self, reader: McapReader, channel: Channel, distribution: str) -> None:
-        self._reader, self._channel = reader, channel
+        self._reader, self._channel, self.metadata = reader, channel, channel.metadata
         schema = reader.schemas.get(channel.schema_id)
         name, encoding, data = ("", "", b"")
         if schema is not None:

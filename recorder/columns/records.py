@@ -91,10 +91,13 @@ def message_rows(capacity: int, payload: np.dtype[Any], channel_id: int) -> NDAr
     return rows
 
 
-def message_record(channel_id: int, sequence: int, time_ns: int, data: bytes) -> bytes:
-    """Return a Message record whose log_time and publish_time are `time_ns`."""
+def message_record(
+    channel_id: int, sequence: int, time_ns: int, data: bytes, publish_ns: int | None = None
+) -> bytes:
+    """Return a Message record; by default, its publish_time is its log_time."""
     length = _MESSAGE.size - RECORD_HEADER_BYTES + len(data)
-    head = _MESSAGE.pack(Opcode.MESSAGE, length, channel_id, sequence, time_ns, time_ns)
+    publish_ns = time_ns if publish_ns is None else publish_ns
+    head = _MESSAGE.pack(Opcode.MESSAGE, length, channel_id, sequence, time_ns, publish_ns)
     return head + data
 
 

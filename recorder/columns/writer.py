@@ -100,24 +100,16 @@ class McapWriter(OutputFile):
         self, topic: str, schema_name: str, schema_text: str, metadata: dict[str, str] | None = None
     ) -> int:
         """Return the channel id of a topic of `ros2msg` messages, and write a new channel."""
-        schemas, channels = self._summary.schemas, self._summary.channels
         wanted = ("ros2msg", schema_name, schema_text.encode())
-        schema_id = next(
-            (s.id for s in schemas.values() if (s.encoding, s.name, s.data) == wanted), None
-        )
-        for channel in channels.values():
+        schema_id = self._schema_ids().get(wanted)
+        for channel in self._summary.channels.values():
             if channel.topic == topic and channel.schema_id == schema_id:
                 return channel.id
             if channel.topic == topic:
                 raise LogError(
                     f"{self.path} has messages of another type on {topic}: record to another file"
                 )
-        if schema_id is None:
-            schema_id = max(schemas, default=0) + 1
-            self.announce(Schema(schema_id, schema_text.encode(), "ros2msg", schema_name))
-        channel_id = max(channels, default=0) + 1
-        self.announce(Channel(channel_id, topic, "cdr", metadata or {}, schema_id))
-        return channel_id
+        return self.add_topic(topic, "cdr", wanted, metadata)
 
     def metadata(self, name: str) -> dict[str, str] | None:
         """Return the metadata record with this name; None if there is none."""
@@ -169,18 +161,48 @@ class McapWriter(OutputFile):
             self._compressors.long if size > LONG_MESSAGE_BYTES else self._compressors.short,
         )
 
-    def write_messages(self, messages: Sequence[tuple[int, int, bytes]]) -> None:
-        """Write messages (channel id, log_time in nanoseconds, CDR bytes) as one chunk."""
+    def add_topic(
+        self,
+        topic: str,
+        encoding: str,
+        schema: tuple[str, str, bytes],
+        metadata: dict[str, str] | None = None,
+    ) -> int:
+        """Write a new channel of any encoding, and return its id.
+
+        `schema` has encoding, name and data of the schema; without an encoding, there is none.
+        """
+        schema_encoding, name, data = schema
+        schema_id = self._schema_ids().get(schema, 0) if schema_encoding else 0
+        if schema_encoding and not schema_id:
+            schema_id = max(self._summary.schemas, default=0) + 1
+            self.announce(Schema(schema_id, data, schema_encoding, name))
+        channel_id = max(self._summary.channels, default=0) + 1
+        self.announce(Channel(channel_id, topic, encoding, metadata or {}, schema_id))
+        return channel_id
+
+    def _schema_ids(self) -> dict[tuple[str, str, bytes], int]:
+        found = reversed(self._summary.schemas.values())
+        return {(one.encoding, one.name, one.data): one.id for one in found}
+
+    def write_messages(
+        self, messages: Sequence[tuple[int, int, bytes]], publish_ns: Sequence[int] = ()
+    ) -> None:
+        """Write messages (channel id, log_time in nanoseconds, data) as one chunk.
+
+        `publish_ns` has the publish_time of each message; default: its log_time.
+        """
         if not messages:
             return
         records = bytearray()
         entries: dict[int, list[int]] = {}
         counts = self._summary.counts
-        for channel_id, time_ns, data in messages:
+        published = publish_ns or [time_ns for _, time_ns, _ in messages]
+        for (channel_id, time_ns, data), publish_time in zip(messages, published, strict=True):
             pairs = entries.setdefault(channel_id, [])
             sequence = (counts[channel_id] + len(pairs) // 2) % 2**32
             pairs += (time_ns, len(records))
-            records += message_record(channel_id, sequence, time_ns, data)
+            records += message_record(channel_id, sequence, time_ns, data, publish_time)
         times = [time_ns for _, time_ns, _ in messages]
         compress = self._compressors.mixed
         if len(records) > RARE_MESSAGE_BYTES * len(messages):

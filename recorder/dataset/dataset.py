@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -606,22 +606,51 @@ class Dataset(Conversions):
         first, second = np.sort(order[:first_count]), np.sort(order[first_count:])
         return self._take(first.tolist()), self._take(second.tolist())
 
-    def save(self, path: str | Path, *, compression: str = "zstd", overwrite: bool = False) -> None:
+    def save(
+        self,
+        path: str | Path,
+        *,
+        compression: str = "zstd",
+        overwrite: bool = False,
+        keep_topics: bool | str | Sequence[str] = False,
+    ) -> None:
         """Write the dataset as one log; `mcaprl.open` reads back an equal dataset.
 
         Args:
             path: Path of the log.
             compression: `zstd`, `lz4` or `none`.
             overwrite: Whether to replace an existing file.
+            keep_topics: Topics of the bag that the data was read from, to be copied beside
+                `/rl/*` with their bytes, schemas and times: True for all, or names and patterns
+                such as `/camera/*`.
 
         Raises:
             OutputExistsError: The file exists and `overwrite` is not set.
-            LogError: The file cannot be written.
+            LogError: The file cannot be written, or a topic cannot be kept.
+            UnknownNameError: The bag has no such topic.
+            UsageError: There are topics to keep, but the data was not read from a bag.
         """
         from mcaprl.recorder.dataset.save import save_log
 
+        add_topics, copy = None, self.origin.copy_topics
+        if keep_topics:
+            if copy is None:
+                raise UsageError("keep_topics is for data that were read from a bag by a mapping")
+            if self.origin.is_shifted:
+                raise LogError(
+                    f"{path}: the topics of the bag cannot be kept, because its recordings overlap"
+                    " in time: convert them one by one"
+                )
+            patterns = ["*"] if keep_topics is True else keep_topics
+            patterns = [patterns] if isinstance(patterns, str) else list(patterns)
+            add_topics = partial(copy, patterns)
         save_log(
-            path, self._transitions, self._description, compression=compression, overwrite=overwrite
+            path,
+            self._transitions,
+            self._description,
+            compression=compression,
+            overwrite=overwrite,
+            add_topics=add_topics,
         )
 
     def to_arrow(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from mcaprl.recorder.format.log_writer import InfoTopics, LogWriter, info_array
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
 from mcaprl.recorder.format.schema import STEPS_PER_CHUNK
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
+from mcaprl.recorder.format.writing import McapWriter
 
 
 def save_log(
@@ -27,8 +28,9 @@ def save_log(
     *,
     compression: str = "zstd",
     overwrite: bool = False,
+    add_topics: Callable[[McapWriter], None] | None = None,
 ) -> None:
-    """Write columns as a log.
+    """Write columns as a log; `add_topics` writes other topics beside them.
 
     If the data has no times, or if they do not increase from frame to frame, they are replaced by
     times that start at the current time. Episodes are numbered from 0.
@@ -52,6 +54,8 @@ def save_log(
             _write_infos(path, log, columns)
             log.write_episodes([e._replace(episode=k) for k, e in enumerate(columns.episodes)])
             _write_steps(log, columns)
+            if add_topics is not None:
+                add_topics(log.mcap)
             log.close()
         finally:
             log.mcap.abandon()

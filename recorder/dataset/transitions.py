@@ -38,6 +38,9 @@ class Origin:
         report: Report of the mapping on what was read and what was left out.
         grow: Function that returns the data with the episodes that have ended since; None if the
             logs are not followed.
+        copy_topics: Function that copies topics of the bag, by names or patterns, to the writer of
+            another file; None for other data.
+        is_shifted: Whether recordings of the bag overlapped, and have later times in the data.
     """
 
     sources: tuple[Path, ...] = ()
@@ -45,6 +48,8 @@ class Origin:
     mapping: Mapping[str, Any] | None = None
     report: Any = None
     grow: Callable[[], Any] | None = None
+    copy_topics: Callable[[Sequence[str], Any], None] | None = None
+    is_shifted: bool = False
 
     @classmethod
     def common(cls, origins: Sequence[Origin]) -> Origin:
@@ -58,7 +63,7 @@ class Origin:
 
     def changed(self) -> Origin:
         """Return the origin of a dataset with other episodes or values."""
-        return Origin(self.sources, mapping=self.mapping, report=self.report)
+        return dataclasses.replace(self, logs=(), grow=None)
 
 
 STEP_COLUMNS = ("actions", "rewards", "terminated", "truncated", "behavior")

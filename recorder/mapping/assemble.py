@@ -163,9 +163,11 @@ def assembled(
     """
     summaries: list[EpisodeSummary] = []
     times: list[NDArray[np.int64]] = []
+    is_shifted = False
     frames, taken, offset = [], [], 0
     for run, episodes in zip(runs, kept, strict=True):
         shift_ns = _shift(run, episodes, times)
+        is_shifted |= shift_ns > 0
         for each in episodes:
             times.append(run.times_ns[each.first : each.last + 1] + shift_ns)
             summaries.append(_summary(plan, run, each, len(summaries), times[-1]))
@@ -217,7 +219,7 @@ def assembled(
         behavior=np.concatenate([run.behavior for run in runs])[steps],
         episodes=tuple(summaries),
     )
-    return Dataset(transitions, metadata, origin=Origin(plan.bag.paths))
+    return Dataset(transitions, metadata, origin=Origin(plan.bag.paths, is_shifted=is_shifted))
 
 
 def _robot(

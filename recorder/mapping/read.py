@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from collections.abc import Mapping as MappingOf
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, Problem
-from mcaprl.recorder.bags.bag import Bag, open_bag
+from mcaprl.recorder.bags.bag import Bag, copy_topics, open_bag
 from mcaprl.recorder.bags.overview import instants_of, is_fresh
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.images import Storage
@@ -259,7 +260,10 @@ def read_bag(
     mapping = mapping.model_copy(update=dict(changes or {}))
     others = [*mapping.definitions, *definitions]
     with closing(open_bag(data, definitions=others, strict=mapping.strict)) as bag:
-        return read_open_bag(bag, mapping, place, trust_code=trust_code, images=images)
+        found = read_open_bag(bag, mapping, place, trust_code=trust_code, images=images)
+    copy = partial(copy_topics, [path.absolute() for path in bag.paths], others)
+    found.dataset.origin = replace(found.dataset.origin, copy_topics=copy)
+    return found
 
 
 def read_open_bag(

@@ -8,6 +8,7 @@ that it fits into a window of 1280 x 720 pixels.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -48,6 +49,9 @@ _REASONS = (
     *("off_lane", "off_line", "collision", "crash", "stall", "no_gate", "slow", "low_reward"),
     *("terminated", "time_limit"),
 )
+_IMAGES = ("Image", "RawImage", "CompressedImage", "CompressedVideo")
+_SPATIAL = ("LaserScan", "PointCloud2", "PointCloud", "OccupancyGrid", "Grid")
+_MOST_CAMERAS = 3
 _LAST_STEPS = 80
 _MAX_EPISODE = 100
 _MEAN_RETURN = "mean_return"
@@ -65,6 +69,7 @@ def layout_of(
     training: Mapping[str, str] | None = None,
     without_q: Collection[str] = (),
     episodes: int = 0,
+    sensors: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Return the layout for a log with these topics.
 
@@ -76,11 +81,12 @@ def layout_of(
         training: Titles of the metrics of a training that is shown live, by field.
         without_q: Topics of policies without Q-values.
         episodes: Number of episodes; 0 if it is unknown.
+        sensors: Types of a robot's own topics, by name.
     """
     # A policy with Q-values is shown first.
     ordered = sorted(topics, key=lambda topic: (is_values_topic(topic), topic in without_q))
     found = (metadata, ordered, telemetry_names, follow_frame, training or {}, without_q, episodes)
-    screens = _Screens(*found)
+    screens = _Screens(*found, sensors or {})
     nodes = {"Drive": screens.drive(), "Learning": screens.learning(), "Data": screens.data()}
     return {
         "configById": {"Tab!screens": panels.tabs(nodes), **screens.found},
@@ -112,6 +118,7 @@ class _Screens:
     training: Mapping[str, str]
     without_q: Collection[str]
     episodes: int
+    sensors: Mapping[str, str]
     found: dict[str, Panel] = field(default_factory=dict)
 
     def drive(self) -> Node:
@@ -245,7 +252,20 @@ class _Screens:
             if leaf.encoding is not None:
                 panel = panels.image(f"observation: {leaf.name}", leaf.topic)
                 names.append(self._put(f"Image!{leaf.name}", panel))
+        own = (VIDEO, _DEPTH)
+        for topic in [each for each in self._sensors(_IMAGES) if each not in own][:_MOST_CAMERAS]:
+            names.append(self._put(f"Image!{topic}", panels.image(topic, topic)))
+        spatial = self._sensors(_SPATIAL)
+        if spatial and _SCENE not in self.topics:
+            shown = dict.fromkeys(spatial, _NONE)
+            camera = {"perspective": False, "distance": _AROUND_M / 4, "phi": 0}
+            names.append(self._put("3D!robot", panels.three_d("robot", shown, camera, _STILL)))
         return names
+
+    def _sensors(self, kinds: Sequence[str]) -> list[str]:
+        """Return the robot's topics with messages of these kinds, of any package."""
+        last = {topic: re.split(r"[/.]", kind)[-1] for topic, kind in self.sensors.items()}
+        return [topic for topic, kind in sorted(last.items()) if kind in kinds]
 
     def _instruments(self) -> Node:
         """Add the gauge, the indicator, plots of reward, return and telemetry, and the actions."""

@@ -358,6 +358,11 @@ def layout_of_log(
         frame,
         without_q={*without_q, *empty},
         episodes=len(Topic(reader, EPISODE_TOPIC).times),
+        sensors={
+            channel.topic: reader.schemas[channel.schema_id].name
+            for channel in reader.channels.values()
+            if channel.schema_id in reader.schemas and not channel.topic.startswith("/rl/")
+        },
     )
 
 

@@ -10,12 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from mcap_ros2.decoder import DecoderFactory
 
 import mcaprl
 from mcaprl.cli import run
-from mcaprl.errors import OutputExistsError, UsageError
+from mcaprl.errors import LogError, OutputExistsError, UnknownNameError, UsageError
+from mcaprl.recorder.bags.bag import copy_topics
 from mcaprl.recorder.mapping.config import load_mapping
 from tests.support.bags import (
+    START_NS,
+    STEP_NS,
     STEPS,
     integers,
     numbers,
@@ -125,6 +131,138 @@ def test_commands_read_a_bag_by_a_mapping(
     estimate = ["evaluate", "random", "--data", str(bag), *mapping, "--updates", "2", "--json"]
     assert run(estimate) == 0
     assert json.loads(capsys.readouterr().out)["episodes"] == 2
+
+
+def _stored(path: Path, topic: str) -> list[tuple[object, ...]]:
+    """Return times, encodings, schema and bytes of a topic, in the order of the file's times."""
+    with path.open("rb") as file:
+        return [
+            (
+                *(one.log_time, one.publish_time, one.data),
+                *(channel.message_encoding, channel.metadata),
+                schema and (schema.encoding, schema.name, schema.data),
+            )
+            for schema, channel, one in make_reader(file).iter_messages([topic])
+        ]
+
+
+@pytest.fixture
+def mixed(tmp_path: Path) -> Path:
+    """Return a bag with topics in ROS 2 messages, JSON, and an encoding that cannot be read."""
+    (tmp_path / "robot.yaml").write_text(MAPPING)
+    (part,) = write_rosbag2(tmp_path / "part").glob("*.mcap")
+    with part.open("rb") as file, (tmp_path / "mixed.mcap").open("wb") as target:
+        writer, ids = Writer(target, chunk_size=2000), dict[str, int]()
+        writer.start()
+        for schema, channel, one in make_reader(file).iter_messages():
+            if channel.topic not in ids:
+                text = writer.register_schema(schema.name, schema.encoding, schema.data)
+                given = (channel.topic, channel.message_encoding, text, channel.metadata)
+                ids[channel.topic] = writer.register_channel(*given)
+            writer.add_message(ids[channel.topic], one.log_time, one.data, one.log_time - 5)
+        image = writer.register_schema("foxglove.CompressedVideo", "jsonschema", b"{}")
+        scan = writer.register_schema("sensor_msgs/msg/LaserScan", "ros2msg", b"float32 range_min")
+        for topic, encoding, schema in (
+            *(("/battery", "json", 0), ("/secret", "weird", 0), ("/rl/step", "json", 0)),
+            *(("/front", "json", image), ("/scan", "cdr", scan)),
+        ):
+            number = writer.register_channel(topic, encoding, schema)
+            for k in range(3):
+                writer.add_message(number, START_NS + k * STEP_NS, b'{"v": %d}' % k, START_NS)
+        writer.finish()
+    return tmp_path / "mixed.mcap"
+
+
+def test_a_converted_bag_keeps_its_own_topics(mixed: Path, tmp_path: Path) -> None:
+    mapping = ["--mapping", str(tmp_path / "robot.yaml")]
+    plain, out, some = (tmp_path / f"{name}.mcap" for name in ("plain", "out", "some"))
+    assert run(["convert", str(mixed), str(plain), *mapping]) == 0
+    assert run(["convert", str(mixed), str(out), *mapping, "--keep-topics"]) == 0
+    topics = {"/odom", "/tf", "/cmd_vel", "/camera/depth", "/joints", "/battery", "/secret"}
+    topics |= {"/front", "/scan"}
+    for topic in topics:
+        assert _stored(out, topic) == _stored(mixed, topic) != []
+    with out.open("rb") as file:
+        reader = make_reader(file)
+        assert {c.topic for c in reader.get_summary().channels.values()} == {
+            *topics,
+            *("/rl/step", "/rl/episode"),
+        }
+        in_file = reader.iter_messages(topics, log_time_order=False)
+        times = [one.log_time for _, _, one in in_file]
+    assert times == sorted(times)
+    # As a dataset, the log is the one without these topics.
+    data = mcaprl.open(out)
+    assert data.fingerprint == mcaprl.open(plain).fingerprint
+    assert data.metadata == mcaprl.open(plain).metadata
+    assert not mcaprl.check(out).problems
+    kept = ["--keep-topic", "/c*", "--keep-topic", "/tf"]
+    assert run(["convert", str(mixed), str(some), *mapping, *kept]) == 0
+    with some.open("rb") as file:
+        names = {c.topic for c in make_reader(file).get_summary().channels.values()}
+    assert names == {"/cmd_vel", "/camera/depth", "/tf", "/rl/step", "/rl/episode"}
+    # The layout shows the camera beside the values.
+    panels = mcaprl.layout(out)["configById"]
+    assert panels["Image!/front"]["imageMode"]["imageTopic"] == "/front"
+    assert list(panels["3D!robot"]["topics"]) == ["/scan"]
+    # Annotating keeps them, those of a log as those of a bag.
+    mcaprl.train(data, tmp_path / "run", algo="bc", updates=2, batch_size=4)
+    annotated = {"policy": tmp_path / "run", "overwrite": True}
+    of_bag = mcaprl.open(mixed, mapping=tmp_path / "robot.yaml")
+    for source, options in ((out, {}), (of_bag, {"keep_topics": True})):
+        mcaprl.annotate(source, tmp_path / "values.mcap", **annotated, **options)
+        for topic in topics:
+            assert _stored(tmp_path / "values.mcap", topic) == _stored(mixed, topic)
+        assert len(_stored(tmp_path / "values.mcap", "/rl/values")) == len(data)
+        assert mcaprl.open(tmp_path / "values.mcap").fingerprint == data.fingerprint
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "zstd", "ros1"])
+def test_topics_of_older_bags_are_kept_with_their_definitions(kind: str, tmp_path: Path) -> None:
+    (tmp_path / "robot.yaml").write_text(MAPPING)
+    if kind == "ros1":
+        bag = write_rosbag1(tmp_path / "one.bag")
+    else:
+        storage, packed = (kind, "") if kind == "sqlite3" else ("mcap", "MESSAGE")
+        bag = write_rosbag2(tmp_path / "bag", storage, packed)
+    data = mcaprl.open(bag, mapping=tmp_path / "robot.yaml")
+    data.save(tmp_path / "out.mcap", keep_topics=["/odom", "/camera/*"])
+    kept = mcaprl.open_bag(tmp_path / "out.mcap")
+    assert list(kept.topics) == ["/camera/depth", "/odom", "/rl/episode", "/rl/step"]
+    odometry = kept.read("/odom", ["twist.twist.linear.x"])
+    assert odometry.columns["twist.twist.linear.x"].tolist() == [speed(k) for k in range(STEPS)]
+    assert odometry.log_time_ns.tolist() == [START_NS + k * STEP_NS for k in range(STEPS)]
+    (depth,) = kept.read("/camera/depth", ["data"]).columns.values()
+    assert [one[0] + 256 * one[1] for one in depth] == [1000 + k for k in range(STEPS)]
+    if kind != "ros1":
+        # So does another reader of MCAP.
+        with (tmp_path / "out.mcap").open("rb") as file:
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            found = [one.decoded_message for one in reader.iter_decoded_messages(["/odom"])]
+        assert [one.twist.twist.linear.x for one in found] == [speed(k) for k in range(STEPS)]
+    assert mcaprl.open(tmp_path / "out.mcap").fingerprint == data.fingerprint
+
+
+def test_topics_that_cannot_be_kept_are_clear_errors(bag: Path, tmp_path: Path) -> None:
+    data = mcaprl.open(bag, mapping=tmp_path / "robot.yaml")
+    out = tmp_path / "out.mcap"
+    with pytest.raises(UnknownNameError, match="unknown topic '/camra'"):
+        mcaprl.convert(data, out, keep_topics="/camra")
+    with pytest.raises(UsageError, match=r"are kept in a log: name an output that ends in \.mcap"):
+        mcaprl.convert(data, tmp_path / "out.npz", keep_topics=True)
+    mcaprl.convert(data, out)
+    with pytest.raises(UsageError, match="for data that were read from a bag by a mapping"):
+        mcaprl.convert(out, tmp_path / "other.mcap", keep_topics=True)
+    with pytest.raises(UsageError, match="annotate keeps all topics of a log"):
+        mcaprl.annotate(out, tmp_path / "other.mcap", policy="run", keep_topics=True)
+    twice = write_rosbag2(tmp_path / "twice")
+    both = mcaprl.open([bag, twice], mapping=tmp_path / "robot.yaml")
+    with pytest.raises(LogError, match="its recordings overlap in time"):
+        mcaprl.convert(both, tmp_path / "other.mcap", keep_topics=True)
+    odd = write_channels(tmp_path / "odd.mcap", [("/odd", "robot/msg/Odd", "", [(0.0, b"1234")])])
+    with pytest.raises(LogError, match=r"/odd cannot be kept: .*definition"):
+        copy_topics([odd], [], ["*"], None)
+    assert sorted(path.name for path in tmp_path.glob("*.mcap")) == ["odd.mcap", "out.mcap"]
 
 
 def test_requests_that_lack_something_are_clear_errors(
