@@ -37,13 +37,16 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl import limits
-from mcaprl.errors import McaprlError, UsageError
+from mcaprl.errors import LogError, McaprlError, UsageError
+from mcaprl.recorder.bags.decoders import decoder_of
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.format.schema import LOG_TOPIC
 from mcaprl.recorder.format.spaces import observation_leaves
+from mcaprl.recorder.mapping.video import Converter, Decoded, VideoDecoder
+from mcaprl.recorder.record.camera import VIDEO, VIDEO_TYPE
 from mcaprl.recorder.record.display import (
     DEPTH,
     SCENE,
@@ -233,6 +236,8 @@ _VALUES_FIELDS = ("q", "policy_action", "value", "advantage", "td_error")
 # If the images of one topic are larger than this without compression, some are left out.
 _MOST_IMAGE_BYTES = 2**26
 _MOST_CHANNELS = 4
+_MOST_EDGE = 320
+"""Width or height in pixels to which larger frames of a video are reduced."""
 
 
 class LogPage:
@@ -290,6 +295,11 @@ class LogPage:
             episode = dataset.episodes[0]
             start_ns, end_ns = int(episode.log_time_ns[0]), int(episode.log_time_ns[-1])
             scene = self._scene and scene_data(self._scene, start_ns, end_ns)
+            notes, rendered = list[str](), list[dict[str, Any]]()
+            try:
+                rendered += self._rendered_images(episode)
+            except (LogError, UsageError) as error:
+                notes.append(f"the video of {VIDEO} cannot be shown: {error}")
             return pack(
                 {
                     "times": _seconds(episode.log_time_ns, start_ns),
@@ -301,7 +311,12 @@ class LogPage:
                     "policies": sorted(
                         self._policies(episode), key=lambda one: bool(np.isnan(one["q"]).all())
                     ),
-                    "images": [*_observed_images(dataset), *self._depth_images(episode)],
+                    "images": [
+                        *rendered,
+                        *_observed_images(dataset),
+                        *self._depth_images(episode),
+                    ],
+                    "notes": notes,
                     "lines": self._lines(start_ns, end_ns),
                     "scene": scene,
                 }
@@ -370,6 +385,42 @@ class LogPage:
             "pixels": coded[..., None],
         }
 
+    def _rendered_images(self, episode: Episode) -> Iterator[dict[str, Any]]:
+        """Yield the video of the environment's images, at most `_MOST_EDGE` wide and high."""
+        if _type_of(self._reader, VIDEO) != VIDEO_TYPE:
+            return
+        channel, times_ns = self._reader.channels_of(VIDEO)[0], episode.log_time_ns
+        packets: list[tuple[int, bytes]] = []
+        for part in self._reader.message_ranges(channel):
+            logged_ns = part.index["log_time"].astype(np.int64)
+            index = part.index[(logged_ns >= times_ns[0]) & (logged_ns <= times_ns[-1])]
+            if len(index):
+                records = self._reader.records_of(part)
+                for time_ns, offset in index.tolist():
+                    data = self._reader.message(records, channel, time_ns, offset)
+                    packets.append((time_ns, data))
+        schema = self._reader.schema_of(channel)
+        messages = decoder_of(channel.message_encoding, VIDEO_TYPE, schema.encoding, schema.data)
+        decoder, found = VideoDecoder(), dict[int, NDArray[np.uint8]]()
+        converter, every = None, 1
+        for row, frame in _frames_of(decoder, [messages.decode(data) for _, data in packets]):
+            if isinstance(frame, str):
+                continue
+            if converter is None:
+                shrink = min(1, _MOST_EDGE / max(frame.width, frame.height))
+                size = (max(1, round(edge * shrink)) for edge in (frame.width, frame.height))
+                width, height = size
+                converter = Converter((width, height))
+                every = _thinning(len(packets) * width * height * 3)
+            if row % every == 0:
+                found[row] = converter.pixels(frame)
+        if not found:
+            raise LogError("it has no frame that can be decoded")
+        seen_ns = np.array([packets[row][0] for row in sorted(found)])
+        steps = np.searchsorted(times_ns, seen_ns, side="right").astype(np.int32) - 1
+        pixels = np.stack([found[row] for row in sorted(found)])
+        yield {"title": "rendered", "is_depth": False, "steps": steps, "pixels": pixels}
+
     def _lines(self, start_ns: int, end_ns: int) -> dict[str, Any]:
         """Return the log lines of an episode."""
         topic = Topic(self._reader, LOG_TOPIC)
@@ -398,6 +449,12 @@ class LogPage:
                 columns[name] = np.full((len(times_ns), *values.shape[1:]), np.nan, np.float32)
                 columns[name][steps] = values
         return columns
+
+
+def _frames_of(decoder: VideoDecoder, messages: Sequence[Any]) -> Iterator[Decoded]:
+    for row, message in enumerate(messages):
+        yield from decoder.feed(row, str(message.format), bytes(message.data))
+    yield from decoder.end()
 
 
 def _observed_images(dataset: Dataset) -> Iterator[dict[str, Any]]:

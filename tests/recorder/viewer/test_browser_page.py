@@ -472,6 +472,48 @@ def test_images_have_the_pixels_of_the_log(browser: Browser, log: Path) -> None:
         assert unknown == [0, 0, 0, 255]
 
 
+class Rendered(Driver):
+    """A driver whose image of 400 x 200 pixels is gray, brighter by 40 in each step."""
+
+    metadata: Any = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    render_mode = "rgb_array"
+
+    def render(self) -> Any:
+        return np.full((200, 400, 3), 20 + 40 * self._step, np.uint8)
+
+
+def test_the_video_of_the_log_is_in_step_with_the_slider(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with closing(mcaprl.RecordMcap(Rendered(), tmp_path / "log.mcap", camera="h264")) as recorder:
+        for seed in (0, 1):
+            recorder.reset(seed=seed)
+            for _ in range(STEPS):
+                recorder.step(6)
+    page = LogPage(tmp_path / "log.mcap")
+    image = unpacked(page.episode(1))["images"][0]
+    assert (image["title"], image["pixels"].shape) == ("rendered", (STEPS + 1, 160, 320, 3))
+    assert image["steps"].tolist() == list(range(STEPS + 1))
+    shades = image["pixels"].reshape(STEPS + 1, -1).astype(int)
+    assert np.abs(shades - (20 + 40 * np.arange(STEPS + 1))[:, None]).max() <= 6
+    with served(tmp_path / "log.mcap") as url:
+        browser.show(url)
+        wait_for_episode(browser)
+        for step in (0, 5, 1, 3):
+            browser.run(f"seek(episode.times[{step}])")
+            assert browser.run("images[0].index") == step
+        pixel = "images[0].canvas.getContext('2d').getImageData(160, 80, 1, 1).data"
+        assert np.abs(np.array(browser.run(f"[...{pixel}]")[:3]) - 140).max() <= 6
+        assert browser.problems == []
+    # Without a decoder, the page says so, and shows everything else.
+    monkeypatch.setitem(sys.modules, "av", None)
+    found = unpacked(page.episode(0))
+    (note,) = found["notes"]
+    assert note.startswith("the video of /camera/image cannot be shown: ")
+    assert "mcaprl[video]" in note
+    assert [one["title"] for one in found["images"]] == ["observation/image", "depth, 0 to 50 m"]
+
+
 def test_keys_and_the_slider_move_the_time(browser: Browser, log: Path) -> None:
     with served(log) as url:
         browser.show(url)

@@ -50,7 +50,7 @@ function report(text) {
 
 /** Build the panels of an episode. */
 function show(data) {
-  report("");
+  report(data.notes.join(" "));
   episode = data;
   get("name").textContent = document.title = `${log.name}, ${summary(state.index)}`;
   plots.forEach((plot) => plot.destroy());
