@@ -4,12 +4,14 @@
     python run_lerobot.py chunks FOLDER OUT.npz  the same, with the actions of the next 4 steps
     python run_lerobot.py merge FOLDER TARGET    a dataset with the episodes of FOLDER twice
     python run_lerobot.py make FOLDER KIND       the golden dataset of KIND `image` or `video`
+    python run_lerobot.py run PROGRAM ...        a script or a module, with its arguments
 
 Only NumPy, PyAV, torch and LeRobot are imported. The writer of LeRobot 0.4 needs NumPy < 2.4.
 """
 
 from __future__ import annotations
 
+import runpy
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -19,9 +21,22 @@ import numpy as np
 import torch
 
 
-def main(command: str, folder: str, target: str) -> None:
+def main(command: str, folder: str, *target: str) -> None:
     """Run a command."""
-    {"read": read, "chunks": chunks, "merge": merge, "make": make}[command](Path(folder), target)
+    if command == "run":
+        run(folder, *target)
+    else:
+        commands = {"read": read, "chunks": chunks, "merge": merge, "make": make}
+        commands[command](Path(folder), *target)
+
+
+def run(program: str, *arguments: str) -> None:
+    """Run a program with LeRobot's modules prepared."""
+    _lerobot()
+    torch.set_num_threads(1)
+    sys.argv = [program, *arguments]
+    start = runpy.run_path if program.endswith(".py") else runpy.run_module
+    start(program, run_name="__main__")
 
 
 def chunks(folder: Path, target: str) -> None:

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 import warnings
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,7 +28,7 @@ from mcaprl.recorder.dataset.formats.lerobot_features import Feature
 from mcaprl.recorder.dataset.formats.lerobot_writer import QUANTILES, describe, pooled, sampled
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of
-from tests.conftest import need
+from tests.support.lerobot_environment import run_lerobot
 from tests.support.recordings import assert_same_bits
 from tests.support.strategies import transitions
 from tests.support.transitions import is_plain
@@ -41,7 +38,6 @@ parquet = pytest.importorskip("pyarrow.parquet")
 pytest.importorskip("PIL", reason="needs Pillow")
 
 _GOLDEN = Path(__file__).parents[3] / "golden"
-_PROGRAM = Path(__file__).parents[3] / "support/run_lerobot.py"
 _CAMERAS = spaces.Dict(
     {
         "state": spaces.Box(-np.inf, np.inf, (2,), np.float32),
@@ -621,25 +617,8 @@ def _broken(table: Any) -> Any:
     return pa.array(rows, table["observation.images.front"].type)
 
 
-def _run_lerobot(*arguments: object, home: Path) -> None:
-    """Run LeRobot; skip the test if LeRobot is not installed."""
-    python = os.environ.get("MCAPRL_LEROBOT_PYTHON", f"{sys.prefix}/lerobot/bin/python")
-    need(Path(python).exists(), "LeRobot is not installed: make .venv/.lerobot")
-    kept = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
-    surroundings = {"HF_HOME": str(home), "HF_HUB_OFFLINE": "1", "HOME": str(home)}
-    done = subprocess.run(
-        [python, "-W", "ignore", str(_PROGRAM), *map(str, arguments)],
-        env=kept | surroundings,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-
-
 def test_lerobot_reads_what_we_write(written: Path, tmp_path: Path) -> None:
-    _run_lerobot("read", written, tmp_path / "items.npz", home=tmp_path / "home")
+    run_lerobot("read", written, tmp_path / "items.npz", folder=tmp_path)
     dataset = _cameras()
     with np.load(tmp_path / "items.npz", allow_pickle=False) as items:
         steps = dataset.frame_of_step
@@ -668,7 +647,7 @@ def test_lerobot_finds_the_images_of_our_videos(tmp_path: Path) -> None:
     pytest.importorskip("av", reason="needs the extra video")
     dataset = _cameras()
     dataset.to_lerobot(tmp_path / "out", video=True, lossy=True)
-    _run_lerobot("read", tmp_path / "out", tmp_path / "items.npz", home=tmp_path / "home")
+    run_lerobot("read", tmp_path / "out", tmp_path / "items.npz", folder=tmp_path)
     found = _opened(tmp_path / "out")[0].observations["front"]
     with np.load(tmp_path / "items.npz", allow_pickle=False) as items:
         # The last frame of the truncated episode is only an observation.
@@ -688,7 +667,7 @@ def test_lerobot_merges_what_we_write(tmp_path: Path) -> None:
     )
     metadata = LogMetadata(space, spaces.Box(-np.inf, np.inf, (2,), np.float32))
     dataset_of([episode], metadata, "test").to_lerobot(tmp_path / "out")
-    _run_lerobot("merge", tmp_path / "out", tmp_path / "merged", home=tmp_path / "home")
+    run_lerobot("merge", tmp_path / "out", tmp_path / "merged", folder=tmp_path)
     with pytest.warns(UserWarning, match="is not stored for 2 terminated episodes"):
         merged = Dataset.from_lerobot(tmp_path / "merged")
     assert merged.rewards.tolist() == [1, 2, 4, 1, 2, 4]
@@ -724,7 +703,7 @@ def test_lerobot_has_the_same_chunks(tmp_path: Path) -> None:
     data.save(tmp_path / "log.mcap")
     notes = mcaprl.open(tmp_path / "log.mcap").to_lerobot(tmp_path / "written")
     assert any("which observations the actions are relative to" in note for note in notes)
-    _run_lerobot("chunks", tmp_path / "written", tmp_path / "items.npz", home=tmp_path / "home")
+    run_lerobot("chunks", tmp_path / "written", tmp_path / "items.npz", folder=tmp_path)
     items = np.load(tmp_path / "items.npz")
     buffer = TransitionBuffer.from_dataset(data, BoxBCConfig(chunk=4).packing)
     rows = torch.arange(12)
