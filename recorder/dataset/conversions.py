@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -14,6 +15,7 @@ from mcaprl.recorder.dataset.format_registry import (
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
+    from mcaprl.recorder.dataset.formats.lerobot_items import LeRobotItems
 
 
 class Conversions:
@@ -57,6 +59,38 @@ class Conversions:
             MissingExtraError: A package of the format is not installed.
         """
         return _read("lerobot", path)
+
+    def as_lerobot(
+        self,
+        *,
+        episodes: Sequence[int] | None = None,
+        delta_timestamps: Mapping[str, Sequence[float]] | None = None,
+        image_transforms: Callable[[Any], Any] | None = None,
+        tolerance_s: float = 1e-4,
+    ) -> LeRobotItems:
+        """Return what LeRobot's policies and loaders read like a `LeRobotDataset`; write nothing.
+
+        Its items equal those that LeRobot reads from the folder of `to_lerobot`. LeRobot need not
+        be installed.
+
+        Args:
+            episodes: Indexes of the episodes; None for all. Statistics are those of all episodes.
+            delta_timestamps: Times of further frames, seconds, by feature.
+            image_transforms: Function of an image (channels, height, width), or None.
+            tolerance_s: Largest difference of a time from a multiple of the period, seconds.
+
+        Raises:
+            SpaceError: LeRobot has no place for a space or dtype.
+            UsageError: There is no such episode or feature, or a time is between two frames.
+        """
+        items: LeRobotItems = module_of("lerobot_items").LeRobotItems(
+            cast("Dataset", self),
+            episodes=episodes,
+            delta_timestamps=delta_timestamps,
+            image_transforms=image_transforms,
+            tolerance_s=tolerance_s,
+        )
+        return items
 
     def to_minari(
         self, path: str | Path, *, lossy: bool = False, overwrite: bool = False

@@ -21,7 +21,7 @@ SMALL = (
     "--policy.pretrained_backbone_weights=null --policy.use_vae=false --policy.dim_model=32"
     " --policy.dim_feedforward=64 --policy.n_encoder_layers=1 --policy.n_heads=4"
     " --policy.optimizer_lr=3e-3 --policy.dropout=0 --batch_size=8 --num_workers=0"
-    " --wandb.enable=false --steps=20"
+    " --wandb.enable=false"
 )
 
 
@@ -29,6 +29,11 @@ def _commands(program: str) -> list[list[str]]:
     blocks = re.findall(r"```sh\n(.*?)```", PAGE.read_text(), re.DOTALL)
     lines = [shlex.split(line) for block in blocks for line in commands(block)]
     return [words[1:] for words in lines if words[0] == program]
+
+
+def _train(words: list[str], steps: int, folder: Path) -> None:
+    kept = [word for word in words if not word.startswith("--steps")]
+    run_lerobot("run", *kept, *SMALL.split(), f"--steps={steps}", folder=folder)
 
 
 @pytest.mark.slow
@@ -39,9 +44,9 @@ def test_act_is_trained_on_a_bag_and_judged(
     monkeypatch.chdir(tmp_path)
     Run(quick=True).page(PAGE)
     (train,) = _commands("lerobot-train")
-    train = [word for word in train if not word.startswith("--steps")]
-    run_lerobot("run", "lerobot.scripts.lerobot_train", *train, *SMALL.split(), folder=tmp_path)
-    run_lerobot("run", *_commands("python")[0], folder=tmp_path)
+    predict, train_on_log = _commands("python")
+    _train(["lerobot.scripts.lerobot_train", *train], 20, tmp_path)
+    run_lerobot("run", *predict, folder=tmp_path)
     capsys.readouterr()
     (evaluate,) = (words for words in _commands("mcaprl") if words[0] == "evaluate")
     assert run([*evaluate, "--json"]) == 0
@@ -61,3 +66,10 @@ def test_act_is_trained_on_a_bag_and_judged(
         # The mean command is 0.6 away from a sine, and ACT sees the command in the image.
         assert part["mean"] < 0.5 * part["baselines"]["mean"]
     assert "the worst ten seconds" in Path("errors/index.html").read_text()
+
+    _train(train_on_log, 2, tmp_path)
+    checkpoint, same = (
+        json.loads(Path(folder, "checkpoints/last/pretrained_model/config.json").read_text())
+        for folder in ("act_on_log", "act")
+    )
+    assert checkpoint == same

@@ -2,6 +2,7 @@
 
     python run_lerobot.py read FOLDER OUT.npz    all items of a dataset, by key
     python run_lerobot.py chunks FOLDER OUT.npz  the same, with the actions of the next 4 steps
+    python run_lerobot.py same LOG FOLDER        compares a log with its dataset, item by item
     python run_lerobot.py merge FOLDER TARGET    a dataset with the episodes of FOLDER twice
     python run_lerobot.py make FOLDER KIND       the golden dataset of KIND `image` or `video`
     python run_lerobot.py run PROGRAM ...        a script or a module, with its arguments
@@ -27,6 +28,7 @@ def main(command: str, folder: str, *target: str) -> None:
         run(folder, *target)
     else:
         commands = {"read": read, "chunks": chunks, "merge": merge, "make": make}
+        commands["same"] = same
         commands[command](Path(folder), *target)
 
 
@@ -65,6 +67,36 @@ def _write(dataset: Any, target: str) -> None:
     found["fps"] = np.asarray(dataset.fps)
     found["lengths"] = np.asarray(dataset.meta.episodes["length"])
     np.savez(target, allow_pickle=False, **found)
+
+
+def same(log: Path, folder: str) -> None:
+    """Compare what a log and its dataset return, and what LeRobot reads of their descriptions."""
+    data = import_module("mcaprl").open(log)
+    reader = _lerobot().LeRobotDataset
+    fps = reader("any/name", root=folder).fps
+    images = [name for name in reader("any/name", root=folder).features if "image" in name]
+    steps = {name: [step / fps for step in (-1, 0, 3)] for name in ("action", *images)}
+    for options in ({}, {"delta_timestamps": steps}, {"episodes": [1], "delta_timestamps": steps}):
+        mine, theirs = data.as_lerobot(**options), reader("any/name", root=folder, **options)
+        assert len(mine) == len(theirs) == mine.num_frames == theirs.num_frames
+        assert (mine.num_episodes, mine.fps) == (theirs.num_episodes, theirs.fps)
+        for row in (*range(len(theirs)), -1):
+            found, wanted = mine[row], theirs[row]
+            assert found.keys() == wanted.keys()
+            assert found.pop("task") == wanted.pop("task")
+            for key, value in wanted.items():
+                assert found[key].dtype == value.dtype, key
+                torch.testing.assert_close(found[key], value, rtol=0, atol=0, equal_nan=True)
+        for name in ("info", "video_keys", "image_keys", "camera_keys", "names", "shapes", "fps"):
+            assert getattr(mine.meta, name) == getattr(theirs.meta, name), name
+        assert mine.meta.tasks.equals(theirs.meta.tasks)
+        for key in ("dataset_from_index", "dataset_to_index", "length", "tasks"):
+            assert mine.meta.episodes[key] == list(theirs.meta.episodes[key]), key
+            assert mine.meta.episodes[1][key] == theirs.meta.episodes[1][key]
+        assert mine.meta.stats.keys() == theirs.meta.stats.keys()
+        for name, stats in theirs.meta.stats.items():
+            for kind, value in stats.items():
+                np.testing.assert_array_equal(mine.meta.stats[name][kind], value)
 
 
 def merge(folder: Path, target: str) -> None:

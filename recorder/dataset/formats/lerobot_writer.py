@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -258,7 +258,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, video: bool = Fa
     Returns:
         One sentence for each thing that was left out or changed.
     """
-    lost = _losses(dataset, lossy=lossy, video=video)
+    lost = losses(dataset, lossy=lossy, video=video)
     writer = _Writer(dataset, path, video=video)
     for index in range(len(dataset.episode_lengths)):
         writer.add_episode(index)
@@ -282,7 +282,7 @@ def task_of(options: str, metadata: LogMetadata) -> str:
     return task if isinstance(task, str) and task else metadata.env_id or _DEFAULT_TASK
 
 
-def _losses(dataset: Dataset, *, lossy: bool, video: bool) -> list[str]:
+def losses(dataset: Dataset, *, lossy: bool, video: bool) -> list[str]:
     """Return one sentence for each change that loses data."""
     leaves = leaves_of(dataset.observation_space)
     named = zip(lerobot_features.observation_names(leaves), leaves, strict=True)
@@ -315,50 +315,131 @@ def _is_large(dataset: Dataset, leaf: Leaf) -> bool:
     return bool((values >= 2**63).any())
 
 
+class Frames:
+    """A dataset as LeRobot's frames, each of which is a transition.
+
+    Attributes:
+        fps: Frames per second.
+        observations: Features of the leaves of an observation.
+        infos: Feature of each info that LeRobot has a place for.
+        features: All features.
+        slices: Frames of each episode.
+        tasks: Index of each task by its text.
+        task_of_episode: Index of the task of each episode.
+        episode_of_frame: (N,) index of the episode of each frame.
+    """
+
+    def __init__(self, dataset: Dataset, *, video: bool = False) -> None:
+        """Name the features of a dataset."""
+        self._dataset = dataset
+        metadata = LogMetadata.from_strings(dataset.metadata)
+        self._leaves = leaves_of(dataset.observation_space)
+        self.fps = frames_per_second(metadata.step_duration_ns)
+        labels = metadata.observation_names
+        named = zip(lerobot_features.observation_names(self._leaves), self._leaves, strict=True)
+        self.observations = [
+            lerobot_features.feature_of(name, leaf, () if leaf.path else labels, video=video)
+            for name, leaf in named
+        ]
+        self._places = {one.name: k for k, one in enumerate(self.observations)}
+        self.infos = lerobot_features.info_features(dataset.infos, dataset.frame_of_step + 1)
+        self._names = {feature.name: name for name, feature in self.infos.items()}
+        others = [*self.infos.values(), *lerobot_features.default_features()]
+        self.features = [*self.observations, *_step_features(dataset), *others]
+        self.slices = [steps for steps, _ in episode_slices(dataset)]
+        self.tasks: dict[str, int] = {}
+        self.task_of_episode = [
+            self.tasks.setdefault(task_of(episode.summary.options, metadata), len(self.tasks))
+            for episode in dataset.episodes
+        ]
+        lengths = dataset.episode_lengths
+        numbers = np.arange(len(dataset)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+        self.episode_of_frame = np.repeat(np.arange(len(lengths)), lengths)
+        self._columns: dict[str, NDArray[Any]] = {
+            lerobot_features.ACTION: dataset.actions,
+            lerobot_features.REWARD: dataset.rewards,
+            lerobot_features.DONE: dataset.terminated,
+            lerobot_features.TRUNCATED: dataset.truncated,
+            _behavior_feature(dataset): dataset.behavior,
+            "timestamp": numbers / float(self.fps),
+            "frame_index": numbers,
+            "episode_index": self.episode_of_frame,
+            "index": np.arange(len(dataset)),
+            "task_index": np.repeat(np.array(self.task_of_episode, np.int64), lengths),
+        }
+
+    def values(self, feature: Feature, rows: Any) -> NDArray[Any]:
+        """Return the values (B, *shape) of a feature in frames: a slice, or B indexes."""
+        if feature.name in self._columns:
+            found = self._columns[feature.name][rows]
+        elif feature.name in self._places:
+            leaf = self._leaves[self._places[feature.name]]
+            found = np.asarray(leaf.of(self._dataset.frames)[self._dataset.frame_of_step[rows]])
+        else:
+            info = self._dataset.infos[self._names[feature.name]]
+            found = info[self._dataset.frame_of_step[rows] + 1].data
+        if feature.dtype == "video":
+            return found
+        kind = found.dtype if feature.dtype == "image" else feature.dtype
+        return found.astype(kind, copy=False).reshape(len(found), *feature.shape)
+
+    def stats(self, feature: Feature, index: int) -> Stats:
+        """Return the statistics of a feature in an episode."""
+        steps = self.slices[index]
+        if not feature.is_image:
+            return describe(feature, self.values(feature, steps))
+        count = steps.stop - steps.start
+        return describe(feature, self.values(feature, steps.start + sampled(feature, count)))
+
+    def info(self, entries: dict[str, Any], *, has_videos: bool) -> dict[str, Any]:
+        """Return the content of `meta/info.json`; `entries` describes the features."""
+        count = len(self.slices)
+        return {
+            "codebase_version": VERSION,
+            "robot_type": None,
+            "total_episodes": count,
+            "total_frames": len(self._dataset),
+            "total_tasks": len(self.tasks),
+            "chunks_size": CHUNK_FILES,
+            "data_files_size_in_mb": MAX_FILE_BYTES >> 20,
+            "video_files_size_in_mb": MAX_VIDEO_BYTES >> 20,
+            "fps": self.fps,
+            "splits": {"train": f"0:{count}"},
+            "data_path": DATA_PATH,
+            "video_path": VIDEO_PATH if has_videos else None,
+            "features": entries,
+        }
+
+
 class _Writer:
     """Writer of the data files, videos and tables of episodes."""
 
     def __init__(self, dataset: Dataset, path: Path, *, video: bool) -> None:
         self._dataset, self._path = dataset, path
-        self._metadata = LogMetadata.from_strings(dataset.metadata)
-        self._leaves = leaves_of(dataset.observation_space)
-        self._fps = frames_per_second(self._metadata.step_duration_ns)
-        labels = self._metadata.observation_names
-        named = zip(lerobot_features.observation_names(self._leaves), self._leaves, strict=True)
-        self._observations = [
-            lerobot_features.feature_of(name, leaf, () if leaf.path else labels, video=video)
-            for name, leaf in named
-        ]
-        self._infos = lerobot_features.info_features(dataset.infos, dataset.frame_of_step + 1)
-        others = [*self._infos.values(), *lerobot_features.default_features()]
-        self._features = [*self._observations, *_step_features(dataset), *others]
-        self._slices = episode_slices(dataset)
-        self._tasks: dict[str, int] = {}
+        self._frames = Frames(dataset, video=video)
+        self._features = self._frames.features
         self._rows: list[dict[str, Any]] = []
         self._stats: list[dict[str, Stats]] = []
         self._files = ParquetFiles(path, self._features)
-        rate = Fraction(self._fps).limit_denominator(1001)
+        rate = Fraction(self._frames.fps).limit_denominator(1001)
         self._videos = {
             feature.name: VideoWriter(path, feature, rate, VIDEO_PATH, MAX_VIDEO_BYTES, CHUNK_FILES)
-            for feature in self._observations
+            for feature in self._frames.observations
             if feature.dtype == "video"
         }
 
     def add_episode(self, index: int) -> None:
         """Write the rows and videos of an episode."""
-        steps, frames = self._slices[index]
+        frames, steps = self._frames, self._frames.slices[index]
+        task = list(frames.tasks)[frames.task_of_episode[index]]
         count = steps.stop - steps.start
-        task = task_of(self._dataset.episodes[index].summary.options, self._metadata)
-        task_index = self._tasks.setdefault(task, len(self._tasks))
         row: dict[str, Any] = {"episode_index": index, "tasks": [task], "length": count}
         columns: dict[str, Any] = {}
         stats: dict[str, Stats] = {}
-        values = self._values(index, steps, frames, task_index)
-        for feature, array in values:
-            if feature.is_image:
-                stats[feature.name] = describe(feature, array[sampled(feature, count)])
-            else:
-                stats[feature.name] = describe(feature, array)
+        for feature in self._features:
+            array = frames.values(feature, steps)
+            shown = array[sampled(feature, count)] if feature.is_image else array
+            stats[feature.name] = describe(feature, shown)
             if feature.dtype == "video":
                 row |= self._videos[feature.name].add_episode(array)
             else:
@@ -375,7 +456,7 @@ class _Writer:
             video.close()
         self._write_info()
         self._write_episodes()
-        write_tasks(self._path / "meta/tasks.parquet", self._tasks)
+        write_tasks(self._path / "meta/tasks.parquet", self._frames.tasks)
         stats = {
             feature.name: pooled([episode[feature.name] for episode in self._stats])
             for feature in self._features
@@ -385,7 +466,7 @@ class _Writer:
 
     def notes(self) -> list[str]:
         """Return a sentence for each thing that LeRobot has no place for."""
-        found, infos = [], self._dataset.infos.keys() - self._infos.keys()
+        found, infos = [], self._dataset.infos.keys() - self._frames.infos.keys()
         if infos:
             found.append(
                 f"not written: the infos {', '.join(sorted(infos))}; LeRobot has a place for"
@@ -404,57 +485,11 @@ class _Writer:
             )
         return found
 
-    def _values(
-        self, index: int, steps: slice, frames: slice, task_index: int
-    ) -> Iterator[tuple[Feature, NDArray[Any]]]:
-        """Yield each feature of an episode of T transitions with its values (T, *shape)."""
-        count = steps.stop - steps.start
-        times = (np.arange(count) / float(self._fps)).astype(np.float32)
-        given: dict[str, Any] = {
-            lerobot_features.ACTION: self._dataset.actions[steps],
-            lerobot_features.REWARD: self._dataset.rewards[steps],
-            lerobot_features.DONE: self._dataset.terminated[steps],
-            lerobot_features.TRUNCATED: self._dataset.truncated[steps],
-            _behavior_feature(self._dataset): self._dataset.behavior[steps],
-            "timestamp": times,
-            "frame_index": np.arange(count),
-            "episode_index": np.full(count, index),
-            "index": np.arange(steps.start, steps.stop),
-            "task_index": np.full(count, task_index),
-        }
-        rows = slice(frames.start, frames.stop - 1)
-        for leaf, feature in zip(self._leaves, self._observations, strict=True):
-            given[feature.name] = np.asarray(leaf.of(self._dataset.frames)[rows])
-        for name, feature in self._infos.items():
-            given[feature.name] = self._dataset.infos[name][frames.start + 1 : frames.stop].data
-        for feature in self._features:
-            values = given[feature.name]
-            if feature.dtype == "video":
-                yield feature, values
-            else:
-                kind = values.dtype if feature.dtype == "image" else feature.dtype
-                yield feature, values.astype(kind, copy=False).reshape(count, *feature.shape)
-
     def _write_info(self) -> None:
-        count = len(self._rows)
         entries = {feature.name: feature.to_json() for feature in self._features}
         for name, video in self._videos.items():
             entries[name]["info"] = video.info
-        info = {
-            "codebase_version": VERSION,
-            "robot_type": None,
-            "total_episodes": count,
-            "total_frames": len(self._dataset),
-            "total_tasks": len(self._tasks),
-            "chunks_size": CHUNK_FILES,
-            "data_files_size_in_mb": MAX_FILE_BYTES >> 20,
-            "video_files_size_in_mb": MAX_VIDEO_BYTES >> 20,
-            "fps": self._fps,
-            "splits": {"train": f"0:{count}"},
-            "data_path": DATA_PATH,
-            "video_path": VIDEO_PATH if self._videos else None,
-            "features": entries,
-        }
+        info = self._frames.info(entries, has_videos=bool(self._videos))
         write_json(self._path / "meta/info.json", info)
 
     def _write_episodes(self) -> None:

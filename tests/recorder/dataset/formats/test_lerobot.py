@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import warnings
 from pathlib import Path
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 import mcaprl
 from mcaprl import Dataset
-from mcaprl.errors import LogError, SpaceError
+from mcaprl.errors import LogError, SpaceError, UsageError
 from mcaprl.offline.algorithms.config import BoxBCConfig
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.recorder.dataset.formats import lerobot_writer
@@ -653,6 +654,48 @@ def test_lerobot_finds_the_images_of_our_videos(tmp_path: Path) -> None:
         # The last frame of the truncated episode is only an observation.
         pixels = np.moveaxis(items["observation.images.front"][:4], 1, -1) * 255
         np.testing.assert_allclose(pixels, found, atol=1e-4)
+
+
+def test_a_log_is_read_like_its_dataset(tmp_path: Path, written: Path) -> None:
+    """Items of a log equal those that LeRobot reads from the converted log, bit for bit."""
+    _cameras().save(tmp_path / "log.mcap")
+    run_lerobot("same", tmp_path / "log.mcap", written, folder=tmp_path)
+
+
+def test_items_of_an_episode_are_padded_by_its_ends() -> None:
+    data = _cameras()
+    steps = {"action": [-0.1, 0.0, 0.3], "observation.images.gray": [0.1]}
+    items = data.as_lerobot(episodes=[1], delta_timestamps=steps, image_transforms=torch.neg)
+    assert (len(items), items.num_episodes, items.meta.total_frames) == (2, 1, 5)
+    first = items[0]
+    # The actions of the episode are 2 and 2, those before it 0, 3 and 1.
+    assert first["action"].tolist() == [2, 2, 2]
+    assert first["action_is_pad"].tolist() == [True, False, True]
+    # The image of the second frame has the value 110.
+    np.testing.assert_allclose(first["observation.images.gray"], np.full((1, 1, 8, 9), -110 / 255))
+    assert first["observation.images.arm.depth"].isinf().any()
+    assert (first["index"].item(), first["frame_index"].item(), first["task"]) == (3, 0, "turn")
+    assert items[-1]["index"].item() == 4
+    with pytest.raises(IndexError):
+        items[2]
+    with pytest.raises(AttributeError, match="no 'motors'"):
+        _ = items.meta.motors
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"episodes": [2]}, "there is no episode 2, but 2 episodes"),
+        ({"delta_timestamps": {"torque": [0.0]}}, "has 'torque'; the features are observation.im"),
+        (
+            {"delta_timestamps": {"action": [0.0, 0.05]}},
+            "'action' has 0.05 s, which is no multiple",
+        ),
+    ],
+)
+def test_options_that_do_not_fit_are_named(options: dict[str, Any], text: str) -> None:
+    with pytest.raises(UsageError, match=re.escape(text)):
+        _cameras().as_lerobot(**options)
 
 
 def test_lerobot_merges_what_we_write(tmp_path: Path) -> None:
