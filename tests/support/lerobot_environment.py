@@ -1,4 +1,4 @@
-"""Runner of LeRobot, which has an environment of its own."""
+"""Runner of LeRobot, which has a separate environment."""
 
 from __future__ import annotations
 
