@@ -1,4 +1,4 @@
-"""The page about LeRobot: its ACT is trained on a bag, and judged by its predictions."""
+"""The page about LeRobot: its ACT is trained on a bag, and its predictions are evaluated."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _train(words: list[str], steps: int, folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_act_is_trained_on_a_bag_and_judged(
+def test_act_is_trained_on_a_bag_and_evaluated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The page is run in LeRobot's environment, with a small ACT."""
