@@ -39,13 +39,20 @@ if TYPE_CHECKING:
 @click.argument("data", nargs=-1, required=True, type=PATH)
 @click.option("--report", type=click.Path(path_type=Path), help="Output folder of the HTML report.")
 @click.option("--strict", is_flag=True, help="Exit with 1 if there are problems.")
+@click.option("--quality", is_flag=True, help="Look for faults of sensors, clocks and recording.")
+@click.option("--test", type=PATH, help="With --quality: held-out data, not to be in DATA.")
 @json_option
 @integer_option(
     "--threads", "Number of threads that decompress chunks; useful for large logs.", least=1
 )
 @partial(mapping_options, has_strict=False)
 def info(
-    data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool, **request: Any
+    data: tuple[str, ...],
+    report: Path | None,
+    strict: bool,
+    test: str | None,
+    as_json: bool,
+    **request: Any,
 ) -> int:
     """Show the contents and problems of DATA: files, folders or globs of logs.
 
@@ -54,6 +61,10 @@ def info(
     """
     with working("reading data"):
         source = bag_reader(data, bag := bag_options(request))
+        if test is not None and bag["mapping"] is not None:
+            request["test"] = mcaprl.open(test, **bag)
+        else:
+            request["test"] = test
         found = mcaprl.info(source, report=report, definitions=bag["definitions"], **request)
     if as_json:
         print_json(found.to_json())
@@ -68,7 +79,13 @@ def info(
             echo(moment)
         if report is not None:
             echo(f"report: {report / PAGE_NAME}")
-    return int(strict and bool(found.problems))
+    if found.quality is not None and not as_json:
+        rows = [(flaw.severity, f"{flaw.share:.1%}", str(flaw)) for flaw in found.quality]
+        print_facts("quality", [(f"{kind}, {share}", text) for kind, share, text in rows])
+        if not rows:
+            echo("no faults of the data were found")
+    worst = [flaw for flaw in found.quality or () if flaw.severity == "problem"]
+    return int(strict and bool(found.problems or worst))
 
 
 def _print_bag(found: Any) -> None:

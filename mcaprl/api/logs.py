@@ -27,6 +27,7 @@ from mcaprl.page import PAGE_NAME
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.dataset.open import find_logs
+from mcaprl.recorder.dataset.quality import Flaw, flaws, ranked, topic_flaws
 from mcaprl.recorder.dataset.statistics import Calibration, calibration
 from mcaprl.recorder.format.behavior import PROBABILITY
 from mcaprl.recorder.format.metadata import METADATA_NAME
@@ -75,6 +76,7 @@ class LogInfo:
         problems: Defects of the logs, and warnings of the reader.
         findings: Defects and notes of `lint`.
         moments: Annotated steps with the largest TD errors or policy disagreements.
+        quality: What is wrong with the data, ranked; None if it was not asked for.
     """
 
     sources: tuple[Path, ...]
@@ -100,6 +102,7 @@ class LogInfo:
     problems: list[str]
     findings: list[Problem] = field(repr=False)
     moments: list[Surprise] = field(repr=False)
+    quality: list[Flaw] | None = field(default=None, repr=False)
 
     @property
     def title(self) -> str:
@@ -115,6 +118,7 @@ class LogInfo:
             "behavior_prob": found and {**found.to_json(), "text": str(found)},
             "findings": [asdict(finding) for finding in self.findings],
             "moments": [asdict(moment) for moment in self.moments],
+            "quality": self.quality and [flaw.to_json() for flaw in self.quality],
         }
         facts = {name: value for name, value in facts.items() if name != "sources"}
         return {"kind": "log", **facts}
@@ -154,6 +158,8 @@ def info(
     report: str | Path | None = None,
     threads: int = 1,
     definitions: Definitions = (),
+    quality: bool = False,
+    test: Source | None = None,
 ) -> LogInfo | Any:
     """Return facts about logs, and their problems; or about another robot's bag.
 
@@ -170,37 +176,53 @@ def info(
         threads: Number of threads that decompress chunks.
         definitions: Files and folders with definitions of ROS types that a bag lacks; see
             docs/bags.md.
+        quality: Whether to look for faults of the data, which become `quality` of the result,
+            ranked by the share of the data; see docs/howto/quality.md. Of a bag without a mapping,
+            the times of its topics are judged.
+        test: Data that is held out, as `data`: its episodes must not be in `data`. Needs `quality`.
 
     Raises:
         LogError: A log or bag cannot be read.
-        UsageError: A report is requested for a bag without a mapping.
+        SpaceError: `test` has other spaces than `data`.
+        UsageError: A report is requested for a bag without a mapping, or `test` without `quality`
+            or for such a bag.
         MissingExtraError: The packages of the `report` extra are not installed.
         ReportError: The report cannot be written.
     """
     if report is not None:
         import_extra("matplotlib", "report")
         import_extra("jinja2", "report")
+    if test is not None and not quality:
+        raise UsageError("test data are compared if `quality=True` is passed")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        contents = _dataset_or_bag(data, threads, definitions)
+        contents = _dataset_or_bag(data, threads, definitions, quality=quality)
     warned = [str(warning.message) for warning in caught]
     if isinstance(contents, BagInfo):
         if report is not None:
             raise UsageError("a report of a bag needs a mapping: pass `mapping=FILE`")
+        if test is not None:
+            raise UsageError("test data of a bag need a mapping: pass `mapping=FILE`")
         return replace(contents, problems=[*warned, *contents.problems])
     if contents.origin.report is not None:
         warned = list(dict.fromkeys([*warned, *map(str, contents.origin.report.problems())]))
     found = _describe(contents, warned)
+    if quality:
+        held_out = None if test is None else open_data(test, threads=threads)
+        found = replace(found, quality=flaws(contents, held_out))
     if report is not None:
         from mcaprl.recorder.viewer.report import dataset_page
 
         folder = Path(report)
         write_json(folder / "dataset.json", found.to_json(), ReportError)
-        dataset_page(folder / PAGE_NAME, contents, found.title, found.rows(), found.findings)
+        findings = [*(found.quality or ()), *found.findings]
+        dataset_page(folder / PAGE_NAME, contents, found.title, found.rows(), findings)
     return found
 
 
-def _dataset_or_bag(data: Source, threads: int, definitions: Definitions) -> Dataset | BagInfo:
+def _dataset_or_bag(
+    data: Source, threads: int, definitions: Definitions, *, quality: bool
+) -> Dataset | BagInfo:
     if isinstance(data, Dataset) or callable(data):
         return opened(data)
     try:
@@ -208,7 +230,7 @@ def _dataset_or_bag(data: Source, threads: int, definitions: Definitions) -> Dat
     except NoEpisodesError:
         raise
     except LogError:
-        found = bag_info(data, definitions)
+        found = bag_info(data, definitions, quality=quality)
         if found is None:
             raise
         return found
@@ -426,6 +448,7 @@ class BagInfo:
         topics: Topics by name.
         problems: Files that were cut off, warnings of the reader, and topics that cannot be read.
         next: Command to run next.
+        quality: What is wrong with the times of the topics; None if it was not asked for.
     """
 
     sources: tuple[Path, ...]
@@ -434,6 +457,7 @@ class BagInfo:
     topics: dict[str, BagTopic]
     problems: list[str]
     next: str
+    quality: list[Flaw] | None = None
 
     topic_columns: ClassVar = [
         "topic",
@@ -467,6 +491,7 @@ class BagInfo:
             "topics": [asdict(topic) for topic in self.topics.values()],
             "problems": self.problems,
             "next": self.next,
+            "quality": self.quality and [flaw.to_json() for flaw in self.quality],
         }
 
     def rows(self) -> list[tuple[str, str]]:
@@ -516,7 +541,9 @@ def _date(time_ns: int) -> str:
     return datetime.fromtimestamp(time_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
-def bag_info(data: Paths, definitions: Definitions = ()) -> BagInfo | None:
+def bag_info(
+    data: Paths, definitions: Definitions = (), *, quality: bool = False
+) -> BagInfo | None:
     """Return facts about a bag; None if the data is a log, or not a bag.
 
     Raises:
@@ -536,7 +563,13 @@ def bag_info(data: Paths, definitions: Definitions = ()) -> BagInfo | None:
             topics={topic.info.name: BagTopic.of(topic) for topic in topics},
             problems=_problems(bag, topics),
             next=_next(data, topics),
+            quality=_quality_of(topics) if quality else None,
         )
+
+
+def _quality_of(topics: list[TopicOverview]) -> list[Flaw]:
+    found = [topic_flaws(one.info.name, one.times_ns, one.recordings) for one in topics]
+    return ranked([flaw for each in found for flaw in each])
 
 
 def _opened(data: Paths, definitions: Definitions = ()) -> Bag | None:

@@ -45,7 +45,7 @@ def _not_finite(dataset: Dataset) -> Iterator[Problem]:
         "one NaN or infinite value in a batch makes every weight NaN; training rejects the dataset"
     )
     counts = {name: c.not_finite for name, c in dataset.statistics.observations.items()}
-    for leaf in _leaves(dataset):
+    for leaf in leaves_of(dataset):
         if counts[leaf.name]:
             places = _places(dataset, functools.partial(_bad_frames, leaf))
             what = f"{counts[leaf.name]} values of {leaf.name} are NaN or infinite"
@@ -65,7 +65,7 @@ def _not_finite(dataset: Dataset) -> Iterator[Problem]:
 
 
 def _out_of_range(dataset: Dataset) -> Iterator[Problem]:
-    for leaf in _leaves(dataset):
+    for leaf in leaves_of(dataset):
         bounds = bounds_of(leaf.of(dataset.observation_space))
         if bounds is None or leaf.encoding is not None:
             continue
@@ -76,7 +76,7 @@ def _out_of_range(dataset: Dataset) -> Iterator[Problem]:
             first = int(wrong[0])
             yield Problem(
                 f"values of {_count(len(wrong), 'element')} of {leaf.name} are outside its space",
-                f"{_name(dataset, leaf, first)} has values from {column.low[first]:.4g} to"
+                f"{element_name(dataset, leaf, first)} has values from {column.low[first]:.4g} to"
                 f" {column.high[first]:.4g}, but bounds {low[first]:.4g} to {high[first]:.4g}",
                 "training rejects values outside of discrete spaces, and observations that are"
                 " scaled by the bounds of the space are out of range",
@@ -86,7 +86,7 @@ def _out_of_range(dataset: Dataset) -> Iterator[Problem]:
 def _impossible_actions(dataset: Dataset) -> Iterator[Problem]:
     space, effect = dataset.action_space, "training rejects the dataset"
     if isinstance(space, spaces.Box):
-        parts = zip(_parts(dataset), space.low.flat, space.high.flat, strict=True)
+        parts = zip(action_parts(dataset), space.low.flat, space.high.flat, strict=True)
         for number, (name, low, high) in enumerate(parts):
             is_bad = functools.partial(_is_beyond, number, low, high)
             count = int(is_bad(dataset).sum())
@@ -116,7 +116,9 @@ def _constant_parts(dataset: Dataset) -> Iterator[Problem]:
     parts = dataset.actions.reshape(len(dataset), -1)
     same = np.flatnonzero((parts == parts[0]).all(0))
     if len(same):
-        names = [f"{_parts(dataset)[index]} is {parts[0, index]:.4g}" for index in same[:_SHOWN]]
+        names = [
+            f"{action_parts(dataset)[index]} is {parts[0, index]:.4g}" for index in same[:_SHOWN]
+        ]
         yield Problem(
             f"{_count(len(same), 'part')} of the action never change",
             ", ".join(names) + (", ..." if len(same) > _SHOWN else ""),
@@ -126,7 +128,7 @@ def _constant_parts(dataset: Dataset) -> Iterator[Problem]:
 
 def _masked_actions(dataset: Dataset) -> Iterator[Problem]:
     joint = joint_actions(dataset.action_space)
-    masks = [leaf for leaf in _leaves(dataset) if leaf.path == (MASK_KEY,)]
+    masks = [leaf for leaf in leaves_of(dataset) if leaf.path == (MASK_KEY,)]
     if joint is None or not masks or masks[0].shape != (joint.count,):
         return
     forbidden = [_is_forbidden(joint, episode) for episode in dataset.episodes]
@@ -153,11 +155,11 @@ def _is_forbidden(joint: JointActions, episode: Episode) -> NDArray[np.bool_]:
 def _constant(dataset: Dataset) -> Iterator[Problem]:
     if len(dataset) < 2:
         return
-    for leaf in _leaves(dataset):
+    for leaf in leaves_of(dataset):
         column = dataset.statistics.observations[leaf.name]
         same = np.flatnonzero(column.low == column.high)
         if len(same):
-            names = ", ".join(_name(dataset, leaf, int(index)) for index in same[:_SHOWN])
+            names = ", ".join(element_name(dataset, leaf, int(index)) for index in same[:_SHOWN])
             yield _note(
                 f"{_count(len(same), 'element')} of {leaf.name} never change",
                 names + (", ..." if len(same) > _SHOWN else ""),
@@ -167,6 +169,19 @@ def _constant(dataset: Dataset) -> Iterator[Problem]:
 
 
 def _duplicates(dataset: Dataset) -> Iterator[Problem]:
+    copies = [indexes for indexes in digests(dataset).values() if len(indexes) > 1]
+    if copies:
+        extra = sum(len(indexes) - 1 for indexes in copies)
+        yield Problem(
+            f"{_count(extra, 'episode')} are duplicates of others",
+            "; ".join(listed(indexes) for indexes in copies[:_SHOWN]),
+            "duplicate episodes are overweighted, and held-out episodes can also be in the training"
+            " data",
+        )
+
+
+def digests(dataset: Dataset) -> dict[bytes, list[int]]:
+    """Return the indexes of the episodes by a digest of observations, actions and rewards."""
     alike: dict[bytes, list[int]] = defaultdict(list)
     for episode in dataset.episodes:
         digest = sha256()
@@ -174,15 +189,7 @@ def _duplicates(dataset: Dataset) -> Iterator[Problem]:
             for block in blocks_of(part):
                 digest.update(block.data)
         alike[digest.digest()].append(episode.index)
-    copies = [indexes for indexes in alike.values() if len(indexes) > 1]
-    if copies:
-        extra = sum(len(indexes) - 1 for indexes in copies)
-        yield Problem(
-            f"{_count(extra, 'episode')} are duplicates of others",
-            "; ".join(_listed(indexes) for indexes in copies[:_SHOWN]),
-            "duplicate episodes are overweighted, and held-out episodes can also be in the training"
-            " data",
-        )
+    return alike
 
 
 def _actions_never_taken(dataset: Dataset) -> Iterator[Problem]:
@@ -312,18 +319,24 @@ _CHECKS: Final[tuple[Callable[[Dataset], Iterator[Problem]], ...]] = (
 )
 
 
-def _leaves(dataset: Dataset) -> tuple[Leaf, ...]:
+def leaves_of(dataset: Dataset) -> tuple[Leaf, ...]:
+    """Return the leaves of the observation space."""
     return observation_leaves(dataset.observation_space)
 
 
 def _bad_frames(leaf: Leaf, episode: Episode) -> NDArray[np.bool_]:
     """Mark the values (T + 1, *shape) of an episode's observations that are not finite."""
-    last = leaf.of(episode.next_observations)[-1:]
-    bad: NDArray[np.bool_] = ~np.isfinite(np.concatenate([leaf.of(episode.observations), last]))
+    bad: NDArray[np.bool_] = ~np.isfinite(frames_of(leaf, episode))
     return bad
 
 
-def _name(dataset: Dataset, leaf: Leaf, index: int) -> str:
+def frames_of(leaf: Leaf, episode: Episode) -> NDArray[Any]:
+    """Return the values (T + 1, *shape) of a leaf in an episode's observations."""
+    last = leaf.of(episode.next_observations)[-1:]
+    return np.concatenate([leaf.of(episode.observations), last])
+
+
+def element_name(dataset: Dataset, leaf: Leaf, index: int) -> str:
     """Return the name of one element of a leaf."""
     names = dataset.observation_names
     return names[index] if len(names) == leaf.size else f"{leaf.name}[{index}]"
@@ -347,7 +360,8 @@ def _places(dataset: Dataset, flags: Callable[[Episode], NDArray[np.bool_]]) -> 
     return ", ".join(found[:_SHOWN])
 
 
-def _parts(dataset: Dataset) -> tuple[str, ...]:
+def action_parts(dataset: Dataset) -> tuple[str, ...]:
+    """Return the names of the parts of the action."""
     return part_names(dataset.action_space, dataset.action_part_names)
 
 
@@ -355,7 +369,8 @@ def _steps(dataset: Dataset, count: int) -> str:
     return f"{count} of {_count(len(dataset), 'step')}"
 
 
-def _listed(indexes: list[int]) -> str:
+def listed(indexes: list[int]) -> str:
+    """Return the first indexes of episodes as text."""
     more = f" and {len(indexes) - _SHOWN} more" if len(indexes) > _SHOWN else ""
     return f"episodes {', '.join(map(str, indexes[:_SHOWN]))}{more}"
 

@@ -27,6 +27,7 @@ from mcaprl.page import (
     write_page,
 )
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.quality import Flaw, Picture
 from mcaprl.recorder.dataset.statistics import calibration
 from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.metadata import LogMetadata
@@ -69,6 +70,7 @@ def dataset_page(
     sections = [
         Section("Overview", table=Table(("", ""), facts)),
         _findings_section(findings),
+        *_pictures_section(findings),
         Section("Episodes", figures=[Figure.of(one.caption, one.figure()) for one in panels]),
         *_calibration_section(dataset),
         Section(
@@ -84,8 +86,38 @@ def dataset_page(
 def _findings_section(findings: Sequence[Problem]) -> Section:
     if not findings:
         return Section("Findings", text="No problems were found.")
-    rows = [(one.severity, one.what, one.where, one.effect) for one in findings]
-    return Section("Findings", table=Table(("", "what", "where", "effect"), rows))
+    rows = [(one.severity, one.what, one.where, one.effect, one.next) for one in findings]
+    return Section("Findings", table=Table(("", "what", "where", "effect", "what to do"), rows))
+
+
+def _pictures_section(findings: Sequence[Problem]) -> list[Section]:
+    """Return the section with the pictures of the findings; concerned parts are marked."""
+    figures = [
+        Figure.of(one.what, Panel(one.what, partial(_picture, picture=one.picture)).figure())
+        for one in findings
+        if isinstance(one, Flaw) and one.picture is not None
+    ]
+    text = "The first or longest place of each finding; what is concerned has another color."
+    return [Section("Pictures of the findings", text, figures=figures)] if figures else []
+
+
+def _picture(axes: Any, picture: Picture) -> None:
+    x, y = np.asarray(picture.x, np.float64), np.asarray(picture.y, np.float64)
+    marked = np.zeros(len(x), bool)
+    for low, high in picture.spans:
+        marked |= (x >= low) & (x <= high)
+    if picture.is_bars:
+        width = 0.9 * float(np.diff(x).min(initial=np.inf)) if len(x) > 1 else 0.9
+        axes.bar(x, y, width, color=np.where(marked, COLORS[1], COLORS[0]))
+    elif picture.spans:
+        axes.plot(x, y, color=COLORS[0], lw=1, marker=".", ms=3)
+        axes.plot(x[marked], y[marked], ".", color=COLORS[1], ms=6)
+        for low, high in picture.spans:
+            axes.axvspan(low, high, color=COLORS[1], alpha=0.15, lw=0)
+    else:
+        axes.plot(x, y, ".", color=COLORS[1], ms=4)
+    axes.set_xlabel(picture.x_label)
+    axes.set_ylabel(picture.y_label)
 
 
 def _calibration_section(dataset: Dataset) -> list[Section]:
