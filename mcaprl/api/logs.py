@@ -178,7 +178,7 @@ def info(
             docs/bags.md.
         quality: Whether to look for faults of the data, which become `quality` of the result,
             ranked by the share of the data; see docs/howto/quality.md. Of a bag without a mapping,
-            the times of its topics are judged.
+            the times of its topics are evaluated.
         test: Data that is held out, as `data`: its episodes must not be in `data`. Needs `quality`.
 
     Raises:

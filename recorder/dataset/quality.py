@@ -74,7 +74,7 @@ class Place(NamedTuple):
         return f"episode {self.episode} {steps}"
 
 
-class Picture(NamedTuple):
+class Plot(NamedTuple):
     """Curve of a finding: its points, and the ranges of x that are concerned."""
 
     x_label: str
@@ -95,7 +95,7 @@ class Flaw(Problem):
         figure: Number that decided, in `unit`.
         unit: Meaning of `figure`.
         places: First places, at most 20; empty if all of the data is concerned.
-        picture: What the page of a report draws; None if there is nothing to draw.
+        plot: What the page of a report draws; None if there is nothing to draw.
     """
 
     kind: str = ""
@@ -103,12 +103,12 @@ class Flaw(Problem):
     figure: float = 0.0
     unit: str = ""
     places: tuple[Place, ...] = ()
-    picture: Picture | None = None
+    plot: Plot | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Return what `info --quality --json` prints, without the picture."""
+        """Return what `info --quality --json` prints, without the plot."""
         found = asdict(self) | {"places": [place._asdict() for place in self.places]}
-        del found["picture"]
+        del found["plot"]
         return found
 
 
@@ -175,14 +175,14 @@ class _Table:
         parts = np.split(rows, cuts)
         return [(int(part[0]), int(part[-1])) for part in parts if len(part) >= least]
 
-    def around(self, values: Floats, first: int, last: int, label: str) -> Picture:
-        """Return the picture of a value of each step around a place."""
+    def around(self, values: Floats, first: int, last: int, label: str) -> Plot:
+        """Return the plot of a value of each step around a place."""
         margin = max(20, last - first)
         same = np.flatnonzero(self.owner == self.owner[first])
         low, high = max(same[0], first - margin), min(same[-1], last + margin)
         rows = np.arange(low, high + 1)
         span = (float(self.step[first]) - 0.5, float(self.step[last]) + 0.5)
-        return Picture("step", label, self.step[rows].tolist(), values[rows].tolist(), [span])
+        return Plot("step", label, self.step[rows].tolist(), values[rows].tolist(), [span])
 
 
 def _flaw(table: _Table, runs: Sequence[tuple[int, int]], what: str, **more: Any) -> Flaw:
@@ -191,7 +191,10 @@ def _flaw(table: _Table, runs: Sequence[tuple[int, int]], what: str, **more: Any
     rest = f" and {len(runs) - _SHOWN} more" if len(runs) > _SHOWN else ""
     share = sum(last - first + 1 for first, last in runs) / len(table.dataset)
     return Flaw(
-        what, "; ".join(map(str, places[:_SHOWN])) + rest, places=places, **{"share": share} | more
+        what,
+        "; ".join(map(str, places[:_SHOWN])) + rest or "all steps",
+        places=places,
+        **{"share": share} | more,
     )
 
 
@@ -219,7 +222,7 @@ def _images(table: _Table) -> Iterator[Flaw]:
                 unit="range of the pixels",
                 next="check exposure, lens cap and cable, and leave these steps out:"
                 " `Dataset.without`",
-                picture=table.around(ranges, *_longest(runs), "range of the pixels"),
+                plot=table.around(ranges, *_longest(runs), "range of the pixels"),
             )
         same &= ~blank
         runs = table.runs(same, 2)
@@ -245,7 +248,7 @@ def _frozen(table: _Table, runs: Sequence[tuple[int, int]], name: str, values: F
         unit="steps",
         next="check the driver and the time limit of the topic (`gap_s`), and leave these steps"
         " out: `Dataset.without`",
-        picture=table.around(values, *longest, name),
+        plot=table.around(values, *longest, name),
     )
 
 
@@ -311,7 +314,7 @@ def _dead(table: _Table) -> Iterator[Flaw]:
             figure=float(len(dead)),
             unit="episodes",
             next="check this sensor or joint, and leave the episodes out: `mcaprl filter`",
-            picture=Picture(
+            plot=Plot(
                 "episode",
                 f"range of {table.names[k]}",
                 long.tolist(),
@@ -344,7 +347,7 @@ def _times(table: _Table) -> Iterator[Flaw]:
             figure=worst,
             unit="s",
             next="set the clock before recording, or take other times: `time` in the mapping",
-            picture=table.around(intervals_s, *_longest(runs), label),
+            plot=table.around(intervals_s, *_longest(runs), label),
         )
     if drops.any():
         runs = table.runs(drops)
@@ -358,7 +361,7 @@ def _times(table: _Table) -> Iterator[Flaw]:
             unit="steps",
             share=lost / (len(table.dataset) + lost),
             next="record with less load, or divide episodes at gaps: `gap_s` in the mapping",
-            picture=table.around(intervals_s, *_longest(runs), label),
+            plot=table.around(intervals_s, *_longest(runs), label),
         )
     rest = intervals_s[~clock & ~drops]
     jitter = robust_spread(rest) / usual_s
@@ -375,7 +378,7 @@ def _times(table: _Table) -> Iterator[Flaw]:
             unit="of the median",
             share=float(far.mean()),
             next="take a fixed rate: `clock.rate_hz` in the mapping",
-            picture=Picture(label, "steps", edges[:-1].tolist(), counts.tolist(), is_bars=True),
+            plot=Plot(label, "steps", edges[:-1].tolist(), counts.tolist(), is_bars=True),
         )
 
 
@@ -387,7 +390,7 @@ def robust_spread(values: Floats) -> float:
 def topic_flaws(name: str, times_ns: Rows, recordings: Rows) -> list[Flaw]:
     """Return what is wrong with the times of a topic of a bag.
 
-    Topics without a steady rate, such as events, are not judged: half of the intervals of a topic
+    Topics without a steady rate, such as events, are not evaluated: half of the intervals
     must be within a tenth of the median.
 
     Args:
@@ -478,7 +481,7 @@ def _saturated(table: _Table) -> Iterator[Flaw]:
                 next="check the limits of the controller"
                 if inside
                 else "if this is no bang-bang control, widen the limits of the controller",
-                picture=table.around(part.astype(np.float64), *_longest(runs), name),
+                plot=table.around(part.astype(np.float64), *_longest(runs), name),
             )
 
 
@@ -511,7 +514,7 @@ def _leaks(table: _Table) -> Iterator[Flaw]:
                 share=1.0,
                 effect="a policy learns to copy it, and has nothing to copy when it drives",
                 next="leave it out of the observation, or take its last value before the action",
-                picture=Picture(
+                plot=Plot(
                     f"{names[k]}",
                     table.names[e],
                     actions[shown, k].tolist(),
@@ -532,9 +535,9 @@ def _lag(table: _Table) -> Iterator[Flaw]:
         return
     effects, chance = found
     best = int(effects.argmax())
-    picture = Picture(
+    plot = Plot(
         "lag, steps",
-        "share of the change that is explained",
+        "share of the change",
         list(range(len(effects))),
         effects.tolist(),
         [(best - 0.5, best + 0.5)],
@@ -550,7 +553,7 @@ def _lag(table: _Table) -> Iterator[Flaw]:
             unit="of the change",
             share=1.0,
             next="check that these are the commands that the robot obeys, and their times",
-            picture=picture,
+            plot=plot,
         )
     elif best > 0 and effects[best] > max(3 * effects[0], _EFFECT):
         seconds = best * float(np.median(table.intervals_ns)) / _NS_PER_S
@@ -565,7 +568,7 @@ def _lag(table: _Table) -> Iterator[Flaw]:
             effect="a policy that sees no earlier actions cannot know what is still to happen",
             next="check the times of commands and sensors (`time: header` in the mapping), or stack"
             " frames",
-            picture=picture,
+            plot=plot,
         )
 
 
@@ -649,7 +652,7 @@ def _outliers(table: _Table) -> Iterator[Flaw]:
             unit=name,
             share=len(far) / len(values),
             next="look at these episodes (`mcaprl replay`), and leave them out: `mcaprl filter`",
-            picture=Picture(
+            plot=Plot(
                 "episode",
                 name,
                 list(range(len(values))),
@@ -701,7 +704,7 @@ def _lonely(table: _Table) -> Iterator[Flaw]:
         figure=float(far.max() / np.median(far)),
         unit="times the median distance",
         next="look for broken values there; what is learned from them holds nowhere else",
-        picture=Picture(
+        plot=Plot(
             "state, by distance",
             "distance to the nearest state",
             list(range(len(curve))),
@@ -743,7 +746,7 @@ def _copied(dataset: Dataset, indexes: list[int], what: str) -> Flaw:
             for one in dataset.episodes
             if one.index in copies
         )[:_PLACES],
-        picture=Picture("episode", "copy", list(range(len(flags))), flags, is_bars=True),
+        plot=Plot("episode", "copy", list(range(len(flags))), flags, is_bars=True),
     )
 
 

@@ -27,7 +27,7 @@ from mcaprl.page import (
     write_page,
 )
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.quality import Flaw, Picture
+from mcaprl.recorder.dataset.quality import Flaw, Plot
 from mcaprl.recorder.dataset.statistics import calibration
 from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.metadata import LogMetadata
@@ -70,7 +70,7 @@ def dataset_page(
     sections = [
         Section("Overview", table=Table(("", ""), facts)),
         _findings_section(findings),
-        *_pictures_section(findings),
+        *_plots_section(findings),
         Section("Episodes", figures=[Figure.of(one.caption, one.figure()) for one in panels]),
         *_calibration_section(dataset),
         Section(
@@ -90,34 +90,34 @@ def _findings_section(findings: Sequence[Problem]) -> Section:
     return Section("Findings", table=Table(("", "what", "where", "effect", "what to do"), rows))
 
 
-def _pictures_section(findings: Sequence[Problem]) -> list[Section]:
-    """Return the section with the pictures of the findings; concerned parts are marked."""
+def _plots_section(findings: Sequence[Problem]) -> list[Section]:
+    """Return the section with the plots of the findings; concerned parts are marked."""
     figures = [
-        Figure.of(one.what, Panel(one.what, partial(_picture, picture=one.picture)).figure())
+        Figure.of(one.what, Panel(one.what, partial(_plot, plot=one.plot)).figure())
         for one in findings
-        if isinstance(one, Flaw) and one.picture is not None
+        if isinstance(one, Flaw) and one.plot is not None
     ]
     text = "The first or longest place of each finding; what is concerned has another color."
-    return [Section("Pictures of the findings", text, figures=figures)] if figures else []
+    return [Section("Plots of the findings", text, figures=figures)] if figures else []
 
 
-def _picture(axes: Any, picture: Picture) -> None:
-    x, y = np.asarray(picture.x, np.float64), np.asarray(picture.y, np.float64)
+def _plot(axes: Any, plot: Plot) -> None:
+    x, y = np.asarray(plot.x, np.float64), np.asarray(plot.y, np.float64)
     marked = np.zeros(len(x), bool)
-    for low, high in picture.spans:
+    for low, high in plot.spans:
         marked |= (x >= low) & (x <= high)
-    if picture.is_bars:
+    if plot.is_bars:
         width = 0.9 * float(np.diff(x).min(initial=np.inf)) if len(x) > 1 else 0.9
         axes.bar(x, y, width, color=np.where(marked, COLORS[1], COLORS[0]))
-    elif picture.spans:
+    elif plot.spans:
         axes.plot(x, y, color=COLORS[0], lw=1, marker=".", ms=3)
         axes.plot(x[marked], y[marked], ".", color=COLORS[1], ms=6)
-        for low, high in picture.spans:
+        for low, high in plot.spans:
             axes.axvspan(low, high, color=COLORS[1], alpha=0.15, lw=0)
     else:
         axes.plot(x, y, ".", color=COLORS[1], ms=4)
-    axes.set_xlabel(picture.x_label)
-    axes.set_ylabel(picture.y_label)
+    axes.set_xlabel(plot.x_label)
+    axes.set_ylabel(plot.y_label)
 
 
 def _calibration_section(dataset: Dataset) -> list[Section]:

@@ -180,7 +180,7 @@ IMAGE_FAULTS: Final = {"black": black, "frozen": stuck_camera}
 
 
 def fits(kind: str, data: Dataset) -> bool:
-    """Return whether a fault can be planted, and the data are enough to judge it."""
+    """Return whether a fault can be planted, and the data are enough to evaluate it."""
     if kind == "saturated":
         return isinstance(data.action_space, spaces.Box)
     return len(data.episodes) >= {"return": 20, "lonely": 5, "dead": 5}.get(kind, 1)

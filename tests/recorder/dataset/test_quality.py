@@ -83,8 +83,8 @@ def test_a_planted_fault_is_found_and_tells_what_to_do(clean: Dataset, kind: str
     for flaw in found:
         assert flaw.next
         assert 0 < flaw.share <= 1
-        assert flaw.picture is not None
-        assert len(flaw.picture.x) == len(flaw.picture.y)
+        assert flaw.plot is not None
+        assert len(flaw.plot.x) == len(flaw.plot.y)
 
 
 @pytest.mark.parametrize("kind", faults.IMAGE_FAULTS)
@@ -164,7 +164,7 @@ def test_times_of_topics() -> None:
     assert topic_flaws("/odom", lost, (np.arange(100) >= 50).astype(np.int64)) == []
 
 
-def test_events_without_a_rate_are_not_judged() -> None:
+def test_events_without_a_rate_are_not_evaluated() -> None:
     times = np.cumsum(np.random.default_rng(0).exponential(1e9, 300)).astype(np.int64)
     assert topic_flaws("/event", times, np.zeros(300, np.int64)) == []
 
@@ -175,8 +175,8 @@ def test_the_command_the_function_and_the_page(
     log = tmp_path / "bad.mcap"
     faults.frozen(clean, np.random.default_rng(3)).save(log)
     found = mcaprl.info(log, quality=True, report=tmp_path / "page").quality
-    told = CliRunner().invoke(cli, ["info", str(log), "--quality", "--json"])
-    assert json.loads(told.output)["quality"] == json.loads(
+    shown = CliRunner().invoke(cli, ["info", str(log), "--quality", "--json"])
+    assert json.loads(shown.output)["quality"] == json.loads(
         json.dumps([flaw.to_json() for flaw in found])
     )
     with pytest.raises(SystemExit) as strict:
@@ -184,7 +184,7 @@ def test_the_command_the_function_and_the_page(
     assert strict.value.code == 1
     assert "stay the same for" in capsys.readouterr().out
     page = (tmp_path / "page" / "index.html").read_text()
-    assert "Pictures of the findings" in page
+    assert "Plots of the findings" in page
     assert "leave these steps out" in page
     assert mcaprl.info(log).quality is None
     with pytest.raises(UsageError, match="quality=True"):
