@@ -19,7 +19,6 @@ from typing import Any, Final
 import numpy as np
 
 import mcaprl
-from mcaprl.recorder.dataset.quality import Flaw, flaws
 from tests.support.faults import FAULTS, IMAGE_FAULTS, fits
 
 CLEAN: Final[dict[str, dict[str, Any]]] = {
@@ -58,9 +57,9 @@ def clean(name: str, seed: int) -> mcaprl.Dataset:
         return mcaprl.open(path)
 
 
-def problems(data: mcaprl.Dataset) -> list[Flaw]:
+def problems(data: mcaprl.Dataset) -> list[Any]:
     """Return the findings that are no notes."""
-    return [flaw for flaw in flaws(data) if flaw.severity == "problem"]
+    return [flaw for flaw in mcaprl.info(data, quality=True).quality if flaw.severity == "problem"]
 
 
 def main() -> None:
