@@ -113,7 +113,7 @@ class LogInfo:
     def to_json(self) -> dict[str, Any]:
         """Return what `info --json` prints."""
         found = self.behavior_prob
-        facts = vars(self) | {
+        facts: dict[str, Any] = vars(self) | {
             "return_range": list(self.return_range),
             "behavior_prob": found and {**found.to_json(), "text": str(found)},
             "findings": [asdict(finding) for finding in self.findings],

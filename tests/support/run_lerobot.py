@@ -27,7 +27,7 @@ def main(command: str, folder: str, *target: str) -> None:
     if command == "run":
         run(folder, *target)
     else:
-        commands = {"read": read, "chunks": chunks, "merge": merge, "make": make}
+        commands: dict[str, Any] = {"read": read, "chunks": chunks, "merge": merge, "make": make}
         commands["same"] = same
         commands[command](Path(folder), *target)
 

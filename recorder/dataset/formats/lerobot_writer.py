@@ -370,6 +370,7 @@ class Frames:
 
     def values(self, feature: Feature, rows: Any) -> NDArray[Any]:
         """Return the values (B, *shape) of a feature in frames: a slice, or B indexes."""
+        found: NDArray[Any]
         if feature.name in self._columns:
             found = self._columns[feature.name][rows]
         elif feature.name in self._places:
