@@ -639,7 +639,8 @@ def copy_topics(
 ) -> None:
     """Copy topics of a bag to another file: bytes, schemas and times, in the order of log_time.
 
-    Topics below `/rl/`, which a log writes itself, are left out. Memory is bounded, the index excepted.
+    Topics below `/rl/`, which a log writes itself, are left out. Memory is bounded, but
+    for the index.
 
     Args:
         paths: Files of the bag.

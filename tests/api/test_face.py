@@ -46,6 +46,7 @@ FUNCTIONS = {
 """Functions of commands that have several functions, a function with another name, or none, since
 only a shell needs them."""
 ONLY_OPTIONS = {
+    "keep-topic": "`keep_topics` takes the patterns",
     "help": "click adds it",
     "quiet": "a function prints nothing unless the caller passes `progress`",
     "json": "a function returns a dataclass, whose to_json the command prints",
