@@ -118,9 +118,10 @@ class LogInfo:
             "behavior_prob": found and {**found.to_json(), "text": str(found)},
             "findings": [asdict(finding) for finding in self.findings],
             "moments": [asdict(moment) for moment in self.moments],
-            "quality": self.quality and [flaw.to_json() for flaw in self.quality],
         }
-        facts = {name: value for name, value in facts.items() if name != "sources"}
+        if self.quality is not None:
+            facts["quality"] = [flaw.to_json() for flaw in self.quality]
+        del facts["sources"]
         return {"kind": "log", **facts}
 
     def rows(self) -> list[tuple[str, str]]:
@@ -208,7 +209,11 @@ def info(
         warned = list(dict.fromkeys([*warned, *map(str, contents.origin.report.problems())]))
     found = _describe(contents, warned)
     if quality:
-        held_out = None if test is None else open_data(test, threads=threads)
+        held_out: Dataset | None = None
+        if isinstance(test, Dataset) or callable(test):
+            held_out = opened(test)
+        elif test is not None:
+            held_out = open_data(test, threads=threads)
         found = replace(found, quality=flaws(contents, held_out))
     if report is not None:
         from mcaprl.recorder.viewer.report import dataset_page

@@ -154,12 +154,12 @@ def test_commands_become_named_actions_and_bins_and_boxes() -> None:
     # more than a quarter of the range.
     assert report.far_actions == pytest.approx(1 / 3)
     assert report.action_counts == {"stop": 1, "go": 1, "turn": 1}
-    binned = {"fields": fields, "edges": [[0.3, 0.8], [0.0]]}
+    binned: dict[str, Any] = {"fields": fields, "edges": [[0.3, 0.8], [0.0]]}
     data = read(bag, action=binned).dataset
     assert data.actions.tolist() == [5, 1, 2]
     assert data.action_names[2] == "v 0.3 to 0.8 and w below 0"
-    named = {**binned, "bins": [["stopped", "slow", "fast"], ["right", "left"]]}
-    data = read(bag, action=named).dataset
+    by_bins = {**binned, "bins": [["stopped", "slow", "fast"], ["right", "left"]]}
+    data = read(bag, action=by_bins).dataset
     assert data.actions.tolist() == [5, 1, 2]
     assert data.action_names[2] == "slow, right"
     data, report = read(bag, action={"fields": fields, "box": {"low": [0, -0.5], "high": [1, 1]}})

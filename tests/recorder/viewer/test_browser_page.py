@@ -903,7 +903,7 @@ def test_the_server_answers_this_machine_alone(log: Path) -> None:
             {"Origin": "null"},
             {"Origin": "http://127.0.0.1:1"},
         ):
-            assert answer(url, **refused)[0] == 403, refused
+            assert answer(url, "/", None, **refused)[0] == 403, refused
         for path in ("/episode/2", "/episode/-1", "/../log.mcap", f"/{log}", "/episode/1/..", "*"):
             assert answer(url, path)[0] == 404, path
 
