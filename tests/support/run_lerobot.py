@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import runpy
 import sys
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,9 @@ def main(command: str, folder: str, *target: str) -> None:
     if command == "run":
         run(folder, *target)
     else:
-        commands: dict[str, Any] = {"read": read, "chunks": chunks, "merge": merge, "make": make}
-        commands["same"] = same
+        commands: dict[str, Callable[..., None]] = {
+            each.__name__: each for each in (read, chunks, same, merge, make)
+        }
         commands[command](Path(folder), *target)
 
 

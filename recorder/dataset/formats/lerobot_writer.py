@@ -382,7 +382,8 @@ class Frames:
         if feature.dtype == "video":
             return found
         kind = found.dtype if feature.dtype == "image" else feature.dtype
-        return found.astype(kind, copy=False).reshape(len(found), *feature.shape)
+        shaped: NDArray[Any] = found.astype(kind, copy=False).reshape(len(found), *feature.shape)
+        return shaped
 
     def stats(self, feature: Feature, index: int) -> Stats:
         """Return the statistics of a feature in an episode."""
