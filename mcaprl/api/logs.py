@@ -113,14 +113,14 @@ class LogInfo:
     def to_json(self) -> dict[str, Any]:
         """Return what `info --json` prints."""
         found = self.behavior_prob
-        facts: dict[str, Any] = vars(self) | {
+        facts: dict[str, Any] = {
+            **{name: value for name, value in vars(self).items() if name != "quality"},
             "return_range": list(self.return_range),
             "behavior_prob": found and {**found.to_json(), "text": str(found)},
             "findings": [asdict(finding) for finding in self.findings],
             "moments": [asdict(moment) for moment in self.moments],
+            **_quality_json(self.quality),
         }
-        if self.quality is not None:
-            facts["quality"] = [flaw.to_json() for flaw in self.quality]
         del facts["sources"]
         return {"kind": "log", **facts}
 
@@ -496,7 +496,7 @@ class BagInfo:
             "topics": [asdict(topic) for topic in self.topics.values()],
             "problems": self.problems,
             "next": self.next,
-            "quality": self.quality and [flaw.to_json() for flaw in self.quality],
+            **_quality_json(self.quality),
         }
 
     def rows(self) -> list[tuple[str, str]]:
@@ -570,6 +570,10 @@ def bag_info(
             next=_next(data, topics),
             quality=_quality_of(topics) if quality else None,
         )
+
+
+def _quality_json(quality: list[Flaw] | None) -> dict[str, Any]:
+    return {} if quality is None else {"quality": [flaw.to_json() for flaw in quality]}
 
 
 def _quality_of(topics: list[TopicOverview]) -> list[Flaw]:
