@@ -55,6 +55,8 @@ _EFFECT: Final = 0.02
 """Smallest share of a change that a lag must explain to be reported."""
 _LONE: Final = 15.0
 _FEW: Final = 0.05
+_APART: Final = 3.0
+_INTERVAL: Final = "seconds until the next step"
 
 
 class Place(NamedTuple):
@@ -259,7 +261,11 @@ def _held(table: _Table) -> Iterator[Flaw]:
         return
     same = (table.changes[:, moving] == 0).all(1)
     size = np.abs(table.changes[:, moving] / table.frames[:, moving].std(0)).sum(1)
-    runs = [run for run in table.runs(same, 2) if _jumps(table, size, run)]
+    runs = [
+        run
+        for run in table.runs(same, _HELD)
+        if _jumps(table, size, run) and _others_move(table, run)
+    ]
     if runs and same.mean() <= 1 - _USUAL:
         yield _frozen(table, runs, "all numbers of the observation", size)
     for k in moving:
@@ -269,11 +275,18 @@ def _held(table: _Table) -> Iterator[Flaw]:
         values, size = table.frames[table.of_step, k], np.abs(table.changes[:, k])
         runs = [
             run
-            for run in table.runs(still, _HELD)
+            for run in table.runs(still, _DEAD)
             if _jumps(table, size, run) and _is_unique(values, run)
         ]
         if runs:
             yield _frozen(table, runs, f"the values of {table.names[k]}", values)
+
+
+def _others_move(table: _Table, run: tuple[int, int]) -> bool:
+    """Return whether actions or rewards change in a run, unlike those of a robot at rest."""
+    rows = slice(run[0], run[1] + 1)
+    others = (table.dataset.actions[rows], table.dataset.rewards[rows])
+    return any(bool((part != part[0]).any()) for part in others)
 
 
 def _is_unique(values: Floats, run: tuple[int, int]) -> bool:
@@ -334,7 +347,6 @@ def _times(table: _Table) -> Iterator[Flaw]:
     calm = sizes <= 3 * np.median(sizes)
     clock = (intervals_s < 0) | ((intervals_s > _CLOCK * usual_s) & calm & (sizes > 0))
     drops = ~clock & (intervals_s > _DROP * usual_s)
-    label = "seconds until the next step"
     if clock.any():
         runs = table.runs(clock)
         worst = float(intervals_s[clock][np.abs(intervals_s[clock]).argmax()])
@@ -347,7 +359,7 @@ def _times(table: _Table) -> Iterator[Flaw]:
             figure=worst,
             unit="s",
             next="set the clock before recording, or take other times: `time` in the mapping",
-            plot=table.around(intervals_s, *_longest(runs), label),
+            plot=table.around(intervals_s, *_longest(runs), _INTERVAL),
         )
     if drops.any():
         runs = table.runs(drops)
@@ -361,9 +373,12 @@ def _times(table: _Table) -> Iterator[Flaw]:
             unit="steps",
             share=lost / (len(table.dataset) + lost),
             next="record with less load, or divide episodes at gaps: `gap_s` in the mapping",
-            plot=table.around(intervals_s, *_longest(runs), label),
+            plot=table.around(intervals_s, *_longest(runs), _INTERVAL),
         )
-    rest = intervals_s[~clock & ~drops]
+    yield from _jitter(intervals_s, usual_s, intervals_s[~clock & ~drops], table)
+
+
+def _jitter(intervals_s: Floats, usual_s: float, rest: Floats, table: _Table) -> Iterator[Flaw]:
     jitter = robust_spread(rest) / usual_s
     if jitter > _JITTER:
         far = np.abs(intervals_s - usual_s) > _JITTER * usual_s
@@ -378,7 +393,7 @@ def _times(table: _Table) -> Iterator[Flaw]:
             unit="of the median",
             share=float(far.mean()),
             next="take a fixed rate: `clock.rate_hz` in the mapping",
-            plot=Plot(label, "steps", edges[:-1].tolist(), counts.tolist(), is_bars=True),
+            plot=Plot(_INTERVAL, "steps", edges[:-1].tolist(), counts.tolist(), is_bars=True),
         )
 
 
@@ -440,18 +455,20 @@ def topic_flaws(name: str, times_ns: Rows, recordings: Rows) -> list[Flaw]:
                 )
             )
     if steady and jitter > _JITTER:
-        found.append(
-            Flaw(
-                f"{name}: the intervals vary by {jitter:.0%} of {usual_s:.4g} s",
-                "all messages",
-                next="take a fixed rate: `clock.rate_hz` in the mapping",
-                kind="jitter",
-                figure=jitter,
-                unit="of the median",
-                share=float((np.abs(ahead - usual_s) > _JITTER * usual_s).mean()),
-            )
-        )
+        found.append(_topic_jitter(name, ahead, usual_s, jitter))
     return found
+
+
+def _topic_jitter(name: str, ahead_s: Floats, usual_s: float, jitter: float) -> Flaw:
+    return Flaw(
+        f"{name}: the intervals vary by {jitter:.0%} of {usual_s:.4g} s",
+        "all messages",
+        next="take a fixed rate: `clock.rate_hz` in the mapping",
+        kind="jitter",
+        figure=jitter,
+        unit="of the median",
+        share=float((np.abs(ahead_s - usual_s) > _JITTER * usual_s).mean()),
+    )
 
 
 def _saturated(table: _Table) -> Iterator[Flaw]:
@@ -671,7 +688,7 @@ def _apart(values: Floats, least: float) -> Rows:
             gap = max(
                 values[rest].min() - values[far].max(), values[far].min() - values[rest].max()
             )
-            if gap > max(1.5 * np.ptp(values[rest]), least):
+            if gap > max(_APART * np.ptp(values[rest]), least):
                 return far
     return np.empty(0, np.int64)
 

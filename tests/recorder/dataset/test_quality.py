@@ -16,7 +16,7 @@ from mcaprl.cli import cli, main
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.quality import Flaw, flaws, topic_flaws
-from tests.support import faults
+from tests.support import bags, faults
 
 EPISODES, STEPS = 24, 30
 
@@ -113,6 +113,23 @@ def test_the_place_of_a_frozen_sensor_is_exact(clean: Dataset) -> None:
     assert flaw.share == pytest.approx(11 / (EPISODES * STEPS))
 
 
+@pytest.mark.parametrize(("frames", "at_rest", "found"), [(6, 0, 1), (5, 0, 0), (12, 1, 0)])
+def test_a_robot_at_rest_is_not_frozen(
+    clean: Dataset, frames: int, at_rest: int, found: int
+) -> None:
+    """Five steps without change are needed, in which actions or rewards do change."""
+    k, leaf = faults.vector(clean)
+    frame, step = 2 * (STEPS + 1) + 10, 2 * STEPS + 10
+    leaf[frame : frame + frames] = leaf[frame]
+    leaf[frame + frames : 3 * (STEPS + 1)] += 1
+    actions, rewards = clean.actions.copy(), clean.rewards.copy()
+    if at_rest:
+        actions[step : step + frames] = 0
+        rewards[step : step + frames] = 0
+    data = faults.changed(faults.with_leaf(clean, k, leaf), actions=actions, rewards=rewards)
+    assert [one.kind for one in problems(data)].count("frozen") == found
+
+
 @pytest.mark.parametrize("steps", [1, 2, 5])
 def test_a_lag_is_found_in_steps(clean: Dataset, steps: int) -> None:
     parts = np.split(clean.actions, EPISODES)
@@ -168,6 +185,27 @@ def test_times_of_topics() -> None:
 def test_events_without_a_rate_are_not_evaluated() -> None:
     times = np.cumsum(np.random.default_rng(0).exponential(1e9, 300)).astype(np.int64)
     assert topic_flaws("/event", times, np.zeros(300, np.int64)) == []
+
+
+def test_a_bag_is_evaluated_through_its_mapping(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 240 odometry messages at 10 Hz, those from the 20th to the 29th are alike."""
+    monkeypatch.setattr(bags, "STEPS", 240)
+    monkeypatch.setattr(bags, "speed", lambda step: float(20 if 20 <= step < 30 else step))
+    bag = bags.write_rosbag2(tmp_path / "bag")
+    mapping = tmp_path / "robot.yaml"
+    mapping.write_text(
+        "clock: {topic: /odom}\n"
+        "observation: {speed: {field: /odom.twist.twist.linear.x}}\n"
+        "action: {fields: [/cmd_vel.angular.z], box: {low: -1, high: 1}}\n"
+    )
+    options = ["info", str(bag), "--mapping", str(mapping), "--quality", "--json"]
+    quality = json.loads(CliRunner().invoke(cli, options).stdout)["quality"]
+    (flaw,) = [one for one in quality if one["kind"] == "frozen"]
+    assert flaw["figure"] == 9
+    assert [place["first"] for place in flaw["places"]] == [20]
+    assert [place["last"] for place in flaw["places"]] == [28]
 
 
 def test_the_command_the_function_and_the_page(
