@@ -283,8 +283,8 @@ def _held(table: _Table) -> Iterator[Flaw]:
 
 
 def _others_move(table: _Table, run: tuple[int, int]) -> bool:
-    """Return whether actions or rewards change in a run, unlike those of a robot at rest."""
-    rows = slice(run[0], run[1] + 1)
+    """Return whether actions or rewards change inside a run, unlike those of a robot at rest."""
+    rows = slice(run[0] + 1, run[1])
     others = (table.dataset.actions[rows], table.dataset.rewards[rows])
     return any(bool((part != part[0]).any()) for part in others)
 
