@@ -36,7 +36,7 @@ def _train(words: list[str], steps: int, folder: Path) -> None:
     run_lerobot("run", *kept, *SMALL.split(), f"--steps={steps}", folder=folder)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_act_is_trained_on_a_bag_and_evaluated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -66,6 +66,11 @@ def test_act_is_trained_on_a_bag_and_evaluated(
         # The mean command is 0.6 away from a sine, and ACT sees the command in the image.
         assert part["mean"] < 0.5 * part["baselines"]["mean"]
     assert "the worst ten seconds" in Path("errors/index.html").read_text()
+    (annotate,) = (words for words in _commands("mcaprl") if words[0] == "annotate")
+    assert run(annotate) == 0
+    assert {"/camera", "/cmd_vel", "/rl/step"} < set(mcaprl.open_bag("shown.mcap").topics)
+    steps = sum(len(episode) for episode in data.episodes[6:])
+    assert mcaprl.open_bag("shown.mcap").topics["/rl/values"].count == steps
 
     _train(train_on_log, 2, tmp_path)
     checkpoint, same = (
