@@ -6,6 +6,7 @@ import sys
 import warnings
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -198,11 +199,12 @@ def _special(arguments: Mapping[str, Any], name: str, *, imports: bool) -> dict[
         imports: Whether to import the module in the id.
     """
     env_id = SIMS.get(name, name)
-    spec = gym.registry.get(env_id.rpartition(":")[2])
-    if spec is None and ":" in env_id and imports:
-        # `make_sim` reports an id that cannot be used.
+    module, _, registered = env_id.rpartition(":")
+    if registered not in gym.registry and module and imports:
+        # `make_sim` reports an id that cannot be used. `gym.spec` would not import the module.
         with suppress(Exception):
-            spec = gym.spec(env_id)
+            import_module(module)
+    spec = gym.registry.get(registered)
     found = dict(arguments)
     for key, default in (spec.kwargs if spec else {}).items():
         with suppress(ValueError):

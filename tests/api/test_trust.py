@@ -93,6 +93,16 @@ def test_a_log_names_the_module_that_registers_its_environment(foreign: Path) ->
     assert mcaprl.verify(log, trust_env=True).difference is None
     unload()
     assert mcaprl.verify(log, sim="foreign_envs:Foreign-v0").difference is None
+
+
+def test_registered_arguments_need_no_trust(foreign: Path) -> None:
+    module = foreign / "foreign_envs.py"
+    module.write_text(
+        MODULE.replace(':Foreign")', ':Foreign", kwargs={"sutton_barto_reward": True})')
+    )
+    log = recorded(foreign / "log.mcap")
+    assert mcaprl.open(log).env_kwargs == {"sutton_barto_reward": True}
+    assert mcaprl.verify(log, sim="foreign_envs:Foreign-v0").difference is None
     with closing(make_sims("foreign_envs:Foreign-v0", 2)) as envs:
         assert LogMetadata.of_env(envs).env_id == "foreign_envs:Foreign-v0"
     with closing(make_sim("CartPole-v1")) as env:
