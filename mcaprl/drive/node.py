@@ -120,6 +120,7 @@ def _spec(driver: Driver) -> dict[str, Any]:
         "frames": {topic: plan.transform_time(topic) for topic in plan.frames},
         "clock_stream": plan.clock,
         "required": plan.required,
+        "observed": plan.observed,
         "shapes": {name: list(shape) for name, shape in driver._robot.shapes.items()},
         "inputs": {leaf.name: "".join(leaf.path) for leaf in driver.policy.encoder.leaves},
         "frame_stack": driver.policy.frame_stack,

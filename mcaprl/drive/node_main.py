@@ -75,6 +75,7 @@ class NodePlan:
         self.constants = {name: np.array(value) for name, value in spec["constants"].items()}
         self.frames, self._times = spec["frames"], spec["frames"]
         self.clock, self.required = spec["clock_stream"], spec["required"]
+        self.observed = spec["observed"]
         self.images = {
             name: self._image(self.quantities[name], fields)
             for name, fields in spec["images"].items()

@@ -29,6 +29,7 @@ from mcaprl.recorder.format.metadata import (
 from mcaprl.recorder.format.spaces import leaves_of
 from mcaprl.recorder.mapping.align import NS_PER_S, as_numbers
 from mcaprl.recorder.mapping.config import Action, Limits, Mapping, Quantity
+from mcaprl.recorder.mapping.observe import place_of
 from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.robot import Robot
 from mcaprl.recorder.mapping.runs import Segment
@@ -338,8 +339,12 @@ def _observations(
     is_complete = True
     for name, reader in plan.images.items():
         places = np.concatenate([run.quantities[name].values for run in runs])[rows]
+        around, poses = plan.mapping.observation[name].around, None
         with plan.place.named("observation", name):
-            found = reader.read(places[stacked], images)
+            if around is not None:
+                each = [place_of(around, run.quantities) for run in runs if len(run.times_ns)]
+                poses = np.concatenate(each)[rows][stacked]
+            found = reader.read(places[stacked], images, poses)
         if found is None:
             # The other images are read all the same, to find all that cannot be decoded.
             is_complete = False

@@ -176,6 +176,18 @@ class Quantity(_Part):
         default=50.0,
         description="Percent of occupancy of unknown (-1) and missing cells of a grid.",
     )
+    outside: Annotated[float, Field(ge=0, le=100)] | None = Field(
+        default=None,
+        description="Percent of occupancy outside of a grid. Default: that of `unknown`.",
+    )
+    around: Annotated[list[str], Field(min_length=1, max_length=3)] | None = Field(
+        default=None,
+        description="Names of the quantities with the robot's pose in the frame of a grid: x, y"
+        " (meters) and, to turn the image so that ahead is up, yaw (radians). `x_m` and `y_m` are"
+        " then measured from the robot; without them, a pixel is as large as a cell, and the robot"
+        " is in the middle. A pixel has the cell at its center. Like observed ones, these"
+        " quantities are needed at each step.",
+    )
     transform: str | None = Field(
         default=None,
         description="Frame whose pose is looked up in the transforms. A leading `/` of a frame is"
@@ -301,6 +313,8 @@ class Quantity(_Part):
             "azimuth_deg": ("range",),
             "elevation_deg": ("range",),
             "unknown": ("grid",),
+            "outside": ("grid",),
+            "around": ("grid",),
         }
         if given == "cloud" and kind is None:
             raise ValueError("cloud needs `as`: range, height or density")
@@ -316,6 +330,8 @@ class Quantity(_Part):
                 raise ValueError(f"{name} must be the lowest value, then the highest value")
         if (self.x_m is None) != (self.y_m is None):
             raise ValueError("give both x_m and y_m")
+        if self.around is not None and self.size is None:
+            raise ValueError("around needs `size`")
         if self.azimuth_deg[1] - self.azimuth_deg[0] > 360:
             raise ValueError("azimuth_deg is limited to 360 degrees")
         if self.size is not None and math.prod(self.size) > MAX_IMAGE_PIXELS:
@@ -696,6 +712,10 @@ class Mapping(_Part):
         both = set(self.observation) & set(self.fields)
         if both:
             raise ValueError(f"'{min(both)}' is both in observation and in fields")
+        for name, quantity in self.observation.items():
+            for each in quantity.around or ():
+                if each not in self.quantities or self.quantities[each].pixels is not None:
+                    raise ValueError(f"around of {name}: no quantity with numbers is named {each}")
         if self.behavior_prob is not None and self.behavior_log_prob is not None:
             raise ValueError("give either behavior_prob or behavior_log_prob")
         if self.behavior_prob is not None and self.action.box is not None:

@@ -20,10 +20,10 @@ import json
 import math
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from gymnasium import spaces
@@ -58,7 +58,7 @@ from mcaprl.recorder.mapping.image_pixels import (
     one_line,
     raw_pixels,
 )
-from mcaprl.recorder.mapping.spatial import fields_of, image_of
+from mcaprl.recorder.mapping.spatial import Grid, fields_of, grid_image, grid_of, image_of
 from mcaprl.recorder.mapping.video import (
     NO_FRAME,
     Converter,
@@ -69,6 +69,7 @@ from mcaprl.recorder.mapping.video import (
 from mcaprl.texts import counted, size
 
 Image = NDArray[Any]
+_Decoded = TypeVar("_Decoded")
 
 Decoded = Iterator[tuple[int, Image]]
 """Messages with readable images: index in the topic, and pixels."""
@@ -98,11 +99,20 @@ class ImageOptions:
         names = {"undistort", "crop", "resize", "gray", "range_m", "range", "as_"}
         if self._quantity.image is None:
             names |= {"size", "x_m", "y_m", "z_m", "azimuth_deg", "elevation_deg", "unknown"}
+            names |= {"outside"}
         return self._quantity.model_dump_json(include=names)
 
     def image(self, message: dict[str, Any]) -> Image:
         """Return the image (H, W, C) of an observation for the fields of a message."""
         return self.applied(pixels_of(self._quantity, message))
+
+    def grid(self, message: dict[str, Any]) -> Grid:
+        """Return the grid in the fields of a message."""
+        return grid_of(self._quantity, message)
+
+    def around(self, grid: Grid, pose: NDArray[np.float64]) -> Image:
+        """Return the image (H, W, 1) around the robot at x, y and, if it is given, yaw."""
+        return grid_image(self._quantity, grid, pose)[..., np.newaxis]
 
     def applied(self, pixels: Pixels) -> Image:
         """Return the image (H, W, C) of an observation."""
@@ -401,7 +411,12 @@ class ImageReader:
         kinds = kinds_of(self.bag.topics[self.topic], self.fields)
         return LiveVideo(self.topic, kinds, self.packets_ns or 0.0)
 
-    def read(self, rows: NDArray[np.int64], storage: Storage = "memory") -> Frames | None:
+    def read(
+        self,
+        rows: NDArray[np.int64],
+        storage: Storage = "memory",
+        poses: NDArray[np.float64] | None = None,
+    ) -> Frames | None:
         """Return the images of N messages as (N, H, W, C); repeated messages are decoded only once.
 
         Args:
@@ -409,16 +424,24 @@ class ImageReader:
                 last axis, (N, H, W, K * C).
             storage: Where the images are stored. If they are `mapped`, they are decoded into a file
                 beside the bag, and read when they are indexed.
+            poses: (N, 2 or 3) or (N, K, 2 or 3) poses of the robot, around which the images are.
+                They are stored in memory.
 
         Returns:
             The images; None if a message has no readable image. All such messages among `rows` are
             in `failures` then: choose other rows, and read again.
         """
-        wanted, places = np.unique(rows, return_inverse=True)
-        images = self._images(wanted)
+        needed, places = np.unique(rows, return_inverse=True)
+        wanted = needed
+        if poses is None:
+            images = self._images(needed)
+        else:
+            pairs = np.column_stack([rows.reshape(-1), poses.reshape(rows.size, -1)])
+            pairs, places = np.unique(pairs, axis=0, return_inverse=True)
+            wanted, images = np.arange(len(pairs)), self._around(needed, pairs)
         first = next(images, None)
         if first is None:
-            raise LogError(f"{self.topic}: {self._why_none(wanted)}")
+            raise LogError(f"{self.topic}: {self._why_none(needed)}")
         image, images = first[1], chain([first], images)
         elements = image.size * (rows.shape[1] if rows.ndim > 1 else 1)
         if elements > MAX_ELEMENTS:
@@ -426,7 +449,7 @@ class ImageReader:
                 f"{self.topic}: an observation of {elements} elements is too large; at most"
                 f" {MAX_ELEMENTS} can be used: set `resize` or `crop`, or a smaller `stack`"
             )
-        if not is_mapped(storage, rows.size * image.nbytes):
+        if poses is not None or not is_mapped(storage, rows.size * image.nbytes):
             found: Frames | None = self._in_memory(
                 wanted, places.reshape(rows.shape), image, images
             )
@@ -434,7 +457,7 @@ class ImageReader:
             found = mapped.rows(places.reshape(rows.shape))
         else:
             found = None
-        return None if self.failures.keys() & set(wanted.tolist()) else found
+        return None if self.failures.keys() & set(needed.tolist()) else found
 
     def blocks(
         self,
@@ -548,13 +571,24 @@ class ImageReader:
         if self._video is not None:
             yield from self._frames(self._video, rows)
             return
+        yield from self._decoded(rows, self.options.image)
+
+    def _around(self, rows: NDArray[np.int64], pairs: NDArray[np.float64]) -> Decoded:
+        """Yield the images of grids: index of the row and pose in `pairs`, which are sorted."""
+        for row, grid in self._decoded(rows, self.options.grid):
+            for k in range(*np.searchsorted(pairs[:, 0], [row, row + 1]).tolist()):
+                yield k, self.options.around(grid, pairs[k, 1:])
+
+    def _decoded(
+        self, rows: NDArray[np.int64], decode: Callable[[dict[str, Any]], _Decoded]
+    ) -> Iterator[tuple[int, _Decoded]]:
         for row, message in self._in_blocks(rows):
             if isinstance(message, Failure):
                 self.leave_out(message)
                 continue
             try:
                 # The full image is not kept: the next one is decoded into the same memory.
-                image = self.options.image(message)
+                image = decode(message)
             except LogError as error:
                 self._leave_out(row, str(error))
                 continue

@@ -42,6 +42,7 @@ from mcaprl.recorder.mapping.observe import (
     Values,
     by_names,
     check_order,
+    place_of,
     pose_of,
     scan_columns,
     shaped,
@@ -334,7 +335,11 @@ class _Image(_Value):
         self._kinds = kinds_of(reader.bag.topics[reader.topic], reader.fields)
         self._reader, self.video, self._camera = reader, video, camera
         self._waiting: list[tuple[int, Any]] = []
-        self.image: NDArray[Any] | None = None
+        # With `around`, this is a grid.
+        self.image: Any = None
+        if wanted.quantity.around is not None:
+            assert wanted.quantity.size, "validated"
+            self.shape = (*wanted.quantity.size[::-1], 1)
 
     def raw(self, message: Any) -> Any:
         return parts_of(message, self._kinds) if self.video is None else self.video.frame
@@ -366,6 +371,9 @@ class _Image(_Value):
             if self.time_ns is not None and own_ns < self.time_ns:
                 break
             try:
+                if self.wanted.quantity.around is not None:
+                    self.time_ns, self.image = own_ns, reader.options.grid(raw)
+                    break
                 image = reader.options.image(raw) if video is None else reader.of_frame(raw)
             except LogError:
                 continue
@@ -672,7 +680,7 @@ class LiveSteps:
         If no quantity is required, that of any topic.
         """
         required = self._streams_of(self._plan.required)
-        every = self._streams_of(self._plan.mapping.observation) if required else [self._any]
+        every = self._streams_of(self._plan.observed) if required else [self._any]
         found = [each.last_ns for each in every]
         return max((each for each in found if each is not None), default=None)
 
@@ -813,6 +821,11 @@ class LiveSteps:
         images = {name: self._values[name] for name in names if name in self._plan.images}
         vector = [quantities[name].values.reshape(-1) for name in names if name not in images]
         found = {name: value.image for name, value in images.items() if isinstance(value, _Image)}
+        for name in images:
+            around = self._plan.mapping.observation[name].around
+            if around is not None:
+                (pose,) = place_of(around, quantities)
+                found[name] = self._plan.images[name].options.around(found[name], pose)
         assert all(image is not None for image in found.values()), "the observation is usable"
         state = {STATE: np.concatenate(vector).astype(np.float32)} if vector else {}
         return cast("dict[str, NDArray[Any]]", {**state, **found})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -359,6 +359,17 @@ def pose_of(
         gap_s,
     )
     return shaped(quantity, found, np.isnan(age_s), age_s)
+
+
+def place_of(names: Sequence[str], quantities: Mapping[str, Values]) -> Floats:
+    """Return the robot's x, y and, if it is known, yaw (N, 2 or 3) at N steps; see `around`."""
+    parts = [quantities[name].values for name in names]
+    count = sum(math.prod(part.shape[1:]) for part in parts)
+    if count not in (2, 3) or any(part.dtype.kind == "O" for part in parts):
+        raise UsageError(
+            f"around: {', '.join(names)} must be 2 or 3 numbers, x, y and yaw, not {count} values"
+        )
+    return np.column_stack(parts)
 
 
 def values_of(

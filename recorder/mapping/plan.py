@@ -160,9 +160,19 @@ class Plan:
 
     @property
     def required(self) -> list[str]:
-        """Names of the observed quantities without which there is no step."""
-        found = self.mapping.observation.items()
-        return [name for name, each in found if each.missing is None or each.pixels is not None]
+        """Names of the observed quantities, and of poses, without which there is no step."""
+        found = self.mapping.observation
+        names = [n for n, each in found.items() if each.missing is None or each.pixels is not None]
+        return list(dict.fromkeys([*names, *self._poses]))
+
+    @property
+    def observed(self) -> list[str]:
+        """Names of the quantities that an observation is made of."""
+        return list(dict.fromkeys([*self.mapping.observation, *self._poses]))
+
+    @property
+    def _poses(self) -> list[str]:
+        return [name for each in self.mapping.observation.values() for name in each.around or ()]
 
     def transform_time(self, topic: str) -> TimeSource:
         """Return the time of the transforms of a topic."""

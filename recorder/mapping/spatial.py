@@ -7,7 +7,7 @@ an image has the largest x, the first column the largest y.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,8 @@ _GRID: Final = ("info.width", "info.height", "info.resolution", *_PLACE, *_TURN,
 # Datatypes of sensor_msgs/PointField and of foxglove.PackedElementField.
 _ROS_TYPES: Final = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), 1))
 _FOXGLOVE_TYPES: Final = dict(enumerate(("u1", "i1", "u2", "i2", "u4", "i4", "f4", "f8"), 1))
+_OUTSIDE: Final = -2
+"""Pixel without a cell."""
 _REFUSED: Final = {
     "CompressedPointCloud": "Draco-compressed clouds cannot be read: republish them raw, with"
     " `ros2 run point_cloud_transport republish`",
@@ -82,7 +84,7 @@ def image_of(quantity: Quantity, message: dict[str, Any]) -> Pixels:
     """
     try:
         if quantity.grid is not None:
-            return Pixels(grid_image(quantity, message), "grid")
+            return Pixels(grid_image(quantity, grid_of(quantity, message)), "grid")
         points = cloud_points(message)
     except (TypeError, ValueError, OverflowError) as error:
         raise LogError(f"the message is damaged: {error}") from error
@@ -218,40 +220,95 @@ def top_image(quantity: Quantity, points: Floats) -> NDArray[np.uint8]:
     return found.reshape(height, width)
 
 
-def grid_image(quantity: Quantity, message: dict[str, Any]) -> NDArray[np.uint8]:
-    """Return the occupancy (H, W) of a window of a grid: 0 if free, 255 if occupied for certain.
+class Grid(NamedTuple):
+    """Occupancy of the cells of a map.
 
-    A pixel has the largest known occupancy of the cells whose centers are in it; if there are no
-    centers in it, that of the cell at its center. A pixel without a known cell, which is one of 0
-    to 100 percent, has the value of `unknown`.
+    Attributes:
+        cells: (H, W) percent; -1 where it is unknown.
+        cell_m: Edge of a cell, meters.
+        place: (2,) x and y of the corner of the first cell, meters.
+        yaw: Angle of the rows to x, radians.
     """
-    width, height = int(message["info.width"]), int(message["info.height"])
-    cell_m, data = float(message["info.resolution"]), np.asarray(message["data"], np.int16)
+
+    cells: NDArray[np.int16]
+    cell_m: float
+    place: Floats
+    yaw: float
+
+
+def grid_of(quantity: Quantity, message: dict[str, Any]) -> Grid:
+    """Return a grid in its frame; if all of it is wanted, along its own axes.
+
+    Raises:
+        LogError: The message is damaged.
+    """
+    try:
+        width, height = int(message["info.width"]), int(message["info.height"])
+        cell_m, data = float(message["info.resolution"]), np.asarray(message["data"], np.int16)
+        place, yaw = np.zeros(2), 0.0
+        if quantity.x_m is not None or quantity.around is not None:
+            place = np.array([float(message[name]) for name in _PLACE])
+            yaw = _yaw(*(float(message[name]) for name in _TURN))
+    except (TypeError, ValueError, OverflowError) as error:
+        raise LogError(f"the message is damaged: {error}") from error
     if min(width, height) < 1 or width * height > MAX_IMAGE_PIXELS or width * height != data.size:
         raise LogError(f"a grid of {width} x {height} cells has {data.size} of them")
     if not 0 < cell_m < np.inf:
         raise LogError(f"a grid with cells of {cell_m:g} m")
-    cells = np.where((data < 0) | (data > 100), -1, data).reshape(height, width)
-    if quantity.x_m is None or quantity.y_m is None:
-        # The whole grid, along its own axes.
-        place, yaw = np.zeros(2), 0.0
-        x_m, y_m = (0.0, width * cell_m), (0.0, height * cell_m)
-    else:
-        place = np.array([float(message[name]) for name in _PLACE])
-        x_m, y_m = quantity.x_m, quantity.y_m
-        yaw = _yaw(*(float(message[name]) for name in _TURN))
     if not np.isfinite([*place, yaw]).all():
         raise LogError("the origin of a grid is not finite")
-    columns, rows = quantity.size or (height, width)
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    cells = np.where((data < 0) | (data > 100), -1, data).reshape(height, width)
+    return Grid(cells, cell_m, place, yaw)
+
+
+def grid_image(quantity: Quantity, grid: Grid, pose: Floats | None = None) -> NDArray[np.uint8]:
+    """Return the occupancy (H, W) of a window of a grid: 0 if free, 255 if occupied for certain.
+
+    A pixel has the largest known occupancy of the cells whose centers are in it; if there are no
+    centers in it, that of the cell at its center. A pixel without a known cell, which is one of 0
+    to 100 percent, has the value of `unknown`, or without any cell that of `outside`.
+
+    Args:
+        quantity: Quantity with `grid`.
+        grid: The grid.
+        pose: (2,) or (3,) x, y and yaw of the robot, around which the window is. A pixel then has
+            the cell at its center.
+    """
+    (cells, cell_m, place, yaw), size = grid, quantity.size
+    height, width = cells.shape
+    x_m, y_m = quantity.x_m or (0.0, width * cell_m), quantity.y_m or (0.0, height * cell_m)
+    if pose is not None:
+        heading = float(pose[2]) if len(pose) > 2 else 0.0
+        place, yaw = (place - pose[:2]) @ _turn(heading), yaw - heading
+        if size is not None and quantity.x_m is None:
+            y_m, x_m = ((-count * cell_m / 2, count * cell_m / 2) for count in size)
+    (columns, rows), turn = size or (height, width), _turn(yaw)
     # Centers of the pixels, in cells.
     xs = x_m[1] - (np.arange(rows) + 0.5) * (x_m[1] - x_m[0]) / rows
     ys = y_m[1] - (np.arange(columns) + 0.5) * (y_m[1] - y_m[0]) / columns
     centers = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
     u, v = np.floor((centers - place) @ turn / cell_m).T
     is_cell = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    found = np.full(rows * columns, -1, np.int16)
+    found = np.full(rows * columns, _OUTSIDE, np.int16)
     found[is_cell] = cells[v[is_cell].astype(np.intp), u[is_cell].astype(np.intp)]
+    if pose is None:
+        _put_largest(found.reshape(rows, columns), grid, turn, x_m, y_m)
+    percent = np.where(found < 0, quantity.unknown, found)
+    if quantity.outside is not None:
+        percent = np.where(found == _OUTSIDE, quantity.outside, percent)
+    return np.rint(percent * 2.55).astype(np.uint8).reshape(rows, columns)
+
+
+def _put_largest(
+    found: NDArray[np.int16],
+    grid: Grid,
+    turn: Floats,
+    x_m: tuple[float, float],
+    y_m: tuple[float, float],
+) -> None:
+    """Put the largest occupancy of the cells with a center in a pixel into the pixels (H, W)."""
+    (rows, columns), (height, width) = found.shape, grid.cells.shape
+    cells, cell_m, place = grid[:3]
     # The cells that may be in the window.
     corners = np.array([[x, y] for x in x_m for y in y_m])
     ends = (corners - place) @ turn / cell_m
@@ -266,10 +323,12 @@ def grid_image(quantity: Quantity, message: dict[str, Any]) -> NDArray[np.uint8]
     inside = is_row & is_column
     pixels, values = (row * columns + column)[inside], cells[v0:v1, u0:u1].reshape(-1)[inside]
     # What is at a pixel's center counts only if no cell's center is in it.
-    found[pixels] = -1
-    np.maximum.at(found, pixels, values)
-    percent = np.where(found < 0, quantity.unknown, found)
-    return np.rint(percent * 2.55).astype(np.uint8).reshape(rows, columns)
+    found.reshape(-1)[pixels] = -1
+    np.maximum.at(found.reshape(-1), pixels, values)
+
+
+def _turn(yaw: float) -> Floats:
+    return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
 
 
 def _yaw(x: float, y: float, z: float, w: float) -> float:

@@ -305,8 +305,8 @@ class StepReader:
         if plan.clock is not None:
             distinct(run.streams, plan.clock, self._streams)
         parts = stretches(
-            [each for name in self._plan.required for each in self._of(name, run)],
-            [each for name in mapping.observation for each in self._of(name, run)],
+            [each for name in plan.required for each in self._of(name, run)],
+            [each for name in plan.observed for each in self._of(name, run)],
             [each.times_ns for each in run.streams.values()],
             mapping.episodes.gap_s,
         )

@@ -151,6 +151,11 @@ QUANTITIES: dict[str, dict[str, Any]] = {
         **{"x_m": [-600, 600], "y_m": [-600, 600], "z_m": [-900, 900]},
     },
     "map": {"grid": "/map", "x_m": [-500, 500], "y_m": [-1, 1], "size": [4, 3]},
+    "around": {"grid": "/map", "size": [5, 4], "around": ["place"], "outside": 100},
+    "ahead": {
+        **{"grid": "/map", "size": [4, 3], "around": ["fresh", "total", "yaw"]},
+        **{"x_m": [-5, 900], "y_m": [-500, 500], "unknown": 10, "tolerance_s": 1.0},
+    },
     "goal": {"field": "/goal.x", "tolerance_s": 0.5, "missing": 0},
     "side": {"field": "/goal.y"},
     "count": {"field": "/goal", "as": "count"},
@@ -186,6 +191,8 @@ def mappings(draw: st.DrawFn) -> dict[str, Any]:
         "fields": {
             "mode": {"field": "/mode.data"},
             "total": {"field": "/odom.twist.twist.linear.x"},
+            "fresh": {"field": "/goal.x", "tolerance_s": 1.0},
+            **{name: QUANTITIES[name] for name in ("place", "yaw") if name not in observed},
         },
         "action": {"fields": ["/cmd.linear.x"], "box": {"low": -1000, "high": 1000}},
         "episodes": episodes,
@@ -326,6 +333,74 @@ def test_frames_of_a_video_equal_those_of_the_bag(
     }
     found = compare(videos(codec, first, lost, damaged), mapping)
     assert found > 5 or len(lost | damaged) > 2
+
+
+AROUND = {"map": {"grid": "/map", "size": [3, 1], "around": ["x", "y", "yaw"], "outside": 100}}
+POSE = {
+    **{axis: {"field": f"/odom.pose.pose.position.{axis}", "tolerance_s": 0.3} for axis in "xy"},
+    "yaw": {"field": "/odom.pose.pose.orientation", "as": "yaw"},
+}
+
+
+def placed(x: float, y: float, z: float, w: float) -> dict[str, Any]:
+    pose = {"position": {"x": x, "y": y}, "orientation": {"x": 0, "y": 0, "z": z, "w": w}}
+    return {"pose": {"pose": pose}}
+
+
+def occupancy(width: int, cells: list[int]) -> dict[str, Any]:
+    origin = {"position": {"x": 0, "y": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+    info = {"width": width, "height": len(cells) // width, "resolution": 1.0, "origin": origin}
+    return {"info": info, "data": cells}
+
+
+@pytest.mark.parametrize("stack", [1, 2])
+def test_a_map_around_the_robot_equals_that_of_the_bag(stack: int) -> None:
+    """The map comes twice, the pose at each step but for a pause of .5 s."""
+    half, sent = math.sqrt(0.5), list[Sent]()
+    poses = [(0.5, 1.5, 0, 1), (1.5, 0.5, half, half), (1.5, 0.5, 1, 0), (9, 9, 0, 1)]
+    for k in range(20):
+        time_ns = START_NS + k * 100 * MS
+        if k in (0, 10):
+            sent.append(Sent(time_ns, "/map", occupancy(3, [k, 20, 40, 60, 80, 100])))
+        if not 12 <= k < 17:
+            sent.append(Sent(time_ns, "/odom", placed(*poses[k % 4])))
+        sent.append(Sent(time_ns, "/cmd", {"linear": {"x": k / 20}}))
+    mapping = {
+        "clock": {"rate_hz": 10},
+        "observation": AROUND,
+        "fields": POSE,
+        "stack": stack,
+        "action": {"fields": ["/cmd.linear.x"], "box": {"low": -1, "high": 1}},
+        "episodes": {"gap_s": GAP_S, "min_steps": 1},
+    }
+    data = read_open_bag(StreamBag(TYPES, sent), parse_mapping(mapping)).dataset
+    (images,) = data._transitions.frames
+    # The cells to the left of the robot, at it, and to its right.
+    seen = np.asarray(images)[:4, 0, :, -1].tolist()
+    assert seen == [[255, 153, 0], [0, 51, 102], [255, 51, 204], [255] * 3]
+    # Without a pose for more than .3 s, there is no step.
+    assert [each.length for each in data.episodes] == [14, 2]
+    assert compare(sent, mapping) == 18
+
+
+def test_a_map_needs_the_pose_of_the_robot() -> None:
+    live = LiveSteps(plan_of(AROUND, fields=POSE))
+    live.push("/map", occupancy(1, [100]), START_NS)
+    assert live.step(START_NS + MS).reason == "x: no message of /odom yet"
+    live.push("/odom", placed(0.5, 0.5, 0, 1), START_NS + 2 * MS)
+    step = live.step(START_NS + 3 * MS)
+    assert step.frame is not None
+    assert step.frame["map"].tolist() == [[[255], [255], [255]]]
+    late = live.step(START_NS + 400 * MS)
+    assert late.reason == "x: the last message of /odom is 0.398 s old"
+    with pytest.raises(UsageError, match="around of map: no quantity with numbers is named x"):
+        plan_of(AROUND)
+    alone = {"map": {**AROUND["map"], "around": ["x"]}}
+    live = LiveSteps(plan_of(alone, fields={"x": POSE["x"]}))
+    live.push("/map", occupancy(1, [100]), START_NS)
+    live.push("/odom", placed(0.5, 0.5, 0, 1), START_NS)
+    with pytest.raises(UsageError, match="around: x must be 2 or 3 numbers, x, y and yaw, not 1"):
+        live.step(START_NS)
 
 
 def plan_of(observation: dict[str, Any], **tree: Any) -> Plan:

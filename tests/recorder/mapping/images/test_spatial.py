@@ -22,6 +22,7 @@ from mcaprl.recorder.mapping.spatial import (
     cloud_points,
     fields_of,
     grid_image,
+    grid_of,
     range_image,
     top_image,
 )
@@ -255,7 +256,7 @@ def test_forward_is_up_and_left_is_left() -> None:
     assert found.tolist() == [[2, 0], [0, 1]]
 
 
-def grid_of(
+def grid_message(
     rows: Any, cell_m: float = 1.0, x: float = 0.0, y: float = 0.0, yaw: float = 0.0
 ) -> Any:
     cells = np.array(rows, np.int8)
@@ -276,24 +277,57 @@ def flat_grid(message: Any) -> dict[str, Any]:
     }
 
 
+def image_of_grid(keys: dict[str, Any], message: dict[str, Any], *pose: float) -> Any:
+    around = {"around": ["pose"]} if pose else {}
+    quantity = Quantity.model_validate({"grid": "/map", **around, **keys})
+    where = np.array(pose) if pose else None
+    return grid_image(quantity, grid_of(quantity, message), where).tolist()
+
+
 def test_a_grid_by_hand() -> None:
     """Rows of a message go along y, its columns along x; in the image, x is up and y left."""
-    message = flat_grid(grid_of([[0, 100, -1], [20, -1, -1]], x=-1))
-    whole = grid_image(Quantity.model_validate({"grid": "/map"}), message)
-    assert whole.tolist() == [[127, 127], [127, 255], [51, 0]]
+    message = flat_grid(grid_message([[0, 100, -1], [20, -1, -1]], x=-1))
+    assert image_of_grid({}, message) == [[127, 127], [127, 255], [51, 0]]
     window = {"x_m": [-2, 2], "y_m": [0, 4], "size": [2, 2], "unknown": 40}
-    found = grid_image(Quantity.model_validate({"grid": "/map", **window}), message)
     # Pixels of 2 m: the largest known cell in each, 102 where none is known.
-    assert found.tolist() == [[102, 255], [102, 51]]
+    assert image_of_grid(window, message) == [[102, 255], [102, 51]]
     # The grid is turned by 90 degrees to the left about (-1, 0): its x is y.
-    turned = flat_grid(grid_of([[0, 100, -1], [20, -1, -1]], x=-1, yaw=math.pi / 2))
+    turned = flat_grid(grid_message([[0, 100, -1], [20, -1, -1]], x=-1, yaw=math.pi / 2))
     window = {"x_m": [-3, -1], "y_m": [0, 3], "size": [3, 2], "unknown": 0}
-    found = grid_image(Quantity.model_validate({"grid": "/map", **window}), turned)
-    assert found.tolist() == [[0, 255, 0], [0, 0, 51]]
+    assert image_of_grid(window, turned) == [[0, 255, 0], [0, 0, 51]]
     # Finer pixels than cells.
     fine = {"x_m": [0, 0.5], "y_m": [0.5, 1.5], "size": [4, 2], "unknown": 100}
-    found = grid_image(Quantity.model_validate({"grid": "/map", **fine}), message)
-    assert found.tolist() == [[255, 255, 255, 255]] * 2
+    assert image_of_grid(fine, message) == [[255, 255, 255, 255]] * 2
+
+
+ROBOT: dict[str, Any] = {"size": [3, 2], "x_m": [0, 2], "y_m": [-1.5, 1.5]}
+
+
+def test_a_grid_around_the_robot_by_hand() -> None:
+    """The map has 3 x 3 cells of 1 m from (10, 20): 5 is the one around (11.5, 21.5)."""
+    message = flat_grid(grid_message([[1, 2, 3], [4, 5, 6], [7, 8, -1]], x=10, y=20))
+    code = {each: round(each * 2.55) for each in range(101)}
+
+    def percents(keys: dict[str, Any], *pose: float) -> Any:
+        found = image_of_grid({"unknown": 50, "outside": 100, **keys}, message, *pose)
+        return [[next(p for p, c in code.items() if c == each) for each in row] for row in found]
+
+    # From x = 10 on and y = 20 to 23; the first row is the far one, the first column the left one.
+    assert percents(ROBOT, 10, 21.5) == [[8, 5, 2], [7, 4, 1]]
+    # The same place, but ahead is y: left is smaller x.
+    assert percents(ROBOT, 11.5, 20.0, math.pi / 2) == [[4, 5, 6], [1, 2, 3]]
+    # Ahead is smaller x, and there are no more cells; left is smaller y.
+    assert percents(ROBOT, 11, 21.5, math.pi) == [[100, 100, 100], [1, 4, 7]]
+    # Without limits, pixels are cells, and the robot is in the middle one.
+    assert percents({"size": [3, 3]}, 12.5, 22.5) == [[100] * 3, [100, 50, 6], [100, 8, 5]]
+    assert percents({"size": [1, 1]}, 11.9, 21.1, 0.3) == [[5]]
+    # The turned map has its rows along y: those of 1 at x = 9.5, those of 4 at x = 8.5.
+    message = flat_grid(grid_message([[1, 2, 3], [4, 5, 6]], x=10, y=20, yaw=math.pi / 2))
+    assert percents({"size": [3, 3]}, 9.5, 21.5) == [[100] * 3, [3, 2, 1], [6, 5, 4]]
+    # Without `outside`, it is as unknown as what is not known.
+    assert image_of_grid({"size": [1, 1], "unknown": 20}, message, 0, 0) == [[51]]
+    window = {"size": [1, 1], "outside": 20, "x_m": [0, 1], "y_m": [0, 1]}
+    assert image_of_grid(window, message) == [[51]]
 
 
 def slow_grid(quantity: Quantity, rows: Any, cell_m: float, x: float, y: float, yaw: float) -> Any:
@@ -345,15 +379,16 @@ def test_grids_equal_a_slow_reference(
 ) -> None:
     window = {"x_m": [-1.5, 2.5], "y_m": [-2, 1.7], "size": size}
     quantity = Quantity.model_validate({"grid": "/map", **window})
-    found = grid_image(quantity, flat_grid(grid_of(rows, 0.41, x, -0.61, yaw)))
+    grid = grid_of(quantity, flat_grid(grid_message(rows, 0.41, x, -0.61, yaw)))
+    found = grid_image(quantity, grid)
     assert found.tolist() == slow_grid(quantity, rows, 0.41, x, -0.61, yaw)
 
 
 def test_damaged_grids_are_clear_errors() -> None:
-    quantity, message = Quantity.model_validate({"grid": "/map"}), flat_grid(grid_of([[0, 1]]))
+    quantity, message = Quantity.model_validate({"grid": "/map"}), flat_grid(grid_message([[0, 1]]))
     for change in ({"info.width": 3}, {"info.resolution": NAN}, {"info.resolution": 0.0}):
         with pytest.raises(LogError, match="a grid"):
-            grid_image(quantity, {**message, **change})
+            grid_of(quantity, {**message, **change})
 
 
 @pytest.mark.parametrize(
@@ -390,6 +425,8 @@ def test_other_clouds_are_refused_by_name(kind: str, expected: str) -> None:
         ({"scan": "/s", "size": [2, 2]}, "size is for"),
         ({"grid": "/m", "align": "linear"}, "cannot be interpolated"),
         ({"scan": "/s", "grid": "/m"}, "give one of"),
+        ({"grid": "/m", "around": ["pose"]}, "around needs `size`"),
+        ({"image": "/i", "outside": 0}, "outside is for grid"),
     ],
 )
 def test_wrong_keys(keys: dict[str, Any], expected: str) -> None:
