@@ -41,7 +41,8 @@ def grid() -> gym.Env[Any, Any]:
 
     name = "minigrid:MiniGrid-Empty-16x16-v0"
     game = gym.make(name, render_mode="rgb_array", max_episode_steps=STEPS)
-    return ImgObsWrapper(FullyObsWrapper(game))
+    found: gym.Env[Any, Any] = ImgObsWrapper(FullyObsWrapper(game))
+    return found
 
 
 class Recorded(NamedTuple):
@@ -99,7 +100,7 @@ def test_a_game_is_recorded_learned_evaluated_and_shown(game: Recorded, tmp_path
 
     mcaprl.annotate(game.log, tmp_path / "values.mcap", policy=str(run.folder))
     with mcaprl.open_bag(tmp_path / "values.mcap") as bag:
-        values = np.stack(bag.read("/rl/values", ["q"]).columns["q"])
+        values = np.stack(list(bag.read("/rl/values", ["q"]).columns["q"]))
     np.testing.assert_allclose(values, policy.q_values(data.observations), atol=1e-5)
 
     page = unpacked(LogPage(tmp_path / "values.mcap").episode(1))

@@ -3,7 +3,7 @@
     python -m benchmarks.studies.quality
 
 Clean data are episodes of sims and of Gymnasium, with other seeds each time. Into each, every
-fault of tests/support/faults.py for which the data are enough is planted at a random place.
+fault of tests/support/damage/planted.py for which the data are enough is planted at a random place.
 A finding in clean data is false if it is a problem; notes are not counted.
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 
 import mcaprl
 from mcaprl.recorder.dataset.quality import Flaw, flaws
-from tests.support.faults import FAULTS, IMAGE_FAULTS, fits
+from tests.support.damage.planted import FAULTS, IMAGE_FAULTS, fits
 
 CLEAN: Final[dict[str, dict[str, Any]]] = {
     f"{sim}{', continuous' if actions else ''}, {name}": {

@@ -24,12 +24,9 @@ START_NS = 1_700_000_000 * 10**9
 
 
 def make_bag(log: str | Path, out: str | Path, form: str = "ros2") -> int:
-    """Write the drives of a log as a bag; return the number of messages.
+    """Write the drives of a log of the lane sim as a bag; return the number of messages.
 
-    Args:
-        log: Log of the lane sim with its default rules.
-        out: Folder of a ROS 2 bag, or MCAP file.
-        form: `ros2`, `protobuf` or `json`.
+    `out` is the folder of a ROS 2 bag, or an MCAP file; `form` is `ros2`, `protobuf` or `json`.
     """
     with WRITERS[form](Path(out)) as write:
         messages = [write(one.topic, at_ns, one.content) for at_ns, one in _recorded(log)]

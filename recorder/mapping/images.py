@@ -573,7 +573,7 @@ class ImageReader:
             return
         yield from self._decoded(rows, self.options.image)
 
-    def _around(self, rows: NDArray[np.int64], pairs: NDArray[np.float64]) -> Decoded:
+    def _around(self, rows: NDArray[np.int64], pairs: NDArray[Any]) -> Decoded:
         """Yield the images of grids: index of the row and pose in `pairs`, which are sorted."""
         for row, grid in self._decoded(rows, self.options.grid):
             for k in range(*np.searchsorted(pairs[:, 0], [row, row + 1]).tolist()):

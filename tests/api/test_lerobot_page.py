@@ -13,7 +13,7 @@ import pytest
 import mcaprl
 from mcaprl.cli import run
 from tests.docs.pages import ROOT, Run, commands
-from tests.support.lerobot_environment import run_lerobot
+from tests.support.lerobot.environment import run_lerobot
 
 PAGE = ROOT / "docs/howto/lerobot.md"
 # In a test, ACT is small and learns fast.

@@ -16,7 +16,8 @@ from mcaprl.cli import cli, main
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.quality import Flaw, flaws, topic_flaws
-from tests.support import bags, faults
+from tests.support import bags
+from tests.support.damage import planted as faults
 
 EPISODES, STEPS = 24, 30
 

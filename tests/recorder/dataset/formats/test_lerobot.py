@@ -29,7 +29,7 @@ from mcaprl.recorder.dataset.formats.lerobot_features import Feature
 from mcaprl.recorder.dataset.formats.lerobot_writer import QUANTILES, describe, pooled, sampled
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of
-from tests.support.lerobot_environment import run_lerobot
+from tests.support.lerobot.environment import run_lerobot
 from tests.support.recordings import assert_same_bits
 from tests.support.strategies import transitions
 from tests.support.transitions import is_plain

@@ -1,11 +1,11 @@
 """LeRobot's own reader and writer, run by the tests in an environment that has LeRobot.
 
-    python run_lerobot.py read FOLDER OUT.npz    all items of a dataset, by key
-    python run_lerobot.py chunks FOLDER OUT.npz  the same, with the actions of the next 4 steps
-    python run_lerobot.py same LOG FOLDER        compares a log with its dataset, item by item
-    python run_lerobot.py merge FOLDER TARGET    a dataset with the episodes of FOLDER twice
-    python run_lerobot.py make FOLDER KIND       the golden dataset of KIND `image` or `video`
-    python run_lerobot.py run PROGRAM ...        a script or a module, with its arguments
+    python run.py read FOLDER OUT.npz    all items of a dataset, by key
+    python run.py chunks FOLDER OUT.npz  the same, with the actions of the next 4 steps
+    python run.py same LOG FOLDER        compares a log with its dataset, item by item
+    python run.py merge FOLDER TARGET    a dataset with the episodes of FOLDER twice
+    python run.py make FOLDER KIND       the golden dataset of KIND `image` or `video`
+    python run.py run PROGRAM ...        a script or a module, with its arguments
 
 Only NumPy, PyAV, torch and LeRobot are imported. The writer of LeRobot 0.4 needs NumPy < 2.4.
 """

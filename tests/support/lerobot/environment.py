@@ -10,11 +10,11 @@ from typing import Final
 
 from tests.conftest import need
 
-PROGRAM: Final = Path(__file__).with_name("run_lerobot.py")
+PROGRAM: Final = Path(__file__).with_name("run.py")
 
 
 def run_lerobot(*arguments: object, folder: Path) -> None:
-    """Run `run_lerobot.py` in a folder; skip the test if LeRobot is not installed."""
+    """Run `run.py` in a folder; skip the test if LeRobot is not installed."""
     python = os.environ.get("MCAPRL_LEROBOT_PYTHON", f"{sys.prefix}/lerobot/bin/python")
     need(Path(python).exists(), "LeRobot is not installed: make .venv/.lerobot")
     kept = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
@@ -22,7 +22,7 @@ def run_lerobot(*arguments: object, folder: Path) -> None:
     surroundings = {"HF_HOME": home, "HF_HUB_OFFLINE": "1", "HOME": home}
     done = subprocess.run(
         [python, "-W", "ignore", str(PROGRAM), *map(str, arguments)],
-        env={**kept, **surroundings, "PYTHONPATH": str(PROGRAM.parents[2])},
+        env={**kept, **surroundings, "PYTHONPATH": str(PROGRAM.parents[3])},
         cwd=folder,
         capture_output=True,
         text=True,

@@ -1,0 +1,1 @@
+"""LeRobot in its own environment, which the tests run as another process."""
