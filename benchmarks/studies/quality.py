@@ -19,7 +19,6 @@ from typing import Any, Final
 import numpy as np
 
 import mcaprl
-from mcaprl.recorder.dataset.quality import Flaw, flaws
 from tests.support.damage.planted import FAULTS, IMAGE_FAULTS, fits
 
 CLEAN: Final[dict[str, dict[str, Any]]] = {
@@ -47,20 +46,19 @@ CLEAN: Final[dict[str, dict[str, Any]]] = {
 IMAGES: Final = {"powerline, depth": {"sim": "powerline", "observation": "depth", "episodes": 3}}
 
 
-def clean(name: str, seed: int) -> mcaprl.Dataset:
-    """Return clean data of one of the names of `CLEAN` and `IMAGES`."""
+def clean(name: str, seed: int, path: Path) -> mcaprl.Dataset:
+    """Record clean data of one of the names of `CLEAN` and `IMAGES`."""
     request = dict((CLEAN | IMAGES)[name])
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "log.mcap"
-        if "continuous" in name and request.get("epsilon"):
-            request["noise"] = request.pop("epsilon")
-        mcaprl.record(request.pop("sim"), path, seed=1000 * seed, scene=False, **request)
-        return mcaprl.open(path)
+    if "continuous" in name and request.get("epsilon"):
+        request["noise"] = request.pop("epsilon")
+    sim = request.pop("sim")
+    mcaprl.record(sim, path, seed=1000 * seed, scene=False, overwrite=True, **request)
+    return mcaprl.open(path)
 
 
-def problems(data: mcaprl.Dataset) -> list[Flaw]:
+def problems(data: mcaprl.Dataset) -> list[Any]:
     """Return the findings that are no notes."""
-    return [flaw for flaw in flaws(data) if flaw.severity == "problem"]
+    return [flaw for flaw in mcaprl.info(data, quality=True).quality if flaw.severity == "problem"]
 
 
 def main() -> None:
@@ -72,6 +70,8 @@ def main() -> None:
     parser.add_argument("--data", default="", help="only kinds of data with this in their names")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
+    folder = tempfile.TemporaryDirectory()
+    path = Path(folder.name) / "log.mcap"
     planted: Counter[str] = Counter()
     found: Counter[str] = Counter()
     print("| clean data | logs | false findings |")
@@ -79,7 +79,7 @@ def main() -> None:
     for name in (one for one in (*CLEAN, *IMAGES) if arguments.data in one):
         wrong = []
         for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
-            data = clean(name, seed)
+            data = clean(name, seed, path)
             base = problems(data)
             wrong += base
             for kind, plant in (IMAGE_FAULTS if name in IMAGES else FAULTS).items():
