@@ -114,7 +114,7 @@ def _table() -> Any:
 
 
 def _lines(status: Sequence[DriveStatus]) -> AbstractContextManager[None]:
-    """Return a context manager that prints the last status each 10 s, if there is no terminal."""
+    """Return a context manager that prints the last status every 10 s, if there is no terminal."""
     if is_quiet() or sys.stderr.isatty():
         return nullcontext()
     return printed_lines(lambda: _summary(status[0]) if status else "loading the policy")

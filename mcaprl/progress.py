@@ -37,7 +37,7 @@ def no_progress(description: str, total: int | None) -> Iterator[Advance]:
 
 @contextmanager
 def terminal_bar(description: str, total: int | None) -> Iterator[Advance]:
-    """Show a progress bar if stderr is a terminal; otherwise, print a line each 10 s."""
+    """Show a progress bar if stderr is a terminal; otherwise, print a line every 10 s."""
     if not _stderr_is_terminal():
         work = Work(printable(description), total)
         with printed_lines(work.line):
@@ -137,7 +137,7 @@ _shown: list[Callable[[], str]] = []
 
 @contextmanager
 def printed_lines(line: Callable[[], str]) -> Iterator[None]:
-    """Print what a function returns to stderr after 5 s and then each 10 s, by a thread.
+    """Print what a function returns to stderr after 5 s and then every 10 s, by a thread.
 
     A unit of work, such as a compilation, may take minutes.
     """
@@ -208,7 +208,7 @@ ProgressCallback = Callable[[TrainingProgress], None]
 def terminal_progress(unit: str, *terms: str) -> Iterator[ProgressCallback]:
     """Show a progress bar for each seed on a terminal: rate, one term and remaining time.
 
-    If stderr is not a terminal, print a line about the seeds that are being trained each 10 s.
+    If stderr is not a terminal, print a line about the seeds that are being trained every 10 s.
     """
     if not _stderr_is_terminal():
         training = Training(unit, terms)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import warnings
 import webbrowser
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
@@ -157,7 +158,11 @@ def _label_track(path: Path, window_ns: tuple[int, int], out: Path) -> Track | N
     """Return what shows the labels of a log beside it; None without labels."""
     if is_url(path) or LABELS_TOPIC in {one.topic for one in McapReader(path).channels.values()}:
         return None
-    labels = labels_to_carry(path)
+    try:
+        labels = labels_to_carry(path)
+    except LogError as error:
+        warnings.warn(str(error), stacklevel=3)
+        return None
     if labels is None or not (texts := labels.texts(open_data(path, columns=[]))):
         return None
     write_labels(out, texts)

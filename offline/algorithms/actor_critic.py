@@ -41,10 +41,10 @@ class ActorCritic(Learner):
     config: ActorCriticConfig
 
     def continue_actor(self, starts: int, rate: float) -> None:
-        """Train critics alone at first, and then the actor more slowly, of a given policy.
+        """Continue a given policy: train the critics alone at first, and the actor more slowly.
 
-        Critics of other data overestimate actions near those of the policy, which an actor that
-        learns with them would take at once.
+        The critics have errors beside the actions that they learned from, and an actor that learns
+        at once follows these errors.
 
         Args:
             starts: Number of updates before the first one of the actor.

@@ -313,7 +313,7 @@ class Learner(ABC):
         return scalar
 
     def set_rate_factor(self, name: str, factor: float) -> None:
-        """Set the learning rate of a model, as a multiple of that of the others; once a model."""
+        """Set the learning rate of a model as a multiple of the others'; call it once for each."""
         weights = self.models[name].weights
         shared = self.optimizer.param_groups[0]
         shared["params"] = [each for each in shared["params"] if each is not weights]

@@ -43,7 +43,7 @@ FINALISTS: Final = ("chosen", "runner-up", "")
 _MEANINGS: Final = {
     "return_spread": "standard deviation of the returns of the episodes",
     "terminated": "fraction of the episodes that end in a terminal state",
-    "entropy": "how random the behavior is: 0 takes always the same action, 1 any of them",
+    "entropy": "randomness of the behavior: 0 for a single action, 1 for all equally often",
     "coverage": "fraction of the actions that are likely in the log, over the states",
     "probabilities": "whether the log has the probabilities of its actions",
     "problems": "what mcaprl info reports",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fnmatch
 import heapq
-import itertools
 import operator
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -586,14 +585,40 @@ class OpenBag:
             raise UnknownNameError("topic", name, self._topics)
         return self._topics[name]
 
-    def copy_topics(self, patterns: Sequence[str], mcap: McapWriter) -> None:
-        """Copy topics to another file; see `copy_topics`."""
-        names = [name for name in self._topics if not name.startswith(_OWN_TOPICS)]
-        chosen = {pattern: fnmatch.filter(names, pattern) for pattern in patterns}
-        for pattern, found in chosen.items():
+
+OpenBag.__module__ = "mcaprl"
+
+
+def copy_topics(
+    paths: Sequence[Path],
+    definitions: Sequence[str | Path],
+    patterns: Sequence[str],
+    mcap: McapWriter,
+) -> None:
+    """Copy topics of a bag to another file: bytes, schemas and times, in the order of log_time.
+
+    Topics below `/rl/`, which a log writes itself, are left out. The messages in memory are
+    bounded; their index is not.
+
+    Args:
+        paths: Files of the bag.
+        definitions: Files and folders with definitions of ROS types that the bag lacks.
+        patterns: Names of topics, or patterns such as `/camera/*`.
+        mcap: Writer of the file.
+
+    Raises:
+        UnknownNameError: A pattern has no topic.
+        LogError: The bag cannot be read, or the type of a topic is not known.
+    """
+    with open_bag(paths, definitions=definitions) as bag:
+        names = [name for name in bag._topics if not name.startswith(_OWN_TOPICS)]
+        chosen = set[str]()
+        for pattern in patterns:
+            found = [name for name in names if fnmatch.fnmatchcase(name, pattern)]
             if not found:
                 raise UnknownNameError("topic", pattern, names)
-        topics = [self._topics[name] for name in sorted({*itertools.chain(*chosen.values())})]
+            chosen |= {*found}
+        topics = [bag._topics[name] for name in sorted(chosen)]
         ids, undone = dict[TopicSource, int](), 0
         for topic in topics:
             for source in topic.sources:
@@ -626,34 +651,6 @@ class OpenBag:
                 f"{counted(undone, 'message')} cannot be decompressed, and are not kept",
                 stacklevel=2,
             )
-
-
-OpenBag.__module__ = "mcaprl"
-
-
-def copy_topics(
-    paths: Sequence[Path],
-    definitions: Sequence[str | Path],
-    patterns: Sequence[str],
-    mcap: McapWriter,
-) -> None:
-    """Copy topics of a bag to another file: bytes, schemas and times, in the order of log_time.
-
-    Topics below `/rl/`, which a log writes itself, are left out. Memory is bounded, but
-    for the index.
-
-    Args:
-        paths: Files of the bag.
-        definitions: Files and folders with definitions of ROS types that the bag lacks.
-        patterns: Names of topics, or patterns such as `/camera/*`.
-        mcap: Writer of the file.
-
-    Raises:
-        UnknownNameError: A pattern has no topic.
-        LogError: The bag cannot be read, or the type of a topic is not known.
-    """
-    with open_bag(paths, definitions=definitions) as bag:
-        bag.copy_topics(patterns, mcap)
 
 
 def _first_ns(file: McapFile | RosbagFile) -> int:

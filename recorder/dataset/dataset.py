@@ -137,10 +137,8 @@ class Dataset(Conversions):
         """
         if not parts:
             raise LogError("no data: the list of datasets or files is empty")
-        first, numbers = (
-            parts[0],
-            np.cumsum([0, *(part.wholes.max(initial=-1) + 1 for part in parts)]),
-        )
+        first = parts[0]
+        numbers = np.cumsum([0, *(part.wholes.max(initial=-1) + 1 for part in parts)])
         for other in parts[1:]:
             for role in ("observation_space", "action_space"):
                 if getattr(first, role) != getattr(other, role):

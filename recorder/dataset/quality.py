@@ -497,7 +497,7 @@ def _saturated(table: _Table) -> Iterator[Flaw]:
                 severity="problem" if inside else "note",
                 next="check the limits of the controller"
                 if inside
-                else "if this is no bang-bang control, widen the limits of the controller",
+                else "unless this is bang-bang control, widen the limits of the controller",
                 plot=table.around(part.astype(np.float64), *_longest(runs), name),
             )
 

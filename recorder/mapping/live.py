@@ -335,6 +335,7 @@ class _Image(_Value):
         self._kinds = kinds_of(reader.bag.topics[reader.topic], reader.fields)
         self._reader, self.video, self._camera = reader, video, camera
         self._waiting: list[tuple[int, Any]] = []
+        self._reason = ""
         # With `around`, this is a grid.
         self.image: Any = None
         if wanted.quantity.around is not None:
@@ -346,17 +347,17 @@ class _Image(_Value):
 
     @property
     def lack(self) -> str:
-        """Why there may be no image: no calibration, or no frame; empty if nothing lacks."""
+        """Why there may be no image; empty if no reason is known."""
         if self._camera is not None and self._camera.rectifier is None:
             return f"no message of {self.wanted.quantity.undistort} yet"
-        return "" if self.video is None else self.video.lack
+        return (self.video.lack if self.video else "") or self._reason
 
     def take(self, time_ns: int, raw: Any) -> None:
         bisect.insort(self._waiting, (time_ns, raw), key=_first)
         del self._waiting[:-_MOST_IMAGES]
 
     def drop(self) -> None:
-        self._waiting, self.time_ns, self.image = [], None, None
+        self._waiting, self.time_ns, self.image, self._reason = [], None, None, ""
 
     def at(self, time_ns: int) -> Values:
         reader, camera, video = self._reader, self._camera, self.video
@@ -373,9 +374,11 @@ class _Image(_Value):
             try:
                 if self.wanted.quantity.around is not None:
                     self.time_ns, self.image = own_ns, reader.options.grid(raw)
+                    self._reason = ""
                     break
                 image = reader.options.image(raw) if video is None else reader.of_frame(raw)
-            except LogError:
+            except LogError as error:
+                self._reason = f"a message of {self.wanted.source.topic} cannot be used: {error}"
                 continue
             if self.shape is not None and image.shape != self.shape:
                 # Like in a bag, a video may have other frames between those of this size.
@@ -386,6 +389,7 @@ class _Image(_Value):
                     f" resize, but the policy was trained with {self.shape}"
                 )
             self.time_ns, self.image, self.shape = own_ns, image, image.shape
+            self._reason = ""
             break
         self._waiting = []
         tolerance_s = self.wanted.quantity.tolerance_s

@@ -413,6 +413,16 @@ def plan_of(observation: dict[str, Any], **tree: Any) -> Plan:
     return Plan(StreamBag(TYPES, []), parse_mapping(mapping), Place(), trust_code=False)
 
 
+def test_a_damaged_image_is_named_until_another_comes() -> None:
+    live = LiveSteps(plan_of({"camera": {"image": "/camera"}}))
+    image = {"height": 2, "width": 4, "step": 3, "encoding": "mono8", "data": [0] * 6}
+    live.push("/camera", image, START_NS)
+    reason = live.step(START_NS + MS).reason
+    assert reason.startswith("camera: a message of /camera cannot be used: "), reason
+    live.push("/camera", {**image, "width": 3}, START_NS + 2 * MS)
+    assert live.step(START_NS + 3 * MS).reason == ""
+
+
 SPEED = {"speed": {"field": "/odom.twist.twist.linear.x"}}
 
 

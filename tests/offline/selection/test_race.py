@@ -307,7 +307,7 @@ def test_the_page_shows_the_finalists_first_with_a_figure(finished: Path, tmp_pa
         assert (cell in finalists) == (one.outcome in ("chosen", "runner-up")) != (cell in others)
     assert "of the 2 finalists" in finalists
     assert "<svg" in finalists.partition("<h2>Finalists</h2>")[2]
-    assert "1 any of them" in others
+    assert "1 for all equally often" in others
 
 
 def test_a_run_of_another_algorithm_has_no_choice(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ import pytest
 from mcap.writer import Writer
 
 import mcaprl
-from mcaprl.errors import UsageError
+from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.messages import EpisodeSummary
@@ -383,6 +383,21 @@ def test_labels_are_played_beside_the_log(log: Path, tmp_path: Path) -> None:
     text = messages.decode(bytes_of(seen, "/rl/labels"), messages.TEXT_TYPE).data
     assert text == "failure: left the lane"
     assert "/scene" in {message["topic"] for message in seen}
+
+
+def test_a_log_with_labels_of_other_data_is_played_without_them(log: Path, tmp_path: Path) -> None:
+    labeled, stop = tmp_path / "lane.mcap", threading.Event()
+    labeled.write_bytes(log.read_bytes())
+    mcaprl.label(labeled, episode=1, success=False)
+    path = tmp_path / "lane.mcap.labels.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "log": "0" * 64}))
+    addresses = list[Any]()
+    stop.set()
+    with pytest.warns(UserWarning, match="has the labels of other data than"):
+        mcaprl.replay(labeled, port=0, on_open=addresses.append, stop=stop)
+    assert len(addresses) == 1
+    with pytest.raises(LogError, match="has the labels of other data than"):
+        mcaprl.annotate(labeled, tmp_path / "out.mcap", scene=True)
 
 
 def test_two_logs_are_played_side_by_side(log: Path, tmp_path: Path) -> None:
