@@ -256,9 +256,11 @@ def _time_gaps(dataset: Dataset) -> Iterator[Problem]:
 def _mixed_policies(dataset: Dataset) -> Iterator[Problem]:
     policies = Counter(episode.policy or "unknown" for episode in dataset.episodes)
     if len(policies) > 1:
+        found = [f"{count} by {name}" for name, count in policies.most_common()]
+        more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
         yield _note(
             f"{len(policies)} behavior policies",
-            "; ".join(f"{count} by {name}" for name, count in policies.most_common(_SHOWN)),
+            "; ".join(found[:_SHOWN] + more),
             "behavior cloning learns a mixture of these policies",
         )
 

@@ -229,7 +229,7 @@ def _images(table: _Table) -> Iterator[Flaw]:
         same &= ~blank
         runs = table.runs(same, 2)
         if runs and _usual(same, runs):
-            yield _frozen(table, runs, f"frames of {leaf.name}", 1.0 - same)
+            yield _frozen(table, runs, f"frames of {leaf.name}", 1.0 - same, "1 if it changes")
 
 
 def _usual(same: Flags, runs: Sequence[tuple[int, int]]) -> bool:
@@ -238,7 +238,9 @@ def _usual(same: Flags, runs: Sequence[tuple[int, int]]) -> bool:
     return bool(same.sum() - held <= (1 - _USUAL) * (len(same) - held))
 
 
-def _frozen(table: _Table, runs: Sequence[tuple[int, int]], name: str, values: Floats) -> Flaw:
+def _frozen(
+    table: _Table, runs: Sequence[tuple[int, int]], name: str, values: Floats, label: str
+) -> Flaw:
     longest = _longest(runs)
     steps = longest[1] - longest[0] + 1
     return _flaw(
@@ -250,7 +252,7 @@ def _frozen(table: _Table, runs: Sequence[tuple[int, int]], name: str, values: F
         unit="steps",
         next="check the driver and the time limit of the topic (`gap_s`), and leave these steps"
         " out: `Dataset.without`",
-        plot=table.around(values, *longest, name),
+        plot=table.around(values, *longest, label),
     )
 
 
@@ -267,7 +269,8 @@ def _held(table: _Table) -> Iterator[Flaw]:
         if _jumps(table, size, run) and _others_move(table, run)
     ]
     if runs and same.mean() <= 1 - _USUAL:
-        yield _frozen(table, runs, "all numbers of the observation", size)
+        label = "change, standard deviations"
+        yield _frozen(table, runs, "all numbers of the observation", size, label)
     for k in moving:
         still = (table.changes[:, k] == 0) & ~same
         if still.mean() > 1 - _USUAL:
@@ -279,7 +282,7 @@ def _held(table: _Table) -> Iterator[Flaw]:
             if _jumps(table, size, run) and _is_unique(values, run)
         ]
         if runs:
-            yield _frozen(table, runs, f"the values of {table.names[k]}", values)
+            yield _frozen(table, runs, f"the values of {table.names[k]}", values, table.names[k])
 
 
 def _others_move(table: _Table, run: tuple[int, int]) -> bool:
