@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,11 +33,10 @@ if TYPE_CHECKING:
     from mcaprl.offline.selection.choice import Choice
 
 
-def _configs() -> dict[str, Settings]:
-    from mcaprl.offline.algorithms.config import default_configs
-    from mcaprl.offline.selection.config import AUTO, AutoConfig
+def _configs() -> Mapping[str, Settings]:
+    from mcaprl.offline.selection.config import default_configs
 
-    return {**default_configs(), AUTO: AutoConfig()}
+    return default_configs()
 
 
 def _names() -> list[str]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from mcaprl.architecture import Architecture, NetworkSettings
-from mcaprl.lazy import installed
 from mcaprl.offline.batches.packing import Packing
 
 if TYPE_CHECKING:
@@ -403,23 +402,3 @@ BOX_CONFIGS: Final[dict[str, type[TrainingConfig]]] = {
     "iql": BoxIQLConfig,
 }
 """Settings of the built-in algorithms for the actions of a Box by name."""
-
-
-def default_configs() -> dict[str, TrainingConfig]:
-    """Return the default settings of the built-in algorithms and of those of installed packages.
-
-    Where an algorithm has other settings for a Box, these have the key `NAME (Box)`.
-
-    Raises:
-        UsageError: An entry point is broken.
-    """
-    configs = dict(CONFIGS)
-    for name, config_type in BOX_CONFIGS.items():
-        configs[f"{name} (Box)" if name in CONFIGS else name] = config_type
-    if installed(ENTRY_POINT_GROUP):
-        # This module imports torch.
-        from mcaprl.offline.algorithms.registry import all_algorithms
-
-        for learner in all_algorithms():
-            configs.setdefault(learner.name, learner.config_type)
-    return {name: config_type() for name, config_type in configs.items()}

@@ -7,7 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from mcaprl.offline.algorithms.config import BootstrapConfig
+from mcaprl.lazy import installed
+from mcaprl.offline.algorithms.config import (
+    BOX_CONFIGS,
+    CONFIGS,
+    ENTRY_POINT_GROUP,
+    BootstrapConfig,
+    TrainingConfig,
+)
 
 AUTO: Final = "auto"
 """Name of the algorithm that chooses among the others."""
@@ -65,3 +72,23 @@ class AutoConfig(BootstrapConfig):
         """
         quarter = round(self.updates * self.short_fraction / 4)
         return max(1, min(self.checkpoint_interval, quarter))
+
+
+def default_configs() -> dict[str, TrainingConfig]:
+    """Return the default settings of `auto`, of the built-in and of installed algorithms.
+
+    Where an algorithm has other settings for a Box, these have the key `NAME (Box)`.
+
+    Raises:
+        UsageError: An entry point is broken.
+    """
+    configs = dict(CONFIGS)
+    for name, config_type in BOX_CONFIGS.items():
+        configs[f"{name} (Box)" if name in CONFIGS else name] = config_type
+    if installed(ENTRY_POINT_GROUP):
+        # This module imports torch.
+        from mcaprl.offline.algorithms.registry import all_algorithms
+
+        for learner in all_algorithms():
+            configs.setdefault(learner.name, learner.config_type)
+    return {**{name: config_type() for name, config_type in configs.items()}, AUTO: AutoConfig()}
