@@ -17,6 +17,7 @@ from mcaprl.cli.options import (
     actions_option,
     bag_options,
     bag_reader,
+    camera_option,
     env_arg_option,
     integer_option,
     json_option,
@@ -178,8 +179,11 @@ def layout(source: str, out: Path, **request: Any) -> None:
 @click.option("--policy", multiple=True, help="Policy as for evaluate --data; may be repeated.")
 @click.option("--gamma", type=click.FloatRange(0, 1), help="Discount. [default: that of the run]")
 @click.option("--scene", is_flag=True, help="Step the sim again and add its scene.")
-@click.option("--camera", is_flag=True, help="With --scene: add metric depth images.")
-@click.option("--sim", type=Name(sims), help="With --scene: sim to step instead of the logged one.")
+@camera_option(
+    "With --scene: add metric depth images; with h264: step the sim again, and add a video of what"
+    " it renders, also without --scene."
+)
+@click.option("--sim", type=Name(sims), help="Sim to step instead of the logged one.")
 @env_arg_option
 @trust_option
 @mapping_options
@@ -202,7 +206,9 @@ def annotate(file: str, out: Path, **request: Any) -> None:
         echo(f"{out}: /rl/labels has the labels")
     if found.scene is not None:
         episodes, steps = found.scene.episodes, found.scene.steps
-        echo(f"{out}: the scene of {counted(episodes, 'episode')}, {counted(steps, 'step')}")
+        added = ["scene"] * request["scene"] + ["video"] * (request["camera"] == "h264")
+        what = " and ".join(f"the {each}" for each in added)
+        echo(f"{out}: {what} of {counted(episodes, 'episode')}, {counted(steps, 'step')}")
 
 
 @click.command(cls=Command)

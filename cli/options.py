@@ -29,6 +29,20 @@ origin_option = click.option(
     metavar="ORIGIN",
     help="Allow another web page to connect, such as https://viewer.example; may be repeated.",
 )
+
+
+def camera_option(text: str) -> Callable[[F], F]:
+    """Return the option `--camera`, whose parameter is True, `h264` or False."""
+    return click.option(
+        "--camera",
+        is_flag=False,
+        flag_value="depth",
+        type=click.Choice(["depth", "h264"]),
+        callback=lambda _, __, given: given if given == "h264" else given is not None,
+        help=text,
+    )
+
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 
 

@@ -12,6 +12,7 @@ import mcaprl
 from mcaprl.cli.completion import Name, policies, sims
 from mcaprl.cli.help import Command
 from mcaprl.cli.options import (
+    camera_option,
     integer_option,
     keys_option,
     max_steps_option,
@@ -77,13 +78,9 @@ def _compressions() -> Iterable[str]:
 @sim_options
 @trust_run_option
 @click.option("--no-scene", is_flag=True, help="Omit the topics that only viewers use.")
-@click.option(
-    "--camera",
-    is_flag=False,
-    flag_value="depth",
-    type=click.Choice(["depth", "h264"]),
-    help="Record metric depth images on /camera/depth; with h264, what the environment renders, as"
-    " video on /camera/image.",
+@camera_option(
+    "Record metric depth images on /camera/depth; with h264, what the environment renders, as video"
+    " on /camera/image."
 )
 @click.option("--infos", is_flag=True, help="Record the info dicts that the environment returns.")
 @keys_option
@@ -110,7 +107,7 @@ def _compressions() -> Iterable[str]:
     type=click.IntRange(1),
     help="With --ray: number of files that are written into the folder OUT.  [default: up to 64]",
 )
-def record(no_scene: bool, camera: str | None, **request: Any) -> None:
+def record(no_scene: bool, **request: Any) -> None:
     """Record episodes of SIM into an MCAP file.
 
     SIM is lane, powerline, racer, highway-lane, or any Gymnasium id. Each episode is
@@ -118,8 +115,7 @@ def record(no_scene: bool, camera: str | None, **request: Any) -> None:
     """
     kept = f"finished {'logs' if request['ray'] else 'episodes'} are kept"
     with keeping(kept), working("loading the sim and the policy") as bar:
-        shown: bool | str = camera if camera == "h264" else camera is not None
-        found = mcaprl.record(**request, camera=shown, scene=not no_scene, progress=bar)
+        found = mcaprl.record(**request, scene=not no_scene, progress=bar)
     written = str(found.out)
     if not found.out.exists():
         parts = [str(path) for path in found.files]

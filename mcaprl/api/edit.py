@@ -238,8 +238,8 @@ class Annotation:
         out: Path of the copy.
         steps: Number of steps of the log.
         topics: Topic of each policy's values, by the policy's path.
-        scene: Number of episodes and number of steps to which the scene was added; None without a
-            scene.
+        scene: Number of episodes and number of steps to which the scene or the video was added;
+            None without both.
         labels: Whether the log has labels, which were added as `/rl/labels` and beside the copy.
     """
 
@@ -257,7 +257,7 @@ def annotate(
     policy: Names = (),
     gamma: float | None = None,
     scene: bool = False,
-    camera: bool = False,
+    camera: bool | str = False,
     sim: str | None = None,
     trust_env: bool = False,
     trust_code: bool = False,
@@ -277,7 +277,8 @@ def annotate(
             values are unknown.
         gamma: Discount of the TD errors; None for the discount of the run.
         scene: Whether to repeat the logged actions in the sim and add its scene.
-        camera: Whether to add metric depth images to the scene.
+        camera: Whether to add metric depth images to the scene; or `h264` to repeat the logged
+            actions and add a video of what the environment renders, with or without `scene`.
         sim: Short name or Gymnasium id to use instead of the logged one.
         trust_env: Whether to import the module that the logged id names, and to pass the logged
             arguments to environments other than the sims of `SIMS`.
@@ -298,9 +299,10 @@ def annotate(
     """
     check_fraction(gamma=gamma)
     names, added = as_names(policy), None
+    replays = scene or isinstance(camera, str)
     check_log_name(out)
     if isinstance(data, Dataset):
-        if scene:
+        if replays:
             raise UsageError("the scene of a bag cannot be added: there is no sim to step")
         check_target(Path(out), overwrite=overwrite)
         with temporary_folder() as folder:
@@ -312,8 +314,10 @@ def annotate(
         raise UsageError("keep_topics is for bags: annotate keeps all topics of a log")
     path = as_path(data, whole=True)
     dataset, labels = open_data(path), None if is_url(data) else labels_to_carry(Path(data))
-    if not names and not scene and labels is None:
-        raise UsageError("annotate needs `policy=POLICY`, `scene=True`, or a log with labels")
+    if not names and not replays and labels is None:
+        raise UsageError(
+            "annotate needs `policy=POLICY`, `scene=True`, `camera='h264'`, or a log with labels"
+        )
     found = values_topics(list(policy_names(names).values()))
     topics = dict(zip(dict.fromkeys(names), found.values(), strict=True))
     with annotated_copy(path, Path(out), overwrite=overwrite) as copy:
@@ -324,10 +328,12 @@ def annotate(
                 copy.add_values(topic, _values(dataset, name, gamma, progress))
         if labels is not None:
             copy.add_labels(labels.texts(dataset))
-        if scene:
-            trust: Any = {"trust_env": trust_env, "sim_options": sim_options}
-            with closing(sim_of(dataset, path, sim, **trust)) as env:
-                added = copy.add_scene(dataset, env, camera=camera)
+        if replays:
+            given: Any = {"trust_env": trust_env, "sim_options": sim_options}
+            if isinstance(camera, str):
+                given["render_mode"] = "rgb_array"
+            with closing(sim_of(dataset, path, sim, **given)) as env:
+                added = copy.add_scene(dataset, env, scene=scene, camera=camera)
     carry_labels(labels, np.arange(len(dataset.episodes)), Path(out))
     return Annotation(Path(out), len(dataset), topics, added, labels is not None)
 

@@ -10,10 +10,11 @@ import struct
 from fractions import Fraction
 from typing import Any, Final
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, import_extra
+from mcaprl.errors import LogError, UsageError, import_extra
 
 VIDEO: Final = "/camera/image"
 VIDEO_TYPE: Final = "foxglove_msgs/msg/CompressedVideo"
@@ -71,6 +72,26 @@ class VideoEncoder:
         content = _START.pack(b"\0\1\0\0", *divmod(time_ns, 10**9)) + _NO_FRAME
         content += struct.pack("<I", len(data)) + data
         return content + bytes(-len(content) % 4) + struct.pack("<I", 5) + b"h264\0"
+
+
+def rendering_env(env: gym.Env[Any, Any], camera: bool | str) -> gym.Env[Any, Any] | None:
+    """Return the environment whose images are recorded as video; None for no video.
+
+    Raises:
+        UsageError: `camera` is another text than `h264`, or the environment renders no images.
+        MissingExtraError: PyAV is not installed.
+    """
+    if isinstance(camera, bool):
+        return None
+    if camera != "h264":
+        raise UsageError(f"camera must be True, False or h264, not {camera!r:.40}")
+    if env.render_mode != "rgb_array":
+        raise UsageError(
+            f"camera 'h264' records what the environment renders, but its render_mode is"
+            f' {env.render_mode}: make it with `render_mode="rgb_array"`'
+        )
+    import_extra("av", "video")
+    return env
 
 
 def rendered(env: Any) -> NDArray[np.uint8]:

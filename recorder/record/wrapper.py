@@ -17,13 +17,14 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 import numpy as np
 
-from mcaprl.errors import SpaceError, UsageError, import_extra
+from mcaprl.errors import SpaceError
 from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.format.log_writer import InfoTopics
 from mcaprl.recorder.format.messages import INTERRUPTED
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import action_leaf
 from mcaprl.recorder.format.writing import HoldSignals
+from mcaprl.recorder.record.camera import rendering_env
 from mcaprl.recorder.record.display import Display
 from mcaprl.recorder.record.recordable import EpisodeInfos, check_single, recorded_space
 from mcaprl.recorder.record.session import EpisodeLog, FinishesAtExit, OpenEpisode, reason_of
@@ -110,7 +111,7 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
             OutputExistsError, LogError: The file cannot be created or appended to.
         """
         check_single(env)
-        rendering = _rendering(env, camera)
+        rendering = rendering_env(env, camera)
         recorded = recorded_space(env.observation_space, keys)
         action_leaf(env.action_space)
         super().__init__(env)
@@ -343,21 +344,6 @@ class RecordMcap(FinishesAtExit, gym.Wrapper[Any, Any, Any, Any]):
         self._recording.advance(summary)
         if self._infos is not None:
             self._infos.warn()
-
-
-def _rendering(env: gym.Env[Any, Any], camera: bool | str) -> gym.Env[Any, Any] | None:
-    """Return the environment whose images are recorded as video; None for no video."""
-    if isinstance(camera, bool):
-        return None
-    if camera != "h264":
-        raise UsageError(f"camera must be True, False or h264, not {camera!r:.40}")
-    if env.render_mode != "rgb_array":
-        raise UsageError(
-            f"camera 'h264' records what the environment renders, but its render_mode is"
-            f' {env.render_mode}: make it with `render_mode="rgb_array"`'
-        )
-    import_extra("av", "video")
-    return env
 
 
 # Reprs and pickles contain this public import path.

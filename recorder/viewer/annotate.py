@@ -37,6 +37,7 @@ from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.format.schema import EPISODE_TOPIC, LABELS_TOPIC, LOG_TOPIC
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 from mcaprl.recorder.format.writing import McapWriter
+from mcaprl.recorder.record.camera import VIDEO, rendering_env
 from mcaprl.recorder.record.display import SCENE, TELEMETRY, TF, Display, ShownTopics
 from mcaprl.recorder.record.layout import (
     LAYOUT_NAME,
@@ -444,13 +445,26 @@ class AnnotatedCopy:
         self._refuse(LABELS_TOPIC)
         _write_labels(self._log.mcap, texts)
 
-    def add_scene(self, dataset: Dataset, env: gym.Env[Any, Any], *, camera: bool) -> Verification:
-        """Replay the log in the environment, and write the scene."""
-        self._refuse(SCENE)
-        display = Display(self._log, env.unwrapped, scene=True, camera=camera)
+    def add_scene(
+        self,
+        dataset: Dataset,
+        env: gym.Env[Any, Any],
+        *,
+        scene: bool = True,
+        camera: bool | str = False,
+    ) -> Verification:
+        """Replay the log in the environment, and write its scene, its camera, or both."""
+        rendering = rendering_env(env, camera)
+        for topic, is_added in ((SCENE, scene), (VIDEO, rendering is not None)):
+            if is_added:
+                self._refuse(topic)
+        options: Any = {"scene": scene, "camera": camera is True, "rendering": rendering}
+        display = Display(self._log, env.unwrapped if scene else None, **options)
         if not display.shows_steps:
             raise UsageError(f"{dataset.env_id} provides no scene")
-        self._display, step_ns = display, self._log.metadata.step_duration_ns
+        if scene:
+            self._display = display
+        what, step_ns = "scene" if scene else "video", self._log.metadata.step_duration_ns
 
         def show(episode: Episode, step: int) -> None:
             if step == 0:
@@ -462,11 +476,11 @@ class AnnotatedCopy:
         found = verify(dataset, env, on_frame=show)
         if found.difference is not None:
             raise LogError(
-                f"no scene was added, since the replay differs: {found.difference.to_problem()}"
+                f"no {what} was added, since the replay differs: {found.difference.to_problem()}"
             )
         if found.unseeded:
             raise LogError(
-                "no scene was added, since the log has no seed for"
+                f"no {what} was added, since the log has no seed for"
                 f" {counted(len(found.unseeded), 'episode')}"
                 f" (first: {found.unseeded[0]})"
             )

@@ -16,7 +16,7 @@ from gymnasium import spaces
 import mcaprl
 from mcaprl.base_policy import BasePolicy
 from mcaprl.cli import run
-from mcaprl.errors import LogError, PolicyError
+from mcaprl.errors import LogError, PolicyError, UsageError
 from mcaprl.offline.estimate.values import (
     gamma_of_run,
     half_ranges,
@@ -356,7 +356,7 @@ def test_commands(
     assert "/rl/values/cql td_error" in printed
     assert "/rl/values/bc disagreement" in printed
     for wrong, why in (
-        (["annotate", str(plain), "--out", "b.mcap"], "--scene, or a log with labels"),
+        (["annotate", str(plain), "--out", "b.mcap"], "--camera h264, or a log with labels"),
         (
             ["annotate", str(plain), "--policy", "pilot", "--out", "b.mcap"],
             "no network to evaluate",
@@ -388,3 +388,31 @@ def test_layouts_of_annotated_logs_refer_to_paths_in_the_log(tmp_path: Path) -> 
     assert [tab["title"] for tab in tabs] == ["values/a", "values/b"]
     title = layout["configById"]["Plot!values/a now"]["foxglovePanelTitle"]
     assert title == "values/a: Q of each action now"
+
+
+def test_a_video_can_be_added_later(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The added images equal those of a recording with video, byte for byte."""
+    logs = [tmp_path / f"{name}.mcap" for name in ("plain", "added", "recorded")]
+    for path, camera in ((logs[0], False), (logs[2], "h264")):
+        env = gym.make("CartPole-v1", render_mode="rgb_array" if camera else None)
+        with closing(mcaprl.RecordMcap(env, path, camera=camera, start_time_ns=10**9)) as recorder:
+            for seed in (1, 2):
+                recorder.reset(seed=seed)
+                while not any(recorder.step(0)[2:4]):
+                    pass
+    assert run(["annotate", str(logs[0]), "--camera", "h264", "--out", str(logs[1])]) == 0
+    assert f"{logs[1]}: the video of 2 episodes, " in capsys.readouterr().out
+    readers = [McapReader(path) for path in logs]
+    added, recorded = (
+        [*reader.messages(reader.channels_of("/camera/image")[0])] for reader in readers[1:]
+    )
+    assert added == recorded
+    assert len(added) > 10
+    layout = json.loads(readers[1].attachment(LAYOUT_NAME) or b"")
+    image = layout["configById"]["Image!rendered"]["imageMode"]
+    assert image["imageTopic"] == "/camera/image"
+    check_layout(logs[1])
+    with pytest.raises(UsageError, match="already has /camera/image"):
+        mcaprl.annotate(logs[1], tmp_path / "again.mcap", camera="h264")
+    with pytest.raises(UsageError, match="must be True, False or h264, not 'vp9'"):
+        mcaprl.annotate(logs[0], tmp_path / "other.mcap", camera="vp9")
