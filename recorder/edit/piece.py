@@ -44,12 +44,12 @@ from mcaprl.recorder.format.schema import (
 from mcaprl.recorder.format.selected_copy import Source, Times, copy_selected, times_of
 from mcaprl.recorder.format.writing import finished_state
 from mcaprl.recorder.mapping.expression import Column, Expression
-from mcaprl.recorder.record.display import CAMERA_INFO, SCENE, SCENE_STATIC, TF, TF_STATIC
+from mcaprl.recorder.record.display import CAMERA_INFO, MAP, SCENE, SCENE_STATIC, TF, TF_STATIC
 from mcaprl.storage.remote import as_path
 from mcaprl.texts import counted
 
 # On these topics, a message is valid until the next message of the same topic.
-_STATES = (SCENE, SCENE_STATIC, TF, TF_STATIC, CAMERA_INFO, PHASE_TOPIC)
+_STATES = (SCENE, SCENE_STATIC, MAP, TF, TF_STATIC, CAMERA_INFO, PHASE_TOPIC)
 
 
 @dataclass(frozen=True)

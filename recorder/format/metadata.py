@@ -173,6 +173,7 @@ class LogMetadata:
         success_reasons: End reasons of successful episodes; empty if unknown.
         view: Numbers for viewers, empty if unknown. `distance_m` and `tilt_deg` place the follow
             camera; `world_m`, `world_x_m` and `world_y_m` are the size and the center of the world;
+            `world_turn_deg` is the angle between y and up in the view of it;
             `depth_min_m` and `depth_max_m` are the limits of the depth colors; `speed_m_s` is the
             highest speed.
         step_duration_ns: Simulated time between two records, nanoseconds.

@@ -2,6 +2,8 @@
 
 /scene                  moving shapes, at most ten times a second, and at episode starts and ends
 /scene/static           static shapes, if they changed since the previous episode
+/scene/map              route, vehicle and its track in this episode, for a view from above, written
+                        when the track is a sixteenth longer
 /scene/tracks           tracks of the episodes so far, written at the ends of episodes
 /tf                     poses of the moving frames at and between the steps; each pose has its own
                         stamp
@@ -36,7 +38,7 @@ from mcaprl.recorder.record.camera import (
     VideoEncoder,
     rendered,
 )
-from mcaprl.recorder.record.layout import RETURN_SO_FAR
+from mcaprl.recorder.record.layout import AROUND_M, RETURN_SO_FAR
 from mcaprl.recorder.record.scene import (
     DepthSource,
     Frame,
@@ -49,6 +51,7 @@ from mcaprl.recorder.record.scene import (
     Tracks,
     camera_info,
     depth_millimeters,
+    map_shapes,
     marker_array,
     motion_transforms,
     transforms,
@@ -56,6 +59,7 @@ from mcaprl.recorder.record.scene import (
 from mcaprl.recorder.record.step_rows import ImageColumn
 
 SCENE, SCENE_STATIC, TRACKS = "/scene", "/scene/static", "/scene/tracks"
+MAP = "/scene/map"
 TF, TF_STATIC, TELEMETRY = "/tf", "/tf_static", "/telemetry"
 DEPTH, CAMERA_INFO = "/camera/depth", "/camera/camera_info"
 # Buffered display messages are written when their total size exceeds this number of bytes, and at
@@ -83,10 +87,11 @@ class ShownTopics:
         types: dict[str, str] = {}
         self.telemetry_names: tuple[str, ...] = ()
         self.follow_frame = ""
+        self._world_m = log.metadata.view.get("world_m", AROUND_M)
         if isinstance(source, SceneSource):
             self.follow_frame = next((frame.name for frame in source.frames()), "")
             types |= dict.fromkeys(
-                (SCENE, SCENE_STATIC, TRACKS), "visualization_msgs/msg/MarkerArray"
+                (SCENE, SCENE_STATIC, TRACKS, MAP), "visualization_msgs/msg/MarkerArray"
             )
             types |= dict.fromkeys((TF, TF_STATIC), "tf2_msgs/msg/TFMessage")
         self.channels = {topic: log.add_channel(topic, name) for topic, name in types.items()}
@@ -94,6 +99,10 @@ class ShownTopics:
             self.telemetry_names = tuple({RETURN_SO_FAR: 0.0, **source.telemetry()})
             name, text = telemetry_schema(self.telemetry_names)
             self.channels[TELEMETRY] = log.sink.add_channel(TELEMETRY, name, text)
+
+    def map(self, source: SceneSource, tracks: Tracks) -> bytes:
+        """Return a message of `/scene/map`."""
+        return marker_array(map_shapes(source, self.follow_frame, self._world_m, tracks))
 
     def telemetry(self, source: TelemetrySource, return_so_far: float) -> bytes:
         """Return a message of `/telemetry`."""
@@ -204,8 +213,8 @@ class Display:
                 self._draw_pending()
             frames = self._scene.frames()
             self._emit_motion(time_ns, frames)
-            if frames:
-                self._tracks.add(frames[0].position)
+            if frames and self._tracks.add(frames[0].position):
+                self._emit(MAP, time_ns, self.shown.map(self._scene, self._tracks))
         if self._telemetry is not None:
             message = self.shown.telemetry(self._telemetry, self._return_so_far)
             self._emit(TELEMETRY, time_ns, message)

@@ -33,6 +33,7 @@ VALUES_TOPIC = "/rl/values"
 TRAINING_TOPIC = "/rl/training"
 RETURN_SO_FAR = "return_so_far"
 _SCENE, _STATIC, _TRACKS, _DEPTH = "/scene", "/scene/static", "/scene/tracks", "/camera/depth"
+_MAP = "/scene/map"
 _WORLD = "map"
 _STILL = (_WORLD, "follow-none")
 _NONE: Sequence[str] = ()
@@ -41,8 +42,9 @@ _SPEED = "speed_m_s"
 _WATCHED = ("offset_m", "steering_rad", "distance_m")
 _MOST_DIALS = 4
 # Values for environments without `view_settings`.
-CAMERA_M, TILT_DEG, _AROUND_M, DEPTH_M, _HIGHEST_M_S = 22.0, 73.0, 100.0, (0.0, 50.0), 30.0
-# Length of the vehicle's axes in the view from above, as a share of the visible height.
+CAMERA_M, TILT_DEG, AROUND_M, DEPTH_M, _HIGHEST_M_S = 22.0, 73.0, 100.0, (0.0, 50.0), 30.0
+# Length of the vehicle's axes in the view from above of a log without /scene/map, as a share of
+# the visible height.
 _MARK = 0.03
 # End reasons of failures, from the sims and from Gymnasium. The indicator shows their names.
 _REASONS = (
@@ -202,25 +204,25 @@ class _Screens:
         surroundings of the vehicle.
         """
         view = self.metadata.view
-        height_m = view.get("world_m", _AROUND_M)
+        height_m = view.get("world_m", AROUND_M)
         camera = {
             "perspective": False,
             "distance": height_m,
             "phi": 0,
-            "thetaOffset": 0,
+            "thetaOffset": view.get("world_turn_deg", 0),
             "targetOffset": [view.get("world_x_m", 0), view.get("world_y_m", 0), 0],
         }
         follows = self.follow_frame and "world_m" not in view
         followed = (self.follow_frame, "follow-position") if follows else _STILL
-        shown = dict.fromkeys(self._of(_STATIC, _TRACKS), _NONE)
+        shown = dict.fromkeys(self._of(_STATIC, _TRACKS, _MAP), _NONE)
         title = "from above; tracks: yellow is best, red marks are failures"
         panel = panels.three_d(
             title if _TRACKS in shown else "from above",
             {_SCENE: ["speed"], **shown},
             camera,
             followed,
-            # The vehicle is too small to see, so larger axes mark its position.
-            axes_m=_MARK * height_m,
+            # The vehicle is too small to see, so an arrow of the map or larger axes mark it.
+            axes_m=0.0 if _MAP in shown else _MARK * height_m,
             without_axes=(_WORLD, IMAGE_FRAME),
         )
         return self._put("3D!above", panel)
@@ -258,7 +260,7 @@ class _Screens:
         spatial = self._sensors(_SPATIAL)
         if spatial and _SCENE not in self.topics:
             shown = dict.fromkeys(spatial, _NONE)
-            camera = {"perspective": False, "distance": _AROUND_M / 4, "phi": 0}
+            camera = {"perspective": False, "distance": AROUND_M / 4, "phi": 0}
             names.append(self._put("3D!robot", panels.three_d("robot", shown, camera, _STILL)))
         return names
 

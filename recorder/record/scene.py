@@ -6,7 +6,8 @@ simulator does not need to import this module. Axes follow REP 103: right-handed
 
 A message of `/tf` at the log_time of a step contains the poses of the frames until the end of the
 step, each with its own stamp: a viewer interpolates between two poses, so it needs the pose after
-the current time, too. `/scene/tracks` shows the tracks of a vehicle in the episodes so far.
+the current time, too. `/scene/tracks` shows the tracks of a vehicle in the episodes so far, and
+`/scene/map` its route, its track in this episode, and its place.
 """
 
 from __future__ import annotations
@@ -137,6 +138,14 @@ class SceneSource(Protocol):
 
     def frames(self) -> Sequence[Frame]:
         """Return the moving coordinate frames with their current poses."""
+
+
+@runtime_checkable
+class MapSource(Protocol):
+    """An environment with shapes for the view from above, such as a route."""
+
+    def map_scene(self) -> Sequence[Shape]:
+        """Return shapes that stay the same in an episode, large enough to see the whole world."""
 
 
 @runtime_checkable
@@ -380,6 +389,8 @@ def _scaled(frames: Sequence[Frame]) -> NDArray[np.float64]:
 
 _MAX_TRACKS = 32
 _MAX_POINTS = 64
+_LEAST_NEW = 4
+_VEHICLE_SHARE = 0.05
 _RAISED_M = 0.2
 _MIN_WIDTH_M = 0.05
 # A track is 1/250 of the world's size wide, so that it is visible in a view of the whole world. A
@@ -387,6 +398,7 @@ _MIN_WIDTH_M = 0.05
 _WIDTHS_PER_WORLD, _WIDTHS_PER_MARK = 250, 5
 _LOW_RETURN, _HIGH_RETURN = np.array([0.30, 0.25, 0.80]), np.array([0.98, 0.85, 0.25])
 _FAILED: Quad = (0.90, 0.10, 0.10, 1.0)
+_SO_FAR: Quad = (0.20, 0.62, 0.95, 1.0)
 
 
 class TrackShape(NamedTuple):
@@ -403,6 +415,24 @@ class TrackShape(NamedTuple):
     text: str = ""
 
 
+def map_shapes(source: object, frame: str, world_m: float, tracks: Tracks) -> list[Shape]:
+    """Return the shapes for a view from above: the route, this episode's track, and the vehicle.
+
+    Args:
+        source: Environment, which may be a `MapSource`.
+        frame: Frame of the vehicle; empty if there is none.
+        world_m: Visible height of the view from above, to which the sizes are adapted.
+        tracks: Tracks, whose current one is shown.
+    """
+    shapes: list[Shape] = [*source.map_scene()] if isinstance(source, MapSource) else []
+    shapes += tracks.so_far(world_m / _WIDTHS_PER_WORLD)
+    if frame:
+        half = _VEHICLE_SHARE * world_m / 2
+        ends, size = np.array([[-half, 0.0, 0.0], [half, 0.0, 0.0]]), (0.7 * half, 1.6 * half, half)
+        shapes.append(TrackShape("vehicle", "arrow", _FAILED, ends, size, frame=frame))
+    return shapes
+
+
 class _Track(NamedTuple):
     episode: int
     points_m: NDArray[np.float64]
@@ -416,15 +446,37 @@ class Tracks:
     def __init__(self) -> None:
         """Start without tracks."""
         self._tracks: deque[_Track] = deque(maxlen=_MAX_TRACKS)
-        self._points_m: list[Vector] = []
+        self.begin()
 
     def begin(self) -> None:
         """Begin an episode."""
-        self._points_m = []
+        self._points_m: list[Vector] = []
+        self._due = 1
 
-    def add(self, position_m: Vector) -> None:
-        """Add a position (x, y, z) of the vehicle in the map, meters."""
+    def add(self, position_m: Vector) -> bool:
+        """Add a position (x, y, z) of the vehicle in the map, meters.
+
+        Returns:
+            Whether to show the track so far again: at first, and when it is a sixteenth longer.
+        """
         self._points_m.append(position_m)
+        count = len(self._points_m)
+        is_due = count >= self._due
+        if is_due:
+            self._due = count + max(_LEAST_NEW, count // 16)
+        return is_due
+
+    def so_far(self, width_m: float) -> list[TrackShape]:
+        """Return a line through the positions of this episode, at most every 64th of them."""
+        count, stride = len(self._points_m), 1
+        if count < 2:
+            return []
+        # A stride that doubles leaves most points as they were, which compresses well.
+        while count > stride * _MAX_POINTS:
+            stride *= 2
+        kept_m = np.array(self._points_m[::stride], np.float64)
+        kept_m[:, 2] += _RAISED_M
+        return [TrackShape("track", "line", _SO_FAR, kept_m, (width_m, 0.0, 0.0))]
 
     def end(self, episode: int, total_reward: float, *, failed: bool) -> None:
         """Keep the episode's track, reduced to at most 64 evenly spaced positions."""

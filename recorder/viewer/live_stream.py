@@ -40,6 +40,7 @@ from mcaprl.recorder.format.schema import (
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.record.display import (
     DEPTH,
+    MAP,
     SCENE,
     SCENE_STATIC,
     TELEMETRY,
@@ -158,7 +159,7 @@ DEFAULT_SPEED = 2.0
 MAX_STEPS = 2_000
 """Maximum number of steps shown per episode; messages take about 20 kB per step in memory."""
 # Topics whose latest message is sent to each new viewer.
-_KEPT_TOPICS = (SCENE, SCENE_STATIC, TRACKS, TF, TF_STATIC, PHASE_TOPIC)
+_KEPT_TOPICS = (SCENE, SCENE_STATIC, TRACKS, MAP, TF, TF_STATIC, PHASE_TOPIC)
 # Poses within a step are sent only if the step takes at least this long.
 _SHORTEST_MOTION_NS = 10_000_000
 _ROW = slice(1)
@@ -423,8 +424,8 @@ class LiveStream(ViewerServer):
             inner = source.motion()
         between = [(time_ns - round(s / self._speed * 1e9), each) for s, each in inner]
         self._send_motion([*between, (time_ns, frames)])
-        if frames:
-            self._tracks.add(frames[0].position)
+        if frames and self._tracks.add(frames[0].position):
+            self._emit(MAP, time_ns, self._shown.map(source, self._tracks))
         if is_shown:
             self._emit(SCENE, time_ns, marker_array(source.scene()))
 

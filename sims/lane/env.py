@@ -183,9 +183,10 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     view_settings: ClassVar[dict[str, float]] = {
         "distance_m": 22.0,
         "tilt_deg": 73.0,
-        "world_m": 300.0,
+        "world_m": 190.0,
         "world_x_m": 65.0,
         "world_y_m": 1.5,
+        "world_turn_deg": 90.0,
         "depth_min_m": 3.0,
         "depth_max_m": 56.0,
         "speed_m_s": 30.0,

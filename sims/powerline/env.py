@@ -194,6 +194,10 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
         """Return the shapes that change with each step."""
         return powerline_scene.moving_shapes(self.flight, self.trail)
 
+    def map_scene(self) -> Sequence[Shape]:
+        """Return the route and the towers, large enough for a view of the whole world."""
+        return powerline_scene.map_shapes()
+
     def static_frames(self) -> Sequence[Frame]:
         """Return the camera's frame, relative to the drone: x right, y down, z along the view."""
         return (powerline_scene.camera_frame(self.fleet.camera_view),)

@@ -67,6 +67,7 @@ SUN = np.array([0.45, 0.35, 0.82])
 DRONE_SCALE = 5.0
 ROUTE_PIECE_M = 12.0
 """Length of the pieces of the route; see `cut`."""
+MAP_ROUTE_M, MAP_TOWER_M = 3.0, 9.0
 CROSSINGS = 6
 """Number of cross-braced sections of a tower."""
 
@@ -194,6 +195,17 @@ def ground_shapes() -> tuple[Shape, ...]:
 def static_shapes() -> tuple[Shape, ...]:
     """Return the shapes that never change: the ground, the rest of the world, and the drone."""
     return (*ground_shapes(), *_line(), *_drone())
+
+
+@functools.cache
+def map_shapes() -> tuple[Shape, ...]:
+    """Return the route and the tops of the towers for a view of the whole world from above."""
+    tops = np.array([[one.x_m, -one.y_m, -one.arm_z_m] for one in course.towers()])
+    size = (MAP_TOWER_M, MAP_TOWER_M, MAP_TOWER_M)
+    return (
+        Shape("route", "line", ROUTE, course.to_ros(course.POINTS_M), size=(MAP_ROUTE_M, 0.0, 0.0)),
+        Shape("towers", "spheres", STEEL, tops, size=size),
+    )
 
 
 def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple[Shape, ...]:

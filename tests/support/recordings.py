@@ -12,6 +12,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.behavior import LOG_DENSITY, behavior_field
 from mcaprl.recorder.record.wrapper import RecordMcap
 
@@ -157,3 +159,12 @@ def assert_holds(dataset: Any, truth: Truth) -> None:
         rows = [leaves_of(observation) for observation in getattr(truth, name)]
         for index, column in enumerate(leaves_of(getattr(dataset, name))):
             assert_same_bits(column, np.stack([row[index] for row in rows]))
+
+
+def read(path: Path, topic: str, type_name: str) -> list[tuple[int, Any]]:
+    """Return the times and messages of a topic with this type."""
+    reader = McapReader(path)
+    channel = reader.channel_of(topic)
+    assert channel is not None, f"no topic {topic}"
+    assert reader.schema_of(channel).name == type_name
+    return [(time, messages.decode(data, type_name)) for time, data in reader.messages(channel)]

@@ -18,6 +18,7 @@ from mcaprl.recorder.format import messages
 from mcaprl.recorder.record.scene import Tracks
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.scene import Shape
+from tests.support.recordings import read
 
 START_NS = 1_700_000_000 * 10**9
 STEP_NS = 250_000_000
@@ -39,13 +40,6 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         while not any(env.step(RIGHT)[2:4]):
             pass
     return path
-
-
-def read(path: Path, topic: str, type_name: str) -> list[tuple[int, Any]]:
-    reader = McapReader(path)
-    channel = reader.channel_of(topic)
-    assert channel is not None, f"no topic {topic}"
-    return [(time, messages.decode(data, type_name)) for time, data in reader.messages(channel)]
 
 
 def test_phase_is_running_until_the_reason_of_the_end(log: Path) -> None:
@@ -166,6 +160,39 @@ def test_track_colors_and_points_by_hand() -> None:
     assert lowest.size[0] == 199 / 250
     assert (mark.name, mark.position) == ("failed_2", (2.0, 0.0, 1.2))
     assert highest.points[-1].tolist() == [199.0, 0.0, 1.2]
+
+
+def test_the_track_of_the_running_episode_by_hand() -> None:
+    """It is due at 1 position, 4 later, and then at each sixteenth more, with 64 points at most."""
+    tracks = Tracks()
+    assert tracks.so_far(2.0) == []
+    due = [step for step in range(200) if tracks.add((float(step), 0.0, 1.0))]
+    assert due[:4] == [0, 4, 8, 12]
+    # 162 + 162 // 16 = 172, 172 + 10 = 182, and 182 + 11 = 193 positions.
+    assert due[-4:] == [161, 171, 181, 192]
+    (line,) = tracks.so_far(2.0)
+    assert line.points[:, 0].tolist() == list(range(0, 200, 4)), "200 / 64 is above 2"
+    assert (line.kind, line.size[0]) == ("line", 2.0)
+    tracks.begin()
+    assert tracks.add((0.0, 0.0, 0.0))
+    assert tracks.so_far(2.0) == []
+
+
+def test_the_map_has_route_track_and_vehicle(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    with closing(mcaprl.RecordMcap(make_sim("powerline"), path)) as env:
+        for _ in range(2):
+            env.reset(seed=1)
+            for _ in range(9):
+                env.step(0)
+    shown = read(path, "/scene/map", "visualization_msgs/msg/MarkerArray")
+    names = [[marker.ns for marker in array.markers[1:]] for _, array in shown]
+    first, later = ["route", "towers", "vehicle"], ["route", "towers", "track", "vehicle"]
+    assert names == [first, later, later] * 2
+    markers = {marker.ns: marker for marker in shown[-1][1].markers}
+    assert (len(markers["route"].points), len(markers["track"].points)) == (5, 9)
+    starts = [episode.log_time_ns[0] for episode in mcaprl.open(path).episodes]
+    assert [shown[0][0], shown[3][0]] == starts
 
 
 def test_only_the_latest_tracks_are_kept() -> None:

@@ -30,6 +30,7 @@ from tests.support.layouts import (
     series_of,
     sizes_of,
 )
+from tests.support.recordings import read
 
 SIMS: list[tuple[str, dict[str, Any]]] = [
     ("lane", {}),
@@ -184,6 +185,8 @@ def test_the_whole_track_is_in_view_from_above(sim: str) -> None:
     camera = layout["configById"]["3D!above"]["cameraState"]
     # The title bar is 30 px high.
     half_m = camera["distance"] / 2 * np.array([width_px / (height_px - 30), 1.0])
+    if camera["thetaOffset"] == 90:
+        half_m = half_m[::-1]
     pilot = make_pilot(env)
     observation, _ = env.reset(seed=1)
     is_over = False
@@ -227,10 +230,20 @@ def test_old_logs_without_tracks_have_a_track_as_a_plot() -> None:
 
 
 def test_the_vehicle_is_marked_from_above(tmp_path: Path) -> None:
-    panels = check_layout(recorded(tmp_path / "log.mcap", "lane"))["configById"]
-    scale = panels["3D!above"]["scene"]["transforms"]["axisScale"]
-    # Axes are 0.2 m long at a scale of 1. They must be 3 % of the world's 300 m, which is 9 m.
-    assert 0.2 * scale == pytest.approx(9.0)
+    log = recorded(tmp_path / "log.mcap", "lane")
+    panels = check_layout(log)["configById"]
+    assert panels["3D!above"]["topics"]["/scene/map"]["visible"]
+    assert panels["3D!above"]["scene"]["transforms"]["axisScale"] == 0
+    (_, shown), *_ = read(log, "/scene/map", "visualization_msgs/msg/MarkerArray")
+    arrow = shown.markers[-1]
+    # 5 % of the 190 m that are visible.
+    assert (arrow.ns, arrow.header.frame_id, arrow.type) == ("vehicle", "car", 0)
+    assert [point.x for point in arrow.points] == pytest.approx([-4.75, 4.75])
+    topics = ["/scene", "/scene/static", "/tf"]
+    old = layout_of(LogMetadata.of_env(make_sim("lane")), topics, [], "car")["configById"]
+    # Axes are 0.2 m long at a scale of 1. They must be 3 % of the world's 190 m, which is 5.7 m.
+    scale = old["3D!above"]["scene"]["transforms"]["axisScale"]
+    assert 0.2 * scale == pytest.approx(5.7)
     assert panels["3D!scene"]["scene"]["transforms"]["axisScale"] == 0
     assert panels["3D!above"]["topics"]["/scene"]["namespaces"] == {"speed": {"visible": False}}
 

@@ -33,6 +33,7 @@ from mcaprl.sims import SIMS, make_sim
 from mcaprl.sims.drawing.scene import Frame, Kind, Shape, cut
 from mcaprl.sims.evaluation.evaluate import make_pilot
 from tests.support.layouts import check_layout, series_of
+from tests.support.recordings import read
 
 EPISODES, STEPS = 2, 12
 
@@ -49,14 +50,6 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for _ in range(STEPS):
                 observation = recorder.step(pilot.act(observation[None])[0])[0]
     return path
-
-
-def read(path: Path, topic: str, type_name: str) -> list[tuple[int, Any]]:
-    reader = McapReader(path)
-    channel = reader.channel_of(topic)
-    assert channel is not None, f"no topic {topic}"
-    assert reader.schema_of(channel).name == type_name
-    return [(time, messages.decode(data, type_name)) for time, data in reader.messages(channel)]
 
 
 def step_times(path: Path) -> list[list[int]]:
