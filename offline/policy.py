@@ -159,9 +159,17 @@ class Policy(BasePolicy):
         The actions of a Box are in its own units. Those of a policy with chunks may have been
         predicted in an earlier call since `begin`.
 
+        Args:
+            observations: Observations (B, *shape), or nested dicts of them; with a frame stack k,
+                also stacks (B, k, *shape). For a single observation (*shape), without B, the result
+                is a single action. A single stack needs its B, because (k, *shape) are the
+                observations of k environments.
+
         Raises:
-            PolicyError: The shape of the observations is not (B, *shape).
+            PolicyError: The observations have another shape.
         """
+        if (batch := self._with_axis(observations)) is not None:
+            return self.act(batch)[0]
         observations = self.encoder.arranged(observations)
         if self.frame_stack > 1 and not self._is_stack(observations):
             inputs = self._stack_onto_stored(self._encode(observations))
@@ -252,6 +260,17 @@ class Policy(BasePolicy):
         if found is None:
             raise PolicyError(f"{self.name} ({self.algo}) has no probabilities, only densities")
         return cast(NDArray[np.float32], found.numpy())
+
+    def _with_axis(self, observation: Any) -> Any:
+        """Return a single observation as a batch; None if it is none."""
+        try:
+            batch = mapped(lambda part: np.asarray(part)[None], observation)
+            arranged = self.encoder.arranged(batch)
+            shapes = [np.shape(leaf.of(arranged)) for leaf in self.encoder.leaves]
+        # A ragged list has no shape.
+        except (KeyError, IndexError, TypeError, ValueError):
+            return None
+        return batch if shapes == [(1, *leaf.shape) for leaf in self.encoder.leaves] else None
 
     def _is_stack(self, observations: Any) -> bool:
         """Return whether `observations` are stacks (B, frame_stack, *shape)."""

@@ -82,14 +82,14 @@ def test_a_comparison_excludes_all_that_shows_the_log(
         assert "run replay once for each" in capsys.readouterr().err
 
 
-def test_one_observation_without_an_axis_is_refused_with_a_hint(data: Path) -> None:
+def test_one_observation_has_one_action_but_values_of_batches_only(data: Path) -> None:
     run = data.parent / "run"
     assert cli.run(["train-offline", str(data), "--out", str(run), *SMALL]) == 0
     policy = mcaprl.load_policy(run)
     one = mcaprl.open(data).observations[0]
     with pytest.raises(PolicyError, match=r"got \(5,\); add an axis .* observation\[None\]"):
-        policy.act(one)
-    assert policy.act(one[None]).shape == (1,)
+        policy.q_values(one)
+    assert policy.act(one) == policy.act(one[None])[0]
 
 
 def test_the_parts_of_one_dict_are_named_in_the_hint() -> None:

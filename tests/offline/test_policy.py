@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mcaprl.api.policies import load_policies, load_policy
 from mcaprl.errors import PolicyError, ReportError
+from mcaprl.frames import mapped
 from mcaprl.networks import Convolutions
 from mcaprl.offline.algorithms.bc import BC
 from mcaprl.offline.algorithms.bcq import BCQ
@@ -282,7 +283,51 @@ def test_observations_are_not_modified(tmp_path: Path) -> None:
     assert policy.act(np.asfortranarray(observations, np.float64)).tolist() == [6, 6, 6]
 
 
-@pytest.mark.parametrize("shape", [(N_CELLS,), (3, N_CELLS + 1), (3, 1, N_CELLS), ()])
+SINGLES: dict[str, Any] = {
+    "vector": np.arange(24, dtype=np.float32).reshape(8, 3),
+    "number": np.arange(8, dtype=np.float32),
+    "images": np.arange(8 * 36 * 36, dtype=np.uint32).astype(np.uint8).reshape(8, 36, 36, 1),
+    "dict": {"x": np.arange(16, dtype=np.float32).reshape(8, 2), "speed": np.arange(8.0)},
+}
+
+
+@pytest.mark.parametrize("kind", SINGLES)
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_single_observation_has_the_action_of_a_batch_of_one(
+    tmp_path: Path, kind: str, count: int
+) -> None:
+    """Also with a frame stack, whose frames are the same ones."""
+    frames = SINGLES[kind]
+    dataset = Dataset.from_arrays(
+        observations=mapped(lambda part: part[:-1], frames),
+        actions=np.arange(7) % 3,
+        rewards=np.ones(7),
+        terminated=np.arange(7) == 6,
+        truncated=np.zeros(7, bool),
+        next_observations=mapped(lambda part: part[1:], frames),
+    )
+    policy = saved_and_loaded(tmp_path, learner_of(BCConfig(**TINY, frame_stack=count), dataset))
+    found = []
+    for rows in (range(3), [slice(k, k + 1) for k in range(3)]):
+        policy.begin()
+        found.append([policy.act(mapped(lambda part, k=k: part[k], frames)) for k in rows])
+    singles, batches = found
+    assert [action.shape for action in singles + batches] == [()] * 3 + [(1,)] * 3
+    np.testing.assert_array_equal(singles, np.concatenate(batches))
+    if kind == "dict":
+        assert policy.act({"x": [1, 2], "speed": 3.0, "more": "unused"}).shape == ()
+        with pytest.raises(PolicyError, match=r"expects observations \(B\) of speed, got \(\)"):
+            policy.act({"x": frames["x"][:1], "speed": 3.0})
+
+
+def test_as_many_frames_as_a_stack_are_a_batch(tmp_path: Path) -> None:
+    policy, frames = walk_policy(tmp_path, 3), np.array([[1.0], [5.0], [9.0]], np.float32)
+    assert policy.act(frames).shape == (3,), "of three environments"
+    policy.begin()
+    assert policy.act(frames[None]).shape == (1,), "a stack"
+
+
+@pytest.mark.parametrize("shape", [(3, N_CELLS + 1), (3, 1, N_CELLS), ()])
 def test_observations_of_another_shape_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
     policy = saved_and_loaded(tmp_path, learner_with_outputs(CQL, [1.0, 2.0]))
     with pytest.raises(PolicyError, match=r"expects observations \(B, 5\), got"):
