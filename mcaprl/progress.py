@@ -192,12 +192,14 @@ class TrainingProgress:
         done: Number of completed updates or steps.
         total: Total number of updates or steps.
         terms: Measured values, such as the loss; empty where a resumed training continues.
+        activity: What is done while the training waits, such as `evaluating 4 candidates`.
     """
 
     seed: int
     done: int
     total: int
     terms: Mapping[str, float]
+    activity: str = ""
 
 
 ProgressCallback = Callable[[TrainingProgress], None]
@@ -240,7 +242,8 @@ def terminal_progress(unit: str, *terms: str) -> Iterator[ProgressCallback]:
                     bars.console.print(resumed, markup=False, highlight=False)
             bar, began, first = started[now.seed]
             rate = (now.done - first) / max(time.perf_counter() - began, 1e-9)
-            bars.update(bar, completed=now.done, rate=rate, shown=_shown_term(now, terms))
+            text = now.activity or _shown_term(now, terms)
+            bars.update(bar, completed=now.done, rate=rate, shown=text)
 
         yield show
 
@@ -256,7 +259,8 @@ class Training:
     def __init__(self, unit: str, terms: Sequence[str]) -> None:
         """Begin the training."""
         self._unit, self._terms = unit, terms
-        self._preparing = Work("preparing", None)
+        # What is done instead of training.
+        self._activity: Work | None = Work("preparing", None)
         # Last report of each seed, and time and progress at its first one.
         self._last: dict[int, TrainingProgress] = {}
         self._first: dict[int, tuple[float, int]] = {}
@@ -265,14 +269,17 @@ class Training:
         """Accept the progress of a seed; print where it is resumed."""
         if resumed := _text_of_resumed(now, self._unit):
             _print(resumed)
+        self._activity = Work(now.activity, None) if now.activity else None
+        if now.activity:
+            return
         self._first.setdefault(now.seed, (time.monotonic(), now.done))
         self._last[now.seed] = now
 
     def line(self) -> str:
         """Return the progress of the seeds that are trained in parallel with the last reported."""
+        if self._activity is not None:
+            return self._activity.line()
         last = list(self._last.values())
-        if not last:
-            return self._preparing.line()
         now = next((each for each in last if each.done < each.total), last[-1])
         seeds = [str(each.seed) for each in last if each.done == now.done]
         text = f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {', '.join(seeds)}"
@@ -283,7 +290,9 @@ class Training:
 
 
 def _text_of_resumed(now: TrainingProgress, unit: str) -> str:
-    return f"seed {now.seed}: resumed at {now.done} of {now.total} {unit}" if not now.terms else ""
+    if now.terms or now.activity:
+        return ""
+    return f"seed {now.seed}: resumed at {now.done} of {now.total} {unit}"
 
 
 def _shown_term(now: TrainingProgress, terms: Sequence[str]) -> str:

@@ -92,6 +92,19 @@ def test_a_line_about_seeds_that_are_trained_one_after_the_other_names_the_curre
     assert training.line() == "seed 1: 50 of 100 steps"
 
 
+def test_a_line_about_training_says_what_it_waits_for(
+    clock: Clock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    training = Training("updates", ("loss",))
+    training.report(TrainingProgress(0, 100, 200, {"loss": 0.5}))
+    training.report(TrainingProgress(0, 100, 200, {}, "evaluating 4 candidates"))
+    clock.now_s += 12
+    assert training.line() == "evaluating 4 candidates: 12 s"
+    training.report(TrainingProgress(0, 150, 200, {"loss": 0.25}))
+    assert training.line().startswith("seed 0: 150 of 200 updates, loss 0.25")
+    assert capsys.readouterr().err == "", "it is not resumed"
+
+
 def test_a_line_about_training_has_the_first_known_term(clock: Clock) -> None:
     training = Training("steps", ("score", "mean_return"))
     lines = []

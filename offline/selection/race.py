@@ -86,6 +86,7 @@ from mcaprl.runs import (
     policy_files,
     saved_updates,
 )
+from mcaprl.texts import counted
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -404,15 +405,18 @@ class _Race:
             self._done[name, now.seed] = now.done
             if not now.terms:
                 return
-            done = sum(count for (_, seed), count in self._done.items() if seed == now.seed)
-            total = self._total
-            self._progress(TrainingProgress(now.seed, min(done, total), total, now.terms))
+            self._progress(self._now(now.seed, now.terms))
             if now.seed == self._seeds[-1]:
                 if now.done >= until:
                     raise Pause
                 self._stop_after(ends)
 
         return report
+
+    def _now(self, seed: int, terms: Mapping[str, float], activity: str = "") -> TrainingProgress:
+        """Return the progress of a seed of all candidates together."""
+        done = sum(count for (_, each), count in self._done.items() if each == seed)
+        return TrainingProgress(seed, min(done, self._total), self._total, terms, activity)
 
     def _train_into(
         self, folder: Path, config: TrainingConfig, seeds: range, progress: ProgressCallback
@@ -460,6 +464,8 @@ class _Race:
     ) -> dict[str, list[Evidence]]:
         """Return the evidence of all models on the networks of each candidate, if time allows."""
         policies = {name: self._policies(name) for name in names}
+        activity = f"evaluating {counted(len(names), 'candidate')}"
+        self._progress(self._now(self._seeds[-1], {}, activity))
         ends, updates = time.perf_counter() + self._left_s(share), round(wanted)
         ticks: list[float] = []
 

@@ -204,6 +204,8 @@ def test_progress_is_that_of_one_training(data: Dataset, tmp_path: Path) -> None
     done = [now.done for now in reported]
     assert done == sorted(done)
     assert done[-1] == reported[-1].total == 10 * len(PORTFOLIO) + 2 * 30
+    activities = [now.activity for now in reported if now.activity]
+    assert activities == [f"evaluating {len(PORTFOLIO)} candidates", "evaluating 2 candidates"]
 
 
 def test_a_budget_ends_the_run_with_a_policy(data: Dataset, tmp_path: Path) -> None:
