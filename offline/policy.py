@@ -169,7 +169,8 @@ class Policy(BasePolicy):
             PolicyError: The observations have another shape.
         """
         if (batch := self._with_axis(observations)) is not None:
-            return self.act(batch)[0]
+            action: NDArray[Any] = self.act(batch)[0]
+            return action
         observations = self.encoder.arranged(observations)
         if self.frame_stack > 1 and not self._is_stack(observations):
             inputs = self._stack_onto_stored(self._encode(observations))

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import re
 import shlex
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -18,6 +21,13 @@ PAGES = [
     *sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md")),
 ]
 GENERATED = {"docs/cli.md", "docs/api.md", "docs/mapping.md"}
+# Other tools that the page is about, which have their own installation.
+OTHERS = {
+    "docs/formats.md": {"minari"},
+    "docs/howto/environment.md": {"ale_py"},
+    "docs/howto/lerobot.md": {"lerobot", "torch"},
+}
+SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())
 RUN = {"python", "sh", "sql", "js", "output", "yaml", "toml"}
 
 
@@ -70,6 +80,30 @@ def test_every_block_has_a_known_language(page: str) -> None:
 def test_blocks_that_are_not_run_have_a_reason(page: str) -> None:
     for comment in re.findall(r"<!--+\s*skip:\s*(.*?)-->", (ROOT / page).read_text()):
         assert re.fullmatch(r'next (if\(quick, )?"[^"]{8,}"\)? ', comment), comment
+
+
+@pytest.mark.parametrize("page", sorted(set(with_code()) - GENERATED))
+def test_the_extras_of_a_page_contain_what_it_imports(page: str) -> None:
+    text, project = (ROOT / page).read_text(), SETTINGS["project"]
+    named = set(re.findall(r"[Ee]xtras?(?: is|:)?\s+`(\w+)`", text))
+    for extras in re.findall(r"(?:mcaprl|\.)\[([\w,]+)\]'", text):
+        named |= set(extras.split(","))
+    wanted, seen = [*project["dependencies"]], set[str]()
+    while extras := named - seen:
+        seen |= extras
+        for extra in extras:
+            wanted += project["optional-dependencies"][extra]
+        for extras_of_ours in re.findall(r"mcaprl\[([\w,]+)\]", " ".join(wanted)):
+            named |= set(extras_of_ours.split(","))
+    names = {re.split(r"[^\w.-]", each)[0].lower().replace("-", "_") for each in wanted}
+    found = packages_distributions()
+    for block in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+        for module in re.findall(r"^ *(?:import|from) (\w+)", block, re.MULTILINE):
+            is_ours = module == "mcaprl" or f"<!-- file: {module}.py" in text
+            if is_ours or module in sys.stdlib_module_names or module in OTHERS.get(page, ()):
+                continue
+            packages = {each.lower().replace("-", "_") for each in found.get(module, [module])}
+            assert packages & names, f"{page} imports {module}, which no extra on it contains"
 
 
 def test_every_command_is_in_a_block_that_runs() -> None:
