@@ -15,6 +15,7 @@ import mcaprl
 from benchmarks.suite import __main__ as suite
 from benchmarks.suite import learners, page, statistics, tasks
 from mcaprl.sims import interquartile_mean
+from tests.support.rivals import run_rivals
 
 SCORES = np.array([[1.0, 5.0], [2.0, 6.0], [3.0, 7.0], [4.0, 8.0]])
 """Scores of four runs of two tasks."""
@@ -202,3 +203,13 @@ def test_results_in_the_repository_have_four_seeds_of_known_tasks() -> None:
         assert each["tier"] == tasks.TASKS[task].tier
         assert kind in tasks.TASKS[task].kinds
         assert page.cell_path(task, kind, learner).is_file()
+
+
+def test_tasks_of_other_packages_are_determined_by_the_seed_and_solved_by_their_pilots() -> None:
+    shapes = {"PointMaze": [2], "Reach": [39], "DrawerOpen": [39]}
+    found = json.loads(run_rivals("-m", "tests.support.suite_tasks", *shapes))
+    assert {name: each["shape"] for name, each in found.items()} == shapes
+    for each in found.values():
+        assert (each["fits"], each["repeats"], each["differs"]) == (True, True, True)
+        # The scale is the mean of other episodes.
+        assert each["score"] == pytest.approx(1, abs=0.05)

@@ -1,6 +1,6 @@
 """Tasks of the suite: environments, behavior policies, and logs that are made from seeds.
 
-    python -m benchmarks.suite.tasks CartPole-v1     # trains the policies of behaviors/ again
+    python -m benchmarks.suite.tasks CartPole     # trains the policies of behaviors/ again
 
 The behaviors of a task are three stages of one online training, `early`, `medium` and `expert`,
 which are in behaviors/TASK/STAGE with weights of 16 bits, or a scripted `pilot`. The file
@@ -11,9 +11,11 @@ of the best behavior, which are the scores 0 and 1.
 from __future__ import annotations
 
 import argparse
+import importlib
 import importlib.util
 import json
 import shutil
+import warnings
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -25,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load_file, save_file
 
+import benchmarks.suite.environments  # noqa: F401
 import mcaprl
 from benchmarks.studies.pendulum_data import pilot as pendulum_pilot
 from mcaprl.files import write_json
@@ -138,6 +141,36 @@ def swing(_: Any) -> Scripted:
     return Scripted(lambda seen: np.array([pendulum_pilot(seen)], np.float32))
 
 
+def navigator(env: Any) -> Scripted:
+    """Return the navigator that made the data sets of `ogbench`, without its noise.
+
+    It moves toward the middle of the next cell on a shortest path.
+    """
+    maze = env.unwrapped
+
+    def move(seen: NDArray[Any]) -> Any:
+        offset = maze.get_oracle_subgoal(seen, maze.cur_goal_xy)[0] - seen
+        return (offset / (np.linalg.norm(offset) + 1e-6)).astype(np.float32)
+
+    return Scripted(move)
+
+
+def arm_pilot(policy: str) -> Callable[[Any], Scripted]:
+    """Return the function that makes a scripted policy of `metaworld`."""
+
+    def make(_: Any) -> Scripted:
+        script = getattr(importlib.import_module("metaworld.policies"), policy)()
+
+        def move(seen: NDArray[Any]) -> Any:
+            # It warns of actions that have to be clipped.
+            with warnings.catch_warnings(action="ignore"):
+                return np.clip(script.get_action(seen), -1, 1).astype(np.float32)
+
+        return Scripted(move)
+
+    return make
+
+
 _DQN: Final[dict[str, Any]] = {
     "algo": "double-dqn",
     "hidden": (64, 64),
@@ -195,6 +228,11 @@ TASKS: Final[dict[str, Task]] = {
         online=_SAC | {"steps": 20_000},
         stages=(-20, -10),
         needs="mujoco",
+    ),
+    "PointMaze": Task("PointMaze-v0", "study", pilot=navigator, noise=0.5, needs="ogbench"),
+    "Reach": Task("Reach-v3", "study", pilot=arm_pilot("SawyerReachV3Policy"), needs="metaworld"),
+    "DrawerOpen": Task(
+        "DrawerOpen-v3", "study", pilot=arm_pilot("SawyerDrawerOpenV3Policy"), needs="metaworld"
     ),
     "LunarLanderContinuous": Task("LunarLanderContinuous-v3", "study", pilot=lander, needs="Box2D"),
     "lane sticks": Task("lane", "study", 0.97, _STICKS, noise=0.1),

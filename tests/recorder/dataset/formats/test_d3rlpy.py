@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,14 +21,14 @@ from mcaprl.recorder.dataset.format_registry import FORMATS, write_format
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of
-from tests.conftest import need
 from tests.support.recordings import assert_same_bits
+from tests.support.rivals import run_rivals
 from tests.support.strategies import transitions
 from tests.support.transitions import is_plain
 
 h5py = pytest.importorskip("h5py", reason="needs the extra interop")
 
-_PROGRAM = Path(__file__).with_name("run_d3rlpy.py")
+PROGRAM = Path(__file__).with_name("run_d3rlpy.py")
 _SPACE = spaces.Dict(
     {
         "camera": spaces.Box(0, 255, (8, 9, 3), np.uint8),
@@ -277,7 +275,7 @@ def test_d3rlpys_picker_gives_every_transition(tmp_path: Path) -> None:
     log = _saved(_vectors(), tmp_path / "log.mcap")
     mcaprl.convert(log, tmp_path / "out.h5", to="d3rlpy")
     direct = ["transitions", log, tmp_path / "direct.npz"]
-    run_d3rlpy(*direct, "--", "load", tmp_path / "out.h5", tmp_path / "loaded.npz")
+    run_rivals(PROGRAM, *direct, "--", "load", tmp_path / "out.h5", tmp_path / "loaded.npz")
     for name in ("direct", "loaded"):
         with np.load(tmp_path / f"{name}.npz") as found:
             assert found["observation"][:, 0].tolist() == [0, 1, 2, 10, 11]
@@ -303,7 +301,7 @@ def test_d3rlpy_has_images_with_the_channels_first_and_trains(tmp_path: Path) ->
     dataset = _images()
     log = _saved(dataset, tmp_path / "log.mcap")
     vectors = _saved(_vectors(), tmp_path / "vectors.mcap")
-    run_d3rlpy("transitions", log, tmp_path / "out.npz", "--", "train", vectors)
+    run_rivals(PROGRAM, "transitions", log, tmp_path / "out.npz", "--", "train", vectors)
     with np.load(tmp_path / "out.npz") as found:
         camera, gray = (dataset.frames[key] for key in ("camera", "gray"))
         np.testing.assert_array_equal(found["observation_0"], np.moveaxis(camera[:2], -1, 1))
@@ -316,7 +314,7 @@ def test_d3rlpy_has_images_with_the_channels_first_and_trains(tmp_path: Path) ->
 def test_d3rlpys_own_files_are_read(tmp_path: Path) -> None:
     log = _saved(_vectors(), tmp_path / "log.mcap")
     dump, back = ["dump", log, tmp_path / "dumped.h5"], ["back", log, tmp_path / "back.mcap"]
-    run_d3rlpy(*dump, "--", *back, "--", "collect", tmp_path / "collected.h5")
+    run_rivals(PROGRAM, *dump, "--", *back, "--", "collect", tmp_path / "collected.h5")
     for path in (tmp_path / "dumped.h5", tmp_path / "back.mcap"):
         found = mcaprl.open(path)
         assert found.frames[:, 0].tolist() == [0, 1, 2, 2, 10, 11, 12]
@@ -328,19 +326,3 @@ def test_d3rlpys_own_files_are_read(tmp_path: Path) -> None:
     assert found.observations[:, 0].tolist() == [0, 1, 2, 10, 11]
     assert found.next_observations[:, 0].tolist() == [1, 2, 2, 11, 12]
     assert found.truncated.tolist() == [False, False, False, False, True]
-
-
-def run_d3rlpy(*arguments: object) -> None:
-    """Run d3rlpy; skip the test if d3rlpy is not installed."""
-    python = os.environ.get("MCAPRL_D3RLPY_PYTHON", f"{sys.prefix}/rivals/bin/python")
-    need(Path(python).exists(), "d3rlpy is not installed: make .venv/.rivals")
-    kept = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
-    done = subprocess.run(
-        [python, "-W", "ignore", str(_PROGRAM), *map(str, arguments)],
-        env=kept,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]

@@ -11,7 +11,8 @@ from gymnasium import spaces
 
 import mcaprl
 from mcaprl.errors import SpaceError
-from tests.recorder.dataset.formats.test_d3rlpy import run_d3rlpy
+from tests.recorder.dataset.formats.test_d3rlpy import PROGRAM
+from tests.support.rivals import run_rivals
 
 h5py = pytest.importorskip("h5py", reason="needs the extra interop")
 
@@ -94,7 +95,7 @@ def test_d3rlpy_reads_the_same_transitions(tmp_path: Path) -> None:
     terminal = (rng.random(40) < 0.7).tolist()
     for is_discrete in (False, True):
         path = _write(tmp_path / "a.h5", lengths, terminal, is_discrete=is_discrete)
-        run_d3rlpy("load_v1", path, tmp_path / "theirs.npz")
+        run_rivals(PROGRAM, "load_v1", path, tmp_path / "theirs.npz")
         with pytest.warns(UserWarning, match="no next_observations"):
             found = mcaprl.open(path)
         with np.load(tmp_path / "theirs.npz") as theirs:
