@@ -151,15 +151,15 @@ $(BENCH)/.ready: $(SETTINGS)
 	@touch $@
 
 # d3rlpy requires an older gymnasium, and metaworld an older MuJoCo, but they run with those of
-# constraints.txt and rivals.txt; so do SCOPE-RL and OGBench without dependencies that they
-# need for other things.
+# constraints.txt and rivals.txt; so do SCOPE-RL, MinAtar and OGBench without dependencies
+# that they need for other things.
 $(VENV)/.rivals: $(SETTINGS) benchmarks/rivals.txt | $(VENV)/bin/python
 	@echo "installing into $(VENV)/rivals: d3rlpy and SCOPE-RL with PyTorch, about 1.9 GB"
 	$(BIN)/python -m venv $(VENV)/rivals
 	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -e '.[sims,offline,online]'
 	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -r benchmarks/rivals.txt
 	$(VENV)/rivals/bin/python -m pip install -qq --no-deps d3rlpy==2.8.1 scope-rl==0.2.1 \
-	  metaworld==3.1.1 ogbench==1.2.2
+	  MinAtar==1.0.15 metaworld==3.1.1 ogbench==1.2.2
 	@touch $@
 
 # LeRobot, which the tests run in a separate environment: it requires older versions of PyTorch, NumPy

@@ -206,10 +206,13 @@ def test_results_in_the_repository_have_four_seeds_of_known_tasks() -> None:
 
 
 def test_tasks_of_other_packages_are_determined_by_the_seed_and_solved_by_their_pilots() -> None:
-    shapes = {"PointMaze": [2], "Reach": [39], "DrawerOpen": [39]}
+    shapes = {"Breakout": [10, 10, 4], "PointMaze": [2], "Reach": [39], "DrawerOpen": [39]}
     found = json.loads(run_rivals("-m", "tests.support.suite_tasks", *shapes))
+    # d3rlpy learns from images, too.
+    assert len(actions := found.pop("clone")) == 50
+    assert set(actions) <= {0, 1, 2}
     assert {name: each["shape"] for name, each in found.items()} == shapes
     for each in found.values():
         assert (each["fits"], each["repeats"], each["differs"]) == (True, True, True)
-        # The scale is the mean of other episodes.
-        assert each["score"] == pytest.approx(1, abs=0.05)
+        # The scale is the mean of more episodes, and those of Breakout have very different lengths.
+        assert each["score"] == pytest.approx(1, abs=1 if each["shape"] == [10, 10, 4] else 0.05)

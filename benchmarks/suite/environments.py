@@ -12,6 +12,32 @@ from unittest import mock
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
+
+
+class Breakout(gym.ObservationWrapper[NDArray[np.uint8], Any, Any]):
+    """MinAtar's Breakout with the three actions that it uses, and cells of 0 or 255, not of bool.
+
+    So an observation (10, 10, 4) is an image, whose channels are paddle, ball, trail and bricks.
+    """
+
+    def __init__(self) -> None:
+        """Make the game of the package `minatar`."""
+        from minatar.gym import BaseEnv
+
+        super().__init__(BaseEnv("breakout", use_minimal_action_set=True))
+        shape = self.env.observation_space.shape
+        self.observation_space = gym.spaces.Box(0, 255, shape, np.uint8)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the game, and the action that the first step may repeat, which it does not."""
+        game: Any = self.unwrapped
+        game.game.last_action = 0
+        return super().reset(seed=seed, options=options)
+
+    def observation(self, observation: NDArray[np.bool]) -> NDArray[np.uint8]:
+        """Return cells as pixels."""
+        return observation * np.uint8(255)
 
 
 class PointMaze(gym.Wrapper[Any, Any, Any, Any]):
@@ -74,6 +100,7 @@ def arm(task: str) -> gym.Env[Any, Any]:
 
 
 _ENTRIES: Final[dict[str, tuple[Any, int, dict[str, Any]]]] = {
+    "Breakout-v1": (Breakout, 1_000, {}),
     "PointMaze-v0": (PointMaze, 1_000, {}),
     "Reach-v3": (arm, 200, {"task": "reach-v3"}),
     "DrawerOpen-v3": (arm, 200, {"task": "drawer-open-v3"}),

@@ -11,10 +11,12 @@ from typing import Any, Final
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 import mcaprl
 from benchmarks.suite.tasks import Task, space_of
 from mcaprl.api import load_policies
+from mcaprl.architecture import ENCODERS
 from mcaprl.offline import ALGORITHMS, BOX_ALGORITHMS, BootstrapConfig
 
 SHARED: Final[dict[str, Any]] = {
@@ -95,15 +97,23 @@ def train_d3rlpy(task: Task, data: mcaprl.Dataset, algo: str, seeds: int) -> Tra
     box, shared = is_box(task), RELEASE if task.tier == "release" else SHARED
     space = d3rlpy.ActionSpace.CONTINUOUS if box else d3rlpy.ActionSpace.DISCRETE
     log = d3rlpy.dataset.MDPDataset(
-        data.observations.astype(np.float32),
+        _inputs(data.observations),
         data.actions,
         data.rewards.astype(np.float32),
         data.terminated.astype(np.float32),
         data.truncated.astype(np.float32),
         action_space=space,
     )
-    encoder = d3rlpy.models.VectorEncoderFactory(list(shared["hidden"]))
     settings: dict[str, Any] = {"batch_size": shared["batch_size"]}
+    if len(data.observation_space.shape or ()) == 3:
+        small = ENCODERS["small"]
+        filters = [
+            [size, *kernel] for size, kernel in zip(small.channels, small.kernels, strict=True)
+        ]
+        encoder = d3rlpy.models.PixelEncoderFactory(filters, shared["hidden"][0])
+        settings |= {"observation_scaler": d3rlpy.preprocessing.PixelObservationScaler()}
+    else:
+        encoder = d3rlpy.models.VectorEncoderFactory(list(shared["hidden"]))
     parts = ("actor_", "critic_") if box and algo != "bc" else ("",)
     for part in parts:
         settings |= {f"{part}encoder_factory": encoder}
@@ -147,7 +157,13 @@ class _Predictor:
         self._predict = predict
 
     def act(self, observations: Any) -> Any:
-        return self._predict(np.asarray(observations, np.float32))
+        return self._predict(_inputs(observations))
+
+
+def _inputs(observations: NDArray[Any]) -> NDArray[Any]:
+    """Return observations as d3rlpy expects them: images with the channels first, or float32."""
+    seen = np.asarray(observations)
+    return np.moveaxis(seen, -1, 1) if seen.ndim == 4 else seen.astype(np.float32)
 
 
 def train(task: Task, data: mcaprl.Dataset, learner: str, seeds: int, folder: Path) -> Trained:

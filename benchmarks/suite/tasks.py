@@ -141,6 +141,25 @@ def swing(_: Any) -> Scripted:
     return Scripted(lambda seen: np.array([pendulum_pilot(seen)], np.float32))
 
 
+def paddle(_: Any) -> Scripted:
+    """Return a pilot of Breakout that moves the paddle to where the falling ball will land.
+
+    While the ball rises, the paddle follows it.
+    """
+
+    def move(seen: NDArray[np.uint8]) -> np.int64:
+        (row, column), (last_row, last), (_, place) = (
+            np.argwhere(seen[..., channel])[0] for channel in (1, 2, 0)
+        )
+        step = int(column - last) or (1 if column == 0 else -1)
+        # The ball bounces off the paddle below the cell that it is in before the last row.
+        for _ in range(8 - row if row > last_row else 0):
+            column, step = (column + step, step) if 0 <= column + step <= 9 else (column, -step)
+        return np.int64(0 if column == place else 2 if column > place else 1)
+
+    return Scripted(move)
+
+
 def navigator(env: Any) -> Scripted:
     """Return the navigator that made the data sets of `ogbench`, without its noise.
 
@@ -211,6 +230,7 @@ TASKS: Final[dict[str, Task]] = {
         pilot=lambda _: Scripted(lambda seen: np.int64(2 if seen[1] > 0 else 0)),
     ),
     "LunarLander": Task("LunarLander-v3", "study", pilot=lander, needs="Box2D"),
+    "Breakout": Task("Breakout-v1", "study", pilot=paddle, needs="minatar"),
     "lane": Task("lane", "study", 0.97),
     "powerline": Task("powerline", "study", 0.97),
     "racer": Task("racer", "study", 0.98),
