@@ -46,7 +46,7 @@ def clone(name: str) -> list[int]:
         pilot = tasks.behavior(name, "pilot", env)
         mcaprl.record(env, f"{folder}/a.mcap", policy=pilot, steps=100, seed=0, scene=False)
         data = mcaprl.open(f"{folder}/a.mcap")
-    learners.SHARED |= {"updates": 5}
+    learners.SHARED["updates"] = 5
     (policy,), _ = learners.train_d3rlpy(task, data, "bc", 1)
     actions: list[int] = policy.act(data.observations[:50]).tolist()
     return actions
