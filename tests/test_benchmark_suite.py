@@ -207,7 +207,7 @@ def test_results_in_the_repository_have_four_seeds_of_known_tasks() -> None:
 
 def test_tasks_of_other_packages_are_determined_by_the_seed_and_solved_by_their_pilots() -> None:
     shapes = {"Breakout": [10, 10, 4], "PointMaze": [2], "Reach": [39], "DrawerOpen": [39]}
-    found = json.loads(run_rivals("-m", "tests.support.suite_tasks", *shapes))
+    found = json.loads(run_rivals("-m", "tests.suite_tasks", *shapes))
     # d3rlpy learns from images, too.
     assert len(actions := found.pop("clone")) == 50
     assert set(actions) <= {0, 1, 2}
