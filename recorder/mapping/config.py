@@ -95,7 +95,8 @@ class Quantity(_Part):
     field: str | None = Field(
         default=None,
         description="Path of a field, such as `/odom.twist.twist.linear.x`, `/scan.ranges[::10]`,"
-        " `/low.motors[3].q` or, for a vector, `/low.motors[0:12].q`.",
+        " `/low.motors[3].q` or, for a vector, `/low.motors[0:12].q`. With `grid`, the name of a"
+        " field of the grid.",
     )
     names: str | list[str] | None = Field(
         default=None,
@@ -141,10 +142,11 @@ class Quantity(_Part):
     )
     grid: str | None = Field(
         default=None,
-        description="Topic of occupancy grids (OccupancyGrid), which become images (uint8, 0 if"
-        " free, 255 if occupied). A pixel has the largest known value of the cells in it. As in a"
-        " bird's-eye view of a cloud, the first row has the largest x, the first column the largest"
-        " y.",
+        description="Topic of grids (OccupancyGrid, foxglove.Grid), which become images (uint8, 0"
+        " if free, 255 if occupied). A pixel has the largest known value of the cells in it. As in"
+        " a bird's-eye view of a cloud, the first row has the largest x, the first column the"
+        " largest y. `field` is the name of one of the fields of a foxglove.Grid, by default of the"
+        " only one; its values are scaled by `range`.",
     )
     size: tuple[_Count, _Count] | None = Field(
         default=None,
@@ -174,7 +176,8 @@ class Quantity(_Part):
     )
     unknown: Annotated[float, Field(ge=0, le=100)] = Field(
         default=50.0,
-        description="Percent of occupancy of unknown (-1) and missing cells of a grid.",
+        description="Percent of occupancy of unknown and missing cells of a grid: those with NaN,"
+        " or a value outside of `range`, such as -1.",
     )
     outside: Annotated[float, Field(ge=0, le=100)] | None = Field(
         default=None,
@@ -237,7 +240,8 @@ class Quantity(_Part):
     offset: Finite = Field(default=0.0, description="Number added after scaling.")
     clip: tuple[float, float] | None = Field(
         default=None,
-        description="Lowest and highest value. Infinite values are clipped, too; NaN is missing.",
+        description="Lowest and highest value. Infinite values are clipped, too; NaN is missing."
+        " The cells of a grid are clipped before they are scaled by `range`.",
     )
     wrap_angle: bool = Field(default=False, description="Whether to wrap radians into [-pi, pi).")
     undistort: str | None = Field(
@@ -259,17 +263,23 @@ class Quantity(_Part):
     range: tuple[Finite, Finite] | None = Field(
         default=None,
         description="Values of an image with `as: intensity` that become 0 and 255; without it,"
-        " values of 16 bits and floats stay as they are, in float32.",
+        " values of 16 bits and floats stay as they are, in float32. For a grid, those of its"
+        " cells: by default 0 and 100 of an OccupancyGrid, 0 and 255 of uint8; other fields of a"
+        " foxglove.Grid need it.",
     )
 
     @model_validator(mode="after")
     def _has_one_source(self) -> Quantity:
         sources = ("field", "image", "transform", "scan", "cloud", "grid")
         given = [name for name in sources if getattr(self, name)]
+        if given == ["field", "grid"]:
+            # This is one of the fields of a grid.
+            given = ["grid"]
         if len(given) != 1:
             raise ValueError(f"give one of {', '.join(sources)}")
         for name in ("undistort", "crop", "resize", "range_m", "range", "gray"):
             is_range = name == "range_m" and self.as_ == "range"
+            is_range |= name == "range" and given == ["grid"]
             if getattr(self, name) and given != ["image"] and not is_range:
                 raise ValueError(f"{name} is for images only")
         if self.as_ is not None and self.as_ not in _AS[given[0]]:
@@ -284,7 +294,7 @@ class Quantity(_Part):
             raise ValueError("parts has a part twice")
         if self.pixels is not None and self.align == "linear":
             raise ValueError("images cannot be interpolated: use last or nearest")
-        if self.range is not None and self.as_ != "intensity":
+        if self.range is not None and self.as_ != "intensity" and self.grid is None:
             raise ValueError("range is for images with `as: intensity`; for depth, use range_m")
         if self.range_m is not None and self.as_ == "intensity":
             raise ValueError("range_m is for depth; with `as: intensity`, use range")
@@ -720,7 +730,9 @@ class Mapping(_Part):
             raise ValueError("give either behavior_prob or behavior_log_prob")
         if self.behavior_prob is not None and self.action.box is not None:
             raise ValueError("the actions of a box have densities: use behavior_log_prob")
-        if self.behavior is not None and self.behavior[1].field is None:
+        if self.behavior is not None and (
+            self.behavior[1].field is None or self.behavior[1].grid is not None
+        ):
             raise ValueError(f"{self.behavior[0]} must be a field")
         return self
 

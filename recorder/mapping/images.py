@@ -99,7 +99,7 @@ class ImageOptions:
         names = {"undistort", "crop", "resize", "gray", "range_m", "range", "as_"}
         if self._quantity.image is None:
             names |= {"size", "x_m", "y_m", "z_m", "azimuth_deg", "elevation_deg", "unknown"}
-            names |= {"outside"}
+            names |= {"outside", "field", "clip"}
         return self._quantity.model_dump_json(include=names)
 
     def image(self, message: dict[str, Any]) -> Image:
@@ -108,7 +108,7 @@ class ImageOptions:
 
     def grid(self, message: dict[str, Any]) -> Grid:
         """Return the grid in the fields of a message."""
-        return grid_of(self._quantity, message)
+        return grid_of(self._quantity, with_bytes(message))
 
     def around(self, grid: Grid, pose: NDArray[np.float64]) -> Image:
         """Return the image (H, W, 1) around the robot at x, y and, if it is given, yaw."""
@@ -130,7 +130,8 @@ class ImageOptions:
         if quantity.gray and values.ndim == 3:
             values = np.rint(values @ _GRAY_WEIGHTS).astype(np.uint8)
         limits = quantity.range_m if is_depth else quantity.range
-        if limits is not None:
+        # The codes of a grid are in its range already.
+        if limits is not None and quantity.grid is None:
             share = np.clip((values - limits[0]) / (limits[1] - limits[0]), 0.0, 1.0)
             codes = np.rint(255 * share)
             # Pixels without a surface get the largest value, as in the depth images of the sims.
@@ -701,10 +702,8 @@ def _packet(message: dict[str, Any], log_time_ns: int) -> Message:
 
 def pixels_of(quantity: Quantity, message: dict[str, Any]) -> Pixels:
     """Decode the fields of a message with an image, a scan, a cloud or a grid."""
-    if quantity.cloud is not None:
-        message = {**message, "data": _bytes_of(message["data"])}
     if quantity.image is None:
-        return image_of(quantity, message)
+        return image_of(quantity, with_bytes(message))
     kind = _kind_of(message)
     if "encoding" in message:
         return raw_pixels({**message, "data": _bytes_of(message["data"])})
@@ -714,6 +713,13 @@ def pixels_of(quantity: Quantity, message: dict[str, Any]) -> Pixels:
         return compressed_pixels(kind, _bytes_of(message["data"]))
     except LogError as error:
         raise LogError(f"a compressed image ({one_line(kind)}) cannot be read: {error}") from error
+
+
+def with_bytes(message: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of a cloud or grid; packed elements are bytes."""
+    if "fields[:].offset" not in message:
+        return message
+    return {**message, "data": _bytes_of(message["data"])}
 
 
 def _kind_of(message: dict[str, Any]) -> str:

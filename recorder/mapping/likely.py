@@ -17,8 +17,9 @@ from mcaprl.recorder.bags.overview import TopicOverview, instants_of, is_fresh
 from mcaprl.recorder.bags.values import without_lacks
 from mcaprl.recorder.format.reading import full_name
 from mcaprl.recorder.mapping.align import pooled, rows_of
-from mcaprl.recorder.mapping.config import Quantity
-from mcaprl.recorder.mapping.spatial import cloud_points, fields_of
+from mcaprl.recorder.mapping.config import LARGEST, Quantity
+from mcaprl.recorder.mapping.images import with_bytes
+from mcaprl.recorder.mapping.spatial import cloud_points, fields_of, layer_of
 from mcaprl.recorder.mapping.summary import needed_offset
 
 _SAMPLES = 200
@@ -39,6 +40,7 @@ IMAGES = {
 }
 _SCANS = ("sensor_msgs/msg/LaserScan", "foxglove.LaserScan")
 _CLOUDS = ("sensor_msgs/msg/PointCloud2", "foxglove.PointCloud")
+_COLORS = ("red", "green", "blue", "alpha")
 _NO_POINTS = np.empty((0, 3))
 _NEVER_TOPICS = {
     *("rosout", "rosout_agg", "parameter_events", "tf", "tf_static", "diagnostics"),
@@ -126,16 +128,41 @@ def image_spec(bag: Bag, info: TopicInfo) -> dict[str, Any] | None:
         return {"image": info.name, "resize": size}
     if kind == "nav_msgs/msg/OccupancyGrid":
         return {"grid": info.name, "size": size}
+    if kind == "foxglove.Grid":
+        return {"grid": info.name, "size": size, **_layer_spec(bag, info)}
     if kind not in _CLOUDS:
         return None
     spec = {"cloud": info.name, "as": "height", "size": size}
     try:
-        fields = fields_of(info, Quantity.model_validate({**spec, **_limits_of_points(_NO_POINTS)}))
-        columns = bag.read(info.name, fields, np.array([info.count // 2])).columns
-        points = cloud_points({name: column[0] for name, column in columns.items()})
+        cloud = Quantity.model_validate({**spec, **_limits_of_points(_NO_POINTS)})
+        points = cloud_points(_middle_message(bag, info, cloud))
     except (LogError, UsageError, IndexError, TypeError, ValueError):
         points = _NO_POINTS
     return {**spec, **_limits_of_points(points)}
+
+
+def _layer_spec(bag: Bag, info: TopicInfo) -> dict[str, Any]:
+    """Return the field of a foxglove.Grid, the first that is no color, and its range."""
+    try:
+        message = _middle_message(bag, info, Quantity(grid=info.name))
+        names = [str(each) for each in message["fields[:].name"]]
+        name = next((each for each in names if each not in _COLORS), names[0])
+        values = layer_of(message, name)
+    except (LogError, UsageError, IndexError, TypeError, ValueError):
+        return {}
+    spec: dict[str, Any] = {"field": name} if len(names) > 1 else {}
+    finite = values[np.isfinite(values)]
+    if values.dtype == np.uint8 or not finite.size:
+        return spec
+    low, high = (float(np.clip(each, -LARGEST, LARGEST)) for each in (finite.min(), finite.max()))
+    low = math.floor(low)
+    return {**spec, "range": [low, max(low + 1, math.ceil(high))]}
+
+
+def _middle_message(bag: Bag, info: TopicInfo, quantity: Quantity) -> dict[str, Any]:
+    fields = fields_of(info, quantity)
+    columns = bag.read(info.name, fields, np.array([info.count // 2])).columns
+    return with_bytes({name: column[0] for name, column in columns.items()})
 
 
 def _limits_of_points(points: NDArray[np.float64]) -> dict[str, list[int]]:

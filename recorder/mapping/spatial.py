@@ -1,4 +1,4 @@
-"""Lidar scans, point clouds and occupancy grids as arrays of a fixed size.
+"""Lidar scans, point clouds and grids as arrays of a fixed size.
 
 Seen from above, x points up and y to the left, as a robot looks forward (REP 103): the first row of
 an image has the largest x, the first column the largest y.
@@ -6,7 +6,7 @@ an image has the largest x, the first column the largest y.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, UsageError
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.bags.bag import TopicInfo
+from mcaprl.recorder.bags.values import Lack
 from mcaprl.recorder.mapping.config import Quantity
-from mcaprl.recorder.mapping.image_pixels import Pixels
+from mcaprl.recorder.mapping.image_pixels import Pixels, one_line
+from mcaprl.texts import shortened
 
 Floats = NDArray[np.float64]
 
@@ -27,14 +29,28 @@ _CLOUD: Final = (
     *(_NAME, _OFFSET, "fields[:].datatype", "data"),
 )
 _FOXGLOVE_CLOUD: Final = ("point_stride", _NAME, _OFFSET, "fields[:].type", "data")
-_PLACE: Final = tuple(f"info.origin.position.{axis}" for axis in "xy")
-_TURN: Final = tuple(f"info.origin.orientation.{axis}" for axis in "xyzw")
-_GRID: Final = ("info.width", "info.height", "info.resolution", *_PLACE, *_TURN, "data")
+_POSE: Final = (
+    *(f"position.{axis}" for axis in "xy"),
+    *(f"orientation.{axis}" for axis in "xyzw"),
+)
+_GRID: Final = (
+    *("info.width", "info.height", "info.resolution"),
+    *(f"info.origin.{name}" for name in _POSE),
+    "data",
+)
+_FOXGLOVE_GRID: Final = (
+    *("column_count", "cell_size.x", "cell_size.y", "row_stride", "cell_stride"),
+    *(_NAME, _OFFSET, "fields[:].type", *(f"pose.{name}" for name in _POSE), "data"),
+)
 # Datatypes of sensor_msgs/PointField and of foxglove.PackedElementField.
 _ROS_TYPES: Final = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), 1))
 _FOXGLOVE_TYPES: Final = dict(enumerate(("u1", "i1", "u2", "i2", "u4", "i4", "f4", "f8"), 1))
+_BLOCK: Final = 1 << 20
+"""Cells of a grid that are scaled at a time."""
 _OUTSIDE: Final = -2
 """Pixel without a cell."""
+_CODE: Final = 2.55
+"""Code of one percent."""
 _REFUSED: Final = {
     "CompressedPointCloud": "Draco-compressed clouds cannot be read: republish them raw, with"
     " `ros2 run point_cloud_transport republish`",
@@ -61,14 +77,17 @@ def fields_of(info: TopicInfo, quantity: Quantity) -> tuple[str, ...]:
     """
     if why := why_refused(info):
         raise UsageError(f"{info.name} has {info.type_name}: {why}")
-    wanted = (_GRID,) if quantity.grid is not None else (_CLOUD, _FOXGLOVE_CLOUD)
+    is_grid = quantity.grid is not None
+    wanted = (_GRID, _FOXGLOVE_GRID) if is_grid else (_CLOUD, _FOXGLOVE_CLOUD)
     known = {name.replace("[]", "[:]") for name in info.fields}
     for fields in wanted:
         if known.issuperset(fields):
+            if fields is _GRID and quantity.field is not None:
+                raise UsageError(f"{info.name} has {info.type_name}, without fields: remove field")
             return fields
-    expected = "nav_msgs/OccupancyGrid"
-    if quantity.grid is None:
-        expected = "sensor_msgs/PointCloud2 or foxglove.PointCloud"
+    expected = "sensor_msgs/PointCloud2 or foxglove.PointCloud"
+    if is_grid:
+        expected = "nav_msgs/OccupancyGrid or foxglove.Grid"
     raise UsageError(f"{info.name} has {info.type_name}: expected {expected}")
 
 
@@ -77,7 +96,8 @@ def image_of(quantity: Quantity, message: dict[str, Any]) -> Pixels:
 
     Args:
         quantity: Quantity with `cloud` or `grid`.
-        message: Values of the fields that `fields_of` returned; of a cloud, `data` are bytes.
+        message: Values of the fields that `fields_of` returned; but for those of OccupancyGrid,
+            `data` are bytes.
 
     Raises:
         LogError: The message is damaged.
@@ -146,25 +166,37 @@ def cloud_points(message: dict[str, Any]) -> Floats:
             f"a cloud of {width} x {height} points of {step} bytes, with {row_step} bytes per row,"
             f" has {len(data)} bytes, which do not match"
         )
+    found, strides = np.empty((height * width, 3)), (row_step, step)
+    for k, axis in enumerate("xyz"):
+        found[:, k] = _packed(message, axis, (height, width), strides, "cloud").reshape(-1)
+    return found[np.isfinite(found).all(axis=1) & found.any(axis=1)]
+
+
+def _packed(
+    message: dict[str, Any], name: str, shape: tuple[int, int], strides: tuple[int, int], what: str
+) -> NDArray[Any]:
+    """Return a view (H, W) of a field of packed elements; the strides fit in the data."""
+    is_ros = "fields[:].datatype" in message
     order = ">" if is_ros and message["is_bigendian"] else "<"
     types = message["fields[:].datatype" if is_ros else "fields[:].type"]
     layout = zip(message[_NAME], message[_OFFSET], types, strict=True)
-    places = {str(name): (offset, kind) for name, offset, kind in layout}
-    found = np.empty((height * width, 3))
-    for k, axis in enumerate("xyz"):
-        if axis not in places:
-            raise LogError(f"a cloud without the field {axis}, but with {', '.join(places)[:80]}")
-        offset, number = map(int, places[axis])
-        kind = (_ROS_TYPES if is_ros else _FOXGLOVE_TYPES).get(number)
-        if kind is None:
-            raise LogError(f"the field {axis} of a cloud has the unknown datatype {number}")
-        dtype = np.dtype(order + kind)
-        if offset < 0 or offset + dtype.itemsize > step:
-            raise LogError(f"the field {axis} is outside of the {step} bytes of a point")
-        strides = (row_step, step)
-        column = np.ndarray((height, width), dtype, data, offset, strides)
-        found[:, k] = column.reshape(-1)
-    return found[np.isfinite(found).all(axis=1) & found.any(axis=1)]
+    places = {str(each): (offset, kind) for each, offset, kind in layout}
+    if name not in places:
+        raise LogError(f"a {what} without the field {name}, but with {_listed(places)}")
+    offset, number = map(int, places[name])
+    kind = (_ROS_TYPES if is_ros else _FOXGLOVE_TYPES).get(number)
+    if kind is None:
+        raise LogError(f"the field {one_line(name)} of a {what} has the unknown datatype {number}")
+    dtype = np.dtype(order + kind)
+    if offset < 0 or offset + dtype.itemsize > strides[1]:
+        raise LogError(
+            f"the field {one_line(name)} is outside of the {strides[1]} bytes of each element"
+        )
+    return np.ndarray(shape, dtype, message["data"], offset, strides)
+
+
+def _listed(names: Iterable[str]) -> str:
+    return shortened(" ".join(", ".join(names).split()), 80) or "none"
 
 
 def _cells(distance: Floats, span: float, count: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
@@ -221,17 +253,17 @@ def top_image(quantity: Quantity, points: Floats) -> NDArray[np.uint8]:
 
 
 class Grid(NamedTuple):
-    """Occupancy of the cells of a map.
+    """Values of the cells of a map.
 
     Attributes:
-        cells: (H, W) percent; -1 where it is unknown.
-        cell_m: Edge of a cell, meters.
+        cells: (H, W) codes from 0 to 255; -1 where the value is unknown.
+        cell_m: (2,) edges of a cell along its rows and columns, meters.
         place: (2,) x and y of the corner of the first cell, meters.
         yaw: Angle of the rows to x, radians.
     """
 
     cells: NDArray[np.int16]
-    cell_m: float
+    cell_m: Floats
     place: Floats
     yaw: float
 
@@ -242,31 +274,91 @@ def grid_of(quantity: Quantity, message: dict[str, Any]) -> Grid:
     Raises:
         LogError: The message is damaged.
     """
+    is_ros, place, yaw = "info.width" in message, np.zeros(2), 0.0
+    sizes = ("info.resolution",) * 2 if is_ros else ("cell_size.x", "cell_size.y")
     try:
-        width, height = int(message["info.width"]), int(message["info.height"])
-        cell_m, data = float(message["info.resolution"]), np.asarray(message["data"], np.int16)
-        place, yaw = np.zeros(2), 0.0
+        values = _occupancy(message) if is_ros else layer_of(message, quantity.field)
+        cell_m = np.array([_number(message[name]) for name in sizes])
         if quantity.x_m is not None or quantity.around is not None:
-            place = np.array([float(message[name]) for name in _PLACE])
-            yaw = _yaw(*(float(message[name]) for name in _TURN))
+            origin = "info.origin." if is_ros else "pose."
+            pose = np.array([_number(message[origin + name]) for name in _POSE])
+            if not is_ros:
+                # Protobuf may omit a pose, or a part of it, that is the origin.
+                for part in (pose[:2], pose[2:]):
+                    if np.isnan(part).all():
+                        part[:] = 0.0
+            place, yaw = pose[:2], _yaw(*pose[2:].tolist())
     except (TypeError, ValueError, OverflowError) as error:
         raise LogError(f"the message is damaged: {error}") from error
-    if min(width, height) < 1 or width * height > MAX_IMAGE_PIXELS or width * height != data.size:
-        raise LogError(f"a grid of {width} x {height} cells has {data.size} of them")
-    if not 0 < cell_m < np.inf:
-        raise LogError(f"a grid with cells of {cell_m:g} m")
+    if not ((cell_m > 0) & (cell_m < np.inf)).all():
+        raise LogError(f"a grid with cells of {cell_m[0]:g} x {cell_m[1]:g} m")
     if not np.isfinite([*place, yaw]).all():
         raise LogError("the origin of a grid is not finite")
-    cells = np.where((data < 0) | (data > 100), -1, data).reshape(height, width)
-    return Grid(cells, cell_m, place, yaw)
+    limits = quantity.range or ((0.0, 100.0) if is_ros else (0.0, 255.0))
+    if not is_ros and quantity.range is None and values.dtype != np.uint8:
+        raise LogError(
+            f"a grid of {values.dtype.name}: set `range: [LOW, HIGH]`, the values that become 0 and"
+            " 255"
+        )
+    return Grid(_codes(values, quantity.clip, limits), cell_m, place, yaw)
+
+
+def _occupancy(message: dict[str, Any]) -> NDArray[np.float32]:
+    """Return the cells (H, W) of an OccupancyGrid, percent; NaN where it is unknown."""
+    width, height = int(message["info.width"]), int(message["info.height"])
+    data = np.asarray(message["data"], np.int16)
+    if min(width, height) < 1 or width * height > MAX_IMAGE_PIXELS or width * height != data.size:
+        raise LogError(f"a grid of {width} x {height} cells has {data.size} of them")
+    known = np.where((data < 0) | (data > 100), np.float32(np.nan), data.astype(np.float32))
+    return known.reshape(height, width)
+
+
+def layer_of(message: dict[str, Any], name: str | None = None) -> NDArray[Any]:
+    """Return the values (H, W) of a field of a foxglove.Grid, by default of its only one.
+
+    Raises:
+        LogError: The message is damaged, or has not one field.
+    """
+    width, data = int(message["column_count"]), message["data"]
+    row_step, step = int(message["row_stride"]), int(message["cell_stride"])
+    # The padding of the last row may be missing.
+    height = -(-len(data) // max(row_step, 1))
+    if not 0 < width * height <= MAX_IMAGE_PIXELS:
+        raise LogError(f"a grid of {width} x {height} cells; 1 to {MAX_IMAGE_PIXELS} can be read")
+    if step < 1 or row_step < width * step or (height - 1) * row_step + width * step > len(data):
+        raise LogError(
+            f"a grid of {width} columns of {step} bytes, with {row_step} bytes per row, has"
+            f" {len(data)} bytes, which do not match"
+        )
+    names = [str(each) for each in message[_NAME]]
+    if name is None and len(names) != 1:
+        raise LogError(f"the grid has the fields {_listed(names)}: choose one of them by `field`")
+    return _packed(message, name or names[0], (height, width), (row_step, step), "grid")
+
+
+def _codes(
+    values: NDArray[Any], clip: tuple[float, float] | None, limits: tuple[float, float]
+) -> NDArray[np.int16]:
+    """Return codes from 0 to 255 of values (H, W) between the limits; -1 of all others."""
+    found = np.empty(values.shape, np.int16)
+    rows = max(1, _BLOCK // values.shape[1])
+    with np.errstate(all="ignore"):
+        for k in range(0, len(values), rows):
+            block = values[k : k + rows].astype(np.float64)
+            if clip is not None:
+                block = np.clip(block, *clip)
+            percent = 100 * (block - limits[0]) / (limits[1] - limits[0])
+            is_known = (percent >= 0) & (percent <= 100)
+            found[k : k + rows] = np.where(is_known, np.rint(percent * _CODE), -1)
+    return found
 
 
 def grid_image(quantity: Quantity, grid: Grid, pose: Floats | None = None) -> NDArray[np.uint8]:
-    """Return the occupancy (H, W) of a window of a grid: 0 if free, 255 if occupied for certain.
+    """Return the codes (H, W) of a window of a grid, as of an occupancy: 0 if free, 255 if not.
 
-    A pixel has the largest known occupancy of the cells whose centers are in it; if there are no
-    centers in it, that of the cell at its center. A pixel without a known cell, which is one of 0
-    to 100 percent, has the value of `unknown`, or without any cell that of `outside`.
+    A pixel has the largest known code of the cells whose centers are in it; if there are no centers
+    in it, that of the cell at its center. A pixel without a known cell has the code of `unknown`,
+    or without any cell that of `outside`.
 
     Args:
         quantity: Quantity with `grid`.
@@ -276,12 +368,13 @@ def grid_image(quantity: Quantity, grid: Grid, pose: Floats | None = None) -> ND
     """
     (cells, cell_m, place, yaw), size = grid, quantity.size
     height, width = cells.shape
-    x_m, y_m = quantity.x_m or (0.0, width * cell_m), quantity.y_m or (0.0, height * cell_m)
+    x_m, y_m = quantity.x_m or (0.0, width * cell_m[0]), quantity.y_m or (0.0, height * cell_m[1])
     if pose is not None:
         heading = float(pose[2]) if len(pose) > 2 else 0.0
         place, yaw = (place - pose[:2]) @ _turn(heading), yaw - heading
         if size is not None and quantity.x_m is None:
-            y_m, x_m = ((-count * cell_m / 2, count * cell_m / 2) for count in size)
+            half = np.array(size[::-1]) * cell_m / 2
+            x_m, y_m = zip(-half, half, strict=True)
     (columns, rows), turn = size or (height, width), _turn(yaw)
     # Centers of the pixels, in cells.
     xs = x_m[1] - (np.arange(rows) + 0.5) * (x_m[1] - x_m[0]) / rows
@@ -293,10 +386,10 @@ def grid_image(quantity: Quantity, grid: Grid, pose: Floats | None = None) -> ND
     found[is_cell] = cells[v[is_cell].astype(np.intp), u[is_cell].astype(np.intp)]
     if pose is None:
         _put_largest(found.reshape(rows, columns), grid, turn, x_m, y_m)
-    percent = np.where(found < 0, quantity.unknown, found)
-    if quantity.outside is not None:
-        percent = np.where(found == _OUTSIDE, quantity.outside, percent)
-    return np.rint(percent * 2.55).astype(np.uint8).reshape(rows, columns)
+    outside = quantity.unknown if quantity.outside is None else quantity.outside
+    unknown, outside = np.rint(np.array([quantity.unknown, outside]) * _CODE)
+    found = np.where(found == _OUTSIDE, outside, np.where(found < 0, unknown, found))
+    return found.astype(np.uint8).reshape(rows, columns)
 
 
 def _put_largest(
@@ -306,7 +399,7 @@ def _put_largest(
     x_m: tuple[float, float],
     y_m: tuple[float, float],
 ) -> None:
-    """Put the largest occupancy of the cells with a center in a pixel into the pixels (H, W)."""
+    """Put the largest code of the cells with a center in a pixel into the pixels (H, W)."""
     (rows, columns), (height, width) = found.shape, grid.cells.shape
     cells, cell_m, place = grid[:3]
     # The cells that may be in the window.
@@ -329,6 +422,10 @@ def _put_largest(
 
 def _turn(yaw: float) -> Floats:
     return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+
+
+def _number(value: Any) -> float:
+    return np.nan if value is None or isinstance(value, Lack) else float(value)
 
 
 def _yaw(x: float, y: float, z: float, w: float) -> float:

@@ -33,6 +33,7 @@ TYPES = {
     "/camera": "sensor_msgs/msg/Image",
     "/points": "sensor_msgs/msg/PointCloud2",
     "/map": "nav_msgs/msg/OccupancyGrid",
+    "/layers": "foxglove_msgs/msg/Grid",
     "/tick": "std_msgs/msg/Header",
     "/cmd": "geometry_msgs/msg/Twist",
 }
@@ -95,6 +96,20 @@ def contents(draw: st.DrawFn, topic: str, time_ns: int) -> dict[str, Any]:
             info["origin"] = {"position": {"x": draw(numbers)}, "orientation": {"w": 1.0}}
             cells = draw(st.lists(st.integers(-1, 100), min_size=6, max_size=6))
             return {"header": header, "info": info, "data": cells}
+        case "/layers":
+            kind = np.dtype([("cost", "<f4"), ("flag", "u1")])
+            costs = np.zeros((2, 3), kind)
+            costs["cost"] = np.reshape(draw(st.tuples(*[odd] * 6)), (2, 3))
+            fields = [{"name": "flag", "offset": 4, "type": 1}]
+            # Some have no costs.
+            if draw(st.integers(0, 4)):
+                fields.append({"name": "cost", "offset": 0, "type": 7})
+            return {
+                **{"timestamp": header["stamp"], "fields": fields, "column_count": 3},
+                **{"cell_size": {"x": 0.5, "y": 1.0}, "row_stride": 15, "cell_stride": 5},
+                "pose": {"position": {"x": draw(numbers)}, "orientation": {"w": 1.0}},
+                "data": list(costs.tobytes()),
+            }
         case "/mode":
             return {"data": draw(st.sampled_from(["drive", "drive", "park"]))}
         case "/goal":
@@ -155,6 +170,14 @@ QUANTITIES: dict[str, dict[str, Any]] = {
     "ahead": {
         **{"grid": "/map", "size": [4, 3], "around": ["fresh", "total", "yaw"]},
         **{"x_m": [-5, 900], "y_m": [-500, 500], "unknown": 10, "tolerance_s": 1.0},
+    },
+    "layer": {
+        **{"grid": "/layers", "field": "cost", "range": [-500, 900], "clip": [-600, 900]},
+        **{"x_m": [-500, 500], "y_m": [-1, 1], "size": [4, 3]},
+    },
+    "beside": {
+        **{"grid": "/layers", "field": "cost", "range": [100, -100], "around": ["place"]},
+        **{"size": [5, 4], "outside": 0, "tolerance_s": 2.0},
     },
     "goal": {"field": "/goal.x", "tolerance_s": 0.5, "missing": 0},
     "side": {"field": "/goal.y"},

@@ -24,10 +24,53 @@ class Sent(NamedTuple):
     message: dict[str, Any]
 
 
+_LINE = "=" * 80
+FOXGLOVE_GRID = f"""\
+builtin_interfaces/Time timestamp
+string frame_id
+geometry_msgs/Pose pose
+uint32 column_count
+foxglove_msgs/Vector2 cell_size
+uint32 row_stride
+uint32 cell_stride
+foxglove_msgs/PackedElementField[] fields
+uint8[] data
+{_LINE}
+MSG: foxglove_msgs/Vector2
+float64 x
+float64 y
+{_LINE}
+MSG: foxglove_msgs/PackedElementField
+string name
+uint32 offset
+uint8 type
+{_LINE}
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+{_LINE}
+MSG: geometry_msgs/Pose
+geometry_msgs/Point position
+geometry_msgs/Quaternion orientation
+{_LINE}
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+{_LINE}
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+"""
+_TEXTS = {"foxglove_msgs/msg/Grid": FOXGLOVE_GRID}
+
+
 def definition(type_name: str) -> Definition:
-    """Return the definition of a standard ROS 2 type."""
-    text = RosDecoder(type_name, "").text().encode()
-    return Definition(type_name, "cdr", "ros2msg", text)
+    """Return the definition of a standard ROS 2 type, or of a grid of Foxglove."""
+    text = _TEXTS.get(type_name) or RosDecoder(type_name, "").text()
+    return Definition(type_name, "cdr", "ros2msg", text.encode())
 
 
 class StreamBag(Topics):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mcaprl
 from mcaprl.errors import LogError, UsageError
-from mcaprl.recorder.bags.bag import TopicInfo
-from mcaprl.recorder.mapping.config import Quantity, parse_mapping
+from mcaprl.recorder.bags.bag import TopicInfo, open_bag
+from mcaprl.recorder.mapping.config import Place, Quantity, parse_mapping
+from mcaprl.recorder.mapping.live import LiveEpisodes, LiveSteps, Topics
+from mcaprl.recorder.mapping.plan import Plan
+from mcaprl.recorder.mapping.robot import Robot
 from mcaprl.recorder.mapping.spatial import (
     beams,
     cloud_points,
@@ -26,7 +30,7 @@ from mcaprl.recorder.mapping.spatial import (
     range_image,
     top_image,
 )
-from tests.support.stream_bag import Sent, StreamBag
+from tests.support.stream_bag import FOXGLOVE_GRID, Sent, StreamBag
 
 INF, NAN = math.inf, math.nan
 TYPES = {
@@ -330,7 +334,9 @@ def test_a_grid_around_the_robot_by_hand() -> None:
     assert image_of_grid(window, message) == [[51]]
 
 
-def slow_grid(quantity: Quantity, rows: Any, cell_m: float, x: float, y: float, yaw: float) -> Any:
+def slow_grid(
+    quantity: Quantity, rows: Any, cell_m: tuple[float, float], x: float, y: float, yaw: float
+) -> Any:
     assert quantity.size
     assert quantity.x_m
     assert quantity.y_m
@@ -339,7 +345,7 @@ def slow_grid(quantity: Quantity, rows: Any, cell_m: float, x: float, y: float, 
     inside: dict[tuple[int, int], list[int]] = {}
     for j, row in enumerate(rows):
         for i, value in enumerate(row):
-            u, v = (i + 0.5) * cell_m, (j + 0.5) * cell_m
+            u, v = (i + 0.5) * cell_m[0], (j + 0.5) * cell_m[1]
             px = x + math.cos(yaw) * u - math.sin(yaw) * v
             py = y + math.sin(yaw) * u + math.cos(yaw) * v
             if x0 <= px <= x1 and y0 <= py <= y1:
@@ -353,8 +359,8 @@ def slow_grid(quantity: Quantity, rows: Any, cell_m: float, x: float, y: float, 
             if values is None:
                 px = x1 - (r + 0.5) * (x1 - x0) / height - x
                 py = y1 - (c + 0.5) * (y1 - y0) / width - y
-                i = math.floor((math.cos(yaw) * px + math.sin(yaw) * py) / cell_m)
-                j = math.floor((-math.sin(yaw) * px + math.cos(yaw) * py) / cell_m)
+                i = math.floor((math.cos(yaw) * px + math.sin(yaw) * py) / cell_m[0])
+                j = math.floor((-math.sin(yaw) * px + math.cos(yaw) * py) / cell_m[1])
                 is_cell = 0 <= i < len(rows[0]) and 0 <= j < len(rows)
                 values = [rows[j][i]] if is_cell else []
             best = max((each for each in values if 0 <= each <= 100), default=50)
@@ -381,7 +387,7 @@ def test_grids_equal_a_slow_reference(
     quantity = Quantity.model_validate({"grid": "/map", **window})
     grid = grid_of(quantity, flat_grid(grid_message(rows, 0.41, x, -0.61, yaw)))
     found = grid_image(quantity, grid)
-    assert found.tolist() == slow_grid(quantity, rows, 0.41, x, -0.61, yaw)
+    assert found.tolist() == slow_grid(quantity, rows, (0.41, 0.41), x, -0.61, yaw)
 
 
 def test_damaged_grids_are_clear_errors() -> None:
@@ -389,6 +395,139 @@ def test_damaged_grids_are_clear_errors() -> None:
     for change in ({"info.width": 3}, {"info.resolution": NAN}, {"info.resolution": 0.0}):
         with pytest.raises(LogError, match="a grid"):
             grid_of(quantity, {**message, **change})
+
+
+def layers(
+    fields: list[tuple[str, int, int]],
+    data: bytes,
+    columns: int,
+    strides: tuple[int, int],
+    cell_m: tuple[float, float] = (1.0, 1.0),
+    *pose: float,
+) -> dict[str, Any]:
+    """Return the fields of a foxglove.Grid: names, offsets and types; bytes per row and cell."""
+    x, y, yaw = pose or (0.0, 0.0, 0.0)
+    place = {"position.x": x, "position.y": y, "orientation.x": 0.0, "orientation.y": 0.0}
+    place |= {"orientation.z": math.sin(yaw / 2), "orientation.w": math.cos(yaw / 2)}
+    return {
+        **{"column_count": columns, "cell_size.x": cell_m[0], "cell_size.y": cell_m[1]},
+        **{"row_stride": strides[0], "cell_stride": strides[1], "data": data},
+        **{f"pose.{name}": value for name, value in place.items()},
+        **{f"fields[:].{key}": [each[k] for each in fields] for k, key in enumerate(_KEYS)},
+    }
+
+
+_KEYS = ("name", "offset", "type")
+COST, HEIGHT = ("cost", 0, 1), ("height", 1, 4)
+# Rows of two cells of 3 bytes, and 1 byte of padding: cost (uint8) and height (int16).
+TWO = struct.pack("<BhBhxBhBhx", 0, -200, 51, 0, 254, 300, 255, 100)
+
+
+def test_layers_by_hand() -> None:
+    message = layers([COST, HEIGHT], TWO, 2, (7, 3), (1.0, 2.0), 10.0, 20.0, 0.0)
+    # As from above: the far row is the second column, the left column is the second row.
+    assert image_of_grid({"field": "cost"}, message) == [[255, 51], [254, 0]]
+    # A costmap of 255, which is unknown, and of 254, which is occupied.
+    keys = {"field": "cost", "range": [0, 254], "unknown": 40}
+    assert image_of_grid(keys, message) == [[102, 51], [255, 0]]
+    # -200 cm and 300 cm are outside of the range; clipped, they are its ends.
+    height = {"field": "height", "range": [-100, 100]}
+    assert image_of_grid(height, message) == [[255, 127], [127, 127]]
+    assert image_of_grid({**height, "clip": [-100, 100]}, message) == [[255, 127], [255, 0]]
+    assert image_of_grid({**height, "range": [100, -155]}, message) == [[0, 100], [127, 127]]
+    # The padding of the last row may be missing, and so may the pose.
+    bare = {each: None if each.startswith("pose.") else value for each, value in message.items()}
+    bare["data"] = TWO[:-1]
+    window = {"x_m": [0, 2], "y_m": [2, 4], "size": [1, 2], "field": "cost"}
+    assert image_of_grid(window, bare) == [[255], [254]]
+    assert image_of_grid({**window, "y_m": [22, 24]}, message) == [[127], [127]]
+    window |= {"x_m": [10, 12], "y_m": [22, 24]}
+    assert image_of_grid(window, message) == [[255], [254]]
+    # Around a robot at the corner of all cells: pixels are as large as cells, 1 m by 2 m.
+    around = {"size": [2, 2], "field": "cost", "outside": 0}
+    assert image_of_grid(around, message, 11, 22) == [[255, 51], [254, 0]]
+    # Ahead is y, left is smaller x: the robot looks from the second row at nothing.
+    ahead = {**around, "x_m": [-2, 2], "y_m": [-1, 1]}
+    assert image_of_grid(ahead, message, 11, 22, math.pi / 2) == [[254, 255], [0, 51]]
+
+
+FORMS = "BbHhIifd"
+"""Letters of struct for the types 1 to 8 of foxglove.PackedElementField."""
+
+
+@settings(max_examples=60)
+@given(st.data())
+def test_layers_equal_a_slow_reference(data: st.DataObject) -> None:
+    """Values of all types at any offset, one by one; then as an occupancy of these percents."""
+    kind, columns, rows = (data.draw(st.integers(1, most)) for most in (8, 4, 4))
+    form = FORMS[kind - 1]
+    width, before, after = (struct.calcsize(form), *data.draw(st.tuples(*[st.integers(0, 3)] * 2)))
+    step, padding = before + width + after, data.draw(st.integers(0, 3))
+    strides = (columns * step + padding, step)
+    packed = data.draw(st.binary(min_size=rows * strides[0], max_size=rows * strides[0]))
+    keys: dict[str, Any] = {
+        "range": data.draw(st.sampled_from([(0, 100), (50.5, -20), (-9e8, 9e8)]))
+    }
+    if data.draw(st.booleans()):
+        keys["clip"] = (-5, 30)
+    pose = (0.37, -0.61, data.draw(st.sampled_from([0.0, 0.3, -2.0])))
+    window = {"x_m": [-1.5, 2.5], "y_m": [-2, 1.7], "size": [4, 3]}
+    quantity = Quantity.model_validate({"grid": "/g", **window, **keys})
+    message = layers([("v", before, kind)], packed, columns, strides, (0.41, 0.73), *pose)
+    percents, (low, high) = list[list[float]](), keys["range"]
+    for row in range(rows):
+        percents.append([])
+        for column in range(columns):
+            at = row * strides[0] + column * step + before
+            (value,) = struct.unpack_from(f"<{form}", packed, at)
+            if "clip" in keys and not math.isnan(value):
+                value = min(max(value, -5), 30)
+            percents[-1].append(100 * (value - low) / (high - low))
+    codes = [[round(each * 2.55) if 0 <= each <= 100 else -1 for each in row] for row in percents]
+    grid = grid_of(quantity, message)
+    assert grid.cells.tolist() == codes
+    assert grid_image(quantity, grid).tolist() == slow_grid(quantity, percents, (0.41, 0.73), *pose)
+
+
+def test_large_layers_are_scaled_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    packed = bytes(range(200))
+    message = layers([("v", 0, 1)], packed, 10, (10, 1))
+    monkeypatch.setattr("mcaprl.recorder.mapping.spatial._BLOCK", 25)
+    found = grid_of(Quantity(grid="/g"), message).cells
+    assert found.tolist() == np.arange(200).reshape(20, 10).tolist()
+
+
+@pytest.mark.parametrize(
+    ("change", "keys", "expected"),
+    [
+        ({}, {}, "has the fields cost, height: choose one of them by `field`"),
+        ({}, {"field": "speed"}, "without the field speed, but with cost, height"),
+        ({}, {"field": "height"}, "a grid of int16: set `range: .LOW, HIGH.`"),
+        ({"fields[:].name": []}, {}, "the grid has the fields none"),
+        ({"fields[:].type": [9, 4]}, {"field": "cost"}, "unknown datatype 9"),
+        ({"fields[:].offset": [0, 2]}, {"field": "height"}, "outside of the 3 bytes"),
+        ({"fields[:].offset": [-1, 0]}, {"field": "cost"}, "outside of the 3 bytes"),
+        ({"fields[:].offset": [0]}, {"field": "cost"}, "the message is damaged"),
+        ({"column_count": 0}, {"field": "cost"}, "a grid of 0 x 2 cells"),
+        ({"column_count": 2**32 - 1}, {"field": "cost"}, "64000000 can be read"),
+        ({"column_count": 3}, {"field": "cost"}, "3 columns of 3 bytes, with 7 bytes per row"),
+        ({"cell_stride": 0}, {"field": "cost"}, "which do not match"),
+        ({"row_stride": 0}, {"field": "cost"}, "with 0 bytes per row"),
+        ({"row_stride": 13}, {"field": "cost"}, "has 14 bytes, which do not match"),
+        ({"data": b""}, {"field": "cost"}, "a grid of 2 x 0 cells"),
+        ({"cell_size.y": 0.0}, {"field": "cost"}, "cells of 1 x 0 m"),
+        ({"cell_size.x": None}, {"field": "cost"}, "cells of nan x 1 m"),
+        ({"pose.position.x": INF}, {"field": "cost", "around": ["p"], "size": [1, 1]}, "origin"),
+    ],
+)
+def test_damaged_layers_are_one_clear_line(
+    change: dict[str, Any], keys: dict[str, Any], expected: str
+) -> None:
+    quantity = Quantity.model_validate({"grid": "/g", **keys})
+    message = {**layers([COST, HEIGHT], TWO, 2, (7, 3)), **change}
+    with pytest.raises(LogError, match=expected) as error:
+        grid_of(quantity, message)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -427,6 +566,9 @@ def test_other_clouds_are_refused_by_name(kind: str, expected: str) -> None:
         ({"scan": "/s", "grid": "/m"}, "give one of"),
         ({"grid": "/m", "around": ["pose"]}, "around needs `size`"),
         ({"image": "/i", "outside": 0}, "outside is for grid"),
+        ({"cloud": "/p", "field": "x"}, "give one of"),
+        ({"scan": "/s", "range": [0, 1]}, "range is for images only"),
+        ({"grid": "/g", "range": [1, 1]}, "two different values"),
     ],
 )
 def test_wrong_keys(keys: dict[str, Any], expected: str) -> None:
@@ -578,3 +720,132 @@ def test_clouds_of_foxglove(tmp_path: Path) -> None:
             [(7.5, 3.5, 1), (step, -0.5, -1)],
         )
         assert found[step][..., 0].tolist() == want
+
+
+LAYER = {"grid": "/g", "field": "cost", "range": [0, 100], "unknown": 20}
+LAYERED: dict[str, Any] = {
+    "whole": LAYER,
+    "ahead": {**LAYER, "size": [3, 2], "around": ["x", "y", "yaw"], "outside": 100},
+}
+
+
+def cells(step: int) -> Any:
+    """Return the bytes of 2 rows of 3 cells of cost (int16) and flag (uint8)."""
+    found = np.zeros((2, 3), [("cost", "<i2"), ("flag", "u1")])
+    found["cost"] = [[step, 20, -1], [40, 50, 101]]
+    return found.tobytes()
+
+
+def write_protobuf(path: Path) -> None:
+    foxglove = pytest.importorskip("foxglove")
+    from foxglove import messages
+
+    context, kinds = foxglove.Context(), messages.PackedElementFieldNumericType
+    grids = foxglove.channels.GridChannel("/g", context=context)
+    number = {name: {"type": "number"} for name in ("x", "yaw", "speed")}
+    state = foxglove.Channel(
+        "/state", schema={"type": "object", "properties": number}, context=context
+    )
+    fields = [
+        messages.PackedElementField(name="cost", offset=0, type=kinds.Int16),
+        messages.PackedElementField(name="flag", offset=2, type=kinds.Uint8),
+    ]
+    turn = messages.Quaternion(z=math.sqrt(0.5), w=math.sqrt(0.5))
+    with foxglove.open_mcap(path, context=context):
+        for step in range(6):
+            grid = messages.Grid(
+                pose=messages.Pose(position=messages.Vector3(x=10, y=20), orientation=turn),
+                column_count=3,
+                cell_size=messages.Vector2(x=1, y=1),
+                row_stride=9,
+                cell_stride=3,
+                fields=fields,
+                data=cells(step),
+            )
+            grids.log(grid, log_time=10**18 + step * 10**8)
+            state.log({"x": 9.5, "yaw": 0.0, "speed": 0.1}, log_time=10**18 + step * 10**8)
+
+
+def write_ros(path: Path) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    state = "float64 x\nfloat64 yaw\nfloat64 speed\n"
+    texts = {"foxglove_msgs/msg/Grid": FOXGLOVE_GRID, "my_msgs/msg/State": state}
+    for kind, text in texts.items():
+        store.register(get_types_from_msg(text, kind))
+    types: Any = store.types
+    field, geometry = types["foxglove_msgs/msg/PackedElementField"], "geometry_msgs/msg/"
+    pose = types[f"{geometry}Pose"](
+        position=types[f"{geometry}Point"](x=10.0, y=20.0, z=0.0),
+        orientation=types[f"{geometry}Quaternion"](x=0.0, y=0.0, z=0.5**0.5, w=0.5**0.5),
+    )
+    with Writer(path, version=9) as writer:
+        grids, states = (
+            writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in zip(("/g", "/state"), texts, strict=True)
+        )
+        for step in range(6):
+            grid = types["foxglove_msgs/msg/Grid"](
+                timestamp=types["builtin_interfaces/msg/Time"](sec=0, nanosec=0),
+                **{"frame_id": "map", "pose": pose, "column_count": 3},
+                cell_size=types["foxglove_msgs/msg/Vector2"](x=1.0, y=1.0),
+                **{"row_stride": 9, "cell_stride": 3},
+                fields=[field(name="cost", offset=0, type=4), field(name="flag", offset=2, type=1)],
+                data=np.frombuffer(cells(step), np.uint8),
+            )
+            state = types["my_msgs/msg/State"](x=9.5, yaw=0.0, speed=0.1)
+            for channel, message in ((grids, grid), (states, state)):
+                data = store.serialize_cdr(message, message.__msgtype__)
+                writer.write(channel, 10**9 + step * 10**8, data)
+
+
+@pytest.mark.parametrize("write", [write_protobuf, write_ros])
+def test_layers_of_a_bag(tmp_path: Path, write: Any) -> None:
+    """The grid is turned by 90 degrees about (10, 20): its rows go along y, its columns down x."""
+    path = tmp_path / ("bag.mcap" if write is write_protobuf else "bag")
+    write(path)
+    tree = {
+        "clock": {"rate_hz": 10},
+        "observation": LAYERED,
+        "fields": {
+            "x": {"field": "/state.x"},
+            "y": {"field": "/state.x", "offset": 12},
+            "yaw": {"field": "/state.yaw"},
+        },
+        "action": {"fields": ["/state.speed"], "box": {"low": -1, "high": 1}},
+    }
+    data = mcaprl.open(path, mapping=tree)
+    found: Any = data.observations
+    robot = Robot.from_json(data.robot, "robot")
+    plan = Plan(Topics(robot.topics), robot.mapping, Place(), trust_code=False)
+    live, episodes = LiveSteps(plan, robot.shapes), LiveEpisodes(plan)
+    with open_bag(path) as bag:
+        messages = list(bag.messages())
+    for step in range(5):
+        # A driver sees the same.
+        for each in messages[2 * step : 2 * step + 2]:
+            live.push(each.topic, each.message, each.log_time_ns)
+        seen: Any = episodes.see(live.step(messages[2 * step].log_time_ns), acts=True).observation
+        for name in LAYERED:
+            assert np.array_equal(seen[name], found[name][step]), name
+        # Unknown, as -1 and 101 are, is 20 percent: 51.
+        first = round(step * 2.55)
+        assert found["whole"][step][..., 0].tolist() == [[51, 51], [127, 51], [102, first]]
+        # Around (9.5, 21.5), the middle cell of the first row: ahead is x, left is larger y.
+        assert found["ahead"][step][..., 0].tolist() == [[255, 255, 255], [51, 51, first]]
+    wrong = {**tree, "observation": {"g": {"grid": "/g"}}}
+    with pytest.raises(LogError, match="the fields cost, flag: choose one of them by `field`"):
+        mcaprl.open(path, mapping=wrong)
+    # The suggestion chooses the first field, and its range in the middle message.
+    with pytest.warns(UserWarning, match="no action yet"):
+        text = mcaprl.suggest_mapping(path)
+    assert "grid: /g, size: [84, 84], field: cost, range: [-1, 101]" in text
+
+
+def test_occupancy_has_no_fields() -> None:
+    bag: Any = StreamBag(TYPES, [])
+    quantity = Quantity.model_validate({"grid": "/map", "field": "data"})
+    with pytest.raises(UsageError, match="OccupancyGrid, without fields: remove field"):
+        fields_of(bag.topics["/map"], quantity)
+    scaled = {"range": [0, 50], "clip": [0, 50]}
+    message = flat_grid(grid_message([[25, 100, -1]]))
+    assert image_of_grid(scaled, message) == [[127], [255], [127]]
