@@ -284,6 +284,8 @@ def convert(
         print_wide("first transitions", *found.first_table(), last=3)
     if found.report is not None:
         print_problems(found.report.problems())
+    for sentence in found.videos:
+        echo(f"video: {sentence}")
     for sentence in found.lost:
         echo(f"lost: {sentence}")
     if found.out is not None:

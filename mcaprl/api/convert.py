@@ -13,7 +13,7 @@ from mcaprl.api.ranges import check_least
 from mcaprl.errors import UsageError, import_extra
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.format_registry import target_format, write_format
+from mcaprl.recorder.dataset.format_registry import VIDEO_NOTE, target_format, write_format
 from mcaprl.recorder.source import Definitions, Paths, Source, opened
 from mcaprl.storage.remote import check_upload, upload_all
 
@@ -33,12 +33,14 @@ class Conversion:
         report: Summary of the data that the mapping used and dropped; None without a mapping.
         out: Path of the written file or folder; None if nothing was written.
         lost: One sentence for each kind of data that the target format cannot store.
+        videos: One sentence for each video: whether its packets were copied, and why not.
     """
 
     dataset: Dataset
     report: MappingReport | None
     out: Path | None
     lost: list[str] = field(default_factory=list)
+    videos: list[str] = field(default_factory=list)
 
     def first(self) -> list[dict[str, Any]]:
         """Return the first five transitions, as JSON types."""
@@ -107,7 +109,13 @@ class Conversion:
         """Return what `convert --json` prints."""
         out = None if self.out is None else str(self.out)
         report = {} if self.report is None else self.report.to_json()
-        return {**report, "first": self.first(), "out": out, "lost": self.lost}
+        return {
+            **report,
+            "first": self.first(),
+            "out": out,
+            "lost": self.lost,
+            "videos": self.videos,
+        }
 
 
 def convert(
@@ -153,14 +161,17 @@ def convert(
         if out is None or (form is not None and not form.suffix):
             raise UsageError("upload copies one file: choose a file, not a folder, as the output")
     dataset = opened(data, lossy=lossy)
-    lost: list[str] = []
+    notes: list[str] = []
     if out is not None and form is not None:
-        lost = write_format(dataset, out, form, lossy=lossy, overwrite=overwrite)
+        notes = write_format(dataset, out, form, lossy=lossy, overwrite=overwrite)
     elif out is not None:
         dataset.save(out, overwrite=overwrite, keep_topics=keep_topics)
     if upload is not None and out is not None:
         upload_all([Path(out)], upload)
-    return Conversion(dataset, dataset.origin.report, None if out is None else Path(out), lost)
+    videos = [each.removeprefix(VIDEO_NOTE) for each in notes if each.startswith(VIDEO_NOTE)]
+    lost = [each for each in notes if not each.startswith(VIDEO_NOTE)]
+    target = None if out is None else Path(out)
+    return Conversion(dataset, dataset.origin.report, target, lost, videos)
 
 
 def suggest_mapping(data: Paths, *, bins: int | None = None, definitions: Definitions = ()) -> str:

@@ -180,6 +180,7 @@ class _Shared(NamedTuple):
             frames=tuple(leaf.numpy() for leaf in self.frames),
             episodes=self.episodes,
             infos={},
+            packets={},
             **{name: column.numpy() for name, column in self.columns.items()},
         )
         return Dataset(columns, self.description, origin=self.origin)

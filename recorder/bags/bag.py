@@ -6,10 +6,10 @@ import fnmatch
 import heapq
 import operator
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
@@ -197,6 +197,9 @@ class Bag(Protocol):
 
     def definition(self, topic: str) -> Definition:
         """Return the type of a topic's messages, with the text that defines it."""
+
+    def again(self) -> Bag:
+        """Open the bag again, as the arguments of `open_bag` name it."""
 
     def close(self) -> None:
         """Close the files."""
@@ -417,6 +420,7 @@ class OpenBag:
         paths: Files of the bag. The files of a recording follow each other.
         recordings: Index of the recording of each file, not descending.
         cut: Files that were cut off, or are still being written.
+        again: Function that opens the bag again, as its arguments name it.
         topics: Description of each topic by name: `type_name`, `encoding`, `count`, `first_ns`,
             `last_ns`, `fields` (kind of each leaf field by its dotted path), `constants`, and
             `problem`, which is not empty if the topic cannot be read.
@@ -427,11 +431,12 @@ class OpenBag:
         recordings: Sequence[Sequence[McapFile | RosbagFile]],
         opened: ExitStack,
         definitions: DefinitionFiles | None,
+        again: Callable[[], OpenBag],
         *,
         strict: bool,
     ) -> None:
         """Join the topics of open files; `opened` closes them."""
-        self._opened, self._strict = opened, strict
+        self._opened, self._strict, self.again = opened, strict, again
         ordered = list(recordings)
         # The first times are not needed, and not read, if there is one file.
         if sum(map(len, ordered)) > 1:
@@ -684,6 +689,9 @@ def open_bag(
         UsageError: There is no such file or folder of definitions, or it has none.
     """
     others = DefinitionFiles(definitions) if definitions else None
+    names = [data] if isinstance(data, str | Path) else data
+    places = [Path(name).absolute() for name in names]
+    again = partial(open_bag, places, definitions=definitions, strict=strict)
     with ExitStack() as opened:
         recordings = open_recordings(find_bags(data), opened)
-        return OpenBag(recordings, opened.pop_all(), others, strict=strict)
+        return OpenBag(recordings, opened.pop_all(), others, again, strict=strict)

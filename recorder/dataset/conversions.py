@@ -25,7 +25,7 @@ class Conversions:
         self,
         path: str | Path,
         *,
-        video: bool = False,
+        video: bool | None = None,
         lossy: bool = False,
         overwrite: bool = False,
     ) -> list[str]:
@@ -33,13 +33,16 @@ class Conversions:
 
         Args:
             path: Path of the folder.
-            video: Whether to store images as H.264 video instead of PNG. Video changes the pixels,
-                so it also needs `lossy`.
+            video: Whether images are videos instead of PNG. If the images are the frames of a
+                video, its packets are copied where LeRobot's files can have them; by default, these
+                are the only videos. With True, the other images are encoded as H.264, which changes
+                the pixels, so it also needs `lossy`. With False, all images are PNG.
             lossy: Whether to leave out or convert data that the format cannot store.
             overwrite: Whether to replace an existing file or folder.
 
         Returns:
-            One sentence for each thing that was left out or changed.
+            One sentence for each thing that was left out or changed. Those that begin with `video:`
+            say of each video whether its packets are copied, and why not.
 
         Raises:
             SpaceError: The format cannot hold a space or dtype, and `lossy` is not set.

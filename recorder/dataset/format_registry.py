@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
 ENTRY_POINT_GROUP: Final = "mcaprl.formats"
+VIDEO_NOTE: Final = "video: "
+"""Begin of the sentences of `Format.write` on videos of which nothing is lost."""
 KINDS = ("terminated", "truncated")
 """Kinds of the end of an episode."""
 _OTHERS = ("success_reasons", "view", "epsilon", "seed", "unstored_kwargs")

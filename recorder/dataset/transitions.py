@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mcaprl.actions import MASK_KEY, OBSERVATION_KEY, info_name
 from mcaprl.errors import SpaceError, UnknownNameError
 from mcaprl.recorder.dataset.images import Frames, joined, rows_of
+from mcaprl.recorder.dataset.packets import Packets
 from mcaprl.recorder.format.behavior import BehaviorField
 from mcaprl.recorder.format.infos import Masked, is_exact, kind_of
 from mcaprl.recorder.format.messages import INTERRUPTED, EpisodeSummary, add_up_each
@@ -86,6 +87,7 @@ class Transitions:
         episodes: Summaries of the episodes, in order. Their lengths divide the rows into episodes.
         infos: (F, *shape) masked array of each info by its dotted name. Row k is the info that the
             environment returned with frame k; it is masked if the environment returned none.
+        packets: Packets of the videos that leaves are the frames of, by the index of the leaf.
     """
 
     frames: tuple[Frames, ...]
@@ -97,6 +99,7 @@ class Transitions:
     behavior: NDArray[np.float32]
     episodes: tuple[EpisodeSummary, ...]
     infos: Mapping[str, Masked] = field(default_factory=dict)
+    packets: Mapping[int, Packets] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check that the columns' lengths agree."""
@@ -140,6 +143,7 @@ class Transitions:
             log_time_ns=self.log_time_ns[frames],
             episodes=tuple(self.episodes[k] for k in chosen),
             infos={name: info[frames] for name, info in self.infos.items()},
+            packets={leaf: one.rows(frames) for leaf, one in self.packets.items()},
             **self.at(steps),
         )
 
@@ -178,6 +182,7 @@ class Transitions:
             log_time_ns=self.log_time_ns[frames],
             episodes=tuple(episodes),
             infos={name: info[frames] for name, info in self.infos.items()},
+            packets={leaf: one.rows(frames) for leaf, one in self.packets.items()},
             **columns,
         )
         return found, old[starts]
@@ -191,6 +196,11 @@ class Transitions:
         leaves = range(len(parts[0].frames))
         return cls(
             infos=joined_infos([(part.infos, len(part.log_time_ns)) for part in parts]),
+            packets={
+                leaf: Packets.joined([part.packets[leaf] for part in parts])
+                for leaf in leaves
+                if all(leaf in part.packets for part in parts)
+            },
             frames=tuple(joined([part.frames[leaf] for part in parts]) for leaf in leaves),
             episodes=tuple(episode for part in parts for episode in part.episodes),
             **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names},

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.images import Frames, Storage
+from mcaprl.recorder.dataset.packets import Packets
 from mcaprl.recorder.dataset.transitions import Origin, Transitions
 from mcaprl.recorder.format.behavior import behavior_field
 from mcaprl.recorder.format.messages import EpisodeSummary, add_up
@@ -147,11 +148,12 @@ _STATE = "state"
 
 
 class _Observations(NamedTuple):
-    """Observation frames by leaf path, their space, and the names of the vector's elements."""
+    """Observation frames and packets by leaf path, their space, and the names of the vector."""
 
     frames: dict[tuple[str, ...], Frames]
     space: spaces.Space[Any]
     names: tuple[str, ...]
+    packets: dict[tuple[str, ...], Packets]
 
 
 def assembled(
@@ -219,6 +221,11 @@ def assembled(
         truncated=_at_ends(lengths, [each.truncated for each in summaries]),
         behavior=np.concatenate([run.behavior for run in runs])[steps],
         episodes=tuple(summaries),
+        packets={
+            k: observed.packets[leaf.path]
+            for k, leaf in enumerate(leaves_of(observed.space))
+            if leaf.path in observed.packets
+        },
     )
     return Dataset(transitions, metadata, origin=Origin(plan.bag.paths, is_shifted=is_shifted))
 
@@ -336,7 +343,7 @@ def _observations(
         parts = {name: _repeated(space, count) for name, space in parts.items()}
         names = _stacked_names(names, count)
     arrays: dict[str, Frames] = dict(vectors)
-    is_complete = True
+    is_complete, packets = True, dict[str, Packets]()
     for name, reader in plan.images.items():
         places = np.concatenate([run.quantities[name].values for run in runs])[rows]
         around, poses = plan.mapping.observation[name].around, None
@@ -350,13 +357,19 @@ def _observations(
             is_complete = False
         else:
             arrays[name], parts[name] = found, reader.space(found)
+            if (copied := reader.packets(places[stacked])) is not None:
+                packets[name] = copied
     if not is_complete:
         return None
     if len(parts) == 1:
         (name,) = parts
-        return _Observations({(): arrays[name]}, parts[name], tuple(names))
+        return _Observations(
+            {(): arrays[name]}, parts[name], tuple(names), {(): one for one in packets.values()}
+        )
     by_path: dict[tuple[str, ...], Frames] = {(name,): array for name, array in arrays.items()}
-    return _Observations(by_path, spaces.Dict(parts), ())
+    return _Observations(
+        by_path, spaces.Dict(parts), (), {(name,): one for name, one in packets.items()}
+    )
 
 
 def _put_vector(

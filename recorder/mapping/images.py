@@ -21,9 +21,11 @@ import math
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from gymnasium import spaces
@@ -46,6 +48,14 @@ from mcaprl.recorder.dataset.images import (
     open_cache,
     write_cache,
 )
+from mcaprl.recorder.dataset.packets import Packets
+from mcaprl.recorder.dataset.video import (
+    NO_FRAME,
+    Converter,
+    Message,
+    VideoDecoder,
+    VideoStream,
+)
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.format.schema import IMAGES_PER_CHUNK
 from mcaprl.recorder.format.spaces import IMAGE_ENCODINGS, MAX_ELEMENTS, Leaf
@@ -59,13 +69,6 @@ from mcaprl.recorder.mapping.image_pixels import (
     raw_pixels,
 )
 from mcaprl.recorder.mapping.spatial import Grid, fields_of, grid_image, grid_of, image_of
-from mcaprl.recorder.mapping.video import (
-    NO_FRAME,
-    Converter,
-    Message,
-    VideoDecoder,
-    VideoStream,
-)
 from mcaprl.texts import counted, size
 
 Image = NDArray[Any]
@@ -96,7 +99,7 @@ class ImageOptions:
 
     def to_json(self) -> str:
         """Return the options that determine the pixels."""
-        names = {"undistort", "crop", "resize", "gray", "range_m", "range", "as_"}
+        names = {*_CHANGES}
         if self._quantity.image is None:
             names |= {"size", "x_m", "y_m", "z_m", "azimuth_deg", "elevation_deg", "unknown"}
             names |= {"outside", "field", "clip"}
@@ -207,9 +210,9 @@ def _resized(image: Any, width: int, height: int, *, is_depth: bool) -> Any:
     return image.resize((width, height), method)
 
 
-_VERSION = "2"
+_VERSION = "3"
 """Version of the decoders. It changes if they decode the same message to other pixels."""
-_FAILURES = "failures"
+_FAILURES, _REORDERED = "failures", "reordered"
 _COPIED_BYTES = 1 << 20
 """Size of the images that are in memory at a time, but for one that is larger."""
 
@@ -263,6 +266,7 @@ def _existing(
     except (LogError, ValueError, TypeError):
         return None
     if found is not None:
+        reader.is_reordered |= _REORDERED in cache.metadata.get(CACHE_NOTES, {})
         for each in failed:
             reader.leave_out(each)
     return found
@@ -305,6 +309,8 @@ def _write(
         if reader.failures:
             failed = [(each.row, each.reason) for each in reader.failures.values()]
             notes[_FAILURES] = json.dumps(failed)
+        if reader.is_reordered:
+            notes[_REORDERED] = ""
 
     try:
         write_cache(path, description, leaf, blocks(), most=most, notes=notes)
@@ -331,6 +337,8 @@ def _files(paths: tuple[Path, ...]) -> Iterator[Path]:
         yield from sorted(path.iterdir()) if path.is_dir() else [path]
 
 
+_CHANGES: Final = {"undistort", "crop", "resize", "gray", "range_m", "range", "as_"}
+"""Options by which an image is not that of the message."""
 _REASONS = 4
 """Number of reasons that are listed for images of a video that have none."""
 _BLOCK_ROWS, _BLOCK_BYTES = 32, 1 << 22
@@ -353,6 +361,7 @@ class ImageReader:
         failures: Messages without a readable image, by their index in the topic, as far as `read`
             found any. They are to be treated as if they did not exist.
         packets_ns: Typical interval of the packets of a video; None for images.
+        is_reordered: Whether frames of a video were decoded in another order than their packets.
     """
 
     def __init__(
@@ -381,6 +390,7 @@ class ImageReader:
             self.fields, is_stream = _image_fields(bag, bag.topics[topic], is_stream=is_stream)
         self.failures: dict[int, Failure] = {}
         self.packets_ns: float | None = None
+        self.is_reordered = False
         self._video: VideoStream | None = None
         if is_stream:
             # A frame is averaged as it is decoded, unless a part of it is wanted.
@@ -395,7 +405,7 @@ class ImageReader:
         elif is_stream:
             files = np.array(bag.recordings)[bag.places(topic)[:, 0]]
             begins = np.flatnonzero(np.diff(files, prepend=-1))
-            self._video = VideoStream(self._packets, begins, bag.times(topic))
+            self._video = VideoStream(self.messages, begins, bag.times(topic))
             self.packets_ns = self._video.typical_ns
             if not strict:
                 for row, reason in self._video.before_keyframes():
@@ -459,6 +469,19 @@ class ImageReader:
         else:
             found = None
         return None if self.failures.keys() & set(needed.tolist()) else found
+
+    def packets(self, rows: NDArray[np.int64]) -> Packets | None:
+        """Return the packets of the images that `read` returned for `rows`; None for images."""
+        if self._video is None:
+            return None
+        changes = self._quantity.model_dump(include=_CHANGES, exclude_defaults=True, by_alias=True)
+        lack = f"the mapping has {', '.join(sorted(changes))}" if changes else ""
+        if rows.ndim > 1:
+            lack = "the mapping has stack"
+        elif self.is_reordered and not lack:
+            lack = "its packets are not in the order of its frames (B-frames)"
+        stream = partial(_packets_of, self.bag.again, self.topic, self._quantity)
+        return Packets.of_rows(stream, rows if rows.ndim == 1 else rows[:, -1], lack=lack)
 
     def blocks(
         self,
@@ -597,8 +620,10 @@ class ImageReader:
 
     def _frames(self, video: VideoStream, rows: NDArray[np.int64]) -> Decoded:
         """Yield the frames of a video; with B-frames, their rows do not ascend."""
-        wanted = set(rows.tolist())
+        wanted, last = set(rows.tolist()), -1
         for row, frame in video.frames(rows):
+            if not isinstance(frame, str):
+                self.is_reordered, last = self.is_reordered or row < last, row
             if isinstance(frame, str):
                 # The frames beside the wanted ones are left out as well: they may be chosen next.
                 if row in wanted or not self._strict:
@@ -611,8 +636,8 @@ class ImageReader:
                     continue
                 yield row, image
 
-    def _packets(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, Message]]:
-        """Yield the packets of a video."""
+    def messages(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, Message]]:
+        """Yield the packets of a video for ascending rows."""
         for row, message in self._in_blocks(rows):
             if isinstance(message, Failure):
                 yield row, message.reason
@@ -638,6 +663,20 @@ class ImageReader:
         for k, row in enumerate(found.rows.tolist()):
             messages[row] = {name: column[k] for name, column in found.columns.items()}
         yield from sorted(messages.items(), key=lambda each: each[0])
+
+
+def _packets_of(
+    again: Callable[[], Bag], topic: str, quantity: Quantity, rows: NDArray[np.int64]
+) -> Iterator[tuple[str, bytes]]:
+    """Yield the codec and the data of the packets `rows` of a topic of a bag that is closed."""
+    with closing(again()) as bag:
+        reader = ImageReader(bag, topic, quantity, strict=True)
+        # Messages are read in ascending order.
+        for part in np.split(rows, np.flatnonzero(np.diff(rows) <= 0) + 1):
+            for row, message in reader.messages(part):
+                if isinstance(message, str):
+                    raise LogError(f"{topic}: message {row}: {message}")
+                yield message[:2]
 
 
 class LiveVideo:

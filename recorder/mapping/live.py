@@ -130,6 +130,10 @@ class Topics:
         """Return the type of a topic's messages."""
         return self.definitions[topic]
 
+    def again(self) -> Topics:
+        """Return the topics."""
+        return self
+
     def close(self) -> None:
         """Do nothing."""
 

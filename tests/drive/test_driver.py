@@ -22,9 +22,9 @@ from mcaprl.base_policy import BasePolicy
 from mcaprl.chunks import planned
 from mcaprl.errors import LogError, McaprlError, UsageError
 from mcaprl.recorder.bags.decoders import decoder_of
+from mcaprl.recorder.dataset.video import LOST
 from mcaprl.recorder.mapping.config import parse_mapping
 from mcaprl.recorder.mapping.read import read_open_bag
-from mcaprl.recorder.mapping.video import LOST
 from mcaprl.sims.evaluation.rollout import EpsilonGreedy
 from tests.drive.test_live import (
     INFO,

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from mcaprl.errors import LogError, UsageError
+from mcaprl.recorder.dataset.video import _h265
 from mcaprl.recorder.mapping.config import Place, parse_mapping
 from mcaprl.recorder.mapping.images import LiveVideo
 from mcaprl.recorder.mapping.live import STATE, LiveEpisodes, LiveSteps, Topics
@@ -18,7 +19,6 @@ from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.read import read_open_bag
 from mcaprl.recorder.mapping.robot import Robot
 from mcaprl.recorder.mapping.steps import StepReader
-from mcaprl.recorder.mapping.video import _h265
 from tests.support.stream_bag import Sent, StreamBag
 from tests.support.videos import packets
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from io import BytesIO
@@ -23,6 +23,7 @@ from mcaprl.errors import LogError, import_extra
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.arrays import exactly
 from mcaprl.recorder.dataset.images import decoded_file
+from mcaprl.recorder.dataset.video import VideoDecoder, is_keyframe
 from mcaprl.recorder.format.behavior import FIELDS
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, check_elements
 
@@ -270,12 +271,13 @@ def _numbers(name: str, column: Any) -> NDArray[Any]:
 _CODEC, _QUALITY, _KEY_FRAMES = "libx264", 18, 2
 
 
-class VideoWriter:
-    """Writer of the videos of a camera.
+def can_mux() -> bool:
+    """Return whether PyAV writes packets that it did not encode."""
+    return hasattr(import_extra("av", "video").container.OutputContainer, "add_mux_stream")
 
-    Attributes:
-        info: Description of the videos for `meta/info.json`.
-    """
+
+class VideoWriter:
+    """Writer of the videos of a camera."""
 
     def __init__(
         self,
@@ -285,6 +287,7 @@ class VideoWriter:
         path: str,
         max_bytes: int,
         chunk_files: int,
+        codec: str = "",
     ) -> None:
         """Create a writer; the first episode creates a file.
 
@@ -295,42 +298,66 @@ class VideoWriter:
             path: Template of file paths in the folder, with placeholders for the file's indexes.
             max_bytes: Size of a file, in bytes, after which the next file begins.
             chunk_files: Number of files in a folder.
+            codec: Codec of packets to be copied; empty if images are encoded.
         """
         self._folder, self._feature, self._rate = folder, feature, rate
         self._path, self._max_bytes, self._chunk_files = path, max_bytes, chunk_files
+        self._codec, self._av = codec, import_extra("av", "video")
         self._number, self._frames, self._bytes = -1, 0, 0
         self._container: Any = None
         self._stream: Any = None
-        height, width, channels = feature.shape
-        # 4:2:0 stores one color for each block of 2 x 2 pixels, so height and width must be even.
-        self._format = "yuv420p" if height % 2 == width % 2 == 0 else "yuv444p"
-        self.info = {
+
+    def info(self) -> dict[str, Any]:
+        """Return the description of the videos for `meta/info.json`, after they were written."""
+        height, width, channels = self._feature.shape
+        with self._av.open(str(self._file(0))) as container:
+            format = container.streams.video[0].codec_context.pix_fmt
+        return {
             "video.height": height,
             "video.width": width,
-            "video.codec": "h264",
-            "video.pix_fmt": self._format,
+            "video.codec": self._codec or "h264",
+            "video.pix_fmt": format,
             "video.is_depth_map": False,
-            "video.fps": float(rate) if rate.denominator > 1 else int(rate),
+            "video.fps": float(self._rate) if self._rate.denominator > 1 else int(self._rate),
             "video.channels": channels,
             "has_audio": False,
         }
 
-    def add_episode(self, images: NDArray[np.uint8]) -> dict[str, Any]:
-        """Write the images of an episode, and return their position for the table of episodes.
+    def encode(self, images: NDArray[np.uint8]) -> dict[str, Any]:
+        """Encode the images of an episode, and return their position for the table of episodes.
 
         Args:
             images: (T, height, width[, channels]) with one or three channels.
         """
-        if self._container is None or self._bytes > self._max_bytes:
-            self._next_file()
-        av = import_extra("av", "video")
-        first = self._frames
+        first = self._begin()
         for image in images:
             color = np.broadcast_to(image.reshape(*image.shape[:2], -1), self._feature.shape)
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(color), "rgb24")
+            frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(color), "rgb24")
             frame.pts, frame.time_base = self._frames, 1 / self._rate
-            self._mux(frame)
+            self._mux(self._stream.encode(frame))
             self._frames += 1
+        return self._position(first)
+
+    def copy(self, packets: Iterable[tuple[str, bytes]]) -> dict[str, Any]:
+        """Write the packets of an episode as they are, and return the position of their frames."""
+        first, decoder = self._begin(), VideoDecoder()
+        for kind, data in packets:
+            packet = self._av.Packet(data)
+            packet.pts = packet.dts = self._frames
+            packet.time_base, packet.duration = 1 / self._rate, 1
+            packet.is_keyframe = is_keyframe(decoder, kind, data)
+            self._mux(self._sets.filter(packet))
+            self._frames += 1
+        return self._position(first)
+
+    def close(self) -> None:
+        """Finish the last file."""
+        if self._container is not None:
+            self._mux([] if self._codec else self._stream.encode(None))
+            self._container.close()
+            self._container = None
+
+    def _position(self, first: int) -> dict[str, Any]:
         name = f"videos/{self._feature.name}"
         return {
             f"{name}/chunk_index": self._number // self._chunk_files,
@@ -339,33 +366,43 @@ class VideoWriter:
             f"{name}/to_timestamp": float(self._frames / self._rate),
         }
 
-    def close(self) -> None:
-        """Finish the last file."""
-        if self._container is not None:
-            self._mux(None)
-            self._container.close()
-            self._container = None
-
-    def _file(self) -> Path:
-        chunk, number = divmod(self._number, self._chunk_files)
+    def _file(self, number: int) -> Path:
+        chunk, place = divmod(number, self._chunk_files)
         return self._folder / self._path.format(
-            video_key=self._feature.name, chunk_index=chunk, file_index=number
+            video_key=self._feature.name, chunk_index=chunk, file_index=place
         )
 
-    def _next_file(self) -> None:
-        self.close()
-        self._number += 1
-        self._frames = self._bytes = 0
-        self._file().parent.mkdir(parents=True, exist_ok=True)
-        self._container = import_extra("av", "video").open(str(self._file()), "w")
+    def _begin(self) -> int:
+        """Open the next file if it is needed, and return the number of its next image."""
+        if self._container is None or self._bytes > self._max_bytes:
+            self.close()
+            self._number += 1
+            self._frames = self._bytes = 0
+            path = self._file(self._number)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._container = self._av.open(str(path), "w")
+            self._open_stream()
+        return self._frames
+
+    def _open_stream(self) -> None:
+        height, width, _ = self._feature.shape
+        if self._codec:
+            self._stream = self._container.add_mux_stream(
+                self._codec, self._rate, width=width, height=height, time_base=1 / self._rate
+            )
+            # A file has the parameter sets of its first packet in its header.
+            filter_of = import_extra("av.bitstream", "video").BitStreamFilterContext
+            self._sets = filter_of("extract_extradata", self._codec)
+            return
         options = {"crf": str(_QUALITY), "g": str(_KEY_FRAMES)}
         self._stream = self._container.add_stream(_CODEC, rate=self._rate, options=options)
-        height, width, _ = self._feature.shape
         self._stream.height, self._stream.width = height, width
-        self._stream.pix_fmt = self._format
+        # 4:2:0 stores one color for each block of 2 x 2 pixels, so height and width must be even.
+        self._stream.pix_fmt = "yuv420p" if height % 2 == width % 2 == 0 else "yuv444p"
 
-    def _mux(self, frame: Any) -> None:
-        for packet in self._stream.encode(frame):
+    def _mux(self, packets: Iterable[Any]) -> None:
+        for packet in packets:
+            packet.stream = self._stream
             self._bytes += packet.size
             self._container.mux(packet)
 

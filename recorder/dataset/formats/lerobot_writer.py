@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import SpaceError, import_extra
 from mcaprl.files import parse_json
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.format_registry import VIDEO_NOTE
 from mcaprl.recorder.dataset.formats import lerobot_features
 from mcaprl.recorder.dataset.formats.columns import episode_slices
 from mcaprl.recorder.dataset.formats.lerobot_features import (
@@ -30,6 +33,7 @@ from mcaprl.recorder.dataset.formats.lerobot_features import (
     VIDEO_PATH,
     Feature,
     VideoWriter,
+    can_mux,
 )
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of
@@ -246,24 +250,54 @@ MAX_VIDEO_BYTES = 200 << 20
 _DEFAULT_TASK = "act"
 
 
-def write(dataset: Dataset, path: Path, *, lossy: bool = False, video: bool = False) -> list[str]:
+def write(
+    dataset: Dataset, path: Path, *, lossy: bool = False, video: bool | None = None
+) -> list[str]:
     """Write a dataset to an empty folder.
 
     Args:
         dataset: Episodes to write.
         path: Empty folder.
         lossy: Whether to leave out or convert data that LeRobot cannot store.
-        video: Whether images are compressed as H.264 video, which changes their pixels.
+        video: See `Dataset.to_lerobot`.
 
     Returns:
-        One sentence for each thing that was left out or changed.
+        One sentence for each thing that was left out or changed, and for each video.
     """
-    lost = losses(dataset, lossy=lossy, video=video)
-    writer = _Writer(dataset, path, video=video)
+    copies = {} if video is False else copies_of(dataset)
+    lost = losses(dataset, lossy=lossy, video=bool(video), copies=copies)
+    writer = _Writer(dataset, path, video=bool(video), copies=copies)
     for index in range(len(dataset.episode_lengths)):
         writer.add_episode(index)
     writer.finish()
     return lost + writer.notes()
+
+
+class Copy(NamedTuple):
+    """Whether the packets of a video are copied.
+
+    Attributes:
+        packets: Packet of each transition's observation.
+        codec: Codec of the packets; empty if they cannot be copied.
+        lack: Why they cannot be copied.
+    """
+
+    packets: Iterator[tuple[str, bytes]]
+    codec: str
+    lack: str
+
+
+def copies_of(dataset: Dataset) -> dict[str, Copy]:
+    """Return whether packets are copied, for each feature whose images are frames of a video."""
+    found = {}
+    rows = [slice(frames.start, frames.stop - 1) for _, frames in episode_slices(dataset)]
+    names = lerobot_features.observation_names(leaves_of(dataset.observation_space))
+    for leaf, packets in dataset._transitions.packets.items():
+        codec, lack = packets.codec(rows)
+        if codec and not can_mux():
+            codec, lack = "", "PyAV is older than 18"
+        found[names[leaf]] = Copy(packets.read(dataset.frame_of_step), codec, lack)
+    return found
 
 
 def frames_per_second(step_duration_ns: int) -> int | float:
@@ -282,8 +316,10 @@ def task_of(options: str, metadata: LogMetadata) -> str:
     return task if isinstance(task, str) and task else metadata.env_id or _DEFAULT_TASK
 
 
-def losses(dataset: Dataset, *, lossy: bool, video: bool) -> list[str]:
-    """Return one sentence for each change that loses data."""
+def losses(
+    dataset: Dataset, *, lossy: bool, video: bool, copies: Mapping[str, Copy] = MappingProxyType({})
+) -> list[str]:
+    """Return one sentence for each change that loses data, and for each video."""
     leaves = leaves_of(dataset.observation_space)
     named = zip(lerobot_features.observation_names(leaves), leaves, strict=True)
     every = [*named, (lerobot_features.ACTION, action_leaf(dataset.action_space))]
@@ -298,15 +334,24 @@ def losses(dataset: Dataset, *, lossy: bool, video: bool) -> list[str]:
         for name, leaf in every
         if len(leaf.shape) > lerobot_features.MAX_DIMENSIONS
     ]
+    copied = {name for name, copy in copies.items() if copy.codec}
     if video:
+        reasons = {name: f", because {copy.lack}" for name, copy in copies.items()}
         found += [
-            f"{name} is compressed as video, which changes its pixels"
+            f"{name} is compressed as video, which changes its pixels{reasons.get(name, '')}"
             for name, leaf in every
-            if lerobot_features.feature_of(name, leaf, video=True).dtype == "video"
+            if name not in copied
+            and lerobot_features.feature_of(name, leaf, video=True).dtype == "video"
         ]
     if found and not lossy:
         raise SpaceError(f"{found[0]}; pass `lossy=True` to write the dataset")
-    return found
+    return found + [
+        f"{VIDEO_NOTE}{name} is copied, {copy.codec}"
+        if copy.codec
+        else f"{VIDEO_NOTE}{name} is written as images, because {copy.lack}"
+        for name, copy in copies.items()
+        if copy.codec or not video
+    ]
 
 
 def _is_large(dataset: Dataset, leaf: Leaf) -> bool:
@@ -329,8 +374,10 @@ class Frames:
         episode_of_frame: (N,) index of the episode of each frame.
     """
 
-    def __init__(self, dataset: Dataset, *, video: bool = False) -> None:
-        """Name the features of a dataset."""
+    def __init__(
+        self, dataset: Dataset, *, video: bool = False, copied: Collection[str] = ()
+    ) -> None:
+        """Name the features of a dataset; with `video`, or `copied`, images are videos."""
         self._dataset = dataset
         metadata = LogMetadata.from_strings(dataset.metadata)
         self._leaves = leaves_of(dataset.observation_space)
@@ -338,7 +385,9 @@ class Frames:
         labels = metadata.observation_names
         named = zip(lerobot_features.observation_names(self._leaves), self._leaves, strict=True)
         self.observations = [
-            lerobot_features.feature_of(name, leaf, () if leaf.path else labels, video=video)
+            lerobot_features.feature_of(
+                name, leaf, () if leaf.path else labels, video=video or name in copied
+            )
             for name, leaf in named
         ]
         self._places = {one.name: k for k, one in enumerate(self.observations)}
@@ -416,16 +465,27 @@ class Frames:
 class _Writer:
     """Writer of the data files, videos and tables of episodes."""
 
-    def __init__(self, dataset: Dataset, path: Path, *, video: bool) -> None:
+    def __init__(
+        self, dataset: Dataset, path: Path, *, video: bool, copies: Mapping[str, Copy]
+    ) -> None:
         self._dataset, self._path = dataset, path
-        self._frames = Frames(dataset, video=video)
+        self._copied = {name: copy for name, copy in copies.items() if copy.codec}
+        self._frames = Frames(dataset, video=video, copied=self._copied)
         self._features = self._frames.features
         self._rows: list[dict[str, Any]] = []
         self._stats: list[dict[str, Stats]] = []
         self._files = ParquetFiles(path, self._features)
         rate = Fraction(self._frames.fps).limit_denominator(1001)
         self._videos = {
-            feature.name: VideoWriter(path, feature, rate, VIDEO_PATH, MAX_VIDEO_BYTES, CHUNK_FILES)
+            feature.name: VideoWriter(
+                path,
+                feature,
+                rate,
+                VIDEO_PATH,
+                MAX_VIDEO_BYTES,
+                CHUNK_FILES,
+                self._copied[feature.name].codec if feature.name in self._copied else "",
+            )
             for feature in self._frames.observations
             if feature.dtype == "video"
         }
@@ -439,11 +499,16 @@ class _Writer:
         columns: dict[str, Any] = {}
         stats: dict[str, Stats] = {}
         for feature in self._features:
+            if feature.name in self._copied:
+                stats[feature.name] = frames.stats(feature, index)
+                packets = islice(self._copied[feature.name].packets, count)
+                row |= self._videos[feature.name].copy(packets)
+                continue
             array = frames.values(feature, steps)
             shown = array[sampled(feature, count)] if feature.is_image else array
             stats[feature.name] = describe(feature, shown)
             if feature.dtype == "video":
-                row |= self._videos[feature.name].add_episode(array)
+                row |= self._videos[feature.name].encode(array)
             else:
                 columns[feature.name] = feature.encode(array)
         row |= self._files.add_episode(columns)
@@ -490,7 +555,7 @@ class _Writer:
     def _write_info(self) -> None:
         entries = {feature.name: feature.to_json() for feature in self._features}
         for name, video in self._videos.items():
-            entries[name]["info"] = video.info
+            entries[name]["info"] = video.info()
         info = self._frames.info(entries, has_videos=bool(self._videos))
         write_json(self._path / "meta/info.json", info)
 

@@ -41,11 +41,11 @@ from mcaprl.errors import LogError, McaprlError, UsageError
 from mcaprl.recorder.bags.decoders import decoder_of
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.transitions import Episode
+from mcaprl.recorder.dataset.video import Converter, Decoded, VideoDecoder
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.format.schema import LOG_TOPIC
 from mcaprl.recorder.format.spaces import observation_leaves
-from mcaprl.recorder.mapping.video import Converter, Decoded, VideoDecoder
 from mcaprl.recorder.record.camera import VIDEO, VIDEO_TYPE
 from mcaprl.recorder.record.display import (
     DEPTH,

@@ -15,7 +15,7 @@ from gymnasium import spaces
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import LogError, MissingExtraError, UsageError
-from mcaprl.recorder.mapping.video import VideoDecoder
+from mcaprl.recorder.dataset.video import VideoDecoder
 from tests.support.videos import scene
 
 

@@ -3,7 +3,7 @@
     python run.py read FOLDER OUT.npz    all items of a dataset, by key
     python run.py chunks FOLDER OUT.npz  the same, with the actions of the next 4 steps
     python run.py same LOG FOLDER        compares a log with its dataset, item by item
-    python run.py merge FOLDER TARGET    a dataset with the episodes of FOLDER twice
+    python run.py merge FOLDER TARGET [OUT.npz]  a dataset with the episodes of FOLDER twice
     python run.py make FOLDER KIND       the golden dataset of KIND `image` or `video`
     python run.py run PROGRAM ...        a script or a module, with its arguments
 
@@ -101,11 +101,13 @@ def same(log: Path, folder: str) -> None:
                 np.testing.assert_array_equal(mine.meta.stats[name][kind], value)
 
 
-def merge(folder: Path, target: str) -> None:
-    """Merge a dataset with itself."""
-    _lerobot()
+def merge(folder: Path, target: str, items: str | None = None) -> None:
+    """Merge a dataset with itself, and write the items of the result."""
+    reader = _lerobot().LeRobotDataset
     aggregate = import_module("lerobot.datasets.aggregate").aggregate_datasets
     aggregate(["any/a", "any/b"], "any/merged", roots=[folder, folder], aggr_root=Path(target))
+    if items is not None:
+        _write(reader("any/name", root=target), items)
 
 
 def make(folder: Path, kind: str) -> None:

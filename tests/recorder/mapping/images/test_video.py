@@ -16,9 +16,7 @@ from hypothesis import strategies as st
 import mcaprl
 from mcaprl.errors import LogError, UsageError
 from mcaprl.limits import MAX_IMAGE_PIXELS
-from mcaprl.recorder.mapping.config import Quantity
-from mcaprl.recorder.mapping.images import ImageReader
-from mcaprl.recorder.mapping.video import (
+from mcaprl.recorder.dataset.video import (
     LOST,
     NO_KEYFRAME,
     VideoDecoder,
@@ -27,6 +25,8 @@ from mcaprl.recorder.mapping.video import (
     _h265,
     _vp9,
 )
+from mcaprl.recorder.mapping.config import Quantity
+from mcaprl.recorder.mapping.images import ImageReader
 from tests.support.bags import START_NS, Channel, integers, write_channels
 from tests.support.memory_bag import MemoryBag
 from tests.support.videos import CODECS, GROUP, frames, packets

@@ -297,6 +297,7 @@ class _Codec(NamedTuple):
     """Codec: its names in messages, the decoder, its options, and how packets are looked at.
 
     Attributes:
+        in_mp4: Name of the codec in the MP4 files of LeRobot; empty if they do not have it.
         is_numbered: Whether packets show the numbers of their frames.
         has_parameters: Whether a keyframe needs parameter sets.
     """
@@ -304,17 +305,18 @@ class _Codec(NamedTuple):
     names: str
     decoder: str
     look: Callable[[bytes, bytes], _Look]
+    in_mp4: str = ""
     is_numbered: bool = False
     has_parameters: bool = True
     options: tuple[tuple[str, str], ...] = ()
 
 
 _CODECS: Final = {
-    "h264": _Codec(r"h\.?264|avc", "h264", _h264, is_numbered=True),
+    "h264": _Codec(r"h\.?264|avc", "h264", _h264, "h264", is_numbered=True),
     # Only with `explode`, a frame whose references are missing is an error.
-    "h265": _Codec(r"h\.?265|hevc", "hevc", _h265, options=(("err_detect", "explode"),)),
+    "h265": _Codec(r"h\.?265|hevc", "hevc", _h265, "hevc", options=(("err_detect", "explode"),)),
     "vp9": _Codec("vp9", "vp9", _vp9, has_parameters=False),
-    "av1": _Codec("av1", "libdav1d", _av1, is_numbered=True),
+    "av1": _Codec("av1", "libdav1d", _av1, "av1", is_numbered=True),
 }
 
 
@@ -326,6 +328,11 @@ def _codec_of(kind: str) -> _Codec:
         if re.search(codec.names, name, re.IGNORECASE):
             return codec
     raise UsageError(f"video '{kind}' is not supported; supported: {', '.join(_CODECS)}")
+
+
+def codec_in_mp4(kind: str) -> str:
+    """Return the name that a codec has in the MP4 files of LeRobot; empty if they lack it."""
+    return _codec_of(kind).in_mp4
 
 
 Decoded = tuple[int, Any]
@@ -498,7 +505,7 @@ class VideoStream:
         for begin, stop in zip(self._begins.tolist(), stops, strict=True):
             decoder = VideoDecoder()
             for row, message in self._read(np.arange(begin, stop)):
-                if not isinstance(message, str) and _starts(decoder, message):
+                if not isinstance(message, str) and is_keyframe(decoder, *message[:2]):
                     break
                 yield row, message if isinstance(message, str) else NO_KEYFRAME
 
@@ -533,7 +540,7 @@ class VideoStream:
     def _learn(self, decoder: VideoDecoder, begin: int, stop: int) -> None:
         """Let a decoder see the parameter sets at the begin of a recording."""
         for _, message in self._read(np.arange(begin, stop)):
-            if not isinstance(message, str) and _starts(decoder, message):
+            if not isinstance(message, str) and is_keyframe(decoder, *message[:2]):
                 return
 
     def _start(self, decoder: VideoDecoder, low: int, first: int) -> int | None:
@@ -543,16 +550,17 @@ class VideoStream:
             found = [
                 row
                 for row, message in self._read(rows)
-                if not isinstance(message, str) and _starts(decoder, message)
+                if not isinstance(message, str) and is_keyframe(decoder, *message[:2])
             ]
             if found:
                 return found[-1]
         return None
 
 
-def _starts(decoder: VideoDecoder, message: tuple[str, bytes, tuple[int, ...]]) -> bool:
+def is_keyframe(decoder: VideoDecoder, kind: str, data: bytes) -> bool:
+    """Return whether decoding can begin with a packet, whose parameter sets the decoder keeps."""
     try:
-        return decoder.starts(*message[:2])
+        return decoder.starts(kind, data)
     except LogError:
         return False
 
