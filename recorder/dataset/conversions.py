@@ -54,7 +54,7 @@ class Conversions:
 
     @staticmethod
     def from_lerobot(path: str | Path) -> Dataset:
-        """Read a LeRobot dataset v3.
+        """Read a LeRobot dataset v3; `save` copies the packets of its videos to a log.
 
         Raises:
             LogError: The files are missing, damaged or of another format.

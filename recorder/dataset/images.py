@@ -27,6 +27,7 @@ from mcaprl.errors import CorruptLogError, LogError, import_extra
 from mcaprl.files import replacing
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.dataset.episodes import time_order
+from mcaprl.recorder.dataset.log_video import LogVideo, is_video_leaf
 from mcaprl.recorder.format.messages import definition
 from mcaprl.recorder.format.reading import (
     MESSAGE_HEADER,
@@ -427,6 +428,14 @@ def read_images(
     reader: McapReader, leaf: Leaf, times: NDArray[np.int64], *, storage: Storage, threads: int
 ) -> Frames:
     """Read the (F, *shape) images of a leaf at these log_times."""
+    if is_video_leaf(reader, leaf):
+        video = LogVideo(reader, leaf)
+        order = video.order_at(times)
+        if not is_mapped(storage, len(times) * leaf.size):
+            return video.read(order)
+        cache = image_cache(reader, leaf, video.blocks())
+        images, times = _Images(cache, leaf), video.times[order]
+        return images.mapped(images.order_at(times))
     images = _Images(reader, leaf)
     if not is_mapped(storage, len(times) * leaf.size):
         return images.read(images.order_at(times), threads)

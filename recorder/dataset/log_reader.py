@@ -42,6 +42,7 @@ from mcaprl.recorder.dataset.episodes import (
     summaries,
 )
 from mcaprl.recorder.dataset.images import Frames, Storage, fingerprint, read_images
+from mcaprl.recorder.dataset.log_video import is_video_leaf, packets_of_leaf
 from mcaprl.recorder.dataset.transitions import Origin, Transitions, ranges
 from mcaprl.recorder.format.behavior import FIELDS, behavior_field
 from mcaprl.recorder.format.infos import read_infos
@@ -289,6 +290,7 @@ class LogReader:
     def _dataset(
         self, metadata: LogMetadata, columns: Columns, lengths: NDArray[np.int64]
     ) -> Dataset:
+        """Return the dataset of the records of whole episodes."""
         leaves = self._leaves(metadata)
         finals = np.cumsum(lengths + 1) - 1
         recorded = self._summaries.summaries(columns[LOG_TIME][finals])
@@ -309,6 +311,11 @@ class LogReader:
             truncated=_without(_flags(columns["truncated"]), finals),
             behavior=_without(behavior, finals),
             infos=read_infos(self._reader, columns[LOG_TIME]),
+            packets={
+                k: packets_of_leaf(self._reader, leaf, columns[LOG_TIME])
+                for k, leaf in enumerate(leaves)
+                if leaf.encoding is not None and is_video_leaf(self._reader, leaf)
+            },
         )
         if self._selection.columns is not None:
             metadata = replace(

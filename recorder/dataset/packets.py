@@ -74,8 +74,8 @@ class Packets:
         names: dict[str, str] = {}
         firsts = self.read(np.array([frames.start for frames in episodes]))
         for k, (kind, data) in enumerate(firsts):
-            names[codec_in_mp4(kind)] = kind
-            if not is_keyframe(VideoDecoder(), kind, data):
+            names[name := codec_in_mp4(kind)] = kind
+            if name and not is_keyframe(VideoDecoder(), kind, data):
                 return "", f"episode {k} does not begin with a keyframe that has parameter sets"
         if "" in names:
             return "", f"videos of LeRobot are h264, hevc or av1, not {names['']}"

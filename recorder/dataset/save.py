@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -13,11 +14,13 @@ from mcaprl.errors import LogError, SpaceError
 from mcaprl.files import replacing
 from mcaprl.recorder.dataset.arrays import with_fresh_times
 from mcaprl.recorder.dataset.images import Frames
-from mcaprl.recorder.dataset.transitions import Transitions
-from mcaprl.recorder.format.log_writer import InfoTopics, LogWriter, info_array
+from mcaprl.recorder.dataset.packets import Packets
+from mcaprl.recorder.dataset.transitions import Transitions, ranges
+from mcaprl.recorder.format.log_writer import InfoTopics, LogWriter, Message, info_array
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
-from mcaprl.recorder.format.schema import STEPS_PER_CHUNK
+from mcaprl.recorder.format.schema import BYTES_PER_CHUNK, STEPS_PER_CHUNK
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
+from mcaprl.recorder.format.video_messages import VIDEO_TEXT, VIDEO_TYPE, video_message
 from mcaprl.recorder.format.writing import McapWriter
 
 
@@ -50,7 +53,7 @@ def save_log(
     with replacing(path, LogError, overwrite=overwrite) as unfinished:
         log = LogWriter(unfinished, metadata, compression=compression)
         try:
-            _write_images(log, columns)
+            _write_images(path, log, columns)
             _write_infos(path, log, columns)
             log.write_episodes([e._replace(episode=k) for k, e in enumerate(columns.episodes)])
             _write_steps(log, columns)
@@ -61,11 +64,40 @@ def save_log(
             log.mcap.abandon()
 
 
-def _write_images(log: LogWriter, columns: Transitions) -> None:
-    for leaf, frames in _leaves(log, columns):
+def _write_images(path: Path, log: LogWriter, columns: Transitions) -> None:
+    for k, (leaf, frames) in enumerate(_leaves(log, columns)):
+        packets = columns.packets.get(k)
+        if packets is not None and packets.in_logs and _copied(path, log, columns, leaf, packets):
+            continue
         if leaf.encoding is not None:
             rows = log.image_rows(leaf.topic, leaf.shape, leaf.encoding)
             rows.write_columns(columns.log_time_ns, {"data": frames})
+
+
+def _copied(path: Path, log: LogWriter, columns: Transitions, leaf: Leaf, packets: Packets) -> bool:
+    """Write the packets of a video instead of images; warn if they cannot be copied."""
+    firsts, stops = columns.first_frames, columns.first_frames + columns.lengths + 1
+    # A last observation that repeats the one before it has no packet.
+    stops = stops - (packets.places[stops - 1] == packets.places[stops - 2]).all(axis=1)
+    codec, lack = packets.codec([slice(*ends) for ends in np.stack([firsts, stops], 1).tolist()])
+    if not codec:
+        warnings.warn(
+            f"{path}: {leaf.topic} has images, not the packets of their video: {lack}",
+            stacklevel=5,
+        )
+        return False
+    channel = log.sink.add_channel(leaf.topic, VIDEO_TYPE, VIDEO_TEXT)
+    frames = ranges(firsts, stops - firsts)
+    messages, size = list[Message](), 0
+    times = columns.log_time_ns[frames].tolist()
+    for time_ns, (kind, data) in zip(times, packets.read(frames), strict=True):
+        messages.append((channel, time_ns, video_message(time_ns, kind, data)))
+        size += len(data)
+        if size > BYTES_PER_CHUNK:
+            log.sink.write_messages(messages)
+            messages, size = [], 0
+    log.sink.write_messages(messages)
+    return True
 
 
 def _write_infos(path: Path, log: LogWriter, columns: Transitions) -> None:

@@ -332,7 +332,23 @@ def _codec_of(kind: str) -> _Codec:
 
 def codec_in_mp4(kind: str) -> str:
     """Return the name that a codec has in the MP4 files of LeRobot; empty if they lack it."""
-    return _codec_of(kind).in_mp4
+    try:
+        return _codec_of(kind).in_mp4
+    except UsageError:
+        return ""
+
+
+def with_parameters(kind: str, data: bytes, parameters: bytes) -> bytes:
+    """Return a packet, with parameter sets if it is a keyframe that has none."""
+    if not codec_in_mp4(kind):
+        return data
+    look = _codec_of(kind).look(data, parameters)
+    return parameters + data if look.is_key and not look.parameters else data
+
+
+def is_parameter_set(kind: str, unit: bytes) -> bool:
+    """Return whether a NAL unit of H.264 or H.265, without a start code, is a parameter set."""
+    return unit[0] & 31 in (7, 8) if kind == "h264" else unit[0] >> 1 & 63 in (32, 33, 34)
 
 
 Decoded = tuple[int, Any]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -28,7 +28,8 @@ from mcaprl.errors import (
 )
 from mcaprl.files import replacing, replacing_folder
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.log_reader import LogReader, Selection
+from mcaprl.recorder.dataset.log_reader import LogReader, Selection, described
+from mcaprl.recorder.dataset.log_video import LogVideo, is_video_leaf
 from mcaprl.recorder.edit.labels import Labels, carry_labels, labels_of, labels_to_carry
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.messages import INTERRUPTED, EpisodeSummary, add_up
@@ -42,6 +43,7 @@ from mcaprl.recorder.format.schema import (
     message_dtype,
 )
 from mcaprl.recorder.format.selected_copy import Source, Times, copy_selected, times_of
+from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.format.writing import finished_state
 from mcaprl.recorder.mapping.expression import Column, Expression
 from mcaprl.recorder.record.display import CAMERA_INFO, MAP, SCENE, SCENE_STATIC, TF, TF_STATIC
@@ -245,6 +247,20 @@ class _Piece:
         return Part(start_ns, end_ns, self.start, count, is_cut=self.stop < self.length)
 
 
+def _check_videos(log: FinishedLog, pieces: Iterable[_Piece]) -> None:
+    """Check that parts of episodes begin with a keyframe, where images are frames of a video."""
+    metadata = described(log.reader)
+    for leaf in observation_leaves(metadata.observation_space) if metadata else ():
+        if leaf.encoding is not None and is_video_leaf(log.reader, leaf):
+            video = LogVideo(log.reader, leaf)
+            for piece in pieces:
+                if piece.start and not video.is_start(piece.part(log).start_ns):
+                    raise UsageError(
+                        f"{log.path}: the images of {leaf.topic} are a video without a keyframe at"
+                        f" step {piece.start} of episode {piece.episode}: begin at another step"
+                    )
+
+
 def slice_log(
     path: str | Path,
     out: str | Path,
@@ -267,6 +283,7 @@ def slice_log(
             raise NoEpisodesError(f"{path} has no whole transition in this part")
         window = _without_single_records(log, pieces, *window)
     cut = [piece for piece in pieces if not piece.is_whole]
+    _check_videos(log, cut)
     spans = np.array([window], np.int64)
     source = Source(
         log.reader,

@@ -343,7 +343,7 @@ def _observations(
         parts = {name: _repeated(space, count) for name, space in parts.items()}
         names = _stacked_names(names, count)
     arrays: dict[str, Frames] = dict(vectors)
-    is_complete, packets = True, dict[str, Packets]()
+    packets, is_complete = dict[str, Packets](), True
     for name, reader in plan.images.items():
         places = np.concatenate([run.quantities[name].values for run in runs])[rows]
         around, poses = plan.mapping.observation[name].around, None
@@ -357,15 +357,14 @@ def _observations(
             is_complete = False
         else:
             arrays[name], parts[name] = found, reader.space(found)
-            if (copied := reader.packets(places[stacked])) is not None:
-                packets[name] = copied
+            if (video := reader.packets(places[stacked])) is not None:
+                packets[name] = video
     if not is_complete:
         return None
     if len(parts) == 1:
         (name,) = parts
-        return _Observations(
-            {(): arrays[name]}, parts[name], tuple(names), {(): one for one in packets.values()}
-        )
+        copied: dict[tuple[str, ...], Packets] = {(): packets[name]} if packets else {}
+        return _Observations({(): arrays[name]}, parts[name], tuple(names), copied)
     by_path: dict[tuple[str, ...], Frames] = {(name,): array for name, array in arrays.items()}
     return _Observations(
         by_path, spaces.Dict(parts), (), {(name,): one for name, one in packets.items()}

@@ -6,7 +6,6 @@ sets, as Foxglove and Lichtblick need it. Each episode begins with a keyframe.
 
 from __future__ import annotations
 
-import struct
 from fractions import Fraction
 from typing import Any, Final
 
@@ -15,27 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, UsageError, import_extra
+from mcaprl.recorder.format.video_messages import video_message
 
 VIDEO: Final = "/camera/image"
-VIDEO_TYPE: Final = "foxglove_msgs/msg/CompressedVideo"
-VIDEO_TEXT: Final = f"""\
-# One image of a video.
-builtin_interfaces/Time timestamp
-string frame_id
-uint8[] data
-string format
-{"=" * 80}
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
 VIDEO_PERIOD_NS: Final = 33_000_000
 """Shortest time between two images, simulated: viewers show up to 30 in a second."""
 _KEYFRAME_EVERY: Final = 60
 _OPTIONS: Final = {"preset": "superfast", "tune": "zerolatency", "crf": "25"}
-# Encapsulation header of CDR, then seconds and nanoseconds; an empty frame_id, and its padding.
-_START: Final = struct.Struct("<4sII")
-_NO_FRAME: Final = b"\1\0\0\0\0\0\0\0"
 
 
 class VideoEncoder:
@@ -69,9 +54,7 @@ class VideoEncoder:
         frame = self._av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuv420p")
         frame.pts, self._count = self._count, self._count + 1
         data = b"".join(bytes(packet) for packet in self._context.encode(frame))
-        content = _START.pack(b"\0\1\0\0", *divmod(time_ns, 10**9)) + _NO_FRAME
-        content += struct.pack("<I", len(data)) + data
-        return content + bytes(-len(content) % 4) + struct.pack("<I", 5) + b"h264\0"
+        return video_message(time_ns, "h264", data)
 
 
 def rendering_env(env: gym.Env[Any, Any], camera: bool | str) -> gym.Env[Any, Any] | None:

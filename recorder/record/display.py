@@ -29,12 +29,11 @@ import gymnasium as gym
 from mcaprl.recorder.format.log_writer import LogTopics
 from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.schema import telemetry_message, telemetry_schema
+from mcaprl.recorder.format.video_messages import VIDEO_TEXT, VIDEO_TYPE
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.camera import (
     VIDEO,
     VIDEO_PERIOD_NS,
-    VIDEO_TEXT,
-    VIDEO_TYPE,
     VideoEncoder,
     rendered,
 )

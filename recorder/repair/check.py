@@ -48,6 +48,7 @@ from mcaprl.recorder.dataset.episodes import (
     summaries_of_records,
 )
 from mcaprl.recorder.dataset.log_reader import LogReader, described
+from mcaprl.recorder.dataset.log_video import LogVideo, is_video_leaf
 from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.behavior import FIELDS
 from mcaprl.recorder.format.messages import EpisodeSummary, add_up
@@ -96,12 +97,11 @@ class EpisodeCheck:
         if not len(self._steps):
             raise NoEpisodesError("no finished episode")
         self._metadata = described(reader)
+        leaves = observation_leaves(self._metadata.observation_space) if self._metadata else []
+        images = [leaf for leaf in leaves if leaf.encoding is not None]
+        self._videos = [leaf for leaf in images if is_video_leaf(reader, leaf)]
         self._images = [
-            (leaf, Topic(reader, leaf.topic))
-            for leaf in (
-                observation_leaves(self._metadata.observation_space) if self._metadata else ()
-            )
-            if leaf.encoding is not None
+            (leaf, Topic(reader, leaf.topic)) for leaf in images if leaf not in self._videos
         ]
         # If other software wrote the log in another form, `LogReader` validates it.
         self._has_our_form = self._metadata is not None and self._schema_fits()
@@ -154,6 +154,11 @@ class EpisodeCheck:
                     " image",
                     leaf.topic,
                 )
+        for leaf in self._videos:
+            readable = LogVideo(self._reader, leaf).has_images(times[:frames], columns["final"])
+            if not readable.all():
+                what = f"{int((~readable).sum())} of {frames} records have no image"
+                yield Problem(what, leaf.topic)
 
     def _schema_fits(self) -> bool:
         """Return whether `/rl/step` has one channel, with a schema that matches the metadata."""

@@ -36,6 +36,7 @@ from mcaprl.errors import (
 )
 from mcaprl.files import locked_file, replacing
 from mcaprl.recorder.dataset.log_reader import described
+from mcaprl.recorder.dataset.log_video import LogVideo, is_video_leaf
 from mcaprl.recorder.format.messages import INTERRUPTED, EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import METADATA_NAME
 from mcaprl.recorder.format.reading import (
@@ -234,7 +235,7 @@ def _runs(reader: McapReader, columns: Columns, channel_ids: NDArray[Any]) -> It
         & (times[1:] > times[:-1])
         & ~columns["final"][:-1].astype(bool)
     )
-    complete = _with_images(reader, times)
+    complete = _with_images(reader, times, columns["final"])
     starts = [0, *(np.flatnonzero(~follows) + 1).tolist()]
     for start, stop in zip(starts, [*starts[1:], len(steps)], strict=True):
         length = int(np.argmin(np.append(complete[start:stop], False)))
@@ -257,11 +258,15 @@ def _message_dtype(schema: Schema) -> np.dtype[Any] | None:
     return message_dtype(schema.data.decode(errors="replace"))
 
 
-def _with_images(reader: McapReader, times: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _with_images(
+    reader: McapReader, times: NDArray[np.int64], final: NDArray[Any]
+) -> NDArray[np.bool_]:
     """Return a mask of the records that have exactly one image on each image topic."""
     metadata, complete = described(reader), np.ones(len(times), np.bool_)
     for leaf in observation_leaves(metadata.observation_space) if metadata else ():
-        if leaf.encoding is not None:
+        if leaf.encoding is not None and is_video_leaf(reader, leaf):
+            complete &= LogVideo(reader, leaf).has_images(times, final)
+        elif leaf.encoding is not None:
             found, counts = np.unique(Topic(reader, leaf.topic).times, return_counts=True)
             complete &= np.isin(times, found[counts == 1])
     return complete

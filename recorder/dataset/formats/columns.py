@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ from mcaprl.recorder.dataset.arrays import (
     with_fresh_times,
 )
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.packets import Packets
 from mcaprl.recorder.dataset.transitions import Transitions, joined_infos
 from mcaprl.recorder.format.behavior import BehaviorField, behavior_field
 from mcaprl.recorder.format.messages import EpisodeSummary, add_up, summary_of
@@ -119,8 +121,11 @@ def dataset_of(
     where: object,
     *,
     has_rewards: bool = True,
+    packets: Mapping[tuple[str, ...], Packets] = MappingProxyType({}),
 ) -> Dataset:
     """Return a dataset of these episodes.
+
+    `packets` has the packets of all images of leaves that are the frames of a video, by their path.
 
     If the times of the episodes increase strictly from row to row, they become the log_times.
     Otherwise, the data has no times: the log_times start at 0 and increase by the step duration in
@@ -137,7 +142,7 @@ def dataset_of(
         place = _place(where, index, episode)
         _check_times_and_shapes(episode, place)
         _check_values(episode, metadata, place, has_rewards=has_rewards)
-    return _joined([episode for _, episode in kept], metadata, where)
+    return _joined([episode for _, episode in kept], metadata, where, packets)
 
 
 def check_duration(metadata: LogMetadata, frames: int, where: object) -> None:
@@ -196,7 +201,12 @@ def _check_values(
         check_inside(name, np.asarray(leaf.of(episode.observations)), space, first_row=first)
 
 
-def _joined(kept: Sequence[EpisodeArrays], metadata: LogMetadata, where: object) -> Dataset:
+def _joined(
+    kept: Sequence[EpisodeArrays],
+    metadata: LogMetadata,
+    where: object,
+    packets: Mapping[tuple[str, ...], Packets],
+) -> Dataset:
     """Return a dataset of episodes with valid values; see `dataset_of`."""
     leaves = observation_leaves(metadata.observation_space)
     action, kind = action_leaf(metadata.action_space), behavior_field(metadata.action_space)
@@ -217,6 +227,9 @@ def _joined(kept: Sequence[EpisodeArrays], metadata: LogMetadata, where: object)
             behavior=np.concatenate([_behavior(e, kind) for e in kept]),
             episodes=tuple(_summary(k, e) for k, e in enumerate(kept)),
             infos=joined_infos([(e.infos, len(e.rewards) + 1) for e in kept]),
+            packets={
+                k: packets[leaf.path] for k, leaf in enumerate(leaves) if leaf.path in packets
+            },
         )
     except SpaceError as error:
         raise SpaceError(f"{where}: {error}") from error

@@ -7,6 +7,7 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,8 @@ from mcaprl.recorder.dataset.formats.lerobot_features import (
     read_frames,
 )
 from mcaprl.recorder.dataset.formats.lerobot_writer import write
+from mcaprl.recorder.dataset.formats.mp4 import packet_times, read_packets
+from mcaprl.recorder.dataset.packets import Packets, Stream
 from mcaprl.recorder.format.behavior import FIELDS
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import MAX_ACTIONS
@@ -92,6 +95,18 @@ class Files:
         """Return the values (N, *shape) of a feature, or the images of a camera."""
         return self._video(feature) if feature.dtype == "video" else self._column(feature)
 
+    def packets(self, feature: Feature) -> Packets:
+        """Return the packets of the images of a camera, in the order of the rows."""
+        places = np.zeros((int(self.stops[-1]), 2), np.int64)
+        streams, reasons = list[Stream](), list[str]()
+        for path, rows, times_s in self._videos(feature):
+            packets_s, lack = packet_times(path)
+            places[rows, 0] = len(streams)
+            places[rows, 1] = np.searchsorted(packets_s, times_s - 0.5 / self.fps)
+            streams.append(partial(read_packets, path))
+            reasons += [lack] if lack else []
+        return Packets(tuple(streams), places, "".join(reasons[:1]), in_logs=True)
+
     def steps(self) -> dict[str, NDArray[Any]]:
         """Return the values (N, *shape) of each feature in `STEPS` that the dataset has."""
         found = {}
@@ -136,11 +151,24 @@ class Files:
 
     def _video(self, feature: Feature) -> NDArray[np.uint8]:
         """Decode the images of a camera from the videos, in the order of the rows."""
+        images: NDArray[np.uint8] | None = None
+        for path, rows, times_s in self._videos(feature):
+            found = read_frames(path, times_s, 0.5 / self.fps)
+            if images is None:
+                images = np.empty((int(self.stops[-1]), *found.shape[1:]), np.uint8)
+            images[rows] = found
+        if images is None:
+            raise LogError(f"{self.path} has no episodes")
+        return images
+
+    def _videos(
+        self, feature: Feature
+    ) -> Iterator[tuple[Path, NDArray[np.int64], NDArray[np.float64]]]:
+        """Yield each video of a camera with its rows, and their times in it, which ascend."""
         name = f"videos/{feature.name}"
         files = [(row[f"{name}/chunk_index"], row[f"{name}/file_index"]) for row in self.episodes]
         firsts = [float(row[f"{name}/from_timestamp"]) for row in self.episodes]
         times = self.times_s() + np.repeat(firsts, self.lengths)
-        images: NDArray[np.uint8] | None = None
         for chunk, number in sorted(set(files)):
             mine = np.repeat([place == (chunk, number) for place in files], self.lengths)
             rows = np.flatnonzero(mine)
@@ -148,13 +176,7 @@ class Files:
             path = VIDEO_PATH.format(
                 video_key=feature.name, chunk_index=int(chunk), file_index=int(number)
             )
-            found = read_frames(self.path / path, times[rows], 0.5 / self.fps)
-            if images is None:
-                images = np.empty((len(times), *found.shape[1:]), np.uint8)
-            images[rows] = found
-        if images is None:
-            raise LogError(f"{self.path} has no episodes")
-        return images
+            yield self.path / path, rows, times[rows]
 
     def _episode_rows(self) -> list[dict[str, Any]]:
         arrow = import_extra("pyarrow", "tables")
@@ -236,7 +258,8 @@ def read(path: Path) -> Dataset:
 
 def _dataset_of(files: Files) -> Dataset:
     """Convert a dataset that has no final observations; warn about the missing data."""
-    values, parts, labels = _observations(files)
+    observed = _observed(files)
+    values, parts, labels = _observations(files, observed)
     steps = files.steps()
     if lerobot_features.ACTION not in steps:
         raise LogError(f"{files.path} has no feature '{lerobot_features.ACTION}'")
@@ -245,15 +268,7 @@ def _dataset_of(files: Files) -> Dataset:
         _warn(files, unread_note(unread))
     actions, action_space = _values_and_space(steps[lerobot_features.ACTION], is_action=True)
     is_single = len(parts) == 1
-    metadata = LogMetadata(
-        next(iter(parts.values())) if is_single else spaces.Dict(list(parts.items())),
-        action_space,
-        observation_names=labels if is_single else (),
-        action_part_names=_labels(files.features[lerobot_features.ACTION])
-        if isinstance(action_space, spaces.Box)
-        else (),
-        step_duration_ns=_step_ns(files),
-    )
+    metadata = _metadata(files, parts, labels, action_space)
     rewards = steps.get(lerobot_features.REWARD, np.full((len(actions), 1), np.nan))
     behavior: dict[str, Any] = {
         field.plural: steps[name][:, 0]
@@ -261,8 +276,8 @@ def _dataset_of(files: Files) -> Dataset:
         if name in steps
     }
     times, infos = _times_ns(files), _infos(files)
-    episodes = []
-    for part in _parts(files, steps):
+    episodes, every = [], _parts(files, steps)
+    for part in every:
         observations = {key: array[part.frames] for key, array in values.items()}
         episode = EpisodeArrays(
             observations=next(iter(observations.values())) if is_single else observations,
@@ -276,20 +291,42 @@ def _dataset_of(files: Files) -> Dataset:
             summary={"options": _options(files, part.source)},
         )
         episodes.append(episode)
+    rows = np.concatenate([np.zeros(0, np.int64), *(part.frames for part in every)])
     return dataset_of(
         episodes,
         metadata,
         files.path,
         has_rewards=lerobot_features.REWARD in steps,
+        packets={
+            () if is_single else (key,): files.packets(feature).rows(rows)
+            for key, feature in observed.items()
+            if feature.dtype == "video"
+        },
+    )
+
+
+def _metadata(
+    files: Files,
+    parts: Mapping[str, spaces.Space[Any]],
+    labels: tuple[str, ...],
+    action_space: spaces.Space[Any],
+) -> LogMetadata:
+    is_single, is_vector = len(parts) == 1, isinstance(action_space, spaces.Box)
+    return LogMetadata(
+        next(iter(parts.values())) if is_single else spaces.Dict(list(parts.items())),
+        action_space,
+        observation_names=labels if is_single else (),
+        action_part_names=_labels(files.features[lerobot_features.ACTION]) if is_vector else (),
+        step_duration_ns=_step_ns(files),
     )
 
 
 def _observations(
-    files: Files,
+    files: Files, observed: Mapping[str, Feature]
 ) -> tuple[dict[str, NDArray[Any]], dict[str, spaces.Space[Any]], tuple[str, ...]]:
     """Return values and spaces by observation key, and the element names of the first key."""
     values, parts, labels = {}, {}, []
-    for key, feature in _observed(files).items():
+    for key, feature in observed.items():
         values[key], parts[key] = _values_and_space(files.values(feature))
         labels.append(_labels(feature))
     return values, parts, labels[0]

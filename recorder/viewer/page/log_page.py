@@ -46,7 +46,8 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.format.schema import LOG_TOPIC
 from mcaprl.recorder.format.spaces import observation_leaves
-from mcaprl.recorder.record.camera import VIDEO, VIDEO_TYPE
+from mcaprl.recorder.format.video_messages import VIDEO_TYPE
+from mcaprl.recorder.record.camera import VIDEO
 from mcaprl.recorder.record.display import (
     DEPTH,
     SCENE,

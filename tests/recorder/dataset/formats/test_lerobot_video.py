@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -11,11 +12,15 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import mcaprl
 from mcaprl import Dataset
 from mcaprl.cli import run
-from mcaprl.errors import SpaceError
+from mcaprl.errors import CorruptLogError, SpaceError, UsageError
+from mcaprl.recorder.dataset import save
+from mcaprl.recorder.format import video_messages
 from tests.recorder.mapping.images.test_video import TEXT, video_message
 from tests.recorder.record.test_camera import Rendered, drive
 from tests.support.bags import Channel, integers, write_channels
@@ -27,6 +32,7 @@ pytest.importorskip("pyarrow", reason="needs the extra tables")
 RATE_HZ = 30
 CAMERA = "videos/observation.image/chunk-000/file-000.mp4"
 NAMES = {"h264": "h264", "h265": "hevc", "av1": "av1"}
+GOLDEN = Path(__file__).parents[3] / "golden/lerobot-video"
 _TYPE = "foxglove_msgs/msg/CompressedVideo"
 
 
@@ -268,3 +274,197 @@ def test_the_command_says_what_is_copied(
     # Without the last observation of each episode.
     rows = [*range(5), *range(6, 11)]
     assert stored(tmp_path / "out" / CAMERA) == [_short(bytes(every[row])) for row in rows]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Return a LeRobot dataset of three episodes for each codec; the last one is truncated."""
+    found = dict[str, Path]()
+    for name in NAMES:
+        folder = tmp_path_factory.mktemp(name)
+        bag = bag_of(folder / "bag.mcap", name, breaks=[GROUP - 1, 3 * GROUP - 1])
+        opened(bag).to_lerobot(found.setdefault(name, folder / "lerobot"))
+    return found
+
+
+ROWS = [*range(9), *range(10, 29), *range(30, 39)]
+"""Packets of the episodes, in order."""
+CAMERAS = CAMERA.replace("observation.image", "observation.images.camera")
+TOPIC = "/rl/observation/camera"
+
+
+@pytest.mark.filterwarnings("ignore:.*is not stored")
+@pytest.mark.parametrize("name", NAMES)
+def test_packets_go_to_a_log_and_back(
+    tmp_path: Path, folders: dict[str, Path], name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, out = tmp_path / "out.mcap", tmp_path / "again"
+    assert run(["convert", str(folders[name]), str(log)]) == 0
+    with mcaprl.open_bag(log) as bag:
+        stream, steps_ns = bag.read(TOPIC, ["data", "format", "timestamp"]), bag.times("/rl/step")
+    # Byte for byte those of the first bag, but for the temporal delimiters of AV1.
+    whole = [packets(name)[row].removeprefix(b"\x12\0") for row in ROWS]
+    assert [bytes(each) for each in stream.columns["data"]] == whole
+    assert set(stream.columns["format"]) == {name}
+    assert stream.columns["timestamp"].tolist() == stream.log_time_ns.tolist()
+    # The last observation of a terminated episode is that of the step before.
+    ends = [9, 29]
+    assert stream.log_time_ns.tolist() == np.delete(steps_ns, ends).tolist()
+
+    data = mcaprl.open(log)
+    source = Dataset.from_lerobot(folders[name])
+    assert data.fingerprint == source.fingerprint
+    images = images_of(name, ROWS)
+    shown = np.insert(images, [9, 28], images[[8, 27]], axis=0)
+    np.testing.assert_array_equal(data.frames["camera"], shown)
+    for options in ({"images": "mapped"}, {"episodes": [1]}, {"columns": ["camera"]}):
+        found = mcaprl.open(log, **options)
+        rows = slice(10, 30) if "episodes" in options else slice(None)
+        camera = found.frames["camera"] if isinstance(found.frames, dict) else found.frames
+        np.testing.assert_array_equal(camera[:], shown[rows])
+    assert mcaprl.check(log).problems == ()
+
+    capsys.readouterr()
+    assert run(["convert", str(log), str(out), "--to", "lerobot"]) == 0
+    assert f"video: observation.images.camera is copied, {NAMES[name]}" in capsys.readouterr().out
+    # An episode that did not terminate loses its last step, as LeRobot has no place for it.
+    assert stored(out / CAMERAS) == stored(folders[name] / CAMERAS)[:-1] == sent(name, ROWS[:-1])
+    np.testing.assert_array_equal(pixels(out / CAMERAS), images[:-1])
+
+
+@pytest.mark.filterwarnings("ignore:.*(is not stored|rewards are NaN)")
+def test_a_dataset_of_lerobot_goes_to_a_log_and_back(tmp_path: Path) -> None:
+    """LeRobot wrote it, with its encoder of AV1 and two episodes in a file."""
+    source = Dataset.from_lerobot(GOLDEN)
+    source.save(tmp_path / "log.mcap")
+    data = mcaprl.open(tmp_path / "log.mcap")
+    assert data.fingerprint == source.fingerprint
+    with mcaprl.open_bag(tmp_path / "log.mcap") as bag:
+        kinds = {
+            name: info.type_name
+            for name, info in bag.topics.items()
+            if name.startswith("/rl/observation/")
+        }
+    assert set(kinds.values()) == {_TYPE}
+    assert len(kinds) == 2
+    said = data.to_lerobot(tmp_path / "out")
+    assert [text for text in said if text.startswith("video: ")] == [
+        f"video: observation.images.{name} is copied, av1" for name in ("front", "wrist")
+    ]
+
+
+@pytest.mark.filterwarnings("ignore:.*is not stored")
+def test_a_log_with_video_is_learned_from_and_edited(
+    tmp_path: Path, folders: dict[str, Path]
+) -> None:
+    log, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
+    data = Dataset.from_lerobot(folders["h264"]).with_rewards(np.arange(36))
+    data.save(log)
+    shown = data.frames["camera"]
+    train = ["train-offline", str(log), "--algo", "bc", "--updates", "2", "--batch-size", "4"]
+    assert run([*train, "--out", str(tmp_path / "run")]) == 0
+    # What is copied by messages, and what is written again.
+    mcaprl.split(log, tmp_path / "parts", episodes=1)
+    parts = sorted((tmp_path / "parts").glob("*.mcap"))
+    np.testing.assert_array_equal(mcaprl.open(parts[1]).frames["camera"], shown[10:30])
+    mcaprl.merge([parts[0], parts[2]], out)
+    joined = mcaprl.open(out)
+    np.testing.assert_array_equal(joined.frames["camera"], np.delete(shown, range(10, 30), axis=0))
+    joined.save(out, overwrite=True)
+    assert mcaprl.check(out).problems == ()
+    found = mcaprl.recover(log, out, overwrite=True)
+    assert (found.episodes, found.has_losses) == (3, False)
+    np.testing.assert_array_equal(mcaprl.open(out).frames["camera"], shown)
+    # Step 9 is the first one of the second episode, and step 19 is its next keyframe.
+    mcaprl.slice(log, out, steps=(19, 25), overwrite=True)
+    np.testing.assert_array_equal(mcaprl.open(out).frames["camera"], shown[20:27])
+    with pytest.raises(UsageError, match="a video without a keyframe at step 5 of episode 1"):
+        mcaprl.slice(log, out, steps=(14, 25), overwrite=True)
+
+
+@pytest.mark.filterwarnings("ignore:.*is not stored")
+def test_a_damaged_packet_is_found_and_its_episode_dropped(
+    tmp_path: Path, folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
+    data = Dataset.from_lerobot(folders["h264"])
+    bad_ns = int(data.episodes[1].log_time_ns[12])
+    original = video_messages.video_message
+
+    def damaged(time_ns: int, kind: str, packet: bytes) -> bytes:
+        return original(time_ns, kind, b"\0\0\1\x41" if time_ns == bad_ns else packet)
+
+    monkeypatch.setattr(save, "video_message", damaged)
+    data.save(log)
+    # Of the second episode, steps 12 to 18 and the observation after them.
+    (problem,) = mcaprl.check(log).problems
+    assert (problem.what, problem.where) == ("8 of 39 records have no image", TOPIC)
+    with pytest.raises(CorruptLogError, match=rf"{TOPIC} at log_time {bad_ns} has no image: "):
+        mcaprl.open(log)
+    found = mcaprl.recover(log, out)
+    assert (found.episodes, [each.number for each in found.dropped]) == (2, [1])
+    shown = np.delete(data.frames["camera"], range(10, 30), axis=0)
+    np.testing.assert_array_equal(mcaprl.open(out).frames["camera"], shown)
+
+
+@pytest.mark.filterwarnings("ignore:.*(is not stored|rewards are NaN)")
+def test_a_log_has_exact_images_where_packets_cannot_be_copied(
+    tmp_path: Path, folders: dict[str, Path]
+) -> None:
+    log, said = tmp_path / "log.mcap", f"{TOPIC} has images, not the packets of their video: "
+    data = Dataset.from_lerobot(folders["h264"])
+    part = data.without(np.arange(len(data)) == 2)
+    with pytest.warns(UserWarning, match=f"{said}episode 1 does not begin with a keyframe"):
+        part.save(log)
+    np.testing.assert_array_equal(mcaprl.open(log).frames["camera"], part.frames["camera"])
+    # The same images in a video with B-frames, and of another codec.
+    folder = tmp_path / "lerobot"
+    shutil.copytree(folders["h264"], folder)
+    encode(folder / CAMERAS, "libx264", {"x264-params": "b-adapt=0:scenecut=0", "bf": "2"})
+    data = Dataset.from_lerobot(folder)
+    with pytest.warns(UserWarning, match=f"{said}its packets are not in the order"):
+        data.save(log, overwrite=True)
+    np.testing.assert_array_equal(mcaprl.open(log).frames["camera"], data.frames["camera"])
+    encode(folder / CAMERAS, "mpeg4", {})
+    data = Dataset.from_lerobot(folder)
+    with pytest.warns(UserWarning, match="h264, hevc or av1, not mpeg4"):
+        data.save(log, overwrite=True)
+    np.testing.assert_array_equal(mcaprl.open(log).frames["camera"], data.frames["camera"])
+
+
+def encode(video: Path, encoder: str, options: dict[str, str]) -> None:
+    with av.open(str(video), "w") as container:
+        stream: Any = container.add_stream(encoder, RATE_HZ, options=options)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for image in images_of("h264", ROWS):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24")))
+        container.mux(stream.encode(None))
+
+
+@pytest.mark.filterwarnings("ignore:.*is not stored")
+def test_keyframes_get_the_parameter_sets_of_their_file(
+    tmp_path: Path, folders: dict[str, Path]
+) -> None:
+    """Encoders of MP4 files put the parameter sets into the header alone."""
+    folder, log = tmp_path / "lerobot", tmp_path / "log.mcap"
+    images = Dataset.from_lerobot(folders["h264"])
+    images.without(np.arange(36) == 40 - 38).to_lerobot(folder, video=True, lossy=True)
+    data = Dataset.from_lerobot(folder)
+    data.save(log)
+    np.testing.assert_array_equal(mcaprl.open(log).frames["camera"], data.frames["camera"])
+    with mcaprl.open_bag(log) as bag:
+        every = [bytes(each) for each in bag.read(TOPIC, ["data"]).columns["data"]]
+    kinds = [[unit[0] & 31 for unit in each.split(b"\0\0\1")[1:]] for each in every]
+    assert {tuple(kind[:2]) for kind in kinds if 5 in kind} == {(7, 8)}
+    assert sum(5 in kind for kind in kinds) > 10
+
+
+@given(st.binary(max_size=30), st.integers(0, 2**62), st.data())
+def test_messages_of_videos_come_back_or_are_damaged(
+    packet: bytes, time_ns: int, data: st.DataObject
+) -> None:
+    message = video_messages.video_message(time_ns % 2**61, "h265", packet)
+    assert video_messages.packet_of(message) == ("h265", packet)
+    cut = data.draw(st.integers(0, len(message) - 1))
+    with pytest.raises(CorruptLogError, match="a message of a video is damaged"):
+        video_messages.packet_of(message[:cut])
