@@ -102,6 +102,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     "label": (
         "mcaprl label data/pilot.mcap --episode 3 --failure --note 'hit the wall'",
         "mcaprl label data/pilot.mcap --episode 3 --interval intervention --steps 40:60",
+        "mcaprl label robot.bag --mapping robot.yaml --episode 3 --success",
     ),
     "completion": (
         "mcaprl completion bash >> ~/.bashrc",
@@ -115,7 +116,7 @@ _BAGS: Final[dict[str, tuple[str, ...]]] = {
 }
 _RAY: Final[dict[str, tuple[str, ...]]] = {"Ray cluster": ("ray", "workers", "address")}
 OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
-    "label": {"Intervals": ("interval", "steps", "time")},
+    "label": {"Intervals": ("interval", "steps", "time"), **_BAGS},
     "record": {
         "Policy and length": (
             "policy",

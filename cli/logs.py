@@ -391,12 +391,14 @@ def relabel(log: str, out: str, reward: str, overwrite: bool) -> None:
 @click.option("--time", metavar="A:B", help="Seconds of the interval since the episode's start.")
 @click.option("--remove", is_flag=True, help="Remove the labels of --episode or --interval.")
 @click.option("--file", metavar="FILE", type=PATH, help="CSV or JSON file of labels.")
+@mapping_options
 @json_option
 def label(log: str, steps: str | None, time: str | None, as_json: bool, **request: Any) -> None:
     """Label episodes and intervals of LOG, which is not changed; without options, list the labels.
 
     Labels are kept in LOG.labels.json. filter and relabel can use them, and train-offline --mask
-    does not learn from labeled intervals.
+    does not learn from labeled intervals. With --mapping, LOG is a recording of another robot; the
+    mapping's reward and conditions can use its labels, such as labels.success.
     """
     request["steps"] = None if steps is None else _bounds("steps", steps)
     request["time"] = None if time is None else _bounds("time", time)

@@ -18,6 +18,7 @@ from mcaprl.recorder.dataset.format_registry import (
     read_format,
 )
 from mcaprl.recorder.dataset.images import STORAGES, Storage
+from mcaprl.recorder.dataset.labels import Labeled
 from mcaprl.recorder.dataset.open import Episodes, GrowingLogs, open_logs, weighted_logs
 
 Paths = str | Path | Sequence[str | Path]
@@ -26,6 +27,9 @@ Data = Dataset | Paths
 """A dataset, or paths of logs."""
 Source = Data | Callable[[], Dataset]
 """Data, or a function that opens them, which is called after other arguments are checked."""
+
+
+_LISTED = 3
 
 
 class ChangedMapping(NamedTuple):
@@ -177,6 +181,7 @@ def read_mapped(
     trust_code: bool = False,
     definitions: Definitions = (),
     images: Storage = "auto",
+    to_label: bool = False,
 ) -> Dataset:
     """Read a bag by a mapping, as `open_data` does, but without warnings on what is left out."""
     import_extra("pydantic", "bags")
@@ -190,7 +195,20 @@ def read_mapped(
         trust_code=trust_code,
         images=images,
         definitions=definitions,
+        to_label=to_label,
     ).dataset
+
+
+def labeled_recording(
+    data: str | Path, mapping: MappingFile, trust_code: bool, definitions: Definitions
+) -> Labeled:
+    """Return the episodes of a bag's only recording, by a mapping, to which labels belong."""
+    dataset = read_mapped(data, mapping, trust_code, definitions, to_label=True)
+    found: Sequence[Labeled] = dataset.origin.labeled
+    if len(found) != 1:
+        names = ", ".join(str(one.path) for one in found[:_LISTED])
+        raise UsageError(f"labels are of one recording: name one of the {len(found)}: {names}")
+    return found[0]
 
 
 def changed_mapping(

@@ -14,6 +14,7 @@ from mcaprl.errors import UsageError, import_extra
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.format_registry import VIDEO_NOTE, target_format, write_format
+from mcaprl.recorder.dataset.labels import carry_labels, labels_of
 from mcaprl.recorder.source import Definitions, Paths, Source, opened
 from mcaprl.storage.remote import check_upload, upload_all
 
@@ -165,7 +166,9 @@ def convert(
     if out is not None and form is not None:
         notes = write_format(dataset, out, form, lossy=lossy, overwrite=overwrite)
     elif out is not None:
+        labels = labels_of(dataset) if dataset.origin.labels else None
         dataset.save(out, overwrite=overwrite, keep_topics=keep_topics)
+        carry_labels(labels, np.arange(len(dataset.episodes)), Path(out))
     if upload is not None and out is not None:
         upload_all([Path(out)], upload)
     videos = [each.removeprefix(VIDEO_NOTE) for each in notes if each.startswith(VIDEO_NOTE)]

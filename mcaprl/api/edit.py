@@ -18,17 +18,24 @@ from mcaprl.errors import UsageError
 from mcaprl.files import check_log_name, check_target, temporary_folder
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.edit.join import merge_logs
-from mcaprl.recorder.edit.labels import (
+from mcaprl.recorder.dataset.labels import (
     Labels,
     carry_labels,
     change_labels,
     changes_in,
+    labels_of,
     labels_to_carry,
 )
+from mcaprl.recorder.edit.join import merge_logs
 from mcaprl.recorder.edit.piece import Bounds, Edited, filter_log, slice_log, split_log
 from mcaprl.recorder.edit.relabel import relabeled
-from mcaprl.recorder.source import Paths, open_data
+from mcaprl.recorder.source import (
+    Definitions,
+    MappingFile,
+    Paths,
+    labeled_recording,
+    open_data,
+)
 from mcaprl.recorder.viewer.annotate import Verification, annotated_copy, values_topics
 from mcaprl.storage.remote import as_path, is_url
 
@@ -191,14 +198,20 @@ def label(
     time: Bounds | None = None,
     remove: bool = False,
     file: str | Path | None = None,
+    mapping: MappingFile | None = None,
+    trust_code: bool = False,
+    definitions: Definitions = (),
 ) -> Labels:
     """Label episodes and intervals of a log; without arguments, return its labels.
 
     The labels are in `LOG.labels.json` beside the log, which is not changed. The file names the
     log's data by a hash: labels are never read for other data.
 
+    A recording of another robot is labeled by the episodes that a mapping finds in it, without the
+    mapping's conditions that use labels. A mapping that finds other episodes is refused.
+
     Args:
-        data: Path of the log.
+        data: Path of the log; or, with `mapping`, of one recording.
         episode: Index of the episode, from 0.
         success: Whether the episode succeeded.
         note: Note on the episode.
@@ -210,6 +223,9 @@ def label(
             these in `episode`; all labels without both.
         file: CSV file with a header or JSON list of labels to add, with the keys `episode`,
             `success`, `note`, `interval`, `start` and `stop` (steps); instead of other arguments.
+        mapping: Mapping of a bag; see `open`.
+        trust_code: Whether the mapping may name a Python function, which is imported.
+        definitions: Files and folders with definitions of ROS types that the bag lacks.
 
     Returns:
         All labels of the log.
@@ -217,7 +233,7 @@ def label(
     Raises:
         UsageError: There is no such episode, the interval is not within it, or arguments exclude
             each other. Nothing is saved.
-        LogError: The log or its labels cannot be read, or belong to different data.
+        LogError: The log or its labels cannot be read, or belong to different data or episodes.
     """
     if is_url(data):
         raise UsageError(f"{data} cannot be labeled: copy the log to this machine")
@@ -227,7 +243,9 @@ def label(
     if file is not None and change:
         raise UsageError(f"`file=` and `{next(iter(change))}=` exclude each other")
     changes = list(changes_in(Path(file))) if file is not None else [change] if change else []
-    return change_labels(Path(data), changes)
+    if mapping is None:
+        return change_labels(Path(data), changes)
+    return change_labels(labeled_recording(data, mapping, trust_code, definitions), changes)
 
 
 @dataclass(frozen=True)
@@ -308,6 +326,8 @@ def annotate(
         with temporary_folder() as folder:
             log = folder / "converted.mcap"
             data.save(log, keep_topics=keep_topics)
+            if data.origin.labels:
+                carry_labels(labels_of(data), np.arange(len(data.episodes)), log)
             options: Any = {"gamma": gamma, "overwrite": overwrite, "progress": progress}
             return annotate(log, out, policy=policy, trust_code=trust_code, **options)
     if keep_topics:

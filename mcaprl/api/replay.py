@@ -25,9 +25,9 @@ from mcaprl.errors import LogError, OutputExistsError, ReportError, UnknownNameE
 from mcaprl.files import check_target, replacing, temporary_folder, write_json
 from mcaprl.progress import Advance, ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.labels import Labels, label_by_json, labels_to_carry, read_labels
 from mcaprl.recorder.dataset.open import find_logs
 from mcaprl.recorder.dataset.transitions import Episode
-from mcaprl.recorder.edit.labels import Labels, label_by_json, labels_to_carry, read_labels
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.format.schema import LABELS_TOPIC

@@ -82,7 +82,7 @@ class Driver(DriverCore):
         self._topics = Topics(robot.topics)
         self._plan = Plan(
             self._topics,
-            robot.mapping,
+            robot.mapping.without_labels(),
             place,
             trust_code=trust_code,
             packets_ns=robot.packets_ns,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import hashlib
 import heapq
 import operator
 import warnings
@@ -419,6 +420,7 @@ class OpenBag:
     Attributes:
         paths: Files of the bag. The files of a recording follow each other.
         recordings: Index of the recording of each file, not descending.
+        names: Path of each recording: that of its file, or of the folder of a split bag.
         cut: Files that were cut off, or are still being written.
         again: Function that opens the bag again, as its arguments name it.
         topics: Description of each topic by name: `type_name`, `encoding`, `count`, `first_ns`,
@@ -428,7 +430,7 @@ class OpenBag:
 
     def __init__(
         self,
-        recordings: Sequence[Sequence[McapFile | RosbagFile]],
+        recordings: Mapping[str, Sequence[McapFile | RosbagFile]],
         opened: ExitStack,
         definitions: DefinitionFiles | None,
         again: Callable[[], OpenBag],
@@ -437,15 +439,16 @@ class OpenBag:
     ) -> None:
         """Join the topics of open files; `opened` closes them."""
         self._opened, self._strict, self.again = opened, strict, again
-        ordered = list(recordings)
+        ordered = [(name, list(files)) for name, files in recordings.items()]
         # The first times are not needed, and not read, if there is one file.
-        if sum(map(len, ordered)) > 1:
+        if sum(len(files) for _, files in ordered) > 1:
             # The parts of a split bag cover successive time ranges.
-            ordered = [sorted(files, key=_first_ns) for files in ordered]
-            ordered.sort(key=lambda files: _first_ns(files[0]))
-        files = [file for each in ordered for file in each]
+            ordered = [(name, sorted(files, key=_first_ns)) for name, files in ordered]
+            ordered.sort(key=lambda each: _first_ns(each[1][0]))
+        self._files = files = [file for _, each in ordered for file in each]
+        self.names = tuple(Path(name) for name, _ in ordered)
         self.paths = tuple(file.path for file in files)
-        self.recordings = tuple(number for number, each in enumerate(ordered) for _ in each)
+        self.recordings = tuple(number for number, (_, each) in enumerate(ordered) for _ in each)
         self.cut = tuple(file.path for file in files if not file.complete)
         names = dict.fromkeys(name for file in files for name in file.topics)
         self._topics = {
@@ -574,6 +577,12 @@ class OpenBag:
             LogError: The file is damaged, or no message of the topic can be decoded.
         """
         return self._readable(topic).failures()
+
+    def checksum(self, recording: int) -> str:
+        """Return the SHA-256 of what the files of a recording list of their messages."""
+        files = zip(self._files, self.recordings, strict=True)
+        sums = [file.checksum for file, number in files if number == recording]
+        return hashlib.sha256(" ".join(sums).encode()).hexdigest()
 
     def close(self) -> None:
         """Close the files."""

@@ -445,8 +445,10 @@ def _note_ignored(paths: Sequence[Path]) -> None:
         warnings.warn(f"ignored, because they are not bags: {names}{more}", stacklevel=2)
 
 
-def open_recordings(paths: Sequence[Path], opened: ExitStack) -> list[list[McapFile | RosbagFile]]:
-    """Open the files of bags, grouped by recording.
+def open_recordings(
+    paths: Sequence[Path], opened: ExitStack
+) -> dict[str, list[McapFile | RosbagFile]]:
+    """Open the files of bags, by the path of their recording.
 
     The files that a `metadata.yaml` lists are the parts of one recording, whether the folder or
     some of its files are given. Every other file is a recording.
@@ -455,7 +457,7 @@ def open_recordings(paths: Sequence[Path], opened: ExitStack) -> list[list[McapF
     for path in paths:
         for key, file in _opened(path, opened):
             parts.setdefault(key, []).append(file)
-    return list(parts.values())
+    return parts
 
 
 def _opened(path: Path, opened: ExitStack) -> Iterator[tuple[str, McapFile | RosbagFile]]:

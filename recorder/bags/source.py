@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import hashlib
 import sqlite3
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -175,7 +176,7 @@ class McapFile:
     def __init__(self, path: Path, *, distribution: str = "") -> None:
         """Open a file."""
         self.path = path
-        reader = McapReader(path)
+        self._reader = reader = McapReader(path)
         self.complete = reader.complete
         self.topics: dict[str, list[TopicSource]] = {}
         for channel in reader.channels.values():
@@ -187,6 +188,11 @@ class McapFile:
         """Lowest log_time of all messages; 0 if there are none."""
         every = [each.times_ns for sources in self.topics.values() for each in sources]
         return min((int(times_ns.min()) for times_ns in every if len(times_ns)), default=0)
+
+    @property
+    def checksum(self) -> str:
+        """Hash of the chunks; see `McapReader`."""
+        return self._reader.checksum
 
     def close(self) -> None:
         """Do nothing: a file that is mapped into memory need not be closed."""
@@ -319,6 +325,13 @@ class Database:
         found = next(rows)[0]
         return 2**63 - 1 if found is None else int(found)
 
+    @property
+    def entries(self) -> Iterator[tuple[Any, ...]]:
+        """Topic, time and size of each message."""
+        return self._connection.execute(
+            "SELECT topic_id, timestamp, length(data) FROM messages ORDER BY id"
+        )
+
     def close(self) -> None:
         """Close the file."""
         self._connection.close()
@@ -419,6 +432,14 @@ class RosbagFile:
             raise LogError(f"{path} cannot be read as a bag: {error}") from error
         self.topics = self._file.topics
 
+    @property
+    def checksum(self) -> str:
+        """SHA-256 of what is listed of each message."""
+        digest = hashlib.sha256(" ".join(self.topics).encode())
+        for entry in self._file.entries:
+            digest.update(repr(tuple(entry)).encode())
+        return digest.hexdigest()
+
     def close(self) -> None:
         """Close the files."""
         self._file.close()
@@ -441,6 +462,12 @@ class _Ros1Bag:
     @property
     def first_ns(self) -> int:
         return int(self._reader.start_time)
+
+    @property
+    def entries(self) -> Iterator[tuple[Any, ...]]:
+        """Connection, time and place of each message."""
+        for number, index in self._reader.indexes.items():
+            yield from ((number, *entry) for entry in index)
 
     def close(self) -> None:
         self._reader.close()

@@ -10,6 +10,7 @@ file without a summary is scanned from the start; its writer was killed or is st
 
 from __future__ import annotations
 
+import hashlib
 import os
 import struct
 from collections.abc import Iterable, Iterator
@@ -148,6 +149,19 @@ class McapReader:
     def is_remote(self) -> bool:
         """Whether the file is on another machine."""
         return self._remote is not None
+
+    @property
+    def checksum(self) -> str:
+        """SHA-256 of the offsets, sizes and CRCs of the chunks; without CRCs, also of the mtime."""
+        digest = hashlib.sha256(str(len(self.view)).encode())
+        has_crcs = bool(self.chunks)
+        for chunk in self.chunks:
+            header = chunk_header(self.view, chunk.chunk_start_offset)
+            digest.update(f"{header.data.start} {header.uncompressed_bytes} {header.crc} ".encode())
+            has_crcs &= header.crc != 0
+        if not has_crcs:
+            digest.update(str(self.path.stat().st_mtime_ns).encode())
+        return digest.hexdigest()
 
     def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
         """Fetch ranges of bytes of a remote file. Do nothing for a local file.

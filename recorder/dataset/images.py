@@ -10,7 +10,6 @@ memory-mapped file at memory speed. The CRC of a chunk is checked at the first r
 
 from __future__ import annotations
 
-import hashlib
 import math
 import mmap
 import os
@@ -353,7 +352,7 @@ def image_cache(reader: McapReader, leaf: Leaf, blocks: Blocks) -> McapReader:
     `blocks` yields the images of the whole topic. It is iterated only if the copy is written.
     """
     path = cache_path(reader.path, leaf)
-    description = {"fingerprint": fingerprint(reader), "topic": leaf.topic}
+    description = {"fingerprint": reader.checksum, "topic": leaf.topic}
     return open_cache(path, description) or write_cache(path, description, leaf, blocks)
 
 
@@ -403,22 +402,6 @@ def write_cache(
         finally:
             writer.abandon()
     return McapReader(path)
-
-
-def fingerprint(reader: McapReader) -> str:
-    """Return the SHA-256 of the offsets, sizes and CRCs of a log's chunks.
-
-    If a chunk has no CRC, the hash includes the mtime of the log.
-    """
-    digest = hashlib.sha256(str(len(reader.view)).encode())
-    has_crcs = bool(reader.chunks)
-    for chunk in reader.chunks:
-        header = chunk_header(reader.view, chunk.chunk_start_offset)
-        digest.update(f"{header.data.start} {header.uncompressed_bytes} {header.crc} ".encode())
-        has_crcs &= header.crc != 0
-    if not has_crcs:
-        digest.update(str(reader.path.stat().st_mtime_ns).encode())
-    return digest.hexdigest()
 
 
 _FIELDS = ("height", "width", "encoding", "step", "data")

@@ -41,7 +41,7 @@ from mcaprl.recorder.dataset.episodes import (
     step_order,
     summaries,
 )
-from mcaprl.recorder.dataset.images import Frames, Storage, fingerprint, read_images
+from mcaprl.recorder.dataset.images import Frames, Storage, read_images
 from mcaprl.recorder.dataset.log_video import is_video_leaf, packets_of_leaf
 from mcaprl.recorder.dataset.transitions import Origin, Transitions, ranges
 from mcaprl.recorder.format.behavior import FIELDS, behavior_field
@@ -176,8 +176,8 @@ class LogReader:
 
     @property
     def checksum(self) -> str:
-        """SHA-256 of the chunk offsets and CRCs; if CRCs are missing, also of the file's mtime."""
-        return fingerprint(self._reader)
+        """Hash of the log's chunks; see `McapReader`."""
+        return self._reader.checksum
 
     def record_times(self) -> NDArray[np.int64]:
         """Return the log_time of each record of the finished episodes, episode by episode.

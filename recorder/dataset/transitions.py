@@ -42,6 +42,9 @@ class Origin:
         copy_topics: Function that copies topics of the bag, by names or patterns, to the writer of
             another file; None for other data.
         is_shifted: Whether recordings of the bag overlapped, and have later times in the data.
+        labels: For a bag with labels, a function that returns or refuses them, and the (E,) lengths
+            of their episodes.
+        labeled: For a bag with labels, the episodes of each recording to which they belong.
     """
 
     sources: tuple[Path, ...] = ()
@@ -51,6 +54,8 @@ class Origin:
     grow: Callable[[], Any] | None = None
     copy_topics: Callable[[Sequence[str], Any], None] | None = None
     is_shifted: bool = False
+    labels: tuple[Callable[[], Any], NDArray[np.int64]] | None = None
+    labeled: tuple[Any, ...] = ()
 
     @classmethod
     def common(cls, origins: Sequence[Origin]) -> Origin:

@@ -28,9 +28,9 @@ from mcaprl.errors import (
 )
 from mcaprl.files import replacing, replacing_folder
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.labels import Labels, carry_labels, labels_of, labels_to_carry
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection, described
 from mcaprl.recorder.dataset.log_video import LogVideo, is_video_leaf
-from mcaprl.recorder.edit.labels import Labels, carry_labels, labels_of, labels_to_carry
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.messages import INTERRUPTED, EpisodeSummary, add_up
 from mcaprl.recorder.format.reading import McapReader
@@ -451,7 +451,7 @@ def _chosen(
     if condition.uses_next:
         raise UsageError(f"'{expression}': next(...) has no meaning for episodes")
     table = episode_columns(summaries, condition.names)
-    if condition.names & {"success", "note"}:
+    if condition.labels or condition.names & {"success", "note"}:
         table |= (labels() or Labels("")).columns(count)
     holds = condition.evaluate(table, np.arange(count))
     if not condition.is_condition(table):
@@ -481,7 +481,8 @@ def selected(dataset: Dataset, only: str | None = None, mask: Sequence[str] = ()
     labels, lengths = cache(lambda: labels_of(dataset)), dataset.episode_lengths
     dropped = np.zeros(len(dataset), np.bool_)
     if mask:
-        steps = (labels() or Labels("")).steps(lengths)
+        firsts = (np.cumsum(lengths) - lengths).tolist()
+        steps = (labels() or Labels("")).steps(firsts, len(dataset))
         for name in mask:
             if name not in steps:
                 raise UnknownNameError("name of intervals", name, steps)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.edit.labels import Labels, labels_of
+from mcaprl.recorder.dataset.labels import labels_of
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.mapping.expression import Expression
 
@@ -21,7 +21,9 @@ def relabeled(dataset: Dataset, reward: str) -> Dataset:
     following = np.minimum(np.arange(count) + 1, count - 1)
     expression = Expression(reward)
     if expression.names - columns.keys() and (labels := labels_of(dataset)) is not None:
-        columns = _label_columns(dataset, labels) | columns
+        lengths = dataset.episode_lengths
+        firsts = np.cumsum(lengths + 1) - lengths - 1
+        columns = labels.rows_of(firsts.tolist(), lengths.tolist(), count) | columns
     found = expression.evaluate(columns, following)[rows].astype(np.float64)
     if not (finite := np.isfinite(found)).all():
         step = int(finite.argmin())
@@ -67,14 +69,3 @@ def _columns(dataset: Dataset) -> dict[str, NDArray[Any]]:
         if info.ndim == 1 and info.dtype.kind in "biuf":
             add(name, np.ma.filled(info.astype(np.float64), np.nan))
     return columns
-
-
-def _label_columns(dataset: Dataset, labels: Labels) -> dict[str, NDArray[Any]]:
-    """Return `success`, and whether each step is in an interval by the interval's name."""
-    lengths, rows = dataset.episode_lengths, dataset.frame_of_step
-    success = np.repeat(labels.columns(len(lengths))["success"], lengths + 1)
-    columns = {}
-    for name, steps in labels.steps(lengths).items():
-        columns["_".join(name.replace("-", " ").split())] = full = np.zeros(len(success), np.bool_)
-        full[rows] = steps
-    return {**columns, "success": success}

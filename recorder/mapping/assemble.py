@@ -275,10 +275,15 @@ def _summary(
     rewards = run.rewards[segment.first : segment.last]
     wrong = np.flatnonzero(~np.isfinite(rewards))
     if len(wrong):
+        remedy = "set `missing` for the quantities in `reward`"
+        if "success" in plan.labels:
+            remedy += (
+                ", or label the episode, or write `0 if isnan(labels.success) else labels.success`"
+            )
         raise UsageError(
             f"{plan.place.of('reward')}: the reward is {rewards[wrong[0]]} at"
             f" {run.times_ns[segment.first + wrong[0]]} ns; it is not finite in {len(wrong)} of"
-            f" {len(rewards)} steps of this episode: set `missing` for the quantities in `reward`"
+            f" {len(rewards)} steps of this episode: {remedy}"
         )
     values, kind = run.behavior[segment.first : segment.last], behavior_field(run.actions.space)
     wrong = np.flatnonzero(kind.is_impossible(values))

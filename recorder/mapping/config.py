@@ -7,7 +7,7 @@ import keyword
 import math
 from collections.abc import Iterator
 from collections.abc import Mapping as MappingOf
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,6 +25,7 @@ from mcaprl.errors import UsageError
 from mcaprl.files import read_yaml
 from mcaprl.limits import MAX_IMAGE_PIXELS
 from mcaprl.recorder.format.spaces import MAX_ACTIONS
+from mcaprl.recorder.mapping.expression import Expression
 
 TimeSource = Literal["log_time", "publish_time", "header"]
 Alignment = Literal["last", "nearest", "linear"]
@@ -680,8 +681,8 @@ class Mapping(_Part):
     reward: str = Field(
         default="0",
         description="Expression that can use the names of quantities, `next(NAME)` for the value at"
-        " the next step, and `action`; or, if the mapping is trusted, a Python function"
-        " `module:function`.",
+        " the next step, `action`, and labels such as `labels.success` (docs/bags.md); or, if the"
+        " mapping is trusted, a Python function `module:function`.",
     )
     episodes: Episodes = Field(default=Episodes(), description="Begin and end of the episodes.")
     behavior_prob: Quantity | None = Field(
@@ -735,6 +736,27 @@ class Mapping(_Part):
         ):
             raise ValueError(f"{self.behavior[0]} must be a field")
         return self
+
+    def without_labels(self) -> Mapping:
+        """Return the mapping without conditions, reasons and a reward that use labels.
+
+        It is the mapping of the robot itself, which has no labels, and of the episodes to label.
+        """
+
+        def uses(text: str | None) -> bool:
+            # Other errors are those of the whole mapping.
+            with suppress(UsageError):
+                return text is not None and bool(Expression(text).labels)
+            return False
+
+        names = ("begin", "end", "terminated", "truncated")
+        changes: dict[str, Any] = {n: None for n in names if uses(getattr(self.episodes, n))}
+        reasons = {name: text for name, text in self.episodes.reasons.items() if not uses(text)}
+        if len(reasons) < len(self.episodes.reasons):
+            changes["reasons"] = reasons
+        found = {"episodes": self.episodes.model_copy(update=changes)} if changes else {}
+        found |= {"reward": "0"} if uses(self.reward) else {}
+        return self.model_copy(update=found) if found else self
 
     @property
     def behavior(self) -> tuple[str, Quantity] | None:

@@ -2,11 +2,14 @@
 
 An expression is parsed by `ast` and evaluated for all rows at once. It may contain numbers,
 strings for comparison, names, elements such as `pose[0]`, `+ - * / // % **`, comparisons, `and`,
-`or`, `not`, `A if CONDITION else B`, and calls of the functions in `FUNCTIONS`. Attributes, other
-calls, and all other syntax are errors.
+`or`, `not`, `A if CONDITION else B`, and calls of the functions in `FUNCTIONS`. Attributes but
+those of `labels`, other calls, and all other syntax are errors.
 
 A missing number is NaN, and a missing text is None. Comparisons with a missing value are missing,
 and logic has three values, as in SQL: `missing or 1` is 1, `missing or 0` is missing.
+
+`labels.NAME` is the name of a label: NaN if it is `success`, empty if it is `note`, and otherwise
+false, where there is none.
 """
 
 from __future__ import annotations
@@ -41,6 +44,8 @@ FUNCTIONS: Final[dict[str, tuple[Callable[..., Any], int]]] = {
     "clip": (np.clip, 3),
 }
 """By name: a function that expressions can call, and the number of its arguments."""
+_PREFIX: Final = "labels."
+"""Beginning of the name of a label."""
 NEXT: Final = "next"
 """Name of the function that evaluates its argument at the next step."""
 _MAX_CHARACTERS, _MAX_DEPTH, _MAX_SHOWN = 4000, 50, 200
@@ -73,6 +78,7 @@ class Expression:
     Attributes:
         text: Text of the expression.
         names: Names of the columns that the expression reads.
+        labels: Names of the labels that the expression reads, without `labels.`.
         uses_next: Whether the expression calls `next`.
     """
 
@@ -87,11 +93,11 @@ class Expression:
             self._tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise UsageError(f"'{self._shown}' is not an expression: {error}") from error
-        self._check(self._tree, 0)
-        self.names = frozenset(
-            node.id
-            for node in ast.walk(self._tree)
-            if isinstance(node, ast.Name) and node.id not in FUNCTIONS and node.id != NEXT
+        names = set[str]()
+        self._check(self._tree, 0, names)
+        self.names = frozenset(names)
+        self.labels = frozenset(
+            name.removeprefix(_PREFIX) for name in names if name.startswith(_PREFIX)
         )
         self.uses_next = any(
             isinstance(node, ast.Name) and node.id == NEXT for node in ast.walk(self._tree)
@@ -104,6 +110,7 @@ class Expression:
             columns: (N,) or (N, K) column of each name.
             following: (N,) index of the row after each row, which `next` reads.
         """
+        columns = {**self._missing_labels, **columns}
         for name in self.names:
             if name not in columns:
                 raise UnknownNameError("name in an expression", name, columns)
@@ -118,6 +125,7 @@ class Expression:
 
     def is_condition(self, columns: Mapping[str, Column]) -> bool:
         """Return whether all values are true, false or missing."""
+        columns = {**self._missing_labels, **columns}
 
         def holds(node: ast.AST) -> bool:
             match node:
@@ -125,8 +133,8 @@ class Expression:
                     return True
                 case ast.Call(func=ast.Name(id="isnan")):
                     return True
-                case ast.Name(id=name):
-                    return columns[name].dtype == np.bool_
+                case ast.Name() | ast.Attribute():
+                    return columns[ast.unparse(node)].dtype == np.bool_
                 case ast.IfExp(body=body, orelse=other):
                     return holds(body) and holds(other)
                 case _:
@@ -134,16 +142,30 @@ class Expression:
 
         return holds(self._tree)
 
-    def _check(self, node: ast.AST, depth: int) -> None:
+    @property
+    def _missing_labels(self) -> dict[str, Column]:
+        """Values of the labels that nobody gave."""
+        known = {"success": np.array(np.nan), "note": np.array("", object)}
+        return {f"{_PREFIX}{name}": known.get(name, np.array(False)) for name in self.labels}
+
+    def _check(self, node: ast.AST, depth: int, names: set[str]) -> None:
         if depth > _MAX_DEPTH:
             raise UsageError(f"'{self._shown}' is nested too deeply")
         allowed: tuple[type[ast.AST], ...] = (ast.Name, ast.Constant, ast.BinOp, ast.UnaryOp)
-        allowed += (ast.BoolOp, ast.Compare, ast.IfExp, ast.Call, ast.Subscript)
+        allowed += (ast.BoolOp, ast.Compare, ast.IfExp, ast.Call, ast.Subscript, ast.Attribute)
         if not isinstance(node, allowed):
             raise self._refused(node)
         match node:
             case ast.Name(id=name) if name in FUNCTIONS or name == NEXT:
                 raise UsageError(f"'{self._shown}': {name} is a function; call it as {name}(...)")
+            case ast.Name(id=name):
+                names.add(name)
+                parts = []
+            case ast.Attribute(value=ast.Name(id="labels")):
+                names.add(ast.unparse(node))
+                parts = []
+            case ast.Attribute():
+                raise self._refused(node)
             case ast.Constant(value=value) if not isinstance(value, bool | int | float | str):
                 raise self._refused(node)
             case ast.Constant(value=int(value)) if value.bit_length() > _MAX_BITS:
@@ -174,7 +196,7 @@ class Expression:
             case _:
                 parts = []
         for part in parts:
-            self._check(part, depth + 1)
+            self._check(part, depth + 1, names)
 
     @property
     def _shown(self) -> str:
@@ -205,8 +227,8 @@ class Expression:
             case ast.Constant(value=constant):
                 # Use float64: NumPy integers can overflow, and Python integers have no size limit.
                 return constant if isinstance(constant, str) else np.float64(cast(Any, constant))
-            case ast.Name(id=name):
-                return columns[name]
+            case ast.Name() | ast.Attribute():
+                return columns[ast.unparse(node)]
             case ast.Subscript(value=inner, slice=part):
                 found = np.asarray(value(inner))
                 if found.ndim != 2:

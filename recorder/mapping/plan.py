@@ -63,6 +63,7 @@ class Plan:
         conditions: Conditions of the episodes: `begin`, `end`, `terminated`, `truncated`.
         reasons: Conditions of the end reasons, by reason.
         reward: Function that computes the rewards.
+        labels: Names of the labels that reward, conditions and reasons use, such as `success`.
         streams: Messages of the used topics by the name of the stream, without those of transforms.
         clock: Name of the stream with a message for each step; None for a fixed rate.
         frames: Coordinate frames of the transforms, by topic.
@@ -114,6 +115,12 @@ class Plan:
             self._expression(("action", "expressions", number), text)
             for number, text in enumerate(action.expressions)
         ]
+        for number, expression in enumerate(self.expressions):
+            if expression.labels:
+                raise UsageError(
+                    f"{place.of('action', 'expressions', number)}: an action cannot depend on"
+                    " labels, which a robot does not have: use them in `reward` or `episodes`"
+                )
         self.behavior = None
         if (behavior := mapping.behavior) is not None:
             key, quantity = behavior
@@ -135,7 +142,9 @@ class Plan:
             for name, text in episodes.reasons.items()
         }
         with place.named("reward"):
-            self.reward = _reward_of(mapping.reward, trust_code=trust_code)
+            self.reward, reward = _reward_of(mapping.reward, trust_code=trust_code)
+        parsed = (*self.conditions.values(), *self.reasons.values(), *filter(None, (reward,)))
+        self.labels = frozenset().union(*(each.labels for each in parsed))
         self.streams: dict[str, TopicStream] = {}
         self.clock: str | None = None
         self._open_streams()
@@ -251,12 +260,16 @@ def _text(time: TimeSource | Stamp) -> str:
     return f"{time.field} in {time.unit}" if isinstance(time, Stamp) else time
 
 
-def _reward_of(text: str, *, trust_code: bool) -> Reward:
-    """Return the function that computes the rewards of all steps."""
+def _reward_of(text: str, *, trust_code: bool) -> tuple[Reward, Expression | None]:
+    """Return the function that computes the rewards of all steps, and its expression if any."""
     module, colon, name = text.partition(":")
     if not colon or not module.replace(".", "").isidentifier():
         expression = Expression(text)
-        return lambda columns, following: expression.evaluate(columns, following).astype(np.float64)
+
+        def evaluated(columns: Columns, following: NDArray[np.int64]) -> NDArray[np.float64]:
+            return expression.evaluate(columns, following).astype(np.float64)
+
+        return evaluated, expression
     if not trust_code:
         raise UsageError(
             f"the function '{text}' is Python code: pass `trust_code=True` if you trust the mapping"
@@ -275,4 +288,4 @@ def _reward_of(text: str, *, trust_code: bool) -> Reward:
             )
         return found
 
-    return rewards
+    return rewards, None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
+import warnings
 from collections.abc import Iterable, Sequence
 from collections.abc import Mapping as MappingOf
 from contextlib import closing
@@ -16,10 +18,11 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, Problem
-from mcaprl.recorder.bags.bag import Bag, copy_topics, open_bag
+from mcaprl.recorder.bags.bag import Bag, OpenBag, copy_topics, open_bag
 from mcaprl.recorder.bags.overview import instants_of, is_fresh
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.images import Storage
+from mcaprl.recorder.dataset.labels import Labeled, Labels, joined_labels, labels_path
 from mcaprl.recorder.mapping.actions import Actions
 from mcaprl.recorder.mapping.align import NS_PER_S
 from mcaprl.recorder.mapping.assemble import assembled, element_names, vector_names
@@ -249,18 +252,22 @@ def read_bag(
     trust_code: bool = False,
     images: Storage = "auto",
     definitions: Sequence[str | Path] = (),
+    to_label: bool = False,
 ) -> MappedBag:
     """Read the bag of `data` (see `open_bag`) as a dataset; see `mcaprl.open`.
 
-    `changes` has values that replace those of the mapping's keys.
+    `changes` has values that replace those of the mapping's keys. With `to_label`, the mapping's
+    own uses of labels are left out, and `labeled` of the origin is never empty.
     """
     place = Place()
     if not isinstance(mapping, Mapping):
         mapping, place = load_mapping(mapping)
     mapping = mapping.model_copy(update=dict(changes or {}))
+    mapping = mapping.without_labels() if to_label else mapping
     others = [*mapping.definitions, *definitions]
     with closing(open_bag(data, definitions=others, strict=mapping.strict)) as bag:
-        found = read_open_bag(bag, mapping, place, trust_code=trust_code, images=images)
+        options: Any = {"trust_code": trust_code, "images": images, "to_label": to_label}
+        found = read_open_bag(bag, mapping, place, **options)
     copy = partial(copy_topics, [path.absolute() for path in bag.paths], others)
     found.dataset.origin = replace(found.dataset.origin, copy_topics=copy)
     return found
@@ -273,31 +280,48 @@ def read_open_bag(
     *,
     trust_code: bool = False,
     images: Storage = "auto",
+    to_label: bool = False,
 ) -> MappedBag:
     """Read an open bag; see `read_bag`. In errors, `place` locates the keys of the mapping."""
     plan = Plan(bag, mapping, place or Place(), trust_code=trust_code)
     # Without the messages of images that cannot be decoded, steps use other messages, whose images
     # may be damaged as well.
-    while (found := _read(plan, images)) is None:
+    while (found := _read(plan, images, to_label)) is None:
         pass
     return found
 
 
-def _read(plan: Plan, images: Storage) -> MappedBag | None:
+def _read(plan: Plan, images: Storage, to_label: bool) -> MappedBag | None:
     """Read the bag of a plan; return None if images turned out to be unreadable."""
     plan.leave_out_images()
     bag, mapping, reader = plan.bag, plan.mapping, StepReader(plan)
     runs = [reader.read(number) for number in range(reader.count)]
-    least = mapping.episodes.min_steps
-    kept = [[each for each in run.episodes if each.length >= least] for run in runs]
     recordings = [run.recording for run in reader.runs.runs]
-    if mapping.episodes.per == "recording":
-        kept = _longest(kept, recordings)
+    kept = _kept(mapping, runs, recordings)
+    labeled = _labeled(bag, runs, kept, recordings, to_label=to_label)
+    labels = partial(joined_labels, labeled) if labeled else None
+    if plan.labels:
+        if labels is None:
+            names = ", ".join(map(str, bag.paths))
+            used = ", ".join(f"labels.{name}" for name in sorted(plan.labels))
+            warnings.warn(
+                f"{names} has no labels, which the mapping uses: {used}; see `mcaprl label`",
+                stacklevel=5,
+            )
+        before, sizes = _spans(runs, kept), [len(run.times_ns) for run in runs]
+        own = labels() if labels else Labels("")
+        columns = own.rows_of(*before, sum(sizes))
+        for number, rows in enumerate(np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])):
+            part = {name: column[rows] for name, column in columns.items()}
+            runs[number] = reader.divided(runs[number], part)
+        kept = _kept(mapping, runs, recordings)
+        if labels:
+            labels = partial(own.divided, before, _spans(runs, kept), sum(sizes))
     report = _report(plan, reader.runs, runs, kept)
     if not any(kept):
         raise LogError(
-            f"{', '.join(map(str, bag.paths))}: the mapping finds no episode of {least} or"
-            f" more steps: {report.why_empty()}"
+            f"{', '.join(map(str, bag.paths))}: the mapping finds no episode of"
+            f" {mapping.episodes.min_steps} or more steps: {report.why_empty()}"
         )
     dataset = assembled(plan, runs, kept, images)
     if dataset is None:
@@ -308,8 +332,61 @@ def _read(plan: Plan, images: Storage) -> MappedBag | None:
         report = replace(report, commands=commands.by_name(dataset.action_names))
     if isinstance(dataset.action_space, spaces.Box):
         report = replace(report, action_parts=list(dataset.action_labels))
-    dataset.origin = replace(dataset.origin, mapping=dataset.robot["mapping"], report=report)
+    dataset.origin = replace(
+        dataset.origin,
+        mapping=dataset.robot["mapping"],
+        report=report,
+        labels=labels and (labels, dataset.episode_lengths),
+        labeled=tuple(labeled),
+    )
     return MappedBag(dataset, report)
+
+
+def _kept(mapping: Mapping, runs: Sequence[Steps], recordings: list[int]) -> list[list[Segment]]:
+    """Return the episodes of each run that are not left out; `recordings` has that of each run."""
+    least = mapping.episodes.min_steps
+    kept = [[each for each in run.episodes if each.length >= least] for run in runs]
+    return _longest(kept, recordings) if mapping.episodes.per == "recording" else kept
+
+
+def _spans(runs: Sequence[Steps], kept: Sequence[Sequence[Segment]]) -> tuple[list[int], list[int]]:
+    """Return the first row and the length of each episode among the steps of all runs."""
+    offsets = np.cumsum([0, *(len(run.times_ns) for run in runs)]).tolist()
+    pairs = [(at, each) for at, some in zip(offsets, kept, strict=False) for each in some]
+    return [at + each.first for at, each in pairs], [each.length for _, each in pairs]
+
+
+def _labeled(
+    bag: Bag,
+    runs: Sequence[Steps],
+    kept: Sequence[Sequence[Segment]],
+    recordings: list[int],
+    *,
+    to_label: bool,
+) -> list[Labeled]:
+    """Return the episodes of each recording to which labels belong, if there are any."""
+    names = bag.names if isinstance(bag, OpenBag) else ()
+    if not to_label and not any(labels_path(name).is_file() for name in names):
+        return []
+    found = []
+    for number, name in enumerate(names):
+        times = [
+            run.times_ns[each.first : each.last + 1]
+            for run, some, recording in zip(runs, kept, recordings, strict=True)
+            for each in some
+            if recording == number
+        ]
+        lengths = np.array([len(each) - 1 for each in times], np.int64)
+        every = np.concatenate([np.empty(0, np.int64), *times])
+        digest = hashlib.sha256(lengths.tobytes() + every.tobytes()).hexdigest()
+        lock = bag.paths[bag.recordings.index(number)]
+        checksum = bag.checksum(number)
+        found.append(Labeled(name, lock, checksum, lengths, partial(_same, every), digest))
+    return found
+
+
+def _same(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    return values
 
 
 def _longest(kept: list[list[Segment]], recordings: list[int]) -> list[list[Segment]]:

@@ -202,6 +202,8 @@ class Steps(NamedTuple):
         rewards: (N,) reward of each step's action; may depend on the next step.
         episodes: Episodes that the steps form.
         reasons: (N,) flags by end reason: whether the condition of this reason is true.
+        ticks: Times of the steps, and gaps between them.
+        columns: Columns of expressions by name.
     """
 
     times_ns: NDArray[np.int64]
@@ -211,6 +213,8 @@ class Steps(NamedTuple):
     rewards: NDArray[np.float64]
     episodes: list[Segment]
     reasons: dict[str, NDArray[np.bool_]]
+    ticks: Ticks
+    columns: Mapping[str, NDArray[Any]]
 
 
 class StepReader:
@@ -247,7 +251,7 @@ class StepReader:
         return len(self.runs.runs)
 
     def read(self, number: int) -> Steps:
-        """Return the steps of one run; `number` is its index."""
+        """Return the steps of one run, as `divided` without labels; `number` is its index."""
         plan, run = self._plan, self.runs.runs[number]
         ticks = self._ticks(run)
         times_ns = ticks.times_ns
@@ -262,31 +266,50 @@ class StepReader:
                 if plan.quantities[name].quantity.pixels is None
             },
         }
-        following = np.minimum(np.arange(len(times_ns)) + 1, max(len(times_ns) - 1, 0))
-        actions = self._actions(run, ticks, columns, following)
+        actions = self._actions(run, ticks, columns, _following(len(times_ns)))
         behavior = self._behavior(run, ticks, behavior_field(actions.space))
         if actions.values.ndim == 1:
             columns["action"] = actions.values
-        conditions = self._conditions(("episodes",), plan.conditions, columns, following)
-        reasons = self._conditions(("episodes", "reasons"), plan.reasons, columns, following)
+        rewards = np.empty(0)
+        found = Steps(times_ns, quantities, actions, behavior, rewards, [], {}, ticks, columns)
+        return self.divided(found)
+
+    def divided(self, steps: Steps, labels: Mapping[str, NDArray[Any]] | None = None) -> Steps:
+        """Return the steps of a run with their rewards and episodes.
+
+        Args:
+            steps: Steps.
+            labels: (N,) columns of the labels of the steps. None if the labels are not known yet:
+                conditions that use them are left out, and rewards are 0.
+        """
+        plan, times_ns, ticks = self._plan, steps.times_ns, steps.ticks
+        columns, following = {**steps.columns, **(labels or {})}, _following(len(times_ns))
+        given = [plan.conditions, plan.reasons]
+        if labels is None:
+            given = [{k: e for k, e in each.items() if not e.labels} for each in given]
+        conditions = self._conditions(("episodes",), given[0], columns, following)
+        reasons = self._conditions(("episodes", "reasons"), given[1], columns, following)
         nothing = np.zeros(len(times_ns), bool)
         terminated = conditions.get("terminated", nothing)
         truncated = conditions.get("truncated", nothing) | conditions.get("end", nothing)
         # For rewards: a transition is terminal if the step that it leads to is terminal.
         columns |= {"terminated": terminated[following], "truncated": truncated[following]}
         marks = Marks(
-            usable=self._usable(quantities, len(times_ns)),
-            acted=~actions.missing,
+            usable=self._usable(steps.quantities, len(times_ns)),
+            acted=~steps.actions.missing,
             gap_before=ticks.gap_before,
             gap_after=ticks.gap_after,
             begin=conditions.get("begin"),
             terminated=terminated,
             truncated=truncated,
         )
-        with plan.place.named("reward"):
-            rewards = plan.reward(columns, following)
+        if labels is None and plan.labels:
+            rewards = np.zeros(len(times_ns))
+        else:
+            with plan.place.named("reward"):
+                rewards = plan.reward(columns, following)
         episodes = segments(marks, self._mapping.episodes.max_steps)
-        return Steps(times_ns, quantities, actions, behavior, rewards, episodes, reasons)
+        return steps._replace(rewards=rewards, episodes=episodes, reasons=reasons)
 
     def _behavior(self, run: Run, ticks: Ticks, field: BehaviorField) -> NDArray[np.float32]:
         """Return the probabilities or log densities of the actions; NaN if unknown."""
@@ -413,6 +436,11 @@ class StepReader:
                 is_stale = np.abs(values.age_s) > self._mapping.episodes.gap_s
             usable &= ~values.missing & ~is_stale
         return usable
+
+
+def _following(count: int) -> NDArray[np.int64]:
+    """Return the (N,) row after each row, which of the last one is itself."""
+    return np.minimum(np.arange(count) + 1, max(count - 1, 0))
 
 
 def command_part(wanted: Wanted, found: Values, type_name: str) -> CommandPart:

@@ -1,17 +1,18 @@
 """Labels of a log's episodes and steps, in a file beside the log, which is not changed.
 
 `LOG.labels.json` names the log's data by the hash of its chunks, so that it is never read for
-another log. It is replaced as a whole.
+another log. It is replaced as a whole. Labels of a recording of a bag also name the episodes that
+the mapping found, by the hash of their times.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from mcaprl.errors import LogError, UsageError
 from mcaprl.files import as_type, locked_file, parse_json, read_file, read_json, write_json
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader
+from mcaprl.texts import counted
 
 _VERSION: Final = 1
 _MAX_TEXT = 10_000
@@ -28,6 +30,33 @@ _KEYS = ("episode", "success", "note", "interval", "start", "stop")
 _SUCCESS = {"": None, "true": True, "1": True, "false": False, "0": False}
 Span = tuple[float | None, float | None]
 """Start (included) and stop (excluded); None for the start or end of the episode."""
+
+
+@dataclass(frozen=True)
+class Labeled:
+    """Episodes of a log, or of a recording of a bag by a mapping, to which labels belong.
+
+    Attributes:
+        path: Log; or file or folder of the recording. The labels are beside it.
+        lock: File that is locked while labels are saved.
+        checksum: Hash of the log or recording.
+        lengths: (E,) number of transitions of each episode.
+        record_times: Function that returns the (N + E,) times of all observations, nanoseconds.
+        episodes: Hash of the times of the episodes of a mapping; empty for a log.
+    """
+
+    path: Path
+    lock: Path
+    checksum: str
+    lengths: NDArray[np.int64]
+    record_times: Callable[[], NDArray[np.int64]]
+    episodes: str = ""
+
+    @classmethod
+    def log(cls, path: Path, reader: LogReader | None = None) -> Labeled:
+        """Return the episodes of a log."""
+        reader = reader or LogReader(path)
+        return cls(path, path, reader.checksum, reader.lengths, reader.record_times)
 
 
 @dataclass(frozen=True)
@@ -52,11 +81,12 @@ class Labels:
     """Labels of a log.
 
     Attributes:
-        log: Hash of the log's chunks.
+        log: Hash of the log's chunks, or of the recording.
         success: Whether each labeled episode succeeded, by the episode's index as text.
         notes: Note of each episode that has one, by the episode's index as text.
         intervals: Named intervals, by episode and start.
         version: Version of the file.
+        mapped: Hash of the episodes of a mapping; empty for a log.
     """
 
     log: str
@@ -64,6 +94,7 @@ class Labels:
     notes: dict[str, str] = field(default_factory=dict)
     intervals: list[Interval] = field(default_factory=list)
     version: int = _VERSION
+    mapped: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return what `label --json` prints and what the file contains."""
@@ -87,20 +118,80 @@ class Labels:
         ]
 
     def columns(self, episodes: int) -> dict[str, NDArray[Any]]:
-        """Return (E,) `success` (1, 0, or NaN without a label) and `note` (empty without one)."""
+        """Return (E,) columns of expressions on episodes.
+
+        They are `success` (1, 0, or NaN without a label), `note` (empty without one), and whether
+        the episode has such an interval by `labels.NAME`.
+        """
         keys = [str(episode) for episode in range(episodes)]
-        return {
+        found: dict[str, NDArray[Any]] = {
             "success": np.array([self.success.get(key, np.nan) for key in keys], np.float64),
             "note": np.array([self.notes.get(key, "") for key in keys], object),
         }
+        flags: dict[str, NDArray[Any]] = {}
+        for one in self.intervals:
+            flags.setdefault(word_of(one.name), np.zeros(episodes, np.bool_))[one.episode] = True
+        return found | _prefixed({**flags, **found})
 
-    def steps(self, lengths: NDArray[np.int64]) -> dict[str, NDArray[np.bool_]]:
-        """Return (N,) whether each step is in an interval, by the name of the intervals."""
-        first = np.cumsum(lengths) - lengths
+    def rows_of(
+        self, firsts: Sequence[int], lengths: Sequence[int], count: int
+    ) -> dict[str, NDArray[Any]]:
+        """Return (count,) columns of expressions on steps, by `NAME` and `labels.NAME`.
+
+        They are `success` (1, 0, or NaN without a label), `note` (empty without one), and whether
+        a step is in an interval by the interval's name, with `_` for blanks and hyphens.
+
+        Args:
+            firsts: (E,) row of the first observation of each episode.
+            lengths: (E,) number of transitions of each episode.
+            count: Number of rows.
+        """
+        found: dict[str, NDArray[Any]] = {}
+        for name, rows in self.steps(firsts, count).items():
+            found[word_of(name)] = rows | found.get(word_of(name), False)
+        found |= {"success": np.full(count, np.nan), "note": np.full(count, "", object)}
+        episodes = self.columns(len(firsts))
+        for name in ("success", "note"):
+            for first, length, value in zip(firsts, lengths, episodes[name], strict=True):
+                found[name][first : first + length + 1] = value
+        return found | _prefixed(found)
+
+    def divided(
+        self,
+        old: tuple[Sequence[int], Sequence[int]],
+        new: tuple[Sequence[int], Sequence[int]],
+        count: int,
+    ) -> Labels:
+        """Return the labels of other episodes of the same rows.
+
+        They have the result and the note that all of their rows have, and the intervals in them.
+
+        Args:
+            old: First rows and lengths of the labeled episodes; see `rows_of`.
+            new: Those of the other episodes.
+            count: Number of rows.
+        """
+        columns, flags = self.rows_of(*old, count), self.steps(old[0], count)
+        found = Labels(self.log)
+        for episode, (first, length) in enumerate(zip(*new, strict=True)):
+            success = np.unique(columns["success"][first : first + length + 1])
+            if len(success) == 1 and not np.isnan(success[0]):
+                found.success[str(episode)] = bool(success[0])
+            notes = {*columns["note"][first : first + length + 1]}
+            if len(notes) == 1 and notes != {""}:
+                found.notes[str(episode)] = notes.pop()
+            for name, column in flags.items():
+                inside = np.pad(column[first : first + length], 1)
+                edges = np.flatnonzero(inside[1:] != inside[:-1]).reshape(-1, 2).tolist()
+                found.intervals.extend(Interval(name, episode, *edge) for edge in edges)
+        return found
+
+    def steps(self, firsts: Sequence[int], count: int) -> dict[str, NDArray[np.bool_]]:
+        """Return which of the rows are in intervals, by name; see `rows_of`."""
         found: dict[str, NDArray[np.bool_]] = {}
         for one in self.intervals:
-            rows = found.setdefault(one.name, np.zeros(int(lengths.sum()), np.bool_))
-            rows[first[one.episode] + one.start : first[one.episode] + one.stop] = True
+            rows = found.setdefault(one.name, np.zeros(count, np.bool_))
+            rows[firsts[one.episode] + one.start : firsts[one.episode] + one.stop] = True
         return found
 
     def texts(self, dataset: Dataset) -> list[tuple[int, str]]:
@@ -146,7 +237,20 @@ class Labels:
         def others(given: Mapping[str, Any]) -> dict[str, Any]:
             return {key: one for key, one in given.items() if episode not in (None, int(key))}
 
-        return Labels(self.log, others(self.success), others(self.notes), kept)
+        return replace(self, success=others(self.success), notes=others(self.notes), intervals=kept)
+
+
+def word_of(name: str) -> str:
+    """Return the name of intervals in expressions.
+
+    >>> word_of("bad-data"), word_of("hand over")
+    ('bad_data', 'hand_over')
+    """
+    return "_".join(name.replace("-", " ").split())
+
+
+def _prefixed(columns: Mapping[str, Any]) -> dict[str, Any]:
+    return {f"labels.{name}": column for name, column in columns.items()}
 
 
 def labels_path(log: Path) -> Path:
@@ -154,25 +258,34 @@ def labels_path(log: Path) -> Path:
     return log.with_name(f"{log.name}.labels.json")
 
 
-def read_labels(log: Path, reader: LogReader | None = None) -> Labels:
+def read_labels(log: Path | Labeled) -> Labels:
     """Return the labels of a log; empty if it has none.
 
     Raises:
         LogError: The file of labels is damaged, or belongs to other data.
     """
-    reader, path = reader or LogReader(log), labels_path(log)
+    labeled = log if isinstance(log, Labeled) else Labeled.log(log)
+    log, path = labeled.path, labels_path(labeled.path)
     try:
         found: Labels = read_json(path, LogError, Labels)
     except FileNotFoundError:
-        return Labels(reader.checksum)
+        return Labels(labeled.checksum, mapped=labeled.episodes)
     if found.version != _VERSION:
         raise LogError(f"{path} has version {found.version}, expected {_VERSION}")
-    if found.log != reader.checksum:
+    if found.log != labeled.checksum:
         raise LogError(
             f"{path} has the labels of other data than {log}, which was replaced or continued:"
             " move the file of labels away"
         )
-    lengths = reader.lengths.tolist()
+    if found.mapped != labeled.episodes:
+        which = counted(len(labeled.lengths), "episode")
+        which += " that the mapping finds in" if labeled.episodes else " of"
+        how = "the mapping by which they were labeled" if found.mapped else "no mapping"
+        raise LogError(
+            f"{path} has the labels of other episodes than the {which} {log}: use {how}, or move"
+            " the file of labels away"
+        )
+    lengths = labeled.lengths.tolist()
     spans = [(str(one.episode), one.start, one.stop) for one in found.intervals]
     known = {str(episode): length for episode, length in enumerate(lengths)}
     for key, start, stop in [*((key, 0, 1) for key in {**found.success, **found.notes}), *spans]:
@@ -181,18 +294,18 @@ def read_labels(log: Path, reader: LogReader | None = None) -> Labels:
     return found
 
 
-def change_labels(log: Path, changes: Sequence[Mapping[str, Any]]) -> Labels:
+def change_labels(log: Path | Labeled, changes: Sequence[Mapping[str, Any]]) -> Labels:
     """Apply changes, which have the arguments of `mcaprl.label`, to a log's labels, and save them.
 
     Nothing is saved if one of the changes is refused.
     """
-    with locked_file(log):
-        reader = LogReader(log)
-        labels = read_labels(log, reader)
+    with locked_file(log.lock if isinstance(log, Labeled) else log):
+        labeled = log if isinstance(log, Labeled) else Labeled.log(log)
+        labels = read_labels(labeled)
         for change in changes:
-            labels = _changed(labels, reader, **change)
+            labels = _changed(labels, labeled, **change)
         if changes:
-            write_json(labels_path(log), labels.to_json(), LogError)
+            write_json(labels_path(labeled.path), labels.to_json(), LogError)
     return labels
 
 
@@ -239,23 +352,34 @@ def labels_of(dataset: Dataset) -> Labels | None:
     Raises:
         UsageError: The dataset has not exactly the episodes of its logs.
     """
+    if dataset.origin.labels is not None:
+        labels, lengths = dataset.origin.labels
+        _check_whole(dataset, lengths)
+        return cast(Labels, labels())
     if not any(labels_path(source).is_file() for source in dataset.sources):
         return None
-    readers = [LogReader(source) for source in dataset.sources]
-    lengths = np.concatenate([reader.lengths for reader in readers])
+    parts = [Labeled.log(source) for source in dataset.sources]
+    _check_whole(dataset, np.concatenate([part.lengths for part in parts]))
+    return joined_labels(parts)
+
+
+def joined_labels(parts: Sequence[Labeled]) -> Labels:
+    """Return the labels of several logs or recordings, whose episodes follow each other."""
+    joined, first = Labels(""), 0
+    for part in parts:
+        # Put the episodes at the place that they have in all data.
+        places = np.concatenate([np.full(first, -1, np.int64), np.arange(len(part.lengths))])
+        moved = read_labels(part).taken("", places)
+        joined.success.update(moved.success)
+        joined.notes.update(moved.notes)
+        joined.intervals.extend(moved.intervals)
+        first += len(part.lengths)
+    return joined
+
+
+def _check_whole(dataset: Dataset, lengths: NDArray[np.int64]) -> None:
     if not np.array_equal(lengths, dataset.episode_lengths):
         raise UsageError("the labels of logs are known for all of their episodes only")
-    joined, first = Labels(""), 0
-    for source, reader in zip(dataset.sources, readers, strict=True):
-        labels, count = read_labels(source, reader), len(reader.lengths)
-        # Put the episodes at the place that they have in the dataset.
-        places = np.concatenate([np.full(first, -1, np.int64), np.arange(count)])
-        part = labels.taken("", places)
-        joined.success.update(part.success)
-        joined.notes.update(part.notes)
-        joined.intervals.extend(part.intervals)
-        first += count
-    return joined
 
 
 def changes_in(path: Path) -> Iterator[dict[str, Any]]:
@@ -292,7 +416,7 @@ def changes_in(path: Path) -> Iterator[dict[str, Any]]:
 
 def _changed(
     labels: Labels,
-    reader: LogReader,
+    reader: Labeled,
     episode: int | None = None,
     success: bool | None = None,
     note: str | None = None,
@@ -328,7 +452,7 @@ def _changed(
 
 
 def _steps_in(
-    reader: LogReader, episode: int, steps: Span | None, time: Span | None
+    reader: Labeled, episode: int, steps: Span | None, time: Span | None
 ) -> tuple[int, int]:
     """Return the range of steps that a range of steps, or of seconds in the episode, selects."""
     if steps is not None and time is not None:
