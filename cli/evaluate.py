@@ -21,6 +21,7 @@ from mcaprl.cli.options import (
     mapping_options,
     max_steps_option,
     ray_options,
+    selection_options,
     sim_options,
     trust_run_option,
 )
@@ -47,6 +48,8 @@ _OF_DATA = (
     "trust_code",
     "definitions",
     "report",
+    "only",
+    "mask",
 )
 
 
@@ -114,6 +117,7 @@ _OF_DATA = (
     is_flag=True,
     help="With --data: print the table of all estimators, with their verdicts.",
 )
+@selection_options
 @mapping_options
 @click.option("--behavior", metavar="DATA", help="Logs whose returns are shown for comparison.")
 @click.option("--record", type=click.Path(path_type=Path), help="Log to write.")
@@ -153,12 +157,13 @@ def evaluate(
         _refuse_unused(given, [name for name in others if name not in _OF_DATA], "sim")
         # Compare with None, because 0 is a valid value of these options.
         bag, report = bag_options(others), others.pop("report")
+        selection = {name: others.pop(name) for name in ("only", "mask")}
         given = {name: others[name] for name in _OF_DATA if others.get(name) is not None}
         with working("reading data") as bar:
             from mcaprl.api.action_errors import is_estimable
 
             read = {"threads": others["threads"] or 1} if bag["mapping"] is None else bag
-            source = mcaprl.open(data, **read)
+            source = mcaprl.select(mcaprl.open(data, **read), **selection)
             errors = mcaprl.action_errors(
                 policies, source, trust_code=bag["trust_code"], seed=seed, report=report
             )

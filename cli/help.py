@@ -142,7 +142,7 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     },
     "train-offline": {
         "Run": ("out", "algo", "seeds", "seed", "threads", "device", "resume"),
-        "Data": ("follow", "other_data"),
+        "Data": ("follow", "other_data", "only", "mask"),
         **_BAGS,
     },
     "evaluate": {
@@ -156,6 +156,8 @@ OPTION_GROUPS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
             "estimate_behavior",
             "clip_actions",
             "threads",
+            "only",
+            "mask",
         ),
         "Output with --sim": ("record", "keys", "report", "overwrite"),
         "Output": ("as_json",),

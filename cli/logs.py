@@ -24,6 +24,7 @@ from mcaprl.cli.options import (
     keep_options,
     keys_option,
     mapping_options,
+    selection_options,
     trust_option,
 )
 from mcaprl.cli.progress import hint, working
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 @integer_option(
     "--threads", "Number of threads that decompress chunks; useful for large logs.", least=1
 )
+@selection_options
 @partial(mapping_options, has_strict=False)
 def info(
     data: tuple[str, ...],
@@ -62,6 +64,9 @@ def info(
     """
     with working("reading data"):
         source = bag_reader(data, bag := bag_options(request))
+        selection = {name: request.pop(name) for name in ("only", "mask")}
+        if any(selection.values()):
+            source = partial(mcaprl.select, source, **selection)
         if test is not None and bag["mapping"] is not None:
             request["test"] = mcaprl.open(test, **bag)
         else:

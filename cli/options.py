@@ -85,6 +85,22 @@ def mapping_options(command: F, *, has_strict: bool = True) -> F:
     return mapping(strict(found) if has_strict else found)
 
 
+def selection_options(command: F) -> F:
+    """Add the options of `mcaprl.select`."""
+    mask = click.option(
+        "--mask",
+        multiple=True,
+        metavar="NAME",
+        help="Leave out the steps in intervals of this name (see `mcaprl label`); repeatable.",
+    )
+    return click.option(
+        "--only",
+        metavar="EXPR",
+        help="Use only the episodes for which EXPR is true, such as 'success == 1'; see `mcaprl"
+        " filter`.",
+    )(mask(command))
+
+
 def bag_options(request: dict[str, Any]) -> dict[str, Any]:
     """Remove the options of `mapping_options` from a request, and return them."""
     return {name: request.pop(name) for name in ("mapping", "trust_code", "definitions")}

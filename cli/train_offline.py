@@ -19,6 +19,7 @@ from mcaprl.cli.options import (
     mapping_options,
     ray_options,
     seed_options,
+    selection_options,
 )
 from mcaprl.cli.progress import checkpoints_kept, hint, training_progress, working
 from mcaprl.cli.settings import SettingsCommand
@@ -68,18 +69,7 @@ def _names() -> list[str]:
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--follow", is_flag=True, help="Use episodes added to DATA during training.")
 @click.option("--other-data", is_flag=True, help="With --resume: allow other DATA than in the run.")
-@click.option(
-    "--only",
-    metavar="EXPR",
-    help="Learn from the episodes for which EXPR is true, such as 'success == 1'; see `mcaprl"
-    " filter`.",
-)
-@click.option(
-    "--mask",
-    multiple=True,
-    metavar="NAME",
-    help="Do not learn from steps in intervals of this name (see `mcaprl label`); repeatable.",
-)
+@selection_options
 @mapping_options
 @ray_options
 @click.option(

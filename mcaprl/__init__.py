@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from mcaprl.api.behavior import estimate_behavior
     from mcaprl.api.convert import convert, suggest_mapping
     from mcaprl.api.drive import drive_robot
-    from mcaprl.api.edit import annotate, filter, label, merge, relabel, slice, split
+    from mcaprl.api.edit import annotate, filter, label, merge, relabel, select, slice, split
     from mcaprl.api.estimate import estimate
     from mcaprl.api.evaluate import evaluate
     from mcaprl.api.logs import check, info, recover
@@ -89,6 +89,7 @@ __all__ = [
     "render",
     "replay",
     "save_page",
+    "select",
     "slice",
     "split",
     "suggest_mapping",
@@ -111,7 +112,16 @@ __getattr__ = lazy_attributes(
         "mcaprl.api.behavior": ["estimate_behavior"],
         "mcaprl.api.convert": ["convert", "suggest_mapping"],
         "mcaprl.recorder.source": ["open_data as open"],
-        "mcaprl.api.edit": ["annotate", "filter", "label", "merge", "relabel", "slice", "split"],
+        "mcaprl.api.edit": [
+            "annotate",
+            "filter",
+            "label",
+            "merge",
+            "relabel",
+            "select",
+            "slice",
+            "split",
+        ],
         "mcaprl.api.action_errors": ["action_errors"],
         "mcaprl.api.logs": ["check", "info", "recover"],
         "mcaprl.api.policies": ["Run", "export", "load_policy"],

@@ -194,11 +194,23 @@ def _split_of(path: Path, dataset: Dataset) -> dict[str, Any]:
             break
     match config:
         case {"data": str(data), "config": {"held_out": float(share) | int(share)}}:
+            wholes = dataset.wholes
             if data != dataset.fingerprint:
-                return {"why": "all episodes; the run was trained on other data"}
-            held_out = choose_held_out(dataset.wholes, share).tolist()
+                match config.get("source"):
+                    case {"data": dataset.content, "episodes": list(episodes)} if {*episodes} <= {
+                        *wholes.tolist()
+                    }:
+                        wholes = np.array(episodes, np.int64)
+                    case {"data": dataset.content}:
+                        pass
+                    case _:
+                        return {"why": "all episodes; the run was trained on other data"}
+            is_held_out = np.isin(np.arange(len(wholes)), choose_held_out(wholes, share))
+            held_out, rest = (
+                np.flatnonzero(np.isin(dataset.wholes, wholes[rows])).tolist()
+                for rows in (is_held_out, ~is_held_out)
+            )
             if held_out:
-                rest = sorted({*range(len(dataset.episodes))} - {*held_out})
                 return {"compared": held_out, "trained_on": rest, "why": "held out of the training"}
             return {"why": "all episodes, which the run was trained on: it held none out"}
     return {}

@@ -27,14 +27,16 @@ from mcaprl.recorder.dataset.labels import (
     labels_to_carry,
 )
 from mcaprl.recorder.edit.join import merge_logs
-from mcaprl.recorder.edit.piece import Bounds, Edited, filter_log, slice_log, split_log
+from mcaprl.recorder.edit.piece import Bounds, Edited, filter_log, selected, slice_log, split_log
 from mcaprl.recorder.edit.relabel import relabeled
 from mcaprl.recorder.source import (
     Definitions,
     MappingFile,
     Paths,
+    Source,
     labeled_recording,
     open_data,
+    opened,
 )
 from mcaprl.recorder.viewer.annotate import Verification, annotated_copy, values_topics
 from mcaprl.storage.remote import as_path, is_url
@@ -106,7 +108,8 @@ def filter(
     numbers, strings, operators, and these columns of the table of episodes: `episode` (its index,
     from 0), `length`, `total_reward`, `terminated`, `truncated`, `reason`, `policy`, `epsilon`,
     `seed` (NaN if there was none), `options`, `start_s` (time since the start of the first
-    episode) and `duration_s`.
+    episode) and `duration_s`. Of labels, it can use `success` (NaN without a label), `note` (empty
+    without a label), and whether the episode has an interval of a name, as `labels.intervention`.
 
     Args:
         expression: Condition on an episode.
@@ -121,6 +124,27 @@ def filter(
         LogError: The log cannot be read, or is not finished.
     """
     return filter_log(expression, data, check_log_name(out), overwrite=overwrite)
+
+
+def select(data: Source, *, only: str | None = None, mask: str | Sequence[str] = ()) -> Dataset:
+    """Return the episodes for which an expression is true, without the steps of some intervals.
+
+    `mcaprl info`, `evaluate --data` and `train-offline` select their data in this way.
+
+    Args:
+        data: Dataset, or path of the logs; see `open`.
+        only: Condition on an episode, such as `"success == 1"`; see `filter`. None for all.
+        mask: Names of labeled intervals, whose steps are left out; see `label` and
+            `Dataset.without`.
+
+    Raises:
+        UsageError: The expression is not a condition; or the data are still growing, or have not
+            exactly the episodes of their logs, so that their labels are not known.
+        UnknownNameError: There is no such column, or no interval of such a name.
+        NoEpisodesError: The expression is true for no episode.
+        LogError: The labels cannot be read, or belong to different data.
+    """
+    return selected(opened(data), only, as_names(mask))
 
 
 def slice(

@@ -78,9 +78,9 @@ def train(
         resume: Whether training continues from the checkpoints in `out`. A number of `updates`
             above that of the run continues the run to this number, also if it has finished.
         other_data: Whether `resume` accepts checkpoints trained on other data.
-        only: Condition on the episodes to learn from, such as `"success == 1"`; see `filter`.
-        mask: Names of labeled intervals, whose steps are not learned from; see `label` and
-            `Dataset.without`.
+        only: Condition on the episodes to learn from, such as `"success == 1"`; see `select`. With
+            `resume`, None without `mask` selects those of the run.
+        mask: Names of labeled intervals, whose steps are not learned from; see `select`.
         ray: Whether Ray workers train, each of them one seed after the other; or the workers and
             the cluster. The result is that of one process. All workers must see the logs and `out`.
         progress: Function called with each row of metrics.
@@ -116,6 +116,8 @@ def train(
     out = Path(out)
     if resume:
         algo, settings = _resumed(out, algo, settings)
+        if only is None and not mask:
+            only, mask = _selection_of(out)
     numbers = choose_seeds(out, seeds, seed, resume)
     if algo == AUTO:
         check_settings(algo, AutoConfig, settings)
@@ -168,6 +170,14 @@ def _resumed(
             f"{out} is a run of {was}: resume it without algo, or choose another folder"
         )
     return algo or was, {**settings_from_json(earlier.get("config")), **settings}
+
+
+def _selection_of(out: Path) -> tuple[str | None, list[str]]:
+    """Return `only` and `mask` of the run in a folder."""
+    match run_to_resume(out):
+        case {"source": {"only": str() | None as only, "mask": list(mask)}}:
+            return only, [str(name) for name in mask]
+    return None, []
 
 
 def train_online(

@@ -71,7 +71,7 @@ from mcaprl.offline.selection.choice import (
 )
 from mcaprl.offline.selection.config import ALL, AUTO, AutoConfig
 from mcaprl.offline.training.metrics import OfflineSummary
-from mcaprl.offline.training.train import train, with_source
+from mcaprl.offline.training.train import facts_of, train, with_source
 from mcaprl.offline.training.watch import SHORT_HORIZON, horizon_warning
 from mcaprl.progress import Pause, ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.lint import lint
@@ -247,16 +247,16 @@ def select(
                 raise UnknownNameError("candidate", name, known)
     if dataset.origin.grow is not None:
         raise UsageError(f"`follow=True` is not for `algo={AUTO!r}`: omit it")
-    dataset = with_source(dataset, config.mask_from)
+    given, dataset = dataset, with_source(dataset, config.mask_from)
     if len(dataset.episodes) < FOLDS:
         raise UsageError(f"`algo={AUTO!r}` needs {FOLDS} episodes or more in the log")
     numbers = choose_seeds(out, seeds, seed, resume)
     parts: dict[str, Any] = {"algo": AUTO, "config": config.to_json()}
     # The estimates of all candidates are averages over the same seeds, so none can be added.
     parts |= {"seeds": len(numbers), "seed": numbers.start, "data": dataset.fingerprint}
-    identity, size = RunIdentity(parts), len(dataset)
+    identity = RunIdentity(parts)
     with locked_run(out, resume):
-        open_run(out, identity, resume, numbers, env_id=dataset.env_id, transitions=size)
+        open_run(out, identity, resume, numbers, **facts_of(given, identity))
         choice, summaries = _Race(dataset, config, out, numbers, device, progress).run()
     if config.report:
         choice.write_report(Path(config.report), f"Choice of a policy for {dataset.env_id}")

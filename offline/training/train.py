@@ -13,7 +13,7 @@ import warnings
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -196,10 +196,22 @@ def start_run(
 ) -> None:
     """Write or check the config of a locked run; warn of settings that hardly learn."""
     late = schedule_warning(read_updates(folder), config) if resume else None
-    size = len(dataset)
-    open_run(folder, identity, resume, seeds, env_id=dataset.env_id, transitions=size)
+    open_run(folder, identity, resume, seeds, **facts_of(dataset, identity))
     for message in filter(None, (late, horizon_warning(config))):
         warnings.warn(message, stacklevel=3)
+
+
+def facts_of(dataset: Dataset, identity: RunIdentity) -> dict[str, Any]:
+    """Return what `config.json` says of the data.
+
+    `source` is the data of which these were made by a selection, weights or masks of actions.
+    """
+    found: dict[str, Any] = {"env_id": dataset.env_id, "transitions": len(dataset)}
+    if dataset.origin.selection is not None:
+        found["source"] = dict(dataset.origin.selection)
+    elif dataset.content != identity.parts["data"]:
+        found["source"] = {"data": dataset.content}
+    return found
 
 
 def with_source(dataset: Dataset, source: str) -> Dataset:

@@ -386,12 +386,19 @@ class Dataset(Conversions):
             found.append(episode)
         return tuple(found)
 
-    @cached_property
+    @property
     def fingerprint(self) -> str:
         """SHA-256 of the spaces and transitions, independent of file names and compression.
 
         Weights are included if they are not all equal.
         """
+        if len(set(self.weights.tolist())) > 1:
+            return hashlib.sha256(self.content.encode() + self.weights.tobytes()).hexdigest()
+        return self.content
+
+    @cached_property
+    def content(self) -> str:
+        """SHA-256 of the spaces and transitions: the fingerprint without weights."""
         columns = self._transitions
         digest = hashlib.sha256(space_to_json(self.observation_space).encode())
         digest.update(space_to_json(self.action_space).encode())
@@ -399,10 +406,7 @@ class Dataset(Conversions):
         for array in (*columns.frames, *steps, columns.lengths):
             for block in blocks_of(array):
                 digest.update(block.data)
-        found = digest.hexdigest()
-        if len(set(self.weights.tolist())) > 1:
-            return hashlib.sha256(found.encode() + self.weights.tobytes()).hexdigest()
-        return found
+        return digest.hexdigest()
 
     @cached_property
     def statistics(self) -> Statistics:

@@ -44,6 +44,8 @@ class Origin:
         is_shifted: Whether recordings of the bag overlapped, and have later times in the data.
         labels: For a bag with labels, a function that returns or refuses them, and the (E,) lengths
             of their episodes.
+        selection: What `selected` took of other data: its conditions, the `content` of that data,
+            and the number of the episode of that data of which each episode is a part.
         labeled: For a bag with labels, the episodes of each recording to which they belong.
     """
 
@@ -56,6 +58,7 @@ class Origin:
     is_shifted: bool = False
     labels: tuple[Callable[[], Any], NDArray[np.int64]] | None = None
     labeled: tuple[Any, ...] = ()
+    selection: Mapping[str, Any] | None = None
 
     @classmethod
     def common(cls, origins: Sequence[Origin]) -> Origin:
@@ -69,7 +72,7 @@ class Origin:
 
     def changed(self) -> Origin:
         """Return the origin of a dataset with other episodes or values."""
-        return dataclasses.replace(self, logs=(), grow=None)
+        return dataclasses.replace(self, logs=(), grow=None, selection=None)
 
 
 STEP_COLUMNS = ("actions", "rewards", "terminated", "truncated", "behavior")

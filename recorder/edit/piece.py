@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -491,7 +491,11 @@ def selected(dataset: Dataset, only: str | None = None, mask: Sequence[str] = ()
         summaries = [episode.summary for episode in dataset.episodes]
         chosen = _chosen(only, summaries, labels, "the data")
         dropped |= np.repeat(~np.isin(np.arange(len(lengths)), chosen), lengths)
-    return dataset.without(dropped)
+    found = dataset.without(dropped)
+    selection = {"only": only, "mask": list(mask), "data": dataset.content}
+    selection["episodes"] = found.wholes.tolist()
+    found.origin = replace(found.origin, selection=selection)
+    return found
 
 
 def split_log(

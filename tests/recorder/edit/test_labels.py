@@ -17,8 +17,9 @@ import pytest
 from gymnasium import spaces
 
 import mcaprl
+from mcaprl.api.action_errors import _split_of
 from mcaprl.cli import run
-from mcaprl.errors import LogError, UnknownNameError, UsageError
+from mcaprl.errors import LogError, TrainingError, UnknownNameError, UsageError
 from mcaprl.offline.batches.items import n_step_returns
 from mcaprl.offline.training.watch import choose_held_out
 from mcaprl.recorder.edit.piece import selected
@@ -312,3 +313,75 @@ def test_training_uses_the_successes(log: Path, tmp_path: Path) -> None:
     first, second = (next((tmp_path / name).rglob("policy.safetensors")) for name in "ab")
     assert first.read_bytes() == second.read_bytes()
     assert run([*ask, "success == 3", "--out", str(tmp_path / "c")]) == 1
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Record 12 episodes, of which the odd ones succeed, and train on these without step 2."""
+    folder = tmp_path_factory.mktemp("trained")
+    log = _recorded(folder / "log.mcap", 12)
+    for episode in range(12):
+        mcaprl.label(log, episode=episode, success=episode % 2 == 1)
+        mcaprl.label(log, episode=episode, interval="cut", steps=(2, 3))
+    chosen: Any = {"only": "success == 1", "mask": "cut"}
+    mcaprl.train(log, folder / "run", algo="bc", updates=2, held_out=0.4, **chosen)
+    return log, folder / "run"
+
+
+def test_a_run_is_compared_on_what_it_held_out_of_its_selection(
+    trained: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, run_folder = trained
+    data = mcaprl.open(log)
+    whole = _split_of(run_folder, data)
+    # Two of the episodes 1, 3, 5, 7, 9 and 11 are held out; the even ones are in neither part.
+    expected = (2 * choose_held_out(np.arange(6), 0.4) + 1).tolist()
+    assert len(expected) == 2
+    assert whole["compared"] == expected
+    assert whole["trained_on"] == sorted({1, 3, 5, 7, 9, 11} - {*expected})
+    # The parts of the same episodes, if the data are selected in the same way.
+    parts = mcaprl.select(data, only="success == 1", mask="cut")
+    found = _split_of(run_folder, parts)["compared"]
+    assert parts.wholes[found].tolist() == np.repeat(expected, 2).tolist()
+    assert "other data" in _split_of(run_folder, data.filter(lambda one: one.index > 0))["why"]
+    ask = ["evaluate", str(run_folder), "--data", str(log), "--updates", "2"]
+    assert run([*ask, "--only", "success == 1", "--mask", "cut"]) == 0
+    assert "4 episodes, held out of the training" in capsys.readouterr().out
+
+
+def test_weights_and_masks_of_actions_do_not_make_other_data(log: Path, tmp_path: Path) -> None:
+    both = [log, _recorded(tmp_path / "other.mcap", 9)]
+    mcaprl.train([f"{log}:2", both[1]], tmp_path / "run", algo="bc", updates=2, held_out=0.2)
+    assert len(_split_of(tmp_path / "run", mcaprl.open(both))["compared"]) == 2
+
+
+@pytest.mark.filterwarnings("ignore:the learning rate decayed")
+def test_a_resumed_run_selects_the_same_data(trained: tuple[Path, Path]) -> None:
+    log, run_folder = trained
+    mcaprl.train(log, run_folder, resume=True, updates=3)
+    with pytest.raises(TrainingError, match="trained on other data"):
+        mcaprl.train(log, run_folder, resume=True, updates=4, only="success == 0")
+    file = log.with_name("log.mcap.labels.json")
+    before = file.read_bytes()
+    mcaprl.label(log, episode=1, success=False)
+    with pytest.raises(TrainingError, match="trained on other data"):
+        mcaprl.train(log, run_folder, resume=True, updates=4)
+    # What was held out does not depend on later labels.
+    assert "compared" in _split_of(run_folder, mcaprl.open(log))
+    file.write_bytes(before)
+
+
+def test_commands_select_the_same_episodes(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mcaprl.label(log, episode=2, interval="bad data", steps=(1, 3))
+    condition = "not labels.bad_data and length == 5"
+    kept = mcaprl.filter(condition, log, tmp_path / "kept.mcap").episodes
+    assert kept == len(mcaprl.select(log, only=condition).episodes) == 2
+    assert run(["info", str(log), "--only", condition, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["episodes"] == kept
+    assert run(["info", str(log), "--mask", "bad data", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["steps"] == 13
+    for command in (["info"], ["evaluate", "random", "--data"]):
+        assert run([*command, str(log), "--only", "sucess == 1"]) == 2
+        assert "sucess" in capsys.readouterr().err
