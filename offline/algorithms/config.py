@@ -73,9 +73,9 @@ class TrainingConfig(NetworkSettings):
         )
 
     @property
-    def best_fraction(self) -> float:
-        """Fraction of the episodes with the largest returns that are learned from."""
-        return 1.0
+    def best(self) -> tuple[float, str]:
+        """Fraction of the best episodes that are learned from, and the expression that ranks."""
+        return 1.0, ""
 
 
 @dataclass(frozen=True)
@@ -129,6 +129,8 @@ class BCConfig(TrainingConfig):
 
     top: float = 1.0
     """fraction of the episodes to learn from: those with the largest returns"""
+    top_by: str = ""
+    """expression of an episode that ranks it for top instead of its return, such as success"""
     chunk: int = 1
     """actions that are predicted from one observation: those of its step and of the next ones"""
     execute: int = 0
@@ -138,6 +140,7 @@ class BCConfig(TrainingConfig):
         """Validate the settings."""
         super().__post_init__()
         self._require("top", 0 < self.top <= 1, "within (0, 1]")
+        self._require("top_by", not self.top_by or self.top < 1, "omitted, or used with top")
         self._require("chunk", 1 <= self.chunk <= MAX_CHUNK, f"within [1, {MAX_CHUNK}]")
         self._require("execute", 0 <= self.execute <= self.chunk, f"within [0, {self.chunk}]")
 
@@ -154,9 +157,9 @@ class BCConfig(TrainingConfig):
         return replace(super().packing, chunk=self.chunk)
 
     @property
-    def best_fraction(self) -> float:
-        """Fraction of the episodes with the largest returns that are learned from."""
-        return self.top
+    def best(self) -> tuple[float, str]:
+        """Fraction of the best episodes that are learned from, and the expression that ranks."""
+        return self.top, self.top_by
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ from mcaprl.offline.selection.choice import (
 from mcaprl.offline.selection.config import ALL, AUTO, AutoConfig
 from mcaprl.offline.training.metrics import OfflineSummary
 from mcaprl.offline.training.train import facts_of, train, with_source
-from mcaprl.offline.training.watch import SHORT_HORIZON, horizon_warning
+from mcaprl.offline.training.watch import ABSOLUTE, SHORT_HORIZON, horizon_warning, relative_warning
 from mcaprl.progress import Pause, ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.format.behavior import PROBABILITY
@@ -247,6 +247,8 @@ def select(
                 raise UnknownNameError("candidate", name, known)
     if dataset.origin.grow is not None:
         raise UsageError(f"`follow=True` is not for `algo={AUTO!r}`: omit it")
+    if message := relative_warning(dataset.relative_to, f"each candidate of {AUTO} but bc"):
+        warnings.warn(message, stacklevel=2)
     given, dataset = dataset, with_source(dataset, config.mask_from)
     if len(dataset.episodes) < FOLDS:
         raise UsageError(f"`algo={AUTO!r}` needs {FOLDS} episodes or more in the log")
@@ -426,6 +428,7 @@ class _Race:
         with suppress(Pause), warnings.catch_warnings():
             # `_warn_about_short_horizons` names the candidates, once for both stages.
             warnings.filterwarnings("ignore", SHORT_HORIZON)
+            warnings.filterwarnings("ignore", ABSOLUTE)
             train(
                 self._dataset,
                 config,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.actions import BoxActions, has_source
-from mcaprl.errors import TrainingError
+from mcaprl.errors import TrainingError, UsageError
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import Algorithm, choose_algorithm
@@ -35,9 +35,11 @@ from mcaprl.offline.training.watch import (
     divergence_warning,
     horizon_warning,
     largest_return,
+    relative_warning,
     schedule_warning,
 )
 from mcaprl.progress import Pause, ProgressCallback, TrainingProgress, terminal_progress
+from mcaprl.recorder.edit.piece import episode_values
 from mcaprl.runs import (
     CHECKPOINT_NAME,
     RunIdentity,
@@ -197,7 +199,10 @@ def start_run(
     """Write or check the config of a locked run; warn of settings that hardly learn."""
     late = schedule_warning(read_updates(folder), config) if resume else None
     open_run(folder, identity, resume, seeds, **facts_of(dataset, identity))
-    for message in filter(None, (late, horizon_warning(config))):
+    algo = str(identity.parts["algo"])
+    relation = () if hasattr(config, "relative") else dataset.relative_to
+    relative = relative_warning(relation, algo)
+    for message in filter(None, (late, horizon_warning(config), relative)):
         warnings.warn(message, stacklevel=3)
 
 
@@ -416,21 +421,39 @@ def _packed(
     dataset: Dataset, config: TrainingConfig, scales: Scales, held_out: NDArray[np.int64]
 ) -> TransitionBuffer:
     """Pack a dataset; draw from the best episodes, and not from those that are held out."""
-    weights = dataset.weights * best_episodes(dataset, config.best_fraction)
+    weights = dataset.weights * best_episodes(dataset, *config.best)
     weights[held_out] = 0.0
     return TransitionBuffer.from_dataset(
         dataset, config.packing, weights=weights, **scales._asdict()
     )
 
 
-def best_episodes(dataset: Dataset, fraction: float) -> NDArray[np.bool_]:
-    """Return a mask (E,) of the fraction of the episodes with the largest returns, at least one."""
+def best_episodes(dataset: Dataset, fraction: float, by: str = "") -> NDArray[np.bool_]:
+    """Return a mask (E,) of the fraction of the episodes with the largest values, at least one.
+
+    All episodes with the value of the last one are in it, and none without a value.
+
+    Args:
+        dataset: Dataset with E episodes.
+        fraction: Fraction of all episodes.
+        by: Expression of an episode, as of `mcaprl.filter`; empty for the return.
+
+    Raises:
+        UsageError: No episode has a value, or the expression is not one.
+        UnknownNameError: The expression has an unknown name.
+    """
     lengths = dataset.episode_lengths
     if fraction == 1 or not len(lengths):
         return np.ones(len(lengths), bool)
-    returns = np.add.reduceat(dataset.rewards, np.cumsum(lengths) - lengths)
+    if by:
+        values = episode_values(by, dataset)
+    else:
+        values = np.add.reduceat(dataset.rewards, np.cumsum(lengths) - lengths)
+    ordered = np.sort(values[~np.isnan(values)])[::-1]
+    if not len(ordered):
+        raise UsageError(f"top_by: '{by}' has no value in any of the {len(values)} episodes")
     count = max(1, round(fraction * len(lengths)))
-    found: NDArray[np.bool_] = returns >= np.sort(returns)[-count]
+    found: NDArray[np.bool_] = values >= ordered[:count][-1]
     return found
 
 

@@ -6,7 +6,8 @@ Values are compared with the Monte Carlo return of each transition.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import torch
@@ -122,6 +123,20 @@ def horizon_warning(config: TrainingConfig) -> str | None:
         f"{counted(target_updates, 'update')} of the target network in {config.updates}: values"
         f" cover {config.horizon_fraction:.0%} of the horizon of gamma {config.gamma}; lower"
         " target_interval or gamma, or raise updates or n_steps"
+    )
+
+
+ABSOLUTE: Final = ".* absolute actions, though"
+"""Pattern of `relative_warning`."""
+
+
+def relative_warning(relation: Sequence[int | None], learner: str) -> str | None:
+    """Return a warning if actions that the data declare as relative are learned as absolute."""
+    if all(each is None for each in relation):
+        return None
+    return (
+        f"{learner} learns absolute actions, though the data have actions relative to observations:"
+        " bc learns these (`algo='bc'`)"
     )
 
 

@@ -10,7 +10,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -448,11 +448,7 @@ def _chosen(
 ) -> NDArray[np.int64]:
     """Return the indexes of the episodes for which an expression is true."""
     condition, count = Expression(expression), len(summaries)
-    if condition.uses_next:
-        raise UsageError(f"'{expression}': next(...) has no meaning for episodes")
-    table = episode_columns(summaries, condition.names)
-    if condition.labels or condition.names & {"success", "note"}:
-        table |= (labels() or Labels("")).columns(count)
+    table = _table(condition, summaries, labels)
     holds = condition.evaluate(table, np.arange(count))
     if not condition.is_condition(table):
         raise UsageError(f"'{expression}' is not a condition: compare it, as in 'length > 10'")
@@ -461,6 +457,38 @@ def _chosen(
     if not len(chosen):
         raise NoEpisodesError(f"{name}: '{expression}' is true for no episode ({count} in the log)")
     return chosen
+
+
+def _table(
+    expression: Expression,
+    summaries: Sequence[EpisodeSummary],
+    labels: Callable[[], Labels | None],
+) -> dict[str, Column]:
+    """Return the columns of episodes that an expression can use."""
+    if expression.uses_next:
+        raise UsageError(f"'{expression.text}': next(...) has no meaning for episodes")
+    table = episode_columns(summaries, expression.names)
+    if expression.labels or expression.names & {"success", "note"}:
+        table |= (labels() or Labels("")).columns(len(summaries))
+    return table
+
+
+def episode_values(expression: str, dataset: Dataset) -> NDArray[np.float64]:
+    """Return the (E,) values of an expression that has the columns of `mcaprl.filter`.
+
+    Raises:
+        UsageError: The expression is not one, or uses labels of data that grow.
+        UnknownNameError: There is no such column.
+    """
+    parsed = Expression(expression)
+
+    def labels() -> Labels | None:
+        if dataset.origin.grow is not None:
+            raise UsageError(f"'{expression}': a log that is being written has no labels")
+        return labels_of(dataset)
+
+    table = _table(parsed, [episode.summary for episode in dataset.episodes], labels)
+    return parsed.evaluate(table, np.arange(len(dataset.episodes))).astype(np.float64)
 
 
 def selected(dataset: Dataset, only: str | None = None, mask: Sequence[str] = ()) -> Dataset:
@@ -494,8 +522,24 @@ def selected(dataset: Dataset, only: str | None = None, mask: Sequence[str] = ()
     found = dataset.without(dropped)
     selection = {"only": only, "mask": list(mask), "data": dataset.content}
     selection["episodes"] = found.wholes.tolist()
-    found.origin = replace(found.origin, selection=selection)
+    kept = partial(_kept_labels, labels, lengths, dropped), found.episode_lengths
+    found.origin = replace(found.origin, selection=selection, labels=kept)
     return found
+
+
+def _kept_labels(
+    labels: Callable[[], Labels | None], lengths: NDArray[np.int64], dropped: NDArray[np.bool_]
+) -> Labels:
+    """Return the labels of the parts that are left of episodes without some of their steps."""
+    firsts = (np.cumsum(lengths + 1) - lengths - 1).tolist()
+    parts = []
+    for first, flags in zip(firsts, np.split(dropped, np.cumsum(lengths)[:-1]), strict=True):
+        inside = np.pad(~flags, 1)
+        edges = np.flatnonzero(inside[1:] != inside[:-1]).reshape(-1, 2)
+        parts += [(first + start, stop - start) for start, stop in edges.tolist()]
+    new = [start for start, _ in parts], [length for _, length in parts]
+    found = labels() or Labels("")
+    return found.divided((firsts, lengths.tolist()), new, int((lengths + 1).sum()))
 
 
 def split_log(

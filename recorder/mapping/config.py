@@ -754,8 +754,9 @@ class Mapping(_Part):
         reasons = {name: text for name, text in self.episodes.reasons.items() if not uses(text)}
         if len(reasons) < len(self.episodes.reasons):
             changes["reasons"] = reasons
-        found = {"episodes": self.episodes.model_copy(update=changes)} if changes else {}
-        found |= {"reward": "0"} if uses(self.reward) else {}
+        found: dict[str, Any] = (
+            {"episodes": self.episodes.model_copy(update=changes)} if changes else {}
+        )
         return self.model_copy(update=found) if found else self
 
     @property

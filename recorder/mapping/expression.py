@@ -110,7 +110,7 @@ class Expression:
             columns: (N,) or (N, K) column of each name.
             following: (N,) index of the row after each row, which `next` reads.
         """
-        columns = {**self._missing_labels, **columns}
+        columns = self._with_labels(columns)
         for name in self.names:
             if name not in columns:
                 raise UnknownNameError("name in an expression", name, columns)
@@ -125,7 +125,7 @@ class Expression:
 
     def is_condition(self, columns: Mapping[str, Column]) -> bool:
         """Return whether all values are true, false or missing."""
-        columns = {**self._missing_labels, **columns}
+        columns = self._with_labels(columns)
 
         def holds(node: ast.AST) -> bool:
             match node:
@@ -142,11 +142,13 @@ class Expression:
 
         return holds(self._tree)
 
-    @property
-    def _missing_labels(self) -> dict[str, Column]:
-        """Values of the labels that nobody gave."""
+    def _with_labels(self, columns: Mapping[str, Column]) -> Mapping[str, Column]:
+        """Add the values of the labels that nobody gave."""
+        if not self.labels:
+            return columns
         known = {"success": np.array(np.nan), "note": np.array("", object)}
-        return {f"{_PREFIX}{name}": known.get(name, np.array(False)) for name in self.labels}
+        missing = {f"{_PREFIX}{name}": known.get(name, np.array(False)) for name in self.labels}
+        return {**missing, **columns}
 
     def _check(self, node: ast.AST, depth: int, names: set[str]) -> None:
         if depth > _MAX_DEPTH:
@@ -155,15 +157,12 @@ class Expression:
         allowed += (ast.BoolOp, ast.Compare, ast.IfExp, ast.Call, ast.Subscript, ast.Attribute)
         if not isinstance(node, allowed):
             raise self._refused(node)
+        parts: list[ast.expr] = []
         match node:
             case ast.Name(id=name) if name in FUNCTIONS or name == NEXT:
                 raise UsageError(f"'{self._shown}': {name} is a function; call it as {name}(...)")
-            case ast.Name(id=name):
-                names.add(name)
-                parts = []
-            case ast.Attribute(value=ast.Name(id="labels")):
+            case ast.Name() | ast.Attribute(value=ast.Name(id="labels")):
                 names.add(ast.unparse(node))
-                parts = []
             case ast.Attribute():
                 raise self._refused(node)
             case ast.Constant(value=value) if not isinstance(value, bool | int | float | str):
@@ -193,8 +192,6 @@ class Expression:
                 parts = values
             case ast.IfExp(test=test, body=body, orelse=other):
                 parts = [test, body, other]
-            case _:
-                parts = []
         for part in parts:
             self._check(part, depth + 1, names)
 
@@ -227,8 +224,10 @@ class Expression:
             case ast.Constant(value=constant):
                 # Use float64: NumPy integers can overflow, and Python integers have no size limit.
                 return constant if isinstance(constant, str) else np.float64(cast(Any, constant))
-            case ast.Name() | ast.Attribute():
-                return columns[ast.unparse(node)]
+            case ast.Name(id=name):
+                return columns[name]
+            case ast.Attribute(attr=name):
+                return columns[f"{_PREFIX}{name}"]
             case ast.Subscript(value=inner, slice=part):
                 found = np.asarray(value(inner))
                 if found.ndim != 2:

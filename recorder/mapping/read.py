@@ -336,7 +336,7 @@ def _read(plan: Plan, images: Storage, to_label: bool) -> MappedBag | None:
         dataset.origin,
         mapping=dataset.robot["mapping"],
         report=report,
-        labels=labels and (labels, dataset.episode_lengths),
+        labels=None if labels is None else (labels, dataset.episode_lengths),
         labeled=tuple(labeled),
     )
     return MappedBag(dataset, report)
@@ -365,11 +365,12 @@ def _labeled(
     to_label: bool,
 ) -> list[Labeled]:
     """Return the episodes of each recording to which labels belong, if there are any."""
-    names = bag.names if isinstance(bag, OpenBag) else ()
-    if not to_label and not any(labels_path(name).is_file() for name in names):
+    if not isinstance(bag, OpenBag):
+        return []
+    if not to_label and not any(labels_path(name).is_file() for name in bag.names):
         return []
     found = []
-    for number, name in enumerate(names):
+    for number, name in enumerate(bag.names):
         times = [
             run.times_ns[each.first : each.last + 1]
             for run, some, recording in zip(runs, kept, recordings, strict=True)

@@ -11,7 +11,7 @@ import torch
 from gymnasium import spaces
 
 import mcaprl
-from mcaprl.errors import PolicyError, SpaceError
+from mcaprl.errors import PolicyError, SpaceError, UsageError
 from mcaprl.offline.algorithms.config import BoxBCConfig
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.batches.buffer import TransitionBuffer
@@ -199,3 +199,20 @@ def test_a_log_keeps_what_its_actions_are_relative_to(tmp_path: Path) -> None:
     for wrong, text in cases:
         with pytest.raises(SpaceError, match=text):
             data.with_relative_actions(wrong)
+
+
+@pytest.mark.filterwarnings("ignore:.*of the target network")
+def test_algorithms_that_learn_absolute_actions_say_so(tmp_path: Path) -> None:
+    data = reaching([0, 5, -8])
+    with pytest.warns(UserWarning, match="iql learns absolute actions"):
+        mcaprl.train(data, tmp_path / "iql", algo="iql", updates=1, hidden=(4,))
+    # One episode is too few to train the candidates of `auto`.
+    with (
+        pytest.warns(UserWarning, match="each candidate of auto but bc learns absolute actions"),
+        pytest.raises(UsageError, match="episodes or more"),
+    ):
+        mcaprl.train(reaching([0]), tmp_path / "auto", algo="auto")
+    with pytest.raises(UsageError, match="chunk"):
+        mcaprl.train(data, tmp_path / "chunks", algo="iql", updates=1, chunk=4)
+    with pytest.raises(UsageError, match="chunk"):
+        mcaprl.train(data, tmp_path / "auto", algo="auto", chunk=4)

@@ -21,6 +21,7 @@ from mcaprl.api.action_errors import _split_of
 from mcaprl.cli import run
 from mcaprl.errors import LogError, TrainingError, UnknownNameError, UsageError
 from mcaprl.offline.batches.items import n_step_returns
+from mcaprl.offline.training.train import best_episodes
 from mcaprl.offline.training.watch import choose_held_out
 from mcaprl.recorder.edit.piece import selected
 from mcaprl.recorder.format.reading import McapReader, Topic
@@ -383,5 +384,45 @@ def test_commands_select_the_same_episodes(
     assert run(["info", str(log), "--mask", "bad data", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["steps"] == 13
     for command in (["info"], ["evaluate", "random", "--data"]):
-        assert run([*command, str(log), "--only", "sucess == 1"]) == 2
-        assert "sucess" in capsys.readouterr().err
+        assert run([*command, str(log), "--only", "winner == 1"]) == 2
+        assert "winner" in capsys.readouterr().err
+
+
+def test_the_best_episodes_are_those_of_an_expression(log: Path, tmp_path: Path) -> None:
+    data = mcaprl.open(log)
+    # Rewards are 1, 2, 4, 8, 16 in each episode: by the return, all three are equal.
+    assert best_episodes(data, 0.4).tolist() == [True, True, True]
+    mcaprl.label(log, episode=0, success=False)
+    mcaprl.label(log, episode=2, success=True, note="slow")
+    assert best_episodes(data, 0.4, "success").tolist() == [False, False, True]
+    # Two of three are wanted: a success comes before a failure, and no label is no value.
+    assert best_episodes(data, 0.7, "labels.success").tolist() == [True, False, True]
+    assert best_episodes(data, 1 / 3, "-episode").tolist() == [True, False, False]
+    assert best_episodes(data, 0.4, "not labels.cut").tolist() == [True, True, True]
+    with pytest.raises(UsageError, match=r"'0 / 0' has no value in any of the 3 episodes"):
+        best_episodes(data, 0.4, "0 / 0")
+    with pytest.raises(UnknownNameError, match="winner"):
+        best_episodes(data, 0.4, "winner")
+    # Parts of episodes have the labels of the whole.
+    mcaprl.label(log, episode=2, interval="cut", steps=(1, 2))
+    mcaprl.label(log, episode=2, interval="late", steps=(1, 4))
+    parts = mcaprl.select(data, mask="cut")
+    assert parts.episode_lengths.tolist() == [5, 5, 1, 3]
+    assert best_episodes(parts, 0.5, "success").tolist() == [False, False, True, True]
+    assert best_episodes(parts, 0.2, "labels.late").tolist() == [False, False, False, True]
+    again = mcaprl.select(parts, only="success == 1 and not labels.late")
+    assert again.episode_lengths.tolist() == [1]
+
+
+def test_training_takes_the_best_by_an_expression(log: Path, tmp_path: Path) -> None:
+    for episode in range(3):
+        mcaprl.label(log, episode=episode, success=episode == 1)
+    ask = ["train-offline", str(log), "--algo", "bc", "--updates", "2", "--held-out", "0"]
+    ask += ["--top", "0.3", "--top-by"]
+    assert run([*ask, "success", "--out", str(tmp_path / "a")]) == 0
+    data = mcaprl.open(log).with_weights([0, 1, 0])
+    mcaprl.train(data, tmp_path / "b", algo="bc", updates=2, held_out=0)
+    first, second = (next((tmp_path / name).rglob("policy.safetensors")) for name in "ab")
+    assert first.read_bytes() == second.read_bytes()
+    assert run([*ask, "winner", "--out", str(tmp_path / "c")]) == 2
+    assert run([*ask[:-3], "--top-by", "success", "--out", str(tmp_path / "d")]) == 2
