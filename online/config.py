@@ -219,6 +219,8 @@ class ActorCriticConfig(ReplayConfig):
     """updates of the critics before the first one of the actor of a policy that is continued"""
     actor_rate: float = 0.1
     """learning rate of the actor of a policy that is continued, as a multiple of the critics'"""
+    anchor: float = 0.1
+    """weight that keeps the actions of a continued policy close to what they were; 0: none"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -226,6 +228,7 @@ class ActorCriticConfig(ReplayConfig):
         self._require("polyak", 0 < self.polyak <= 1, "within (0, 1]")
         self._require("actor_starts", self.actor_starts >= 0, "at least 0")
         self._require("actor_rate", 0 < self.actor_rate < math.inf, "above 0 and finite")
+        self._require("anchor", 0 <= self.anchor < math.inf, "at least 0 and finite")
         self._require_fraction("data_fraction")
         self._require("smoothness", 0 <= self.smoothness < math.inf, "at least 0 and finite")
 

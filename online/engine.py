@@ -120,7 +120,8 @@ class Agents:
         self.is_pretrained = True
         if isinstance(self.learner, ActorCritic):
             assert isinstance(self.config, ActorCriticConfig)
-            self.learner.continue_actor(self.config.actor_starts, self.config.actor_rate)
+            config = self.config
+            self.learner.continue_actor(config.actor_starts, config.actor_rate, config.anchor)
 
     @property
     def epsilon(self) -> float:

@@ -12,8 +12,9 @@ https://arxiv.org/abs/1910.01741). There is no target network of the encoder, as
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import ClassVar
 
 import torch
@@ -25,12 +26,18 @@ from mcaprl.offline.algorithms.config import ActorCriticConfig
 from mcaprl.offline.algorithms.heads import BOX_HEADS, ENCODER, FEATURES, encoded
 from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.algorithms.losses import action_change, clipped_double_q_target
+from mcaprl.offline.algorithms.models import Model
 from mcaprl.offline.batches.buffer import Batch
 from mcaprl.offline.batches.observations import Observations
 
 
 class ActorCritic(Learner):
-    """Learner with the models `actor` and `q`; a subclass defines the losses of both."""
+    """Learner with the models `actor` and `q`; a subclass defines the losses of both.
+
+    Attributes:
+        actor_starts: Number of updates before the first one of the actor.
+        first_models: Actor, and encoder if there is one, of the policy that training continues.
+    """
 
     acts_by: str = "deterministic"
     policy_models = ("actor", "q")
@@ -38,20 +45,32 @@ class ActorCritic(Learner):
     critics = ("q",)
     shares_encoder: ClassVar[bool] = False
     actor_starts = 0
+    first_models: Mapping[str, Model] = MappingProxyType({})
+    _anchor = 0.0
+    _first_actions: Tensor
     config: ActorCriticConfig
 
-    def continue_actor(self, starts: int, rate: float) -> None:
-        """Continue a given policy: train the critics alone at first, and the actor more slowly.
+    def continue_actor(self, starts: int, rate: float, anchor: float) -> None:
+        """Continue the current policy: train the critics alone at first, and the actor slowly.
 
         The critics have errors beside the actions that they learned from, and an actor that learns
-        at once follows these errors.
+        at once follows these errors, as one does that goes far from these actions.
 
         Args:
             starts: Number of updates before the first one of the actor.
             rate: Learning rate of the actor, as a multiple of the critics'.
+            anchor: Weight of `anchor_loss`.
         """
-        self.actor_starts = starts
+        self.actor_starts, self._anchor = starts, anchor
         self.set_rate_factor("actor", rate)
+        if anchor:
+            names = [name for name in ("actor", ENCODER) if name in self.models]
+            self.first_models = {name: self.models[name].clone() for name in names}
+
+    def all_models(self) -> dict[str, Model]:
+        """Return the learning models, the target networks and `first_models` by name."""
+        first = {f"{name}_first": model for name, model in self.first_models.items()}
+        return {**super().all_models(), **first}
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shapes of the actor's outputs, and of one value per critic."""
@@ -79,6 +98,8 @@ class ActorCritic(Learner):
 
         Gradients flow to the encoder from the observations, and not from the next ones.
         """
+        if self.first_models:
+            self._first_actions = self._actions_of_first(batch.observations)
         if not self._has_encoder:
             return batch
         with torch.no_grad():
@@ -111,6 +132,24 @@ class ActorCritic(Learner):
             return 0.0
         actions, next_actions = self.act(batch.observations), self.act(batch.next_observations)
         return weight * action_change(actions, next_actions)
+
+    @torch.no_grad()
+    def _actions_of_first(self, observations: Observations) -> Tensor:
+        if self._has_encoder:
+            observations = encoded(self.first_models[ENCODER], observations)
+        return BOX_HEADS[self.acts_by].best(self.first_models["actor"](observations))
+
+    def anchor_loss(self, batch: Batch, q_tm1: Tensor) -> Tensor | float:
+        """Return the weighted squared difference (R,) from the actions of the continued policy.
+
+        The weight is multiplied by the mean absolute value of each seed's batch, so that it has no
+        unit. `q_tm1` are the values (2, R) of the logged actions.
+        """
+        if not self.first_models:
+            return 0.0
+        change = (self.act(batch.observations) - self._first_actions).square().mean(1)
+        scale = self.batch_means(q_tm1.detach().abs().mean(0))
+        return self._anchor * scale.repeat_interleave(len(change) // len(scale)) * change
 
     def validate(self, batch: Batch) -> dict[str, Tensor]:
         """Return metrics of the values in units of the logged rewards, and the actor's error.

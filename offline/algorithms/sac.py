@@ -4,6 +4,7 @@
         Q_e(s,a)  regression to r + gamma (min_e Q'_e(s', a') - alpha log pi(a'|s')), a' ~ pi(s')
         pi        minimize alpha log pi(a|s) - min_e Q_e(s, a), a ~ pi(s)
                   + smoothness |mode of pi(s) - mode of pi(s')|, https://arxiv.org/abs/2012.06644
+                  + anchor (mode of pi(s) - mode of the continued policy)^2
         alpha     minimize log(alpha) (entropy of pi - target entropy)
 
 Q' are target networks, averages of the learning networks. The policy is the tanh of a normal
@@ -67,7 +68,8 @@ class SAC(ActorCritic):
         entropy_loss = temperature_loss(log_alpha, log_pi.detach(), self._target_entropy)
         loss = td_loss
         if self.step >= self.actor_starts:
-            loss = td_loss + policy_loss + smoothness_loss + entropy_loss
+            anchor_loss = self.anchor_loss(batch, q_tm1)
+            loss = td_loss + policy_loss + smoothness_loss + anchor_loss + entropy_loss
         return {
             "mean_q": self.in_reward_units(q_tm1.detach().mean(0)),
             "td_loss": td_loss,

@@ -4,6 +4,7 @@
         Q_e(s,a)  regression to r + gamma min_e Q'_e(s', a'), where a' = pi'(s') + clipped noise
         pi        minimize -Q_1(s, pi(s))
                   + smoothness |pi(s) - pi(s')|, https://arxiv.org/abs/2012.06644
+                  + anchor (pi(s) - action of the continued policy)^2
 
 Q' and pi' are target networks, averages of the learning networks. The actor and the target networks
 are updated every `policy_interval` and `target_interval` updates of the critics. `td3_bc` and
@@ -58,7 +59,8 @@ class TD3(ActorCritic):
         with torch.set_grad_enabled(is_due):
             policy_terms = self.policy_losses(batch)
             smoothness_loss = self.smoothness_loss(batch, self.config.smoothness)
-        loss = td_loss + policy_terms["policy_loss"] + smoothness_loss
+            anchor_loss = self.anchor_loss(batch, q_tm1)
+        loss = td_loss + policy_terms["policy_loss"] + smoothness_loss + anchor_loss
         return {**terms, **policy_terms, "loss": loss}
 
     def policy_losses(self, batch: Batch) -> dict[str, Tensor]:

@@ -291,6 +291,35 @@ def test_the_actor_of_a_continued_policy_learns_later_and_more_slowly(
     assert 0 < changes[0.01] < 0.03 * changes[1.0]
 
 
+@pytest.mark.parametrize("algo", ["sac", "td3"])
+def test_an_anchor_keeps_the_actions_of_a_continued_policy(tmp_path: Path, algo: str) -> None:
+    changes, observations = {}, logged().observations
+    for anchor in (0.0, 1e4):
+        settings = {**SHORT, "actor_starts": 0, "actor_rate": 1.0, "anchor": anchor}
+        task = Task.for_sim(PENDULUM, algo, **settings)
+        agent = LearningAgent(task, PENDULUM, tmp_path / f"{anchor}", 0, Scale(0, 1))
+        other = LearningAgent(task, PENDULUM, tmp_path / f"{anchor} again", 0, Scale(0, 1))
+        try:
+            for each in (agent, other):
+                fill_buffer(each.agents, logged())
+            agent.agents.continue_policy()
+            learner, first = agent.agents.learner, agent.policy.act(observations)
+            for _ in range(40):
+                learner.update()
+            changes[anchor] = np.abs(agent.policy.act(observations) - first).mean()
+            # A resumed agent has the same anchor.
+            other.agents.load_state(agent.agents.state(), agent.agents.counters())
+            for each in (learner, other.agents.learner):
+                each.update()
+            for name, model in learner.all_models().items():
+                assert torch.equal(model.weights, other.agents.learner.all_models()[name].weights)
+            assert ("actor_first" in learner.all_models()) == (anchor > 0)
+        finally:
+            agent.close()
+            other.close()
+    assert changes[1e4] < 0.2 * changes[0.0]
+
+
 def test_a_missing_package_is_named_before_the_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -80,6 +80,7 @@ def test_a_rollout_is_shared_by_the_environments() -> None:
         (SACConfig, "smoothness", -0.1),
         (SACConfig, "actor_starts", -1),
         (SACConfig, "actor_rate", 0.0),
+        (TD3Config, "anchor", -0.1),
         (TD3Config, "exploration_noise", 0.0),
         (TD3Config, "policy_interval", 0),
         (PPOConfig, "max_grad_norm", 0.0),

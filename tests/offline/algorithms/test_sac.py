@@ -68,6 +68,18 @@ def test_targets_of_td3_clip_the_noise_and_the_actions() -> None:
     assert smoothed_actions(actions, noise, 0.5).tolist() == [[-0.5, 1.0]]
 
 
+def test_the_anchor_is_a_multiple_of_the_values_of_each_seed() -> None:
+    learner = SAC(SACConfig(**SMALL | {"batch_size": 2}), buffer(), [0, 1])
+    learner.continue_actor(0, 1.0, anchor=0.5)
+    batch = learner.encoded(learner.buffer.batch(torch.arange(4)))
+    learner._first_actions = learner.act(batch.observations) - torch.tensor([[1.0], [2], [3], [4]])
+    q = torch.tensor([[1.0, -3, 10, 20], [3, -1, 30, -20]])
+    # Means of |Q|: 2 of the first seed, and 20 of the second one.
+    loss = learner.anchor_loss(batch, q)
+    assert isinstance(loss, Tensor)
+    torch.testing.assert_close(loss, torch.tensor([1.0, 4, 90, 160]))
+
+
 def test_the_change_of_actions_is_the_mean_over_their_numbers() -> None:
     before = torch.tensor([[0.5, -1.0], [0.25, 0.0]], requires_grad=True)
     after = torch.tensor([[0.0, 1.0], [0.25, -0.5]], requires_grad=True)
