@@ -436,10 +436,10 @@ def test_layers_by_hand() -> None:
     assert image_of_grid({**height, "clip": [-100, 100]}, message) == [[255, 127], [255, 0]]
     assert image_of_grid({**height, "range": [100, -155]}, message) == [[0, 100], [127, 127]]
     # The padding of the last row may be missing, and so may the pose.
-    bare = {each: None if each.startswith("pose.") else value for each, value in message.items()}
-    bare["data"] = TWO[:-1]
+    plain = {each: None if each.startswith("pose.") else value for each, value in message.items()}
+    plain["data"] = TWO[:-1]
     window = {"x_m": [0, 2], "y_m": [2, 4], "size": [1, 2], "field": "cost"}
-    assert image_of_grid(window, bare) == [[255], [254]]
+    assert image_of_grid(window, plain) == [[255], [254]]
     assert image_of_grid({**window, "y_m": [22, 24]}, message) == [[127], [127]]
     window |= {"x_m": [10, 12], "y_m": [22, 24]}
     assert image_of_grid(window, message) == [[255], [254]]
