@@ -265,8 +265,14 @@ def check_single(env: Any) -> None:
 
 
 def check_vector(env: Any) -> None:
-    """Check that an object is a vector environment of Gymnasium."""
+    """Check that an object is a vector environment of Gymnasium whose steps are those of all."""
     if isinstance(env, gym.vector.VectorEnv):
+        rows = getattr(env.unwrapped, "batch_size", env.num_envs)
+        if isinstance(rows, int) and rows != env.num_envs:
+            raise UsageError(
+                f"RecordVecMcap records the steps of all environments, and {env} returns those of"
+                f" {rows} of its {env.num_envs} at a time: make it with batch_size={env.num_envs}"
+            )
         return
     if not isinstance(env, gym.Env):
         raise _refused("RecordVecMcap", "a vector environment", env)
