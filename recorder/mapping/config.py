@@ -754,9 +754,11 @@ class Mapping(_Part):
         reasons = {name: text for name, text in self.episodes.reasons.items() if not uses(text)}
         if len(reasons) < len(self.episodes.reasons):
             changes["reasons"] = reasons
-        found: dict[str, Any] = (
-            {"episodes": self.episodes.model_copy(update=changes)} if changes else {}
-        )
+        found: dict[str, Any] = {}
+        if changes:
+            found["episodes"] = self.episodes.model_copy(update=changes)
+        if uses(self.reward):
+            found["reward"] = "0"
         return self.model_copy(update=found) if found else self
 
     @property

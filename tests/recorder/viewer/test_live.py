@@ -306,7 +306,7 @@ def test_time_comes_before_the_messages_after_a_restart_and_a_jump_back(log: Pat
     starts = [str(e.log_time_ns[0]) for e in mcaprl.open(log).episodes]
     seen, _ = look([str(log)], [["loop", 20.0, 2], ["episode", 1], ["episode", 0]])
     looped, _, jumped = (step["wire"] for step in seen["steps"])
-    shown = ("/scene", "/scene/static", "/tf", "/tf_static", "/telemetry")
+    shown = ("/scene", "/scene/map", "/scene/static", "/tf", "/tf_static", "/telemetry")
     shown_topics = {"/rl/step", "/rl/phase", "/rosout", *shown}
     for wire, rounds in ((looped, 2), (jumped, 1)):
         assert not [kind for kind, _ in wire if kind == "session"]
