@@ -106,13 +106,8 @@ class Heading(NamedTuple):
 
 @inlined
 def heading_of(yaw_rad: float) -> Heading:
-    """Return the direction of a yaw angle, accurate to about the last bit.
-
-    Like `sine`, the function has no branches or calls. It splits the angle into quarter turns and
-    a remainder of at most 45 degrees, and computes the sine and cosine of the remainder. The number
-    of quarter turns determines which of these two values is the cosine of the yaw, and the signs
-    of both.
-    """
+    """Return the direction of a yaw angle from quarter turns and a rest of up to 45 degrees."""
+    # Like `sine`, the function has no branches or calls.
     quarters = np.floor(yaw_rad * (2.0 / math.pi) + 0.5)
     rest_rad = (yaw_rad - quarters * _QUARTER_RAD) - quarters * _QUARTER_REST_RAD
     sin, cos = sine(rest_rad), cosine(rest_rad)
@@ -198,11 +193,8 @@ def point_at(path: Path, along_m: float) -> tuple[float, float]:
 
 @compiled
 def project(path: Path, x_m: float, y_m: float, from_m: float, to_m: float) -> Projection:
-    """Return the path point nearest to (x_m, y_m) between two distances along the path.
-
-    Where the path crosses itself, the window [from_m, to_m] selects the vehicle's branch. The
-    window may begin on any lap. The result's `along_m` is within the window.
-    """
+    """Return the path point nearest to (x_m, y_m) between two distances along the path."""
+    # The window, on any lap, selects the vehicle's branch where the path crosses itself.
     leg, rest_m = spot_at(path, from_m)
     leg_start_m = from_m - rest_m
     nearest, along_m, leftward, yaw_rad = math.inf, from_m, True, 0.0
@@ -304,12 +296,6 @@ def slip_of(
     tan(beta) = tan(steering) / 2, so sin(beta) = sin(steering) / sqrt(4 - 3 sin^2(steering)). Let l
     be half the wheelbase and v the speed. The radius of the turn is l / sin(beta), so the lateral
     acceleration is v^2 sin(beta) / l. It limits sin(beta) to l / v^2 times the maximum.
-
-    Args:
-        steering_rad: Steering angle, from -45 to 45 degrees.
-        speed_m_s: Speed v; 0 for a slip without a limit.
-        most_lateral_m_s2: Maximum lateral acceleration.
-        wheelbase_m: Distance between the axles.
     """
     steering_sine = sine(steering_rad)
     root = math.sqrt(4.0 - 3.0 * steering_sine * steering_sine)
@@ -474,20 +460,14 @@ _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z i
 
 
 def box_faces(middle_m: Point, size_m: Point) -> NDArray[np.float64]:
-    """Return the faces of an axis-aligned box, (6 faces, 4 corners, xyz), meters.
-
-    Seen from outside, the corners of each face run counter-clockwise.
-    """
+    """Return the faces of a box, (6 faces, 4 corners, 3) meters, counter-clockwise outside."""
     corners: NDArray[np.float64] = np.array(middle_m) + _CORNERS * np.array(size_m)
     faces: NDArray[np.float64] = corners[np.array(_FACES)]
     return faces
 
 
 def box_mesh(middle_m: Point, size_m: Point) -> NDArray[np.float64]:
-    """Return the triangles of an axis-aligned box, (12 triangles, 3 corners, xyz), meters.
-
-    Seen from outside, the corners of each triangle run counter-clockwise.
-    """
+    """Return the triangles of a box, (12, 3 corners, 3) meters, counter-clockwise outside."""
     corners: NDArray[np.float64] = np.array(middle_m) + _CORNERS * np.array(size_m)
     triangles: NDArray[np.float64] = corners[_TRIANGLES]
     return triangles
@@ -503,10 +483,8 @@ def ground_mesh(half_side_m: float) -> NDArray[np.float64]:
 def frustum_mesh(
     foot_m: Point, foot_side_m: float, top_side_m: float, height_m: float
 ) -> NDArray[np.float64]:
-    """Return the triangles of an upright square frustum without base, (10, 3, 3) meters.
-
-    With a top side of 0, the frustum is a pyramid with 4 triangles, (4, 3, 3).
-    """
+    """Return the triangles of a square frustum without base, (10, 3, 3) meters."""
+    # (4, 3, 3) of a pyramid.
     height = _CORNERS[:, 2:] + 0.5
     level = _CORNERS[:, :2] * (foot_side_m + (top_side_m - foot_side_m) * height)
     corners: NDArray[np.float64] = np.array(foot_m) + np.hstack([level, height_m * height])

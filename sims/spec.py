@@ -87,11 +87,10 @@ class SimSpec:
 
 
 class SimCatalog(Mapping[str, str]):
-    """Mapping from short names to Gymnasium ids.
+    """Mapping from short names to Gymnasium ids."""
 
-    Built-in sims are registered with Gymnasium when the catalog is created. Sims of other packages
-    are imported and registered when their short name or an unregistered id is looked up.
-    """
+    # Built-in sims are registered with Gymnasium at once; those of other packages are imported when
+    # their short name or an unregistered id is looked up.
 
     def __init__(self, own: Iterable[SimSpec]) -> None:
         """Register the built-in sims."""
@@ -100,12 +99,7 @@ class SimCatalog(Mapping[str, str]):
             spec.register()
 
     def __getitem__(self, name: str) -> str:
-        """Return the id of a sim.
-
-        Raises:
-            KeyError: There is no sim of this name.
-            UsageError: The sim's entry point cannot be loaded.
-        """
+        """Return the id of a sim; raise UsageError if its entry point cannot be loaded."""
         return self._spec(name).env_id
 
     def __iter__(self) -> Iterator[str]:
@@ -121,13 +115,8 @@ class SimCatalog(Mapping[str, str]):
         return name in self._specs or name in _installed()
 
     def find(self, env_id: str, *, loads: bool = True) -> SimSpec | None:
-        """Return the description of the sim with this id, or None if no sim has it.
-
-        Args:
-            env_id: Gymnasium id.
-            loads: Whether to import the sims of other packages if no registered sim has the id. A
-                failed import causes a warning.
-        """
+        """Return the description of the sim with this id, or None if no sim has it."""
+        # `loads` imports the sims of other packages if no registered one has the id; failures warn.
         specs = self._specs
         if loads and all(env_id not in spec.env_ids for spec in specs.values()):
             for name in self:

@@ -74,10 +74,7 @@ def level_axes(yaw_rad: float) -> Floats:
 
 
 def fronts(mesh: Floats) -> Floats:
-    """Return the planes of triangles, (T, 4). A row contains n and d of the equation n . p = d.
-
-    The unit normal n points to the front of the triangle.
-    """
+    """Return planes (T, 4) of triangles: n, d of n . p = d with the unit normal n to the front."""
     ahead = np.cross(mesh[:, 1] - mesh[:, 0], mesh[:, 2] - mesh[:, 0])
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     return np.column_stack([ahead, (ahead * mesh[:, 0]).sum(axis=1)])
@@ -95,10 +92,7 @@ class Faces(NamedTuple):
 
 
 def faces_of(mesh: Floats) -> Faces:
-    """Merge successive triangles (T, 3, 3) of a mesh that are two halves of a convex quadrilateral.
-
-    Most faces of a mesh of boxes become quadrilaterals, and half as many faces are drawn.
-    """
+    """Merge successive triangles (T, 3, 3) that are two halves of a convex quadrilateral."""
     corners = np.concatenate([mesh, mesh[:, :1]], axis=1)
     planes = fronts(mesh)
     has_partner, is_merged = np.zeros((2, len(mesh)), dtype=np.bool_)
@@ -115,17 +109,8 @@ def faces_of(mesh: Floats) -> Faces:
 def _quadrilaterals(
     mesh: Floats, planes: Floats, here: int, there: int
 ) -> tuple[NDArray[np.bool_], Floats]:
-    """Merge each triangle but the last with the next one along one edge of each.
-
-    Args:
-        mesh: (T, 3, 3) triangles.
-        planes: (T, 4) result of `fronts` for the mesh.
-        here: Index of the corner at which the common edge begins in the first triangle.
-        there: Index of the corner at which the common edge begins in the next triangle.
-
-    Returns:
-        (T - 1,) whether the result is a flat convex quadrilateral, and the results (T - 1, 4, 3).
-    """
+    """Merge each triangle but the last with the next one along one edge of each."""
+    # Returns (T - 1,) whether the result is a flat convex quadrilateral, and (T - 1, 4, 3) these.
     first, second = mesh[:-1], mesh[1:]
     other = second[:, (there + 2) % 3]
     quads = np.insert(first, here + 1, other, axis=1)
@@ -180,10 +165,7 @@ def draw(faces: Faces, eye_m: Floats, axes: Floats, focal_px: float, inverse_z: 
 
 
 class _Plane(NamedTuple):
-    """Plane of all points p with x p_x + y p_y + z p_z = offset.
-
-    The offset is negative if the camera is in front of the plane.
-    """
+    """Plane x p_x + y p_y + z p_z = offset, which is below 0 if the camera is in front."""
 
     x: float
     y: float
@@ -245,15 +227,10 @@ def project(
 def _spans(
     polygon: Floats, count: int, middles: Floats, left_u: Floats, right_u: Floats
 ) -> tuple[int, int]:
-    """Compute the leftmost and rightmost u of a convex polygon on each row of the image.
-
-    Adjacent polygons list their common edge in opposite directions. Since each edge is evaluated
-    from its upper end, both polygons get bit-identical results. The loop over rows is the inner
-    loop, and its index is unsigned, so that the compiler can vectorize it.
-
-    Returns:
-        First row that the polygon covers, and the row after the last one.
-    """
+    """Compute the leftmost and rightmost u of a convex polygon per row."""
+    # Return the first and end row. Each edge is evaluated from its upper end, so that adjacent
+    # polygons get bit-identical results. The index of the inner loop is unsigned, so that the
+    # compiler can vectorize it.
     top, bottom = math.inf, -math.inf
     for i in range(count):
         top, bottom = min(top, polygon[i, 1]), max(bottom, polygon[i, 1])
@@ -285,15 +262,10 @@ def _fill(
     focal_px: float,
     inverse_z: Floats,
 ) -> None:
-    """Fill a convex polygon that lies in a plane.
-
-    A pixel is filled if its middle is inside. If the middle is on an edge, the pixel belongs to the
-    polygon to the right of the edge or below it.
-
-    At a pixel (u, v), relative to the middle of the image, the inverse depth of the plane is
-    (x u/f + y v/f + z) / offset. Here, f is the focal length; the fields of `plane` are x, y,
-    z and offset.
-    """
+    """Fill a convex polygon in a plane."""
+    # On an edge, pixels belong to the polygon right of or below it. At (u, v) from the middle of
+    # the image, the inverse depth is (x u/f + y v/f + z) / offset, with the focal length f and the
+    # fields of `plane`.
     height, width = inverse_z.shape
     middle_u, middle_v = 0.5 * width, 0.5 * height
     step = plane.x / (plane.offset * focal_px)
@@ -319,19 +291,8 @@ def draw_wires(
     focal_y_px: float,
     inverse_z: Floats,
 ) -> None:
-    """Draw straight wires into the image `inverse_z`. Nearer surfaces hide the wires.
-
-    A wire is one pixel wide at any distance. It covers one pixel in each column that it crosses. If
-    it is steeper than 45 degrees in the image, it covers one pixel in each row instead.
-
-    Args:
-        wires: (S, 2, 3) both ends of each of the S wires.
-        eye_m: (3,) position of the camera.
-        axes: (3, 3) axes of the camera, as in `draw`.
-        focal_x_px: Focal length in pixel widths.
-        focal_y_px: Focal length in pixel heights.
-        inverse_z: Image to draw into.
-    """
+    """Draw wires (S, 2, 3) into the image `inverse_z`; nearer surfaces hide them."""
+    # A wire is one pixel wide: in each column, or in each row if it is steeper than 45 degrees.
     ends = np.empty((2, 3))
     for wire in range(len(wires)):
         for i in range(2):

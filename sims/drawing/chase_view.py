@@ -110,19 +110,8 @@ def packed(red: float, green: float, blue: float) -> int:
 
 @compiled
 def keys(faces: Faces, far: int, eye: Eye, width_px: int, height_px: int, order_by: Floats) -> None:
-    """Compute the keys by which the faces are sorted before they are drawn.
-
-    Faces that lie flat on the ground come first, the lowest first; then all other faces, the
-    farthest first. Faces outside the image have the key infinity.
-
-    Args:
-        faces: Faces in the map.
-        far: Number of faces at the start of `faces` that are drawn only within `FAR_M`.
-        eye: Camera.
-        width_px: Width of the image.
-        height_px: Height of the image.
-        order_by: (F,) output.
-    """
+    """Compute sort keys (F,) of faces: first those flat on the ground, then the farthest."""
+    # Outside the image, they are infinite. The first `far` faces are drawn only within `FAR_M`.
     wide, high = 0.5 * width_px / eye.focal_px, 0.5 * height_px / eye.focal_px
     wide_reach, high_reach = math.hypot(1.0, wide), math.hypot(1.0, high)
     for face in range(len(order_by)):
@@ -197,18 +186,8 @@ def paint(faces: Faces, order: NDArray[np.int64], eye: Eye, samples: Samples) ->
 
 @compiled
 def _stroke(ends: Floats, scale: float, flat: Floats) -> int:
-    """Replace the ends of a stroke in `flat` by the corners of its polygon.
-
-    A short stroke becomes a dot.
-
-    Args:
-        ends: (2, 3) ends in camera coordinates.
-        scale: Width of the stroke at a distance of one meter, in samples.
-        flat: (2, 2) ends in the image; output: the corners.
-
-    Returns:
-        Number of corners.
-    """
+    """Replace the ends of a stroke in `flat` by the corners of its polygon; return their number."""
+    # A short stroke becomes a dot. `scale` is its width at a distance of one meter, in samples.
     x, y = flat[0, 0], flat[0, 1]
     along_x, along_y = flat[1, 0] - x, flat[1, 1] - y
     length = math.hypot(along_x, along_y)
@@ -243,20 +222,9 @@ def _light(corners_m: Floats) -> float:
 
 @compiled
 def _spans(flat: Floats, count: int, lefts: Floats, rights: Floats) -> tuple[int, int]:
-    """Compute the left and right end of a convex polygon on each row of samples.
-
-    Each row and column of samples that the polygon touches counts, so that a face that is thinner
-    than a sample remains visible, and neighbors have no gap between them.
-
-    Args:
-        flat: (K, 2) corners in samples.
-        count: Number of corners.
-        lefts: (rows,) output: left end on each row that the polygon touches.
-        rights: (rows,) output: right end on each of these rows.
-
-    Returns:
-        First row that the polygon touches, and the row after the last one.
-    """
+    """Compute the left and right end of a convex polygon per row."""
+    # Return the first and the end row. All rows and columns that it touches count: thin faces stay
+    # visible, neighbors have no gap.
     rows = float(len(lefts))
     high, low = math.inf, -math.inf
     for i in range(count):
@@ -531,10 +499,8 @@ _NONE = Faces(np.empty((0, 3)), np.zeros(1, np.int64), np.empty((0, 3)), np.empt
 
 
 def _outlines(shape: Shape) -> tuple[Sequence[Floats] | Floats, float]:
-    """Return outlines in the shape's own axes, and a line width.
-
-    Polygons are (K, 3) with the width 0; strokes are (2, 3) with their width.
-    """
+    """Return outlines in the shape's axes, and a line width: 0 for polygons (K, 3)."""
+    # Strokes are (2, 3).
     points, size = shape.points, shape.size
     match shape.kind:
         case "box":

@@ -108,10 +108,7 @@ def decode_depth(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def encode_nearness(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Encode meters as bytes by the formula of AirSim's examples: 255 / max(1, d), rounded down.
-
-    Infinity is 0. Half of the codes cover distances of 1 to 2 m.
-    """
+    """Encode meters as bytes, like AirSim's examples: 255 / max(1, d), rounded down."""
     codes: NDArray[np.uint8] = (255.0 / np.maximum(1.0, depth_m)).astype(np.uint8)
     return codes
 
@@ -168,20 +165,10 @@ def downsampling(old: tuple[int, int], new: tuple[int, int]) -> Downsampling:
 def shrink(
     inverse: Floats, nearness: Floats, sizes: Downsampling, depth_m: NDArray[np.float32]
 ) -> None:
-    """Downsample an image of inverse depths to a smaller image of distances.
-
-    If surfaces cover at least half of a new pixel, its inverse distance is the mean over the
-    covered part. Otherwise, its distance is infinite. Thus the sky does not affect distances. On a
-    plane, inverse depth is linear in image coordinates, so the mean gives the distance near the
-    middle of the covered part.
-
-    Args:
-        inverse: (H, W) inverse depths, 1/m, 0 where there is no surface. They are replaced by
-            inverse distances.
-        nearness: (H, W) depth divided by distance.
-        sizes: Result of `downsampling` for both sizes.
-        depth_m: (h, w) output, meters.
-    """
+    """Downsample an image of inverse depths to a smaller image of distances."""
+    # If surfaces cover at least half of a new pixel, its inverse distance is the mean over the
+    # covered part, so that the sky has no effect; otherwise its distance is infinite. On a plane,
+    # inverse depth is linear in image coordinates. `inverse` is overwritten.
     rows, columns = sizes.rows, sizes.columns
     covered = _to_distances(inverse, nearness)
     width, new_width = inverse.shape[1], depth_m.shape[1]

@@ -110,17 +110,12 @@ def coarse(points_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def cut(segments_m: NDArray[np.float64], longest_m: float) -> NDArray[np.float64]:
-    """Cut each segment into pieces of `longest_m`; the last piece may be shorter.
-
-    Viewers do not draw a line that begins behind the camera, even if the rest of the line is in
-    front. With short pieces, only a small part of the line is missing.
-
-    Returns:
-        (2 M, K) alternating starts and ends of M pieces.
+    """Cut segments into pieces of `longest_m` or less: (2 M, K) alternating starts and ends.
 
     >>> cut(np.array([[0.0, 0.0], [5.0, 0.0]]), 2.0)[:, 0].tolist()
     [0.0, 2.0, 2.0, 4.0, 4.0, 5.0]
     """
+    # Viewers do not draw a line that begins behind the camera, even if the rest is in front.
     cuts = []
     for start, end in segments_m.reshape(-1, 2, segments_m.shape[-1]):
         length_m = float(np.linalg.norm(end - start))

@@ -66,17 +66,8 @@ def lookahead(points_m: NDArray[np.float64]) -> Shape:
 
 
 def rays(lines_m: NDArray[np.float64], car: Frame, height_m: float) -> tuple[Shape, Shape]:
-    """Return distance rays as lines, with dots at their ends.
-
-    Dots and lines use the same array of points in the car's frame, because repeated bytes compress
-    well in logs. Therefore, the starts of the rays have dots, too. These dots are inside the car or
-    mark the car's sensors.
-
-    Args:
-        lines_m: (R, 2, 2) starts and ends in the map.
-        car: Frame of the car.
-        height_m: Height of the rays.
-    """
+    """Return distance rays (R, 2, 2) as lines, with dots at their ends."""
+    # Dots and lines share one array of points, because repeated bytes compress well in logs.
     _, _, sin, cos = car.rotation
     turn = np.array([[cos * cos - sin * sin, -2 * sin * cos], [2 * sin * cos, cos**2 - sin**2]])
     points = raised(coarse((lines_m - np.array(car.position[:2])) @ turn), height_m)

@@ -93,11 +93,7 @@ _SMOOTH = 2
 
 
 class Canvas:
-    """Canvas for a sequence of images. In mode `human`, a window shows them.
-
-    For each image, call `polygon` any number of times, then `flatten`, then the methods that draw
-    text and other elements without smoothing, then `finish`.
-    """
+    """Canvas for images: first `polygon`, then `flatten`, then text and others, then `finish`."""
 
     def __init__(
         self,
@@ -134,10 +130,7 @@ class Canvas:
         self._image = self.pygame.transform.smoothscale(self._large, self._size_px)
 
     def paste(self, image: NDArray[np.uint8]) -> None:
-        """Use (height, width, 3) pixels as the image; later calls draw over them, in place.
-
-        This replaces the calls of `polygon` and `flatten`.
-        """
+        """Use (height, width, 3) pixels as the image; later calls draw over them, in place."""
         self._pixels = image
         self._image = self.pygame.image.frombuffer(image, self._size_px, "RGB")
 
@@ -159,11 +152,7 @@ class Canvas:
         self._image.blit(self._fonts[height_px].render(text, True, color), at_px)
 
     def strip(self, box_px: tuple[int, int, int, int], color: Rgb) -> Any:
-        """Fill the rectangle (left, top, width, height) with a background color.
-
-        Returns:
-            Pygame surface that shares memory with this rectangle of the image.
-        """
+        """Fill a rectangle (left, top, width, height); return a surface with its memory."""
         part = self._image.subsurface(box_px)
         part.fill(color)
         return part
@@ -227,10 +216,7 @@ class FollowView:
         frames_per_s: int,
         floor: Iterable[Shape] = (),
     ) -> None:
-        """Prepare the static shapes. Shapes in `floor` are drawn below all other shapes.
-
-        The image shows `width_m` meters of the ground from left to right.
-        """
+        """Prepare the static shapes, with `floor` below all others, and a view of `width_m`."""
         self.canvas = Canvas(render_mode, (SIDE_PX, SIDE_PX), f"mcaprl {name}", frames_per_s)
         lowest = [patch._replace(top_m=-math.inf) for patch in patches(floor)]
         self._static = [*lowest, *patches(static)]
@@ -240,10 +226,7 @@ class FollowView:
         self._width_m = width_m
 
     def draw(self, moving: Iterable[Shape], body: Body, text: str) -> None:
-        """Draw the body, its surroundings, and a line of text at the bottom.
-
-        The caller may draw more on `canvas` before the call of `show`.
-        """
+        """Draw the body, its surroundings, and a text; the caller may draw more before `show`."""
         lifted = [
             patch._replace(top_m=patch.top_m + body.height_m) if patch.frame != "map" else patch
             for patch in [*self._near(body), *patches(moving)]

@@ -104,10 +104,6 @@ def mean_interval(returns: Floats, *, seed: int = 0) -> tuple[float, float]:
     fewer than `LEAST_RESAMPLED` start states. If the lower limits of these intervals
     are a and b below the mean, the lower limit of the result is sqrt(a^2 + b^2) below the mean. The
     upper limit is computed in the same way.
-
-    Args:
-        returns: (S, E) returns.
-        seed: Seed of the resampling.
     """
     mean = float(returns.mean())
     down, up = 0.0, 0.0
@@ -124,13 +120,7 @@ def mean_interval(returns: Floats, *, seed: int = 0) -> tuple[float, float]:
 def bootstrap_interval(
     returns: Floats, statistic: Callable[[Floats], Floats], *, seed: int = 0
 ) -> tuple[float, float]:
-    """Return the 95 % percentile bootstrap interval of a statistic.
-
-    Args:
-        returns: (S, E) returns.
-        statistic: Function of returns (..., S, E), such as `median` or `interquartile_mean`.
-        seed: Seed of the resampling.
-    """
+    """Return the 95 % percentile bootstrap interval of a statistic of returns (S, E)."""
     return _interval(statistic(_resampled(returns, np.random.default_rng(seed))))
 
 
@@ -207,11 +197,7 @@ def _standard_errors(values: Floats) -> Floats:
 
 
 def student_quantile(degrees_of_freedom: int) -> float:
-    """Return the 97.5 % quantile of Student's t, within 0.1 %.
-
-    Values between the rows of a table are interpolated linearly in 1 / degrees of freedom. SciPy,
-    which has this function, is not a dependency of this package.
-    """
+    """Return the 97.5 % quantile of Student's t, within 0.1 %; SciPy is no dependency."""
     degrees = np.array(list(_STUDENT))
     quantiles = np.array(list(_STUDENT.values()))
     return float(np.interp(-1 / degrees_of_freedom, -1 / degrees, quantiles))

@@ -55,11 +55,7 @@ def comparison_figure(
     behavior: tuple[float, float, float] | None,
     width: float = 8.0,
 ) -> Any:
-    """Draw mean returns with their intervals, and a dot for each training seed.
-
-    `behavior` is the mean return of the logged episodes, drawn as a line, and the lower and upper
-    limit of its interval, drawn as a band.
-    """
+    """Draw mean returns with intervals, a dot per training seed, and `behavior` as a band."""
     figure, axes = new_figure((width, 0.62 * len(scores) + 1.8))
     if behavior is not None:
         mean, low, high = behavior
@@ -102,10 +98,7 @@ def _exceeds_returns(score: PolicyScore) -> bool:
 
 
 def _draw_interval(axes: Any, row: int, score: PolicyScore) -> tuple[float, float]:
-    """Draw an interval up to the extreme returns; return the limits of the line.
-
-    The interval of few, skewed returns can be many times as wide as the returns.
-    """
+    """Draw an interval, cut at the extreme returns; return the limits of the line."""
     if not score.has_interval:
         return (score.mean_return,) * 2
     limits = (float(score.returns.min()), float(score.returns.max()))
@@ -158,11 +151,8 @@ def evaluation_page(
     recorded: tuple[Path, int] | None,
     curves: Sequence[Figure] = (),
 ) -> None:
-    """Write FOLDER/index.html, comparison.png and trajectories.png.
-
-    `behavior` is that of `comparison_figure`. `recorded` is a log and a number N: the log contains
-    the episodes of the first N policies in `scores`.
-    """
+    """Write FOLDER/index.html, comparison.png and trajectories.png."""
+    # `recorded` is a log, and the number of first policies in `scores` whose episodes it contains.
     save_png(comparison_figure(scores, "mean return", behavior), folder / "comparison.png")
     comparison = comparison_figure(scores, "", behavior, width=5.6)
     figures = [Figure.of("Mean returns", comparison)]
@@ -235,10 +225,8 @@ def _cards(
 
 
 def _thumbnail(episode: EpisodeResult, world: Sequence[Shape], color: str) -> str:
-    """Return an episode's trajectory as a small SVG; empty if the episode has no positions.
-
-    The last position is a cross if the episode ended before the time limit, otherwise a dot.
-    """
+    """Return a trajectory as a small SVG; empty without positions."""
+    # The end is a cross if it came before the time limit, otherwise a dot.
     if not episode.positions.size:
         return ""
     figure, axes = new_figure((3.2, 2.2))

@@ -129,10 +129,7 @@ class NoisyPolicy(BasePolicy):
 def quantile(
     share: Floats, mean: Floats, sigma: Floats | float, low: Floats | float, high: Floats | float
 ) -> Floats:
-    """Return the quantiles of normal distributions truncated to [low, high].
-
-    Uniform numbers from 0 to 1 as `share` draw numbers with the density of `log_density`.
-    """
+    """Return the quantiles of normal distributions truncated to [low, high]."""
     first, last = (_probability((bound - mean) / sigma) for bound in (low, high))
     shares = np.clip(first + (last - first) * share, 1e-16, 1 - 1e-16)
     found: Floats = np.clip(mean + sigma * _QUANTILE(shares), low, high)
@@ -177,16 +174,12 @@ DEFAULT_MAX_STEPS: Final = 27_000
 
 
 class StepLimit(gym.Wrapper[Any, Any, Any, Any]):
-    """A wrapper that truncates episodes, with the reason `step_limit`.
-
-    Attributes:
-        max_steps: Steps after which an episode is truncated.
-    """
+    """Wrapper that truncates episodes after `max_steps` steps, with the reason `step_limit`."""
 
     def __init__(self, env: gym.Env[Any, Any], max_steps: int) -> None:
         """Wrap `env`."""
         super().__init__(env)
-        self.max_steps = max_steps
+        self.max_steps = max_steps  # Steps after which an episode is truncated
         self._step = 0
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
@@ -228,10 +221,8 @@ def make_limited(
 def make_limited_sims(
     name: str, num_envs: int, max_steps: int | None, /, **kwargs: Any
 ) -> gym.vector.VectorEnv[Any, Any, Any]:
-    """Make environments whose episodes end, which are stepped together; see `make_limited`.
-
-    With another limit than that of the environment, they are stepped one after the other.
-    """
+    """Make environments whose episodes end, which are stepped together; see `make_limited`."""
+    # With another limit than that of the environment, they are stepped one after the other.
     limit = max_steps or _default_of(name, kwargs)
     if limit is None:
         return make_sims(name, num_envs, **kwargs)
@@ -509,11 +500,8 @@ def batch_rollout(
     seeds: Sequence[int],
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> list[EpisodeResult]:
-    """Run one greedy episode for each seed in parallel, with the same results as `run_episode`.
-
-    All environments are stepped until the last of these episodes ends. Further episodes that start
-    in an environment are ignored.
-    """
+    """Run one greedy episode for each seed in parallel, with the same results as `run_episode`."""
+    # Further episodes that start in an environment until the last one ends are ignored.
     assert envs.num_envs == len(seeds)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     # The base class is typed for a single seed, but vector environments accept a list.

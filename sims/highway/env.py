@@ -452,13 +452,7 @@ class HighwayPilot(ScriptedPilot[HighwayLaneEnv]):
     """Scripted driver of the highway-lane sim's car."""
 
     def choose(self) -> int | list[float]:
-        """Choose the action for the current state of the car.
-
-        Let a point ahead be at distance d from the car, and l meters to the left of its heading.
-        The circle through this point that is tangent to the heading has the radius d^2 / (2 l).
-        Coulter, "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01,
-        1992.
-        """
+        """Choose the action for the car's state by pure pursuit; see `mcaprl.sims.lane.pilot`."""
         car, course = self.sim.car, self._free_course()
         is_continuous = self.sim.controls.commands is None
         pursuit_m = CONTINUOUS_PURSUIT_M if is_continuous else PURSUIT_M

@@ -71,10 +71,7 @@ class Course(NamedTuple):
         )
 
     def point(self, along_m: float) -> tuple[float, float]:
-        """Return the point (x, y) at a distance along the course.
-
-        Beyond an open end, the course continues straight.
-        """
+        """Return (x, y) at a distance along the course; it goes straight on at an open end."""
         x_m, y_m = self.points_m.T
         if self.is_closed:
             along_m %= self.length_m
@@ -96,11 +93,8 @@ def courses_of(network: Any) -> tuple[Course, ...]:
 
 
 def _lanes_between(graph: dict[str, dict[str, list[Any]]]) -> Iterator[tuple[str, str, list[Any]]]:
-    """Yield start node, end node and lanes of each edge, in the direction of travel.
-
-    The first edge starts at the node without a predecessor. A closed road has no such node; its
-    first edge starts at the first node of the graph.
-    """
+    """Yield start node, end node and lanes of each edge, in the direction of travel."""
+    # The first edge starts at the node without a predecessor; of a closed road, at the first node.
     reached = {end for ends in graph.values() for end in ends}
     first = next((node for node in graph if node not in reached), next(iter(graph)))
     node, is_new = first, True
@@ -170,10 +164,7 @@ class Car(NamedTuple):
 
 
 def static_shapes(network: Any, courses: Sequence[Course]) -> tuple[Shape, ...]:
-    """Return the shapes that never change.
-
-    The world is in the frame `map`, and the parts of the car are in the frame `car`.
-    """
+    """Return the shapes that never change."""
     points_m = np.concatenate([course.points_m for course in courses])
     low, high = points_m.min(axis=0) - MARGIN_M, points_m.max(axis=0) + MARGIN_M
     return (

@@ -50,15 +50,8 @@ def step_cars(
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
 ) -> None:
-    """Advance N cars by one decision each, in place.
-
-    Args:
-        cars: (N, 10) rows that begin with `Car`.
-        commands: (N, 2) rows of `Command`.
-        rewards: (N,) output.
-        ends: (N,) output: DRIVING, OFF_LANE or STALL.
-        observations: (N, 12) output.
-    """
+    """Advance N cars by one decision each, in place."""
+    # cars is (N, 10) and begins with a `Car`, commands (N, 2), observations (N, 12).
     first = 0
     if len(cars) >= LANES:
         first = _step_blocks(cars, commands, rewards, ends, observations)
@@ -81,11 +74,7 @@ def advance(row: NDArray[np.float64], command: Command) -> tuple[Car, float, int
 def step_only_car(
     arrays: Arrays, pedal: float, steering: float
 ) -> tuple[float, int, float, float, float, float]:
-    """Advance a single car like `step_cars`; also return the values for its `info`.
-
-    Returns:
-        Reward, end, offset, heading error, speed and progress.
-    """
+    """Advance a car; return reward, end, offset, heading error, speed and progress."""
     row = array_at(arrays, 0, (STARTED_AT + 1,), np.float64)
     car, reward, end = advance(row, Command(pedal, steering))
     array_at(arrays, 1, (1,), np.float64)[0] = reward
@@ -146,12 +135,7 @@ def observe_cars(
 
 @compiled
 def car_info(cars: NDArray[np.float64], info: NDArray[np.float64]) -> None:
-    """Compute the contents of the `info` of N cars.
-
-    Args:
-        cars: (N, 10) rows: a `Car`, then its distance along the path at the episode's start.
-        info: (4, N) output: offsets, heading errors, speeds and progress.
-    """
+    """Compute the `info` (4, N) of cars (N, 10): offsets, heading errors, speeds and progress."""
     for i in range(len(cars)):
         car = car_at(cars[i])
         info[0, i], info[1, i], info[2, i] = car.offset_m, car.heading_error_rad, car.speed_m_s

@@ -30,10 +30,8 @@ IMAGE_SHAPE = (84, 84)
 
 @functools.cache
 def lane_mesh(closed: tuple[Box, ...] = ()) -> NDArray[np.float64]:
-    """Return (T, 3, 3) triangles of all surfaces, meters. Callers must not modify the array.
-
-    `closed` contains the barriers. The classic rules have no barriers.
-    """
+    """Return (T, 3, 3) triangles of all surfaces, meters, if `closed` with barriers."""
+    # Callers must not modify them.
     solids = [
         box_mesh((box.x_m, box.y_m, box.height_m / 2), (box.length_m, box.width_m, box.height_m))
         for box in (*rails(), *buildings(), *closed)

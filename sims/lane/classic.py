@@ -52,10 +52,7 @@ def classic_distance(x_m: float, y_m: float) -> float:
 
 @compiled
 def classic_reward(distance_m: float, speed_m_s: float) -> float:
-    """Return the reward: -3 beyond 3.5 m, else (exp(-3 d) - 0.5) + ((v - 10) / (300 - 10) - 0.5).
-
-    The distance is d in meters, and the speed is v in m/s.
-    """
+    """Return -3 beyond 3.5 m, else (exp(-3 d) - 0.5) + ((v - 10) / (300 - 10) - 0.5)."""
     if distance_m > CLASSIC_LANE_M:
         return CLASSIC_OFF_LANE_REWARD
     nearness = math.exp(-NEARNESS_PER_M * distance_m) - 0.5
@@ -78,10 +75,7 @@ def classic_end(
 
 @compiled
 def classic_decide(car: Car, command: Command) -> tuple[Car, bool]:
-    """Drive for one second; return the new state, and whether the body touched an obstacle.
-
-    Obstacles do not stop the car.
-    """
+    """Drive for one second; return the state, and whether the body met an obstacle."""
     hit = False
     for _ in range(CLASSIC_SUBSTEPS):
         car = drive(car, command, 1)

@@ -70,19 +70,14 @@ class Box(NamedTuple):
 
 
 def streets() -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return the start point and the end point of each leg, (2,) each, meters.
-
-    The leg that belongs to both squares of the course is listed once.
-    """
+    """Return the start and end point of each leg, (2,) each, meters; that of both squares once."""
     legs = {tuple(sorted(ends)) for ends in itertools.pairwise(CORNERS_M)}
     return [(np.array(start), np.array(end)) for start, end in sorted(legs)]
 
 
 def street_bounds(half_width_m: float) -> NDArray[np.float64]:
-    """Return the streets as (K, 4) rectangles x0, y0, x1, y1, meters.
-
-    Each rectangle extends `half_width_m` beyond both ends of the street's leg.
-    """
+    """Return the streets as (K, 4) rectangles x0, y0, x1, y1 in meters."""
+    # Each extends `half_width_m` beyond both ends of its leg.
     ends = np.array(streets())
     return np.hstack([ends.min(axis=1) - half_width_m, ends.max(axis=1) + half_width_m])
 
@@ -90,11 +85,7 @@ def street_bounds(half_width_m: float) -> NDArray[np.float64]:
 def pavement(
     half_width_m: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Divide the ground into a grid whose lines pass through the edges of all streets.
-
-    Returns:
-        (M + 1,) x and (N + 1,) y of the grid lines, and a mask (M, N) of the cells on a street.
-    """
+    """Return x and y of a grid along all street edges, and a mask of its cells on a street."""
     bounds = street_bounds(half_width_m)
     x_m, y_m = np.unique(bounds[:, [0, 2]]), np.unique(bounds[:, [1, 3]])
     middle_x, middle_y = (x_m[:-1] + x_m[1:]) / 2, (y_m[:-1] + y_m[1:]) / 2
@@ -126,13 +117,10 @@ def rails() -> list[Box]:
 
 
 def barriers() -> tuple[tuple[Box, ...], tuple[Box, ...]]:
-    """Return the barriers for a car on the first square, and those for a car on the second.
-
-    Both ends of the shared leg are crossings. Barriers close the streets of the other square there,
-    so that the street to take is visible. Without the barriers, the shared leg would look the same
-    on both squares, but the car must turn right at its end on the first square, and left on the
-    second.
-    """
+    """Return the barriers for a car on the first square, and those for a car on the second."""
+    # They close the streets of the other square at both crossings of the shared leg. Without them,
+    # the leg would look the same on both squares, but the car must turn right at its end on the
+    # first square, and left on the second.
     (x0, y0), (x1, _) = CORNERS_M[:2]
     aside_m = RAIL_OFFSET_M + RAIL_THICKNESS_M / 2
     size = (2 * RAIL_OFFSET_M, RAIL_THICKNESS_M, BARRIER_HEIGHT_M)
@@ -151,11 +139,7 @@ def _overlaps(box: Box, bounds: NDArray[np.float64]) -> bool:
 def _house(
     index: int, at: NDArray[np.float64], forward: NDArray[np.float64], left: NDArray[np.float64]
 ) -> Box:
-    """Return a house; `index` determines its size and its distance from the street.
-
-    The house's front begins beside the point `at` (2,) on the center line. `forward` is the unit
-    vector along the street, and `left` is the unit vector from the street to the house.
-    """
+    """Return a house beside the point `at`; `index` gives its size and its distance."""
     front_m, deep_m = scattered(index, 8.0, 18.0), scattered(3 * index, 8.0, 15.0)
     garden_m = scattered(5 * index, 7.5, 11.5)
     middle = at + forward * (front_m / 2) + left * (garden_m + deep_m / 2)
@@ -261,10 +245,7 @@ def course_spot_at(along_m: float) -> CourseSpot:
 
 @inlined
 def course_point_ahead(here: CourseSpot, ahead_m: float) -> tuple[float, float]:
-    """Return the point (x, y), meters, at a distance along the course from a position.
-
-    The distance `ahead_m` must be less than `LONGEST_LOOK_M`.
-    """
+    """Return the point (x, y), meters, at less than `LONGEST_LOOK_M` ahead along the course."""
     leg, following = here.leg, here.after
     on_leg_m = here.rest_m + ahead_m
     is_beyond = on_leg_m >= leg.length_m
@@ -276,11 +257,8 @@ def course_point_ahead(here: CourseSpot, ahead_m: float) -> tuple[float, float]:
 
 @inlined
 def course_project(x_m: float, y_m: float, from_m: float, to_m: float) -> Projection:
-    """Return the course point nearest to (x_m, y_m) between two distances along the course.
-
-    The result equals that of `paths.project`. The distances must differ by less than
-    `LONGEST_LOOK_M`.
-    """
+    """Return the course point nearest to (x_m, y_m) between two distances along the course."""
+    # As `geometry.project`; the distances must differ by less than `LONGEST_LOOK_M`.
     here = course_spot_at(from_m)
     leg, after = here.leg, here.after
     start_m = from_m - here.rest_m
@@ -300,12 +278,7 @@ def course_project(x_m: float, y_m: float, from_m: float, to_m: float) -> Projec
 def _on_leg(
     leg: Leg, x_m: float, y_m: float, first_m: float, last_m: float
 ) -> tuple[float, float, float]:
-    """Find the point nearest to (x_m, y_m) on a leg, between `first_m` and `last_m` on the leg.
-
-    Returns:
-        Distance along the leg, squared distance from (x_m, y_m), and the offset of (x_m, y_m) to
-        the left of the leg's line.
-    """
+    """Return the nearest point's distance along the leg, squared distance, and offset."""
     dx, dy = x_m - leg.x_m, y_m - leg.y_m
     along_m = min(max(dx * leg.cos + dy * leg.sin, first_m), last_m)
     off_x, off_y = dx - along_m * leg.cos, dy - along_m * leg.sin
@@ -314,11 +287,8 @@ def _on_leg(
 
 @inlined
 def _at(lap_m: float, numbers: Eight) -> float:
-    """Return the number of the leg at a distance from the start of the lap.
-
-    The compiler cannot vectorize lookups in an array, but it can vectorize these comparisons. In
-    calls with the same distance, it compares only once.
-    """
+    """Return the number of the leg at a distance."""
+    # The compiler vectorizes comparisons, not lookups.
     number = numbers[1] if lap_m >= _ALONG_M[1] else numbers[0]
     number = numbers[2] if lap_m >= _ALONG_M[2] else number
     number = numbers[3] if lap_m >= _ALONG_M[3] else number

@@ -338,10 +338,7 @@ allowed."""
 
 @compiled
 def start_on_line(shares: NDArray[np.float64]) -> Car:
-    """Return a car at rest near the start line.
-
-    Two random numbers from 0 to 1 set its offset (up to 0.3 m) and heading error (up to 0.05 rad).
-    """
+    """Return a car at rest near the start: offset up to 0.3 m, heading error up to 0.05 rad."""
     return beside(0, LINE_M, spread(shares[0], 0.3), spread(shares[1], 0.05), 0.0)
 
 
@@ -359,15 +356,8 @@ def start_anywhere(shares: NDArray[np.float64]) -> Car:
 
 @compiled
 def beside(leg: int, rest_m: float, offset_m: float, error_rad: float, speed_m_s: float) -> Car:
-    """Return a car beside a point of the path, with an offset and a heading error, left positive.
-
-    Args:
-        leg: Index of the leg with the point, which must be the path point nearest to the car.
-        rest_m: Distance of the point from the start of the leg.
-        offset_m: Distance of the car from the point.
-        error_rad: Yaw of the car relative to the leg.
-        speed_m_s: Speed of the car.
-    """
+    """Return a car beside a point of the path, with an offset and a heading error."""
+    # The point, `rest_m` from the start of the leg, must be the path point nearest to the car.
     along_m = COURSE.along_m[leg] + rest_m
     cos, sin = COURSE.forward[leg]
     x_m = COURSE.points_m[leg, 0] + rest_m * cos - offset_m * sin
@@ -387,11 +377,7 @@ def start_at_random(shares: NDArray[np.float64], on_line: bool, classic: bool) -
 
 @compiled
 def start_only_car(arrays: Arrays, on_line: bool, classic: bool) -> tuple[float, float, float]:
-    """Start a single car like `start_cars`; also return the values for its `info`.
-
-    Returns:
-        Offset, heading error and speed.
-    """
+    """Start a car like `start_cars`; return its offset, heading error and speed."""
     shares = np.empty(SHARES)
     draw(array_at(arrays, 0, (1,), np.intp)[0], shares)
     car = start_at_random(shares, on_line, classic)
@@ -415,18 +401,8 @@ def start_cars(
     observations: NDArray[np.float32],
     chosen: NDArray[np.int64],
 ) -> None:
-    """Start some of N cars.
-
-    Args:
-        addresses: Attribute of `Generators`.
-        on_line: Whether to start on the start line instead of anywhere.
-        classic: Whether a car on the start line first drives straight ahead for a second.
-        cars: (N, 10) output: the fields of `Car`, then its distance along the path at the start.
-        rewards: (N,) output; set to 0 for the chosen cars.
-        ends: (N,) output; set to DRIVING for the chosen cars.
-        observations: (N, 12) output.
-        chosen: (K,) indices of the cars to start.
-    """
+    """Start the `chosen` (K,) of N cars (N, 10): a `Car`, then its distance along the path."""
+    # A classic car on the start line first drives straight ahead for a second.
     shares = np.empty(SHARES)
     for i in chosen:
         draw(addresses[i], shares)

@@ -119,11 +119,8 @@ def pursuit_value(car: Car, substeps: int = SUBSTEPS) -> float:
 
 @compiled
 def choose(car: Car, substeps: int = SUBSTEPS) -> int:
-    """Choose the pursuit action if `HORIZON` decisions of pursuit are safe. Otherwise, search.
-
-    The search tries all pairs of two actions, each followed by pursuit. The result is the first
-    action of the best pair.
-    """
+    """Choose pursuit if `HORIZON` decisions of it are safe, else the best pair's first action."""
+    # The search tries all pairs of two actions, each followed by pursuit.
     if pursuit_value(car, substeps) >= HORIZON:
         return pursue(car)
     best, most = BRAKE, -math.inf

@@ -44,11 +44,7 @@ def world_at(along_m: float) -> int:
 
 @compiled
 def touches(car: Car) -> bool:
-    """Return whether the car's body touches a rail or a house.
-
-    By the separating axis theorem, two rectangles are disjoint if and only if their projections
-    onto the direction of some edge are disjoint.
-    """
+    """Return whether the car's body touches a rail or a house, by the separating axis theorem."""
     cos, sin = math.cos(car.yaw_rad), math.sin(car.yaw_rad)
     x_m, y_m = car.x_m + BODY_FORWARD_M * cos, car.y_m + BODY_FORWARD_M * sin
     ahead_m, aside_m = 0.5 * BODY_LENGTH_M, 0.5 * BODY_WIDTH_M
@@ -69,11 +65,7 @@ def touches(car: Car) -> bool:
 
 @compiled
 def ray_length(x_m: float, y_m: float, angle_rad: float, world: int = NO_BARRIERS) -> float:
-    """Return the distance from a point to the nearest obstacle in a direction, at most 100 m.
-
-    `world` is an index in `WORLDS_M`. The slab method is used: a point is in a box if it is between
-    the left and right sides and between the lower and upper sides.
-    """
+    """Return the distance to the nearest obstacle in a direction, by slabs, at most 100 m."""
     boxes = WORLDS_M[world]
     per_x, per_y = _per_meter(math.cos(angle_rad)), _per_meter(math.sin(angle_rad))
     nearest_m = FAR_M

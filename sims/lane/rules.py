@@ -131,11 +131,8 @@ def store_car(car: Car, row: NDArray[np.float64]) -> None:
 
 @inlined
 def steering_share(speed_m_s: float) -> float:
-    """Return the maximum steering angle at a speed, as a fraction of 40 degrees.
-
-    It falls from 40 degrees at rest to 36 degrees at 20 km/h, 32 degrees at 60 km/h and 28 degrees
-    at 120 km/h.
-    """
+    """Return the maximum steering angle at a speed, as a fraction of 40 degrees."""
+    # 40 degrees at rest, 36 at 20 km/h, 32 at 60 km/h and 28 at 120 km/h.
     # The curve is convex and consists of straight lines, so it is the maximum of these lines.
     return max(
         max(
@@ -148,10 +145,7 @@ def steering_share(speed_m_s: float) -> float:
 
 @inlined
 def slip(steering: float, speed_m_s: float) -> float:
-    """Return the sine of the car's slip angle for a steering command at a speed.
-
-    The slip angle is limited so that the lateral acceleration is at most 9 m/s^2.
-    """
+    """Return the sine of the slip angle, with a lateral acceleration of at most 9 m/s^2."""
     steering_rad = steering * MAX_STEERING_RAD * steering_share(speed_m_s)
     return slip_of(steering_rad, speed_m_s, MAX_LATERAL_M_S2, WHEELBASE_M)
 
@@ -181,10 +175,7 @@ def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Ca
 
 @inlined
 def driven(motion: Motion, steering: float, pedal: float) -> Motion:
-    """Advance a motion by a substep of 0.05 s.
-
-    The function has no branches, so that the compiler can vectorize loops over cars.
-    """
+    """Advance a motion by 0.05 s, without branches, so that loops over cars are vectorized."""
     slip_sine = slip(steering, motion.speed_m_s)
     acceleration_m_s2 = acceleration(motion.speed_m_s, pedal)
     return roll(motion, slip_sine, acceleration_m_s2, WHEELBASE_M, SUBSTEP_S)
@@ -230,11 +221,8 @@ def end_of(car: Car) -> int:
 
 @inlined
 def reward_of(before: Car, after: Car) -> float:
-    """Return the reward of a decision.
-
-    The reward is ds / 7.5 m (1 - (d / 3.5 m)^2 / 2), where ds is the progress along the path, d the
-    distance from the path, and 7.5 m the progress at 30 m/s. A failure has the reward -5.
-    """
+    """Return the reward ds / 7.5 m (1 - (d / 3.5 m)^2 / 2), or -5 for a failure."""
+    # ds is the progress along the path, 7.5 m that at 30 m/s, and d the distance from the path.
     progress = (after.along_m - before.along_m) / (MAX_SPEED_M_S * DECISION_S)
     paid = progress * (1.0 - 0.5 * (after.offset_m / LANE_HALF_WIDTH_M) ** 2)
     return paid if end_of(after) == DRIVING else FAILURE_REWARD

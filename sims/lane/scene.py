@@ -105,10 +105,7 @@ def _car() -> list[Shape]:
 
 @functools.cache
 def static_shapes() -> tuple[Shape, ...]:
-    """Return the shapes that never change.
-
-    The world is in the frame `map`, and the parts of the car are in the frame `car`.
-    """
+    """Return the shapes that never change."""
     return (*_road(), *_surroundings(), *_car())
 
 

@@ -42,16 +42,7 @@ def fly_all(
     winds_m_s: NDArray[np.float64],
     duration_s: float,
 ) -> None:
-    """Advance K of N drones in place. The results are the same as those of `fly`.
-
-    Args:
-        plant: As in `fly`.
-        drones: (N, 23 or more) rows that begin with a `Drone`.
-        chosen: (K,) indices of the drones.
-        commands_m_s: (N, 3) commanded velocities.
-        winds_m_s: (N, 3) velocities of the air.
-        duration_s: As in `fly`.
-    """
+    """Advance the chosen (K,) of N drones (N, 23 or more) in place, with the results of `fly`."""
     first, count = 0, len(chosen)
     if plant == QUAD:
         block = np.empty(_BLOCK_NUMBERS * LANES)
@@ -97,11 +88,9 @@ def _scatter(
 
 @compiled
 def _advance_block(block: NDArray[np.float64]) -> None:
-    """Advance the drones of a block by 2 ms.
-
-    The loop has no branches and no calls, and all offsets are constants. Otherwise, the
-    compiler could not prove that lanes do not overlap in memory, and would not vectorize the loop.
-    """
+    """Advance the drones of a block by 2 ms."""
+    # No branches, no calls and constant offsets: otherwise the compiler could not prove that lanes
+    # do not overlap in memory, and would not vectorize the loop.
     for lane in range(LANES):
         command = _vector_in(block, _COMMAND + lane)
         wind = _vector_in(block, _WIND + lane)

@@ -61,10 +61,7 @@ def ground_triangles() -> Floats:
 
 
 def grid_triangles(x_m: Floats, y_m: Floats) -> Floats:
-    """Return two triangles of the ground for each grid cell, (T, 3, 3) meters, facing up.
-
-    The grid's x and y are in NED axes. The triangles are in ROS axes, ordered by cell.
-    """
+    """Return two upward triangles per cell, (T, 3, 3) meters in ROS axes, of a grid in NED axes."""
     corners = np.array([[(x, y, -ground_height(x, y)) for y in y_m] for x in x_m])
     here, north = corners[:-1, :-1], corners[1:, :-1]
     east, both = corners[:-1, 1:], corners[1:, 1:]

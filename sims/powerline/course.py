@@ -120,11 +120,7 @@ def nearest_on_line(position_m: Vector) -> Place:
 
 @compiled
 def distance_to_infinite_line(position_m: Vector, leg: int) -> float:
-    """Return the distance to the infinite line through a leg, meters.
-
-    The distance is |(p - a) x t| for a position p, a point a on the line, and the line's unit
-    vector t.
-    """
+    """Return the distance |(p - a) x t| to the infinite line through a leg, meters."""
     start = Vector(POINTS_M[leg, 0], POINTS_M[leg, 1], POINTS_M[leg, 2])
     tangent = Vector(TANGENTS[leg, 0], TANGENTS[leg, 1], TANGENTS[leg, 2])
     return norm(cross(minus(position_m, start), tangent))
@@ -132,10 +128,7 @@ def distance_to_infinite_line(position_m: Vector, leg: int) -> float:
 
 @compiled
 def ground_height(x_m: float, y_m: float) -> float:
-    """Return the height of the ground, meters above z = 0.
-
-    The ground is a smooth curve through the towers' feet below the line, and hilly beside the line.
-    """
+    """Return the ground's height, meters: smooth through the towers' feet, hilly beside them."""
     span = 0
     while span + 1 < LEGS and POINTS_M[span + 1, 0] <= x_m:
         span += 1
@@ -157,11 +150,7 @@ def _foot_height(tower: int) -> float:
 
 @compiled
 def wire_distance(position_m: Vector) -> float:
-    """Return the distance to the nearest conductor, meters.
-
-    In each span, only the segments near the position are evaluated. The result is exact below 4 m;
-    otherwise the true distance may be slightly smaller.
-    """
+    """Return the distance to the nearest conductor, meters; from 4 m on, a lower bound."""
     nearest_m = math.inf
     for wire in range(len(WIRES_M)):
         start, end = WIRES_M[wire, 0], WIRES_M[wire, CHORDS]
@@ -207,12 +196,6 @@ def catenary(span_m: float, rise_m: float, sag_m: float, x_m: Floats) -> Floats:
     The curve is y = a cosh((x - x0) / a) + c, where x0 follows from a and the rise. Bisection finds
     the value of a that results in the sag `sag_m`: the distance of the wire's middle below the
     straight line between its ends.
-
-    Args:
-        span_m: Horizontal distance between the ends.
-        rise_m: Height of the second end relative to the first.
-        sag_m: Sag, above 0.
-        x_m: (N,) horizontal distances from the first end.
     """
 
     def lowest(a: float) -> float:

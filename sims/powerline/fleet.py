@@ -123,11 +123,8 @@ class PowerlineFleet(Fleet):
         return flight_at(self._flights[i])
 
     def drones_from(self, before: Flight) -> list[Drone]:
-        """Return the states of the fleet's only drone after each 0.05 s of its last decision.
-
-        The decision began in the state `before`. The last returned state is the current one. If the
-        episode ended during the decision, the drone keeps its state for the rest of the decision.
-        """
+        """Return the states of the fleet's only drone after each 0.05 s of its last decision."""
+        # The decision began in `before`. After the end of the episode, the drone keeps its state.
         after = self.flight(0)
         wind_m_s = plus(after.wind_m_s, after.gust_m_s)
         drones, drone = list[Drone](), before.drone
@@ -260,10 +257,7 @@ def start_on_line(
 
 
 def start_anywhere(random: np.random.Generator, wind: Vector) -> Flight:
-    """Return a flight that begins at a random position and moves along the line.
-
-    The speed is random. The velocity is rounded to 0.5 m/s on each axis.
-    """
+    """Return a flight from a random position, with the velocity rounded to 0.5 m/s."""
     along_m = float(random.uniform(0.0, LENGTH_M - LAST_START_M))
     point = point_on_line(along_m)
     speed_m_s = random.uniform(0.0, MAX_SPEED_M_S)

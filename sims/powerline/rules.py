@@ -145,14 +145,8 @@ def approach(plant: int, position_m: Vector, command_m_s: Vector, wind_m_s: Vect
 
 @compiled
 def commanded(velocity_m_s: Vector, command: Vector, is_change: bool) -> Vector:
-    """Return the commanded velocity after a command.
-
-    Args:
-        velocity_m_s: Commanded velocity before.
-        command: Change of the velocity in m/s, which is ignored if the velocity would exceed 8 m/s;
-            or velocity in units of 8 m/s, which is shortened to 8 m/s.
-        is_change: Whether the command is a change.
-    """
+    """Return the commanded velocity after a command."""
+    # A change beyond 8 m/s is ignored; a velocity, in units of 8 m/s, is shortened to 8 m/s.
     if is_change:
         changed = plus(velocity_m_s, command)
         return changed if norm(changed) <= MAX_COMMAND_M_S else velocity_m_s
@@ -234,13 +228,7 @@ def observe(flight: Flight, observation: NDArray[np.float32]) -> None:
 
 @compiled
 def store_bearings(flights: NDArray[np.float64], bearings: NDArray[np.float64]) -> None:
-    """Compute where N drones are relative to the line, in ROS axes.
-
-    Args:
-        flights: (N, 33) rows of `Flight`.
-        bearings: (N, 5) output: offset to the left of the line, offset above the line, distance
-            from the line, speed, and distance along the line.
-    """
+    """Compute (N, 5) offsets left and above, distance, speed, and way along the line."""
     for i in range(len(flights)):
         drone = drone_at(flights[i])
         place = nearest_on_line(drone.position_m)
@@ -264,19 +252,9 @@ def step_flights(
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
 ) -> None:
-    """Advance N drones by one decision each, in place.
-
-    Args:
-        plant: QUAD or POINT.
-        flights: (N, 33) rows of `Flight`.
-        commands: (N, 3) commands; see `commanded`.
-        is_change: Whether the commands are changes of the velocity.
-        gust_m_s: Standard deviation of the gusts.
-        noise: (N, 3) standard normal numbers for the gusts; (N, 0) without gusts.
-        rewards: (N,) output.
-        ends: (N,) output: FLYING, OFF_LINE, COLLISION or FINISHED.
-        observations: (N, 18) output.
-    """
+    """Advance drones (N, 33), rows of `Flight`, by one decision each, in place."""
+    # commands is (N, 3), observations (N, 18), noise (N, 3) standard normal or (N, 0) without
+    # gusts.
     if gust_m_s > 0.0:
         for i in range(len(flights)):
             gust = next_gust(vector_at(flights[i], GUST), gust_m_s, noise[i])
@@ -298,10 +276,7 @@ def decide_all(
     is_change: bool,
     ends: NDArray[np.int64],
 ) -> None:
-    """Fly N drones for half a second or until their episodes end; arguments as in `step_flights`.
-
-    Write FLYING, OFF_LINE, COLLISION or FINISHED to `ends` (N,).
-    """
+    """Fly N drones for half a second or until their episodes end; see `step_flights`."""
     count = len(flights)
     velocities_m_s, winds = flights[:, COMMAND : COMMAND + 3], np.empty((count, 3))
     for i in range(count):
@@ -347,10 +322,8 @@ def classic_end(position_m: Vector, hit: bool) -> int:
 
 @compiled
 def classic_reward(position_m: Vector, speed_m_s: float, hit: bool) -> float:
-    """Return the reward: -100 for a collision, -10 beyond 7 m, else (exp(-d) - 0.5) + speed - 0.5.
-
-    The distance d to the nearest infinite line is in meters, and the speed is in m/s.
-    """
+    """Return -100 for a collision, -10 beyond 7 m, else (exp(-d) - 0.5) + speed - 0.5."""
+    # The distance d to the nearest infinite line is in meters, and the speed is in m/s.
     end = classic_end(position_m, hit)
     if end == COLLISION:
         return COLLISION_REWARD
@@ -361,11 +334,7 @@ def classic_reward(position_m: Vector, speed_m_s: float, hit: bool) -> float:
 
 @compiled
 def classic_decide(plant: int, flight: Flight, change_m_s: Vector) -> tuple[Flight, bool]:
-    """Fly for 5 s; the command is the measured velocity plus a change.
-
-    Returns:
-        State of the drone, and whether the drone collided.
-    """
+    """Fly for 5 s at the measured velocity plus a change; return whether it collided, too."""
     command = plus(flight.drone.velocity_m_s, change_m_s)
     wind = plus(flight.wind_m_s, flight.gust_m_s)
     drone, furthest_m, hit = flight.drone, flight.furthest_m, False
@@ -387,10 +356,7 @@ def step_classic(
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
 ) -> None:
-    """Advance N drones by one decision each, in place; see `step_flights` for the arguments.
-
-    The wind is constant within an episode.
-    """
+    """Advance N drones by one decision each, in place, like `step_flights`, with constant wind."""
     for i in range(len(flights)):
         change_m_s = vector_at(changes_m_s[i], 0)
         after, hit = classic_decide(plant, flight_at(flights[i]), change_m_s)

@@ -228,11 +228,9 @@ def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple
 
 
 def drone_frames(drone: Drone) -> tuple[Frame, ...]:
-    """Return the drone's level frame in the map, and the body's frame in the level frame.
-
-    Both in the world and in the body, NED axes are ROS axes rotated by half a turn about x.
-    Therefore, y and z change sign, in vectors and in quaternions.
-    """
+    """Return the drone's level frame in the map, and the body's frame in the level frame."""
+    # NED axes are ROS axes rotated by half a turn about x: y and z change sign, also in
+    # quaternions.
     q = drone.attitude
     return (
         Frame("base_stabilized", ros(drone.position_m), (0.0, 0.0, 0.0, 1.0)),

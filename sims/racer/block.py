@@ -40,18 +40,9 @@ def step_cars(
     classic: bool,
     drift: bool,
 ) -> None:
-    """Advance N independent cars by one step each, in place.
-
-    Args:
-        track: Track of all cars.
-        cars: (N, 13) rows: a `Car`, then its distance along the path at the start.
-        commands: (N, 2) rows of `Command`.
-        rewards: (N,) output.
-        ends: (N,) output: DRIVING, CRASH, NO_GATE or TIME_LIMIT.
-        observations: (N, 19) output.
-        classic: Whether the classic rules apply.
-        drift: Whether the direction of travel lags behind the heading.
-    """
+    """Advance N independent cars by one step each, in place."""
+    # cars is (N, 13), a `Car` and its start along the path, commands (N, 2), observations (N, 19).
+    # With `drift`, the direction of travel lags behind the heading.
     lines, block = _lines_of(track.walls_px), np.empty(BLOCK_SIZE)
     lengths_px = np.empty((len(cars), RAYS))
     for i in range(len(cars)):
@@ -119,11 +110,7 @@ def step_only_car(
     acceleration: float,
     turn: float,
 ) -> StepResult:
-    """Advance a single car with `step_cars`; also return the contents of its `info`.
-
-    Returns:
-        Reward, end, offset, heading error, speed, progress, and gates passed.
-    """
+    """Advance a car; return reward, end, offset, heading error, speed, progress and gates."""
     commands[0, 0], commands[0, 1] = acceleration, turn
     step_cars(track, cars, commands, rewards, ends, observations, classic, drift)
     car = car_at(cars[0])
@@ -133,12 +120,7 @@ def step_only_car(
 
 @compiled
 def car_info(cars: NDArray[np.float64], info: NDArray[np.float64]) -> None:
-    """Compute the contents of the `info` of N cars.
-
-    Args:
-        cars: (N, 13) rows: a `Car`, then its distance along the path at the episode's start.
-        info: (5, N) output: offsets, heading errors, speeds, progress and gates.
-    """
+    """Compute the `info` (5, N) of cars: offsets, heading errors, speeds, progress and gates."""
     for i in range(len(cars)):
         car = car_at(cars[i])
         info[0, i], info[1, i], info[2, i] = car.offset_m, car.heading_error_rad, speed_of(car)

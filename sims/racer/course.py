@@ -99,10 +99,7 @@ def asphalt(track: Track) -> Floats:
 
 
 def _progress(path: Path, corners_px: Floats) -> list[float]:
-    """Return the distance along the path to each wall corner of one side.
-
-    The last item is the length of the path: the distance to the first corner after one lap.
-    """
+    """Return the distance along the path to each wall corner of a side, and its length."""
     rest = [project(path, x, y, 0.0, path.length_m).along_m for x, y in to_map(corners_px[1:])]
     return [0.0, *rest, path.length_m]
 
@@ -138,10 +135,8 @@ def track_through(controls_px: Floats) -> Track:
 
 
 def _spline(controls: Floats) -> Floats:
-    """Sample the closed Catmull-Rom spline through (N, 2) points; the last sample equals the first.
-
-    E. Catmull and R. Rom, "A class of local interpolating splines", 1974.
-    """
+    """Sample the closed spline through (N, 2) points; the last sample equals the first."""
+    # E. Catmull and R. Rom, "A class of local interpolating splines", 1974.
     t = np.arange(_SAMPLES_PER_SPAN)[:, None] / _SAMPLES_PER_SPAN
     spans = []
     for i in range(len(controls)):
@@ -310,11 +305,8 @@ def placed(
     near_m: float,
     within_m: float = math.inf,
 ) -> Car:
-    """Return a car on a track before its first step. Its next gate is the nearest gate ahead.
-
-    The function searches for the car's position along the path within a distance of `near_m`, at
-    most half a lap.
-    """
+    """Return a car on a track before its first step. Its next gate is the nearest gate ahead."""
+    # Its position along the path is searched within `near_m`, at most half a lap.
     reach_m = min(within_m, 0.5 * track.path.length_m)
     x_m, y_m = METERS_PER_PX * x_px, METERS_PER_PX * (IMAGE_HEIGHT_PX - y_px)
     place = project(track.path, x_m, y_m, near_m - reach_m, near_m + reach_m)
@@ -337,10 +329,7 @@ def is_beyond(x_px: float, y_px: float, gate: NDArray[np.float64]) -> bool:
 
 @compiled
 def corner_at(car: Car, forward: float, right: float) -> tuple[float, float]:
-    """Return a corner of the car.
-
-    `forward` is 1 (front) or -1 (rear); `right` is 1 (right) or -1 (left).
-    """
+    """Return a corner of the car: `forward` is 1 or -1 (rear), `right` 1 or -1 (left)."""
     cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
     ahead, aside = 0.5 * CAR_LENGTH_PX * forward, 0.5 * CAR_WIDTH_PX * right
     return car.x_px + ahead * cos - aside * sin, car.y_px + ahead * sin + aside * cos

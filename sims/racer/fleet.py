@@ -240,18 +240,8 @@ def start_cars(
     observations: NDArray[np.float32],
     chosen: NDArray[np.int64],
 ) -> None:
-    """Start some of N cars; write their states and observations.
-
-    Args:
-        track: Track of the cars.
-        classic: Whether the classic rules apply.
-        kind: ANYWHERE, ON_LINE or EXACTLY.
-        addresses: Attribute of `Generators`.
-        cars: (N, 13) output. A row contains the fields of a `Car`, then the distance along the path
-            at which the car starts.
-        observations: (N, 19) output.
-        chosen: (K,) indices of the cars to start.
-    """
+    """Start the `chosen` (K,) of N cars (N, 13), and write their observations (N, 19)."""
+    # A row has a `Car`, then the distance along the path at which it starts.
     shares = np.empty(kind)
     for i in chosen:
         draw(addresses[i], shares)

@@ -30,11 +30,9 @@ STOP_PX, SPEED_PER_PX, SLOWEST_PX = 38.5, 0.296, 2.0
 
 @compiled
 def aim(track: Track, car: Car, room_exponent: float) -> tuple[float, float]:
-    """Return the wanted turn, radians, right positive, and the wanted change of speed, pixels.
-
-    The mean direction of the rays up to 90 degrees to each side, weighted by length, determines the
-    turn. The ray straight ahead determines the speed.
-    """
+    """Return the wanted turn, radians, right positive, and the wanted change of speed, pixels."""
+    # The mean direction of the rays up to 90 degrees to each side, weighted by length, is the turn;
+    # the ray straight ahead determines the speed.
     block = np.empty(BLOCK_SIZE)
     measure(track.walls_px, car, False, block)
     lengths_px = block[LENGTH:]
@@ -58,10 +56,7 @@ def steer(track: Track, car: Car) -> Command:
 
 @compiled
 def choose(track: Track, car: Car, allowed: NDArray[np.int64], classic: bool) -> int:
-    """Choose the allowed action that fits the wanted turn and change of speed.
-
-    If no allowed action fits both, the turn has priority.
-    """
+    """Choose the allowed action that fits the wanted turn, and if possible the change of speed."""
     aim_rad, lacking_px = aim(track, car, ROOM_EXPONENT)
     turn = 0.0 if abs(aim_rad) <= TURN_BEYOND_RAD else math.copysign(1.0, -aim_rad)
     acceleration = 0.0

@@ -40,13 +40,7 @@ RAY_NAMES = (
 def crossing(
     x: float, y: float, dx: float, dy: float, line: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Return the intersection of the line through two points with another line.
-
-    Returns:
-        Position of the intersection as a fraction of the segment between the points, and as a
-        fraction of `line`. Both are between 0 and 1 if the segments intersect, and infinite if
-        the lines are parallel.
-    """
+    """Return where two lines cross, as fractions of both; infinite if they are parallel."""
     ex, ey = line[2] - line[0], line[3] - line[1]
     cross = dx * ey - dy * ex
     if cross == 0.0:
@@ -57,12 +51,9 @@ def crossing(
 
 @compiled
 def write_rays(car: Car, classic: bool, block: NDArray[np.float64]) -> None:
-    """Write a car's rays into a block: x, y, dx and dy.
-
-    A ray starts at (x, y) and ends at (x + dx, y + dy), 1000 pixels away.
-
-    The sideways ray of the left corner points left; in the classic rules, it points right.
-    """
+    """Write a car's rays into a block: x, y, dx and dy."""
+    # A ray ends at (x + dx, y + dy), 1000 pixels away. The sideways ray of the left corner points
+    # left; in the classic rules, it points right.
     cos, sin = heading_of(car.heading_rad)
     for ray in range(CENTER_RAYS):
         block[X + ray], block[Y + ray] = car.x_px, car.y_px
@@ -83,16 +74,9 @@ def write_rays(car: Car, classic: bool, block: NDArray[np.float64]) -> None:
 
 @compiled
 def cast(walls: NDArray[np.float64], block: NDArray[np.float64]) -> None:
-    """Compute the first hit of each ray on a wall.
-
-    The equations are those of `crossing`, without branches, so that the compiler can vectorize the
-    loop over rays. Parallel lines result in inf or NaN, which fail the comparisons.
-
-    Args:
-        walls: (W, 4) walls.
-        block: (BLOCK_SIZE,) rays as written by `write_rays`, followed by the output: distance of
-            the hit as a fraction of the ray's length; 1 without a hit.
-    """
+    """Compute each ray's first hit on a wall, as a fraction of its length; 1 without one."""
+    # The equations are those of `crossing`, without branches, so that the compiler can vectorize
+    # the loop over rays. Parallel lines result in inf or NaN, which fail the comparisons.
     for ray in range(SLOTS):
         block[SHARE + ray] = 1.0
     for wall in range(len(walls)):
@@ -112,11 +96,7 @@ def cast(walls: NDArray[np.float64], block: NDArray[np.float64]) -> None:
 
 @compiled
 def floored_distance(car: Car, line: NDArray[np.float64], share: float) -> float:
-    """Return the distance from a car's center to a point on a line.
-
-    The coordinates of the point are rounded down to whole pixels. `share` is the position of the
-    point as a fraction of the line, 0 to 1.
-    """
+    """Return the distance from the center to a point of a line, rounded down to whole pixels."""
     hit_x = math.floor(line[0] + share * (line[2] - line[0]))
     hit_y = math.floor(line[1] + share * (line[3] - line[1]))
     return math.hypot(hit_x - car.x_px, hit_y - car.y_px)
@@ -126,10 +106,7 @@ def floored_distance(car: Car, line: NDArray[np.float64], share: float) -> float
 def floored_ray_length(
     walls: NDArray[np.float64], car: Car, block: NDArray[np.float64], ray: int
 ) -> float:
-    """Return the classic length of a ray: the distance from the car's center to the nearest hit.
-
-    The coordinates of hits are rounded down to whole pixels. Without a hit, the length is 1000.
-    """
+    """Return the classic length of a ray, from the center to the nearest floored hit."""
     nearest = math.inf
     x, y, dx, dy = block[X + ray], block[Y + ray], block[DX + ray], block[DY + ray]
     for wall in walls:
@@ -143,10 +120,7 @@ def floored_ray_length(
 def measure(
     walls: NDArray[np.float64], car: Car, classic: bool, block: NDArray[np.float64]
 ) -> None:
-    """Write the car's rays into a block, followed by their lengths in pixels.
-
-    Classic lengths begin at the car's center.
-    """
+    """Write the car's rays and their lengths in pixels, classic ones from the center."""
     write_rays(car, classic, block)
     if classic:
         for ray in range(RAYS):

@@ -130,11 +130,7 @@ def edges_hit(track: Track, car: Car) -> int:
 
 @inlined
 def is_near(wall: NDArray[np.float64], car: Car) -> bool:
-    """Return whether a wall (4,) may touch a car.
-
-    It cannot if the line through the wall is farther from the car's center than a corner of the
-    car, or if the center is farther beyond an end of the wall, measured along the wall.
-    """
+    """Return whether a wall (4,) may touch a car, by its distance from the car's center."""
     along_x, along_y = wall[2] - wall[0], wall[3] - wall[1]
     x, y = car.x_px - wall[0], car.y_px - wall[1]
     square = along_x * along_x + along_y * along_y
@@ -146,10 +142,7 @@ def is_near(wall: NDArray[np.float64], car: Car) -> bool:
 
 @compiled
 def drive(track: Track, car: Car, command: Command, classic: bool, drift: bool) -> Car:
-    """Return the car after one command; if it passed the next gate, increase its count of gates.
-
-    In the classic rules, forward and back are swapped.
-    """
+    """Return the car after one command, with passed gates; classic rules swap forward and back."""
     # A subtraction from 0 returns 0 for 0, but a negation returns -0.
     throttle = 0.0 - command.acceleration if classic else command.acceleration
     speed_px = min(max(car.speed_px + SPEED_CHANGE_PX * throttle, -MAX_SPEED_PX), MAX_SPEED_PX)
@@ -195,11 +188,7 @@ def sees_gate(car: Car, gate: NDArray[np.float64]) -> bool:
 
 @compiled
 def outcome_of(track: Track, before: Car, after: Car, classic: bool) -> tuple[float, int]:
-    """Return a step's reward and end: DRIVING, CRASH, NO_GATE or TIME_LIMIT.
-
-    The reward is +1 for a gate and -1 for a crash. In the classic rules, a crash has the
-    reward -1 for each wall that is hit.
-    """
+    """Return a step's reward (1 for a gate, -1 for a crash, if classic per wall), and its end."""
     return outcome_with(walls_hit(track, after), before, after, classic)
 
 

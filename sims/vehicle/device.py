@@ -163,16 +163,7 @@ class DeviceSims(ABC):
 
 @compiled
 def draw(seed: Any, i: int, episode: int, shares: Any) -> None:
-    """Write random numbers from 0 to 1, a function of the seed, the vehicle and the episode.
-
-    The generator is SplitMix64, whose state begins with a hash of the three arguments.
-
-    Args:
-        seed: Seed of the batch, uint64.
-        i: Index of the vehicle.
-        episode: Number of the vehicle's episode.
-        shares: (K,) output.
-    """
+    """Write numbers (K,) from 0 to 1 by SplitMix64, a function of seed, vehicle and episode."""
     state = _mixed(_mixed(_mixed(seed) + np.uint64(i)) + np.uint64(episode))
     for k in range(len(shares)):
         state += _GOLDEN
@@ -199,16 +190,7 @@ def begin_episode(batch: Batch, i: int, seed: Any, shares: Any) -> None:
 def finish_step(
     batch: Batch, i: int, reward: float, terminated: bool, truncated: bool, max_steps: int
 ) -> bool:
-    """Store the outcome of a step of vehicle i, and return whether its episode ended.
-
-    Args:
-        batch: Arrays of all vehicles, with the new observation of vehicle i.
-        i: Index of the vehicle.
-        reward: Reward of the step.
-        terminated: Whether the rules terminate the episode.
-        truncated: Whether the rules truncate the episode.
-        max_steps: Steps after which an episode is truncated in any case.
-    """
+    """Store the outcome of a step of vehicle i, and return whether its episode ended."""
     batch.steps[i] += 1
     truncated = truncated or batch.steps[i] >= max_steps
     batch.rewards[i] = reward
@@ -226,12 +208,7 @@ def to_gpu(array: Any) -> Any:
 
 @cache
 def _gpu() -> Any:
-    """Return numba's module `cuda`, with NumPy's floor, which it does not have.
-
-    Raises:
-        MissingExtraError: numba-cuda is not installed.
-        UsageError: There is no GPU.
-    """
+    """Return numba's module `cuda`, with NumPy's floor, which it does not have."""
     import_extra("numba_cuda", "gpu")
     from numba import cuda
     from numba.cuda import ufuncs

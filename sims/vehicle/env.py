@@ -217,12 +217,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
 
     @abstractmethod
     def _moments(self, before: Any, command: Sequence[float]) -> list[Frames]:
-        """Return the moving coordinate frames at equal intervals in the last step and at its end.
-
-        Args:
-            before: State of the vehicle before the step.
-            command: Command of the step.
-        """
+        """Return the moving coordinate frames at equal intervals of the last step."""
 
     def _watch(self) -> None:
         """Store the vehicle's position and state. In mode `human`, render the vehicle."""
@@ -233,17 +228,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
 
 
 def before_end(moments: Sequence[Frames], duration_s: float) -> list[tuple[float, Frames]]:
-    """Return the coordinate frames at moments within a step, with the time left in the step.
-
-    The coordinate frames at the end of the step are omitted.
-
-    Args:
-        moments: Frames at equal intervals of the step; the last moment is the end of the step.
-        duration_s: Duration of the step.
-
-    Returns:
-        Seconds before the end of the step, and the frames at that moment, in order of time.
-    """
+    """Return the seconds before a step's end and the frames of all moments but the last."""
     count = len(moments)
     return [(duration_s * (count - 1 - k) / count, moments[k]) for k in range(count - 1)]
 

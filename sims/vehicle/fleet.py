@@ -134,10 +134,7 @@ class Fleet(ABC):
 
     @abstractmethod
     def _kernel(self) -> tuple[Any, ...]:
-        """Return the compiled function that advances the vehicles, and its arguments.
-
-        The arguments stay the same objects for the lifetime of the fleet.
-        """
+        """Return the compiled function, and its arguments, always the same objects."""
 
     @cached_property
     def _step(self) -> Callable[[], None]:
@@ -152,10 +149,7 @@ class Fleet(ABC):
         return copy
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for copying or pickling, without cached properties.
-
-        Cached properties refer to the arrays of this fleet, not to those of the copy.
-        """
+        """Return the state without cached properties, which refer to the arrays of this fleet."""
         kind = type(self)
         return {
             name: value
@@ -218,18 +212,13 @@ _capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c
 
 
 class Generators:
-    """Generators of N vehicles, from which compiled code draws numbers.
-
-    Compiled code draws the same numbers in a small part of the time of a call in Python.
-
-    Attributes:
-        addresses: (N,) addresses of the generators, for `draw`; 0 before `use`.
-    """
+    """Generators of N vehicles for compiled code, which draws faster than a call in Python."""
 
     def __init__(self, count: int) -> None:
         """Prepare to draw from `count` generators."""
         self._generators: list[np.random.Generator | None] = [None] * count
         self._missing = count
+        # (N,) addresses of the generators, for `draw`; 0 before `use`.
         self.addresses = np.zeros(count, dtype=np.intp)
 
     def use(self, i: int, generator: np.random.Generator) -> None:
@@ -243,10 +232,7 @@ class Generators:
     def complete(
         self, chosen: NDArray[np.int64], generators: Sequence[np.random.Generator]
     ) -> None:
-        """Assign a generator to each of the chosen vehicles (K,) that has none.
-
-        `generators` has one generator for each of the N vehicles.
-        """
+        """Assign to each of the chosen vehicles (K,) that has none its generator of the N."""
         if self._missing:
             for i in chosen.tolist():
                 if self._generators[i] is None:
@@ -266,12 +252,7 @@ class Generators:
 
 @compiled
 def draw(address: int, shares: NDArray[np.float64]) -> None:
-    """Fill an array with the next numbers of a generator, like `Generator.random`.
-
-    Args:
-        address: Element of `Generators.addresses`, not 0.
-        shares: (K,) output: numbers of at least 0 and below 1.
-    """
+    """Fill an array with a generator's next numbers in [0, 1), like `Generator.random`."""
     for k in range(len(shares)):
         shares[k] = _next_double(address)
 
