@@ -440,11 +440,7 @@ class _Description:
 
 
 def read_policy(folder: Path) -> Policy:
-    """Read the policy of one seed's folder.
-
-    Raises:
-        PolicyError: A file is missing or broken.
-    """
+    """Read the policy of one seed's folder."""
     try:
         found = parse_json(read_file(folder / POLICY_NAME))
         description: _Description = as_type(_Description, found, POLICY_NAME)

@@ -86,10 +86,7 @@ class BoxBC(Learner):
         return {"actor": self.head.output_shape(self.config.chunk * self.n_actions)}
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the mean squared error or the negative log density, and the absolute error.
-
-        Both are those of actions, or relative ones, that are scaled to [-1, 1].
-        """
+        """Return the squared error or negative log density, and the absolute error, in [-1, 1]."""
         outputs = self.models["actor"](batch.observations)
         actions, known = batch.actions, torch.ones_like(batch.actions)
         relative = self.buffer.relative

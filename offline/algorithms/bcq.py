@@ -43,10 +43,7 @@ class BCQ(DQN):
         return {**super().output_shapes(), "logits": (self.n_actions,)}
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the temporal-difference loss, plus the loss of the behavior-cloning network.
-
-        The latter is the cross entropy plus a penalty on large logits.
-        """
+        """Return the temporal-difference loss plus the clone's cross entropy and logit penalty."""
         q_tm1 = self.outputs("q", batch.observations)
         logits_tm1 = self.outputs("logits", batch.observations)
         target_tm1 = self.targets(batch, self.target_outputs(batch))

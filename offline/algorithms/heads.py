@@ -47,25 +47,19 @@ from mcaprl.offline.batches.relative import RelativeActions
 
 
 class Head(nn.Module):
-    """Networks and the policy that they define, for B observations.
-
-    Attributes:
-        networks: Networks by name, such as `q` and `logits`.
-        chunk: Number of actions H that are predicted from one observation. With more than one, only
-            `actions` and `scores` are defined.
-    """
+    """Networks and the policy that they define, for B observations."""
 
     def __init__(self, networks: Mapping[str, nn.Module], chunk: int = 1) -> None:
         """Wrap the networks."""
         super().__init__()
+        # Number of actions H that are predicted from one observation. With more than one, only
+        # `actions` and `scores` are defined.
+        # Networks by name, such as `q` and `logits`.
         self.networks, self.chunk = nn.ModuleDict(networks), chunk
 
     @abstractmethod
     def actions(self, observations: Observations) -> Tensor:
-        """Return the best actions (B, *shape), as values of the action space.
-
-        With chunks, they are (B, H, *shape).
-        """
+        """Return the best actions (B, *shape) of the space; with chunks (B, H, *shape)."""
 
     @abstractmethod
     def log_prob(self, observations: Observations, actions: NDArray[Any]) -> Tensor:
@@ -85,11 +79,7 @@ class Head(nn.Module):
 
 
 class DiscreteHead(Head):
-    """Head for a finite action space.
-
-    Attributes:
-        joint: Numbering of the actions: the order of the axis A.
-    """
+    """Head for a finite action space."""
 
     _values: Tensor
 
@@ -100,12 +90,9 @@ class DiscreteHead(Head):
         threshold: float = 0.0,
         chunk: int = 1,
     ) -> None:
-        """Wrap the networks; `threshold` is that of `FilteredQ`.
-
-        Raises:
-            SpaceError: The action space is not finite, or has too many actions.
-        """
+        """Wrap the networks; `threshold` is that of `FilteredQ`."""
         super().__init__(networks, chunk)
+        # Numbering of the actions: the order of the axis A.
         self.joint = discrete_actions(action_space)
         self.threshold = threshold
         values = torch.from_numpy(self.joint.values(np.arange(self.joint.count)))
@@ -113,10 +100,7 @@ class DiscreteHead(Head):
 
     @abstractmethod
     def scores(self, observations: Observations) -> Tensor:
-        """Return a score of each action (B, A); minus infinity for masked actions.
-
-        With chunks, they are (B, H, A).
-        """
+        """Return action scores (B, A), or (B, H, A) of chunks; minus infinity if masked."""
 
     def outputs(self, name: str, observations: Observations) -> Tensor:
         """Return a network's outputs (B, A), with minus infinity for masked actions."""
@@ -195,16 +179,11 @@ class FilteredQ(DiscreteHead):
 
 
 class BoxHead(Head):
-    """Head for the actions of a Box, from the outputs of the network `actor`.
+    """Head for the actions of a Box, from the outputs of the network `actor`."""
 
-    If there is a network `encoder`, the others receive its features in place of images.
+    # If there is a network `encoder`, the others receive its features in place of images.
 
-    Attributes:
-        box: Scaling of the actions to numbers in [-1, 1].
-        log_std: (n,) logarithms of the standard deviations, if they are the same in all states.
-        relative: Conversion of the networks' numbers, if they are relative to the observations.
-    """
-
+    # (n,) logarithms of the standard deviations, if they are the same in all states.
     log_std: Tensor | None
     _low: Tensor
     _high: Tensor
@@ -219,7 +198,8 @@ class BoxHead(Head):
     ) -> None:
         """Wrap the networks."""
         super().__init__(networks, chunk)
-        self.box, self.relative = box, relative
+        # Conversion of the networks' numbers, if they are relative to the observations.
+        self.box, self.relative = box, relative  # Scaling of the actions to numbers in [-1, 1]
         self.register_buffer("log_std", log_std)
         # In float64, so that the bounds are the same numbers as in the space.
         self.register_buffer("_low", torch.from_numpy(box.low), persistent=False)
@@ -242,17 +222,11 @@ class BoxHead(Head):
         log_std: Tensor | None = None,
         known: Tensor | None = None,
     ) -> Tensor:
-        """Return the log densities (B,) of actions (B, n) in [-1, 1].
-
-        With `known` (B, n), it is that of the numbers with a 1; the others, with a 0, may be any.
-        """
+        """Return log densities (B,) of actions (B, n), of the numbers with a 1 in `known`."""
         raise PolicyError("a deterministic policy has no density of actions")
 
     def actions(self, observations: Observations) -> Tensor:
-        """Return the best actions (B, *shape), in the units and dtype of the space.
-
-        With chunks, they are (B, H, *shape).
-        """
+        """Return the best actions (B, *shape) in the space's units; with chunks (B, H, *shape)."""
         numbers = self.best(self._outputs(observations)).double()
         numbers = numbers.view(-1, self.chunk, self.box.size)
         if self.relative is not None:
@@ -304,11 +278,10 @@ class Deterministic(BoxHead):
 
 
 class Gaussian(BoxHead):
-    """Independent normal distributions, truncated to the Box: outputs are means and deviations.
+    """Independent normal distributions, truncated to the Box: outputs are means and deviations."""
 
-    The outputs (B, n) are means before a tanh; with deviations that depend on the state, the
-    outputs (B, 2, n) also have their logarithms.
-    """
+    # Outputs (B, n) are means before a tanh; (B, 2, n) have the logarithms of deviations that
+    # depend on the state, too.
 
     @staticmethod
     def output_shape(size: int) -> tuple[int, ...]:
@@ -350,10 +323,7 @@ class SquashedGaussian(Gaussian):
 
     @staticmethod
     def sample(outputs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Return actions (B, n) in [-1, 1] from normal noise (B, n), and their log densities (B,).
-
-        Gradients flow through both.
-        """
+        """Return actions (B, n) from normal noise, and their log densities, with gradients."""
         mean, raw = outputs.unbind(1)
         log_std = bounded_log_std(raw)
         pre = torch.addcmul(mean, log_std.exp(), noise)
@@ -361,11 +331,10 @@ class SquashedGaussian(Gaussian):
 
 
 class Mixture(BoxHead):
-    """Mixture of `COMPONENTS` truncated normal distributions, for demonstrations with several ways.
+    """Mixture of `COMPONENTS` truncated normals, for demonstrations with several ways."""
 
-    The outputs (B, C * (1 + 2 n)) are C logits, then the means before a tanh, and the logarithms of
-    the deviations. The action is the mode of the component with the largest weight.
-    """
+    # Outputs (B, C * (1 + 2 n)) are C logits, means before a tanh, and logarithms of deviations.
+    # The action is the mode of the component with the largest weight.
 
     @staticmethod
     def output_shape(size: int) -> tuple[int, ...]:

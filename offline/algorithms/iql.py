@@ -154,11 +154,8 @@ class BoxIQL(ActorCritic):
 
 
 def advantage_weights(learner: IQL | BoxIQL, advantages: Tensor) -> Tensor:
-    """Return exp(beta A) of advantages (R,), at most `MAX_WEIGHT`.
-
-    If the settings say so, the advantages of each seed are first divided by their root mean square
-    in the seed's batch.
-    """
+    """Return exp(beta A) of advantages (R,), at most `MAX_WEIGHT`."""
+    # If the settings say so, those of a seed are first divided by their root mean square.
     config = learner.config
     if config.normalize_advantages:
         advantages = normalized(learner, advantages)

@@ -29,11 +29,7 @@ _WARM_UPS = 3
 
 
 class CapturedUpdate:
-    """An update of fixed shape that was recorded once and is replayed with other rows.
-
-    Attributes:
-        terms: Terms of the loss; each replay overwrites them.
-    """
+    """An update of fixed shape that was recorded once and is replayed with other rows."""
 
     def __init__(
         self, gradients: Callable[[Tensor], Terms], optimizer: torch.optim.Optimizer, rows: Tensor
@@ -55,7 +51,7 @@ class CapturedUpdate:
         gc.collect()
         self._gradients, self._step = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._gradients):
-            self.terms = gradients(self._rows)
+            self.terms = gradients(self._rows)  # Terms of the loss; each replay overwrites them
         with torch.cuda.graph(self._step):
             optimizer.step()
 
@@ -77,16 +73,12 @@ _STEPS = "steps"
 
 
 class NotFiniteError(ArithmeticError):
-    """A term of the loss is NaN or infinite.
-
-    Attributes:
-        update: Number of the update that computed the term, from 1.
-    """
+    """A term of the loss is NaN or infinite."""
 
     def __init__(self, message: str, update: int) -> None:
         """Store the message and the number of the update."""
         super().__init__(message)
-        self.update = update
+        self.update = update  # Number of the update that computed the term, from 1
 
 
 class Learner(ABC):
@@ -236,11 +228,7 @@ class Learner(ABC):
             target.reset()
 
     def _gradients(self, rows: Tensor) -> dict[str, Tensor]:
-        """Compute the gradients of all weights for rows (R,) of the buffer, on its device.
-
-        Returns:
-            The terms of `losses`, detached.
-        """
+        """Compute the gradients of all weights for rows (R,); return the detached terms."""
         terms = self.losses(self.encoded(self.buffer.batch(rows)))
         self.optimizer.zero_grad()
         # A seed's loss depends only on that seed's weights, so one sum yields all gradients.

@@ -34,22 +34,17 @@ _NORM_EPSILON = 1e-5
 
 
 class Model(ABC):
-    """K networks whose weights are rows of one matrix, which is a leaf tensor of autograd.
+    """K networks whose weights are rows of one matrix, which is a leaf tensor of autograd."""
 
-    Attributes:
-        networks: K networks, or K * E networks of ensembles, ordered by seed; their parameters
-            share memory with `weights`.
-        members: Number of networks E of an ensemble; 1 if there is one network per seed.
-        weights: (K, P), one row of weights per seed.
-        bulk_gain: Time per row in a small batch, divided by the time per row in a batch of a
-            thousand rows.
-    """
-
+    # Time per row in a small batch, divided by the time per row in a batch of a thousand rows.
     bulk_gain: ClassVar[float] = 1.0
 
     def __init__(self, networks: Sequence[Network], members: int = 1) -> None:
         """Move the weights of networks of one shape into one matrix."""
+        # K networks, or K * E networks of ensembles, ordered by seed; their parameters share memory
+        # with `weights`.
         self.networks = list(networks)
+        # Number of networks E of an ensemble; 1 if there is one network per seed.
         self.members = members
         parameters = dict(networks[0].named_parameters())
         self._names, self._shapes = list(parameters), [p.shape for p in parameters.values()]
@@ -62,18 +57,14 @@ class Model(ABC):
             for parameter, part in parts:
                 part.copy_(parameter.detach().flatten())
                 parameter.data = part.view_as(parameter)
+        # (K, P), one row of weights per seed.
         self.weights = nn.Parameter(weights.view(-1, members * weights.shape[1]))
 
     def __call__(
         self, observations: Observations, *, frozen: bool = False, members: int | None = None
     ) -> Tensor:
-        """Map the observations of all seeds to outputs (R, *output_shape), or (E, R) of ensembles.
-
-        Args:
-            observations: R observations, the same ones for all networks of an ensemble.
-            frozen: Whether gradients flow back to the observations only, and not to the weights.
-            members: Number of networks of an ensemble to evaluate; default: all.
-        """
+        """Map observations of all seeds to outputs (R, *output_shape), or (E, R) of ensembles."""
+        # `frozen` stops gradients at the weights; `members` evaluates only these of an ensemble.
         weights = self.weights.detach() if frozen else self.weights
         if self.members == 1:
             return self._outputs(observations, weights, 1)
@@ -86,10 +77,7 @@ class Model(ABC):
 
     @abstractmethod
     def _outputs(self, observations: Observations, weights: Tensor, members: int) -> Tensor:
-        """Return the outputs of networks with these weights (K * members, P), ordered by network.
-
-        The networks of a seed have the same observations.
-        """
+        """Return the outputs of networks with weights (K * members, P), ordered by network."""
 
     def clone(self) -> Model:
         """Return another model with the same weights."""
@@ -131,11 +119,9 @@ class StackedMLP(Model):
 
     @staticmethod
     def fits(network: Network) -> bool:
-        """Return whether a network consists of linear layers, layer normalization and ReLU only.
-
-        Layers with a single input are excluded on the CPU, because matrix-vector products round
-        differently for one seed than for several. So are hidden layers with a single output.
-        """
+        """Return whether a network consists of linear layers, layer normalization and ReLU only."""
+        # On the CPU, layers with a single input or output are excluded, because matrix-vector
+        # products round differently for one seed than for several.
         kinds = (Network, nn.ModuleList, nn.Sequential, nn.Linear, nn.LayerNorm, nn.ReLU)
         plain = len(network.stems) == 1 and all(isinstance(m, kinds) for m in network.modules())
         matrices = [weights for weights in network.parameters() if weights.ndim == 2]
@@ -205,16 +191,10 @@ def build_model(networks: Sequence[Network], members: int = 1) -> Model:
 
 
 class TargetNetwork:
-    """Copy of a model in training. At intervals, the copy is updated, or moved toward the model.
+    """Copy of a model in training. At intervals, the copy is updated, or moved toward the model."""
 
-    Between two updates, the outputs do not change. Therefore, the outputs for the whole dataset are
-    computed once after each update and then looked up, unless a forward pass for each batch is
-    faster.
-
-    Attributes:
-        model: K target networks.
-        polyak: Weight of the learning network in an update; 1 copies it.
-    """
+    # Outputs do not change between updates: those of all data are computed once and looked up,
+    # unless a pass for each batch is faster.
 
     def __init__(
         self,
@@ -225,12 +205,9 @@ class TargetNetwork:
         next_states: bool,
         polyak: float = 1.0,
     ) -> None:
-        """Copy `model`, to evaluate the states or next states of a buffer.
-
-        `rows_per_sync` is the approximate number of rows per seed between two calls of `sync`.
-        """
+        """Copy `model`, for a buffer's states or next states; `rows_per_sync` are per seed."""
         self.model = model.clone()
-        self.polyak = polyak
+        self.polyak = polyak  # Weight of the learning network in an update; 1 copies it
         self._buffer = buffer
         self._next_states = next_states
         # On a GPU, a CUDA graph contains the forward pass, which takes hardly any time there.
@@ -255,10 +232,7 @@ class TargetNetwork:
 
     @torch.no_grad()
     def outputs(self, batch: Batch) -> Tensor:
-        """Return the outputs (R, ...) for the states or next states of a batch.
-
-        No gradients are computed.
-        """
+        """Return outputs (R, ...) for the states or next states of a batch, without gradients."""
         if not self._use_table:
             return self.model(batch.next_observations if self._next_states else batch.observations)
         if self._table is None:

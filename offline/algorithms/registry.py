@@ -49,11 +49,7 @@ class Algorithm(NamedTuple):
 
 
 def all_algorithms() -> list[type[Learner]]:
-    """Return the built-in algorithms and those of installed packages.
-
-    Raises:
-        UsageError: An entry point is broken.
-    """
+    """Return the built-in algorithms and those of installed packages."""
     entries = installed(ENTRY_POINT_GROUP).values()
     names = {learner.name for learner in _BUILT_IN}
     return [*_BUILT_IN, *(load(entry, Learner, names) for entry in entries)]
@@ -62,16 +58,7 @@ def all_algorithms() -> list[type[Learner]]:
 def algorithms_named(
     algo: str | type[Learner] | None, others: Iterable[str] = ()
 ) -> list[type[Learner]]:
-    """Return the algorithms with a name; None for the default algorithms.
-
-    Args:
-        algo: Name of an algorithm, or a subclass of `Learner`.
-        others: More names that the caller accepts, for the message about an unknown name.
-
-    Raises:
-        UnknownNameError: No algorithm has that name.
-        UsageError: An entry point is broken, or the class lacks a name or settings.
-    """
+    """Return the algorithms with a name; None for the default algorithms."""
     if algo is None:
         return list(_DEFAULTS)
     if not isinstance(algo, str):
@@ -93,19 +80,7 @@ def choose_algorithm(
     *,
     space: spaces.Space[Any] | None = None,
 ) -> Algorithm:
-    """Return an algorithm and its settings.
-
-    Args:
-        algo: Name of an algorithm or subclass of `Learner`, for default settings; None for the
-            default algorithm; or an algorithm's config, or the result of this function.
-        others: More names that the caller accepts, for the message about an unknown name.
-        space: Action space of the data; None for any.
-
-    Raises:
-        UnknownNameError: No algorithm has that name.
-        UsageError: No algorithm has a config of this type, or an entry point is broken.
-        SpaceError: The algorithm does not support the action space.
-    """
+    """Return an algorithm and its settings, by a name, a class, a config, or as given."""
     if isinstance(algo, Algorithm):
         found = [algo]
     elif isinstance(algo, TrainingConfig):
@@ -133,13 +108,7 @@ def configured(
     *,
     space: spaces.Space[Any] | None = None,
 ) -> Algorithm:
-    """Return an algorithm with some settings; the arguments are those of `choose_algorithm`.
-
-    Without a space, the algorithm is one of those with this name that have the settings.
-
-    Raises:
-        UsageError: The algorithm has no such setting, or a setting is out of its range.
-    """
+    """Return an algorithm with some settings; without a space, one with them by this name."""
     if space is not None:
         named = [choose_algorithm(algo, others, space=space).learner_type]
     else:

@@ -301,11 +301,8 @@ class TransitionBuffer:
 
 
 def return_spread(dataset: Dataset, gamma: float) -> float:
-    """Return the standard deviation of the discounted returns of all transitions.
-
-    A return ends at the end of the episode, even if the episode was truncated. The result is 0 if a
-    reward is not finite.
-    """
+    """Return the standard deviation of all discounted returns; 0 if a reward is not finite."""
+    # A return ends at the end of the episode, even if the episode was truncated.
     with np.errstate(over="ignore", invalid="ignore"):
         returns = returns_to_go(dataset.rewards, dataset.episode_lengths, gamma)
         spread = float(returns.std())
@@ -325,10 +322,7 @@ def choose_device(name: str) -> torch.device:
 
 
 def discrete_actions(space: spaces.Space[Any], what: str = "this policy") -> JointActions:
-    """Return the numbering of the actions of a space; `what` needs it, for the message.
-
-    Each combination of the elements of a MultiDiscrete or MultiBinary space is one action.
-    """
+    """Return the numbering of a space's joint actions; `what` needs it, for the message."""
     joint = joint_actions(space)
     if joint is None:
         raise SpaceError(f"{what} needs discrete actions, got {space}")
@@ -414,12 +408,7 @@ def _next_rows(lengths: NDArray[np.int64], n_steps: int) -> Tensor:
 
 
 def _first_frames(counts: NDArray[np.int64], frame_stack: int) -> Tensor:
-    """Return the first frame of each frame's episode if frames are stacked, else an empty tensor.
-
-    Args:
-        counts: (E,) number of frames of each episode.
-        frame_stack: Number of frames in a stack.
-    """
+    """Return the first frame of each frame's episode (counts E,); empty without stacks."""
     if frame_stack == 1:
         return torch.empty(0, dtype=torch.int64)
     return torch.from_numpy(np.repeat(np.cumsum(counts) - counts, counts))

@@ -22,22 +22,15 @@ _BLOCK_ROWS = 1 << 18
 
 @dataclass(frozen=True)
 class ItemOptions:
-    """Settings that define the items of a dataset.
+    """Settings that define the items of a dataset."""
 
-    Attributes:
-        n_steps: Number of rewards in a return; returns at the end of an episode have fewer.
-        gamma: Discount per step.
-        frame_stack: Number of successive observations in one item; an episode's first observation
-            also pads the stacks.
-        length: Number of transitions in a sequence; None for single transitions.
-        stride: Number of steps between the starts of two sequences of an episode.
-    """
-
-    n_steps: int = 1
-    gamma: float = 1.0
+    n_steps: int = 1  # Number of rewards in a return; returns at the end of an episode have fewer
+    gamma: float = 1.0  # Discount per step
+    # Number of successive observations in one item; an episode's first observation also pads the
+    # stacks.
     frame_stack: int = 1
-    length: int | None = None
-    stride: int = 1
+    length: int | None = None  # Number of transitions in a sequence; None for single transitions
+    stride: int = 1  # Number of steps between the starts of two sequences of an episode
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -87,10 +80,7 @@ class Items:
         return len(self._starts)
 
     def batch(self, items: NDArray[np.int64]) -> Arrays:
-        """Return the items with these indexes (B,) as arrays.
-
-        The docstring of `mcaprl.torch.TransitionDataset` lists the arrays.
-        """
+        """Return items (B,) as the arrays that `mcaprl.torch.TransitionDataset` lists."""
         rows = self._starts[items]
         return self._transitions(rows) if self.options.length is None else self._sequences(rows)
 
@@ -145,17 +135,9 @@ class Items:
 def n_step_returns(
     dataset: Dataset, n_steps: int, gamma: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Compute n-step returns, which stop at the end of an episode.
-
-    A return that ends with a termination has no bootstrap value. A return that ends with a
-    truncation bootstraps from the last next observation.
-
-    Returns:
-        Two arrays. The first, (2, N), contains two frame indexes for each transition: the index of
-        its observation, and the index of the observation n steps later, or of the episode's last
-        observation if that comes earlier. The second, (2, N), contains the discounted sum of the
-        rewards between these two observations, and the discount for the later observation's value.
-    """
+    """Return (2, N) frames now and n steps later, and (2, N) sums of rewards and discounts."""
+    # Returns stop at the end of an episode: a truncation bootstraps from the last observation, a
+    # termination has no bootstrap value.
     count, lengths = len(dataset), dataset.episode_lengths
     ends = np.repeat(np.cumsum(lengths), lengths)
     here = dataset.frame_of_step

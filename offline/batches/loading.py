@@ -128,11 +128,7 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
         return torch.utils.data.DataLoader(self, batch_size=None, sampler=batches, **options)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a worker process needs: paths, or tensors in shared memory.
-
-        Raises:
-            UsageError: The images are on disk, and the dataset is not that of whole logs.
-        """
+        """Return what a worker process needs: paths, or tensors in shared memory."""
         data = self._items.dataset
         columns = data._transitions
         if any(isinstance(leaf, MappedImages) for leaf in columns.frames):

@@ -69,10 +69,7 @@ class Observations:
         return [self.like(parts) for parts in zip(*columns, strict=True)]
 
     def stacked(self, count: int) -> Observations:
-        """Return stacks of `count` successive observations.
-
-        The mask of a stack is that of its last observation.
-        """
+        """Return stacks of `count` successive observations, with the mask of the last one."""
         if count == 1:
             return self
         rows = self.vector.shape[0] // count
@@ -98,16 +95,12 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class FramesOnDisk:
-    """F observations whose images stay on disk until `rows` selects them.
+    """F observations whose images stay on disk until `rows` selects them."""
 
-    Attributes:
-        numbers: The observations without images.
-        images: Images (F, height, width) or (F, height, width, channels), one array per camera.
-        shapes: Shape (height, width, channels) of one image of each camera.
-    """
-
-    numbers: Observations
+    numbers: Observations  # The observations without images
+    # Images (F, height, width) or (F, height, width, channels), one array per camera.
     images: tuple[Frames, ...]
+    # Shape (height, width, channels) of one image of each camera.
     shapes: tuple[tuple[int, ...], ...]
 
     def __len__(self) -> int:
@@ -139,18 +132,7 @@ class FramesOnDisk:
 
 
 class ObservationEncoder:
-    """Encoder from observations of one space to tensors, saved with each policy.
-
-    Attributes:
-        space: Space of one observation.
-        width: Length V of the vector.
-        image_inputs: Shape and normalization of each image.
-        images: Leaves of the space that are images.
-        numbers: Leaves that form the vector, with their spaces.
-        mask: Leaf of the action mask, if any.
-        shift: (V,) float32, subtracted from the vector.
-        scale: (V,) float32, divisor of the shifted vector.
-    """
+    """Encoder from observations of one space to tensors, saved with each policy."""
 
     layout = "C"
     """Layout in memory of the arrays of images; empty for any."""
@@ -159,22 +141,26 @@ class ObservationEncoder:
         """Create the encoder, without normalization."""
         self.space = space
         leaves = {leaf.path: leaf for leaf in observation_leaves(space)}
-        self.mask = leaves.pop((mask_key,), None)
+        self.mask = leaves.pop((mask_key,), None)  # Leaf of the action mask, if any
         if self.mask is not None and self.mask.shape != (n_actions,):
             shape = self.mask.shape
             raise SpaceError(f"{MASK_KEY} has shape {shape}, but there are {n_actions} actions")
         kinds = [(leaf, leaf.of(space)) for leaf in leaves.values()]
+        # Leaves of the space that are images.
         self.images = [leaf for leaf, part in kinds if self.is_image(part)]
+        # Leaves that form the vector, with their spaces.
         self.numbers = [(leaf, part) for leaf, part in kinds if not self.is_image(part)]
         if not kinds:
             raise SpaceError(f"the observation contains only {MASK_KEY}")
+        # Shape and normalization of each image.
         self.image_inputs = [ImageInput(_image_shape(leaf.shape)) for leaf in self.images]
         widths = [_width(part) for _, part in self.numbers]
-        self.width = sum(widths)
+        self.width = sum(widths)  # Length V of the vector
         bytes_ = [
             isinstance(part, spaces.Box) and part.dtype == np.uint8 for _, part in self.numbers
         ]
-        self.shift = np.zeros(self.width, np.float32)
+        self.shift = np.zeros(self.width, np.float32)  # (V,) float32, subtracted from the vector
+        # (V,) float32, divisor of the shifted vector.
         self.scale = np.repeat(np.where(bytes_, 255, 1), widths).astype(np.float32)
 
     @staticmethod
@@ -189,11 +175,8 @@ class ObservationEncoder:
         return observations
 
     def normalize_to(self, observations: Any) -> None:
-        """Normalize all inputs to mean 0 and standard deviation 1 over these observations.
-
-        Each number has its own scale; all pixels of an image share one scale. A constant input
-        keeps its default scale and becomes 0.
-        """
+        """Normalize inputs to mean 0 and deviation 1; pixels of an image share a scale."""
+        # A constant input keeps its default scale and becomes 0.
         self.center_images(observations)
         self.shift, scale = np.zeros_like(self.shift), self.scale
         self.scale = np.ones_like(scale)
@@ -211,10 +194,7 @@ class ObservationEncoder:
         ]
 
     def encode(self, observations: Any) -> Observations:
-        """Encode B observations of the space: arrays (B, *shape), or nested dicts of these.
-
-        The result shares the memory of the arrays if they need no conversion.
-        """
+        """Encode B observations, whose memory the result shares if it needs no conversion."""
         for leaf in self.leaves:
             _check_shape(leaf, observations)
         images = [
@@ -283,10 +263,7 @@ def _channels_last(images: Any, leaf: Leaf) -> Any:
 
 
 def codes_of(space: spaces.Space[Any]) -> JointActions | None:
-    """Return the elements of a Discrete or MultiDiscrete space, which are one-hot encoded.
-
-    The result is None for other spaces, whose values are numbers.
-    """
+    """Return the elements of a (Multi)Discrete space, to be one-hot encoded; None of others."""
     return None if isinstance(space, spaces.MultiBinary) else joint_actions(space)
 
 

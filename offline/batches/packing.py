@@ -7,28 +7,20 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Packing:
-    """Settings for building transitions from a log.
+    """Settings for building transitions from a log."""
 
-    Attributes:
-        frame_stack: Number of successive observations in one network input; an episode's
-            first observation also pads the stacks.
-        normalize: Whether network inputs are normalized to mean 0 and standard deviation 1.
-        center_images: Whether images are normalized even if `normalize` is False.
-        gamma: Discount per step.
-        n_steps: Number of rewards in a return; returns at the end of an episode have fewer.
-        scale_rewards: Whether rewards are divided by the standard deviation of the discounted
-            returns of all transitions.
-        clip_actions: Whether logged actions outside a Box are clipped to its bounds.
-        chunk: Number of successive actions that are learned from one observation.
-        relative: Whether actions are learned relative to observations, where the data declare it.
-    """
-
+    # Number of successive observations in one network input; an episode's first observation also
+    # pads the stacks.
     frame_stack: int = 1
+    # Whether network inputs are normalized to mean 0 and standard deviation 1.
     normalize: bool = False
-    center_images: bool = False
-    gamma: float = 1.0
-    n_steps: int = 1
+    center_images: bool = False  # Whether images are normalized even if `normalize` is False
+    gamma: float = 1.0  # Discount per step
+    n_steps: int = 1  # Number of rewards in a return; returns at the end of an episode have fewer
+    # Whether rewards are divided by the standard deviation of the discounted returns of all
+    # transitions.
     scale_rewards: bool = False
-    clip_actions: bool = False
-    chunk: int = 1
+    clip_actions: bool = False  # Whether logged actions outside a Box are clipped to its bounds
+    chunk: int = 1  # Number of successive actions that are learned from one observation
+    # Whether actions are learned relative to observations, where the data declare it.
     relative: bool = False

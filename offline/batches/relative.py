@@ -26,15 +26,10 @@ class RelativeActions(nn.Module):
     With an action a of the k-th step and a reference r, which is the observed value, both scaled
     as `BoxActions` does, the number is 2 (a - r - low_k) / (high_k - low_k) - 1. Absolute elements
     have r = 0, low = -1 and high = 1, so that they stay the same.
-
-    Attributes:
-        relation: Element of the observation for each element of an action.
-        low: (H, n) smallest difference at each step of a chunk.
-        high: (H, n) largest difference at each step of a chunk.
     """
 
-    low: Tensor
-    high: Tensor
+    low: Tensor  # (H, n) smallest difference at each step of a chunk
+    high: Tensor  # (H, n) largest difference at each step of a chunk
     _columns: Tensor
     _gain: Tensor
     _offset: Tensor
@@ -47,11 +42,7 @@ class RelativeActions(nn.Module):
         low: Tensor,
         high: Tensor,
     ) -> None:
-        """Prepare the conversion, for observations of an encoder.
-
-        Raises:
-            SpaceError: An action or observation has no such element.
-        """
+        """Prepare the conversion, for observations of an encoder."""
         super().__init__()
         width = encoder.width
         shapes = [tuple(part.shape or ()) for _, part in encoder.numbers]
@@ -66,7 +57,7 @@ class RelativeActions(nn.Module):
             raise SpaceError(
                 "relative actions need one vector in the observation, or a vector beside images"
             )
-        self.relation = relation
+        self.relation = relation  # Element of the observation for each element of an action
         is_relative = np.array([each is not None for each in relation])
         columns = np.array([each or 0 for each in relation])
         half = (box.high - box.low) / 2
@@ -94,18 +85,8 @@ class RelativeActions(nn.Module):
         rows: Tensor,
         length: int,
     ) -> RelativeActions:
-        """Return the conversion with the ranges of the chunks that start at some rows.
-
-        Args:
-            relation: Element of the observation for each element of an action.
-            encoder: Encoder of the observations.
-            box: Scaling of the actions.
-            actions: (N, n) scaled actions.
-            vectors: (N, V) encoded observations.
-            ends: (N,) row after the last one of each row's episode.
-            rows: (M,) rows to learn from.
-            length: Number of actions of a chunk, H.
-        """
+        """Return the conversion with the ranges of the chunks that start at rows (M,)."""
+        # `ends` (N,) has the row after the last one of each row's episode.
         plain = torch.ones(length, box.size, dtype=torch.float64)
         found = cls(relation, encoder, box, -plain, plain.clone())
         references = found._references(vectors.index_select(0, rows))[:, 0]

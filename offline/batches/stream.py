@@ -29,16 +29,10 @@ _PARTS_PER_BLOCK = 8
 
 
 class _Part(NamedTuple):
-    """Successive episodes of one log.
-
-    Attributes:
-        log: Index of the log.
-        first, stop: Range of episodes.
-        items: Number of items.
-    """
+    """Successive episodes of one log."""
 
     log: int
-    first: int
+    first: int  # Range of episodes, with `stop`
     stop: int
     items: int
 
@@ -228,11 +222,7 @@ class _Source:
         self._logs: dict[int, LogReader] = {}
 
     def parts(self, options: ItemOptions, size: int) -> list[_Part]:
-        """Divide the episodes into parts of at least `size` items, except the last part of a log.
-
-        Raises:
-            LogError: There are no episodes.
-        """
+        """Divide the episodes into parts of at least `size` items, except the last of a log."""
         if self._data is not None:
             every = [self._data.episode_lengths]
         else:
@@ -321,11 +311,7 @@ def _grouped(shares: list[_Share], size: int) -> Iterator[list[_Share]]:
 
 
 def _rank_of(rank: int | None, world_size: int | None) -> tuple[int, int]:
-    """Return rank and world size. The default is that of `torch.distributed`, or 0 and 1.
-
-    Raises:
-        UsageError: Only one of the two is given, or the rank is outside the world size.
-    """
+    """Return rank and world size; the default is `torch.distributed`'s, or 0 and 1."""
     if (rank is None) != (world_size is None):
         raise UsageError("pass both rank and world_size, or neither")
     if rank is None or world_size is None:

@@ -40,27 +40,20 @@ _SHOWN_STATE: Final = 6
 
 @dataclass
 class Actor:
-    """What is compared.
-
-    Attributes:
-        name: Name in tables.
-        actions: Function of an episode that returns actions (T, *shape) or chunks (T, H, *shape).
-            A step that has no action is NaN.
-        call: Function that selects the action of one step of an episode, for its latency; None if
-            the actions were computed elsewhere.
-        log_probs: Function of an episode that returns the log probabilities (T,) of its actions.
-        compared: Numbers of the episodes to compare; None for all.
-        trained_on: Numbers of the reference episodes; None for all.
-        why: Why these episodes are compared.
-    """
+    """What is compared."""
 
     name: str
+    # Function of an episode that returns actions (T, *shape) or chunks (T, H, *shape). A step that
+    # has no action is NaN.
     actions: Callable[[Episode], Any]
+    # Function that selects the action of one step of an episode, for its latency; None if the
+    # actions were computed elsewhere.
     call: Callable[[Episode, int], Any] | None = None
+    # Function of an episode that returns the log probabilities (T,) of its actions.
     log_probs: Callable[[Episode], NDArray[np.floating[Any]]] | None = None
-    compared: Sequence[int] | None = None
-    trained_on: Sequence[int] | None = None
-    why: str = "all episodes"
+    compared: Sequence[int] | None = None  # Numbers of the episodes to compare; None for all
+    trained_on: Sequence[int] | None = None  # Numbers of the reference episodes; None for all
+    why: str = "all episodes"  # Why these episodes are compared
 
 
 @dataclass(frozen=True)
@@ -184,11 +177,7 @@ class ActionError:
 
 
 def as_chunks(actions: Any, count: int, shape: tuple[int, ...], who: str) -> NDArray[Any]:
-    """Return actions (T, *shape) or chunks (T, H, *shape) as chunks.
-
-    Raises:
-        PolicyError: They have another shape, or are not numbers.
-    """
+    """Return actions (T, *shape) or chunks (T, H, *shape) as chunks."""
     try:
         found = np.asarray(actions)
     except ValueError as error:
@@ -207,13 +196,7 @@ def as_chunks(actions: Any, count: int, shape: tuple[int, ...], who: str) -> NDA
 
 
 def compare(dataset: Dataset, actor: Actor, seed: int = 0) -> ActionError:
-    """Compute the errors of a policy's actions.
-
-    At most `MAX_STEPS` steps are compared, of whole episodes that are drawn by the seed.
-
-    Raises:
-        PolicyError: The policy fails, or returns actions of another shape.
-    """
+    """Compute the errors of a policy's actions in at most `MAX_STEPS` steps of whole episodes."""
     rng = np.random.default_rng(seed)
     wanted = range(len(dataset.episodes)) if actor.compared is None else actor.compared
     compared = _few(dataset, wanted, rng)
@@ -259,11 +242,7 @@ def compare(dataset: Dataset, actor: Actor, seed: int = 0) -> ActionError:
 def predicted(
     dataset: Dataset, actor: Actor, compared: Sequence[int]
 ) -> tuple[list[NDArray[Any]], int]:
-    """Return the chunks (T, H, *shape) of each episode, and H.
-
-    Raises:
-        PolicyError: The policy fails, or returns actions of another shape.
-    """
+    """Return the chunks (T, H, *shape) of each episode, and H."""
     space, shape = dataset.action_space, tuple(dataset.action_space.shape or ())
     chunks = []
     for episode in (dataset.episodes[number] for number in compared):

@@ -151,21 +151,7 @@ def estimate_behavior(
     clip_actions: bool = False,
     on_update: Callable[[], None] = lambda: None,
 ) -> BehaviorEstimate:
-    """Estimate the probability, or density, of each action under the policy that took it.
-
-    Args:
-        dataset: Dataset with discrete actions or those of a Box; its `behavior` is ignored.
-        folds: Number of parts of the episodes; each part is predicted from the others.
-        updates: Number of gradient steps for each fold.
-        seed: Seed of the folds and of the networks.
-        clip_actions: Whether actions outside a Box are clipped to its bounds.
-        on_update: Callback for each gradient step.
-
-    Raises:
-        SpaceError: The actions are neither discrete nor floats of a Box.
-        TrainingError: There are no transitions, or a number is not finite.
-        UsageError: There are fewer than two folds, or too few episodes for them.
-    """
+    """Estimate the probability, or density, of each action under the policy that took it."""
     is_box = isinstance(dataset.action_space, spaces.Box)
     if not is_box:
         discrete_actions(dataset.action_space, "estimating behavior_prob")
@@ -330,10 +316,8 @@ def _fitted_densities(
     validated: NDArray[np.bool_],
     on_update: Callable[[], None],
 ) -> tuple[Floats, FoldScore]:
-    """Train a network; return its best log densities and PITs (N, 1 + n), and their score.
-
-    The densities are in the units of the space.
-    """
+    """Train a network; return its log densities and PITs (N, 1 + n), and their score."""
+    # The densities are in the units of the space.
     buffer, updates = learner.buffer, learner.config.updates
     box, actions = buffer.box, buffer.actions
     assert box is not None
@@ -375,11 +359,7 @@ def _mixed(log_densities: Floats, uniform: float, share: float) -> Floats:
 
 
 def _calibrated(logits: Floats, actions: NDArray[np.int64]) -> tuple[float, float, float]:
-    """Find the temperature and uniform share with the best mean log probability.
-
-    Returns:
-        Mean log probability, temperature and uniform share.
-    """
+    """Return the best mean log probability, with its temperature and uniform share."""
     candidates = []
     for temperature in _TEMPERATURES.tolist():
         own = _probabilities(logits, temperature, 0.0)[np.arange(len(actions)), actions]

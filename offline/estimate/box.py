@@ -101,19 +101,7 @@ class BoxEvaluator(OffPolicyEvaluator):
     config_type: ClassVar[type[FQEConfig]] = BoxFQEConfig
 
     def __init__(self, dataset: Dataset, config: FQEConfig | None = None, seed: int = 0) -> None:
-        """Prepare the evaluation on a log.
-
-        Args:
-            dataset: Dataset with the actions of a Box of floats.
-            config: Settings of the model; its `gamma` is the discount of all estimates.
-            seed: Seed of the models, of the resampling and of the support's subsets.
-
-        Raises:
-            SpaceError: The actions are outside their space or never change, or no network supports
-                the space or the observations.
-            TrainingError: There are no transitions, or a number is not finite.
-            UsageError: There are too few episodes for cross-fitting.
-        """
+        """Prepare the evaluation on a log."""
         super().__init__(dataset, config, seed)
         self._first = np.cumsum(self._lengths) - self._lengths
         self._last = self._first + self._lengths - 1
@@ -129,11 +117,7 @@ class BoxEvaluator(OffPolicyEvaluator):
         assert isinstance(space, spaces.Box)
 
     def check_behavior(self, on_update: Callable[[], None] = lambda: None) -> BehaviorCheck:
-        """Compare FQE's value of the behavior with the returns of the log, once.
-
-        Raises:
-            UsageError: All episodes were truncated after one step, which shows no second action.
-        """
+        """Compare FQE's value of the behavior with the returns of the log, once."""
         if self._check is not None:
             return self._check
         following = self._buffer.next_rows.numpy()
@@ -171,19 +155,9 @@ class BoxEvaluator(OffPolicyEvaluator):
         epsilon: float = 0.0,
         on_update: Callable[[], None] = lambda: None,
     ) -> PolicyEstimates:
-        """Estimate a policy's discounted return by FQE and by importance sampling.
-
-        Args:
-            policy: Policy to evaluate; None is the uniform random policy.
-            name: Name in tables.
-            epsilon: Must be 0.
-            on_update: Callback for each update of a model; it is called `updates_of_model` times
-                per policy, and as many times for the first one's `check_behavior`.
-
-        Raises:
-            PolicyError: The observations do not fit the policy.
-            UsageError: `epsilon` is not 0.
-        """
+        """Estimate a policy's return by FQE and importance sampling; None acts at random."""
+        # `on_update` is called `updates_of_model` times per policy, and as many for
+        # `check_behavior`.
         if epsilon:
             raise UsageError("`epsilon=` needs discrete actions; for a Box, evaluate without it")
         box = self._buffer.box
@@ -227,14 +201,8 @@ class BoxEvaluator(OffPolicyEvaluator):
         weights: Floats,
         on_update: Callable[[], None],
     ) -> Floats:
-        """Return values (SEEDS, C * E) by the networks that were not trained on each episode.
-
-        Args:
-            next_actions: (N, n) scaled actions of a policy in the next states.
-            values: Function of a trained learner that returns C values of each of the E episodes.
-            weights: (N,) sampling weight of each transition.
-            on_update: Callback for each update.
-        """
+        """Return values (SEEDS, C * E) by networks that were not trained on the episode."""
+        # `values` gives C values of each of the E episodes, from a trained learner.
         fold, parts = self._folds(), []
         for held_out in range(FOLDS):
             training = self._buffer.with_weights(np.where(fold == held_out, 0.0, weights))

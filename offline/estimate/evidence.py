@@ -183,11 +183,7 @@ class EvidenceCollector:
         next_actions: NDArray[np.int64],
         on_update: Callable[[], None],
     ) -> Floats:
-        """Return three values (3, P, N) by FQE for P policies.
-
-        The values are those of the policy's action, of the logged action, and of the best action in
-        the next state.
-        """
+        """Return FQE's values (3, P, N) of the policy's, the logged, and the best next action."""
         pi_t = np.eye(self._buffer.joint.count, dtype=np.float32)[next_actions]
         rows = np.arange(actions.shape[1])
         fixed_v_t = None
@@ -393,10 +389,7 @@ def likely_commands(
 def weighted_value(
     dataset: Dataset, evidence: Evidence, gamma: float
 ) -> tuple[float, float] | None:
-    """Return a policy's value by WPDIS, and its effective number of episodes.
-
-    None is returned if the log has no valid action probabilities, as one with a Box.
-    """
+    """Return a policy's WPDIS and effective episodes; None without valid probabilities."""
     if isinstance(dataset.action_space, spaces.Box):
         return None
     behavior = dataset.behavior_probs.astype(np.float64)

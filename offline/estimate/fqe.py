@@ -102,18 +102,10 @@ class FQE(Learner):
         pi_t: Tensor,
         fixed_v_t: Tensor | None = None,
     ) -> None:
-        """Initialize the network with random weights, and copy them to the target network.
-
-        Args:
-            config: Settings.
-            buffer: N transitions of the log.
-            seeds: Seeds of the weights and batches of each of K policies. Equal seeds give equal
-                initial weights and batches, which reduces the noise of differences.
-            pi_t: Probabilities (K, N, A) of each policy in each next state; for a Box, its actions
-                (K, N, n), scaled by the buffer's `box`.
-            fixed_v_t: Fixed values (K, N) of next states, in units of the logged rewards; NaN where
-                the value is learned. Default: all values are learned.
-        """
+        """Initialize the network with random weights, and copy them to the target network."""
+        # Equal `seeds` give equal weights and batches, which reduces the noise of differences.
+        # `pi_t` is (K, N, A), or for a Box scaled actions (K, N, n). `fixed_v_t` (K, N) is in units
+        # of the logged rewards, NaN where the value is learned.
         super().__init__(config, buffer, seeds)
         self._pi_t = pi_t.flatten(0, 1)
         self._fixed_v_t = None if fixed_v_t is None else fixed_v_t.flatten() / buffer.reward_scale
@@ -177,14 +169,8 @@ class BoxFQE(FQE):
 
     @torch.no_grad()
     def values_of(self, actions: Tensor, rows: Tensor | None = None) -> Tensor:
-        """Return the values (K, M) of scaled actions, clipped to the possible returns.
-
-        They are in units of the logged rewards.
-
-        Args:
-            actions: (K, M, n) actions of each network's policy.
-            rows: (M,) transitions in whose states the actions are taken; default: all N.
-        """
+        """Return values (K, M) of scaled actions (K, M, n) in rows (M,), within the returns."""
+        # They are in units of the logged rewards.
         buffer, networks = self.buffer, len(self.seeds)
         rows = torch.arange(len(buffer)) if rows is None else rows
         places, parts = buffer.places[0].index_select(0, rows), []

@@ -57,16 +57,10 @@ _RESAMPLES_AT_ONCE = 64
 
 @dataclass(frozen=True, eq=False)
 class RatioEstimate:
-    """Estimate sum_k w_k (mean a_k / mean b_k), where the means are over E episodes.
+    """Estimate sum_k w_k (mean a_k / mean b_k), where the means are over E episodes."""
 
-    If there are several pairs of arrays a and b, their ratios are added for each k.
-
-    Attributes:
-        weights: Weights w (K,).
-        pairs: Pairs of arrays a (E, K) and b (E, K). Where b is 0 in all episodes, the ratio is 0.
-    """
-
-    weights: Floats
+    weights: Floats  # Weights w (K,)
+    # Pairs of arrays a (E, K) and b (E, K). Where b is 0 in all episodes, the ratio is 0.
     pairs: tuple[tuple[Floats, Floats], ...]
 
     @classmethod
@@ -76,11 +70,7 @@ class RatioEstimate:
         return cls(np.ones(1), ((column, np.ones_like(column)),))
 
     def values(self, counts: Floats) -> Floats:
-        """Return the estimate (B,) in each of B resamplings.
-
-        Args:
-            counts: Number of times (B, E) that each resampling contains each episode.
-        """
+        """Return the estimate (B,) in each of B resamplings of the episodes, counts (B, E)."""
         return sum(divide(counts @ a, counts @ b) for a, b in self.pairs) @ self.weights
 
     def errors(self, counts: Floats) -> Floats:
@@ -103,9 +93,6 @@ class RatioEstimate:
         resamplings are excluded, the method returns the percentile interval. With fewer than
         `LEAST_RESAMPLED` episodes, it returns the interval of Student's t; see
         `mcaprl.sims.evaluation.evaluate`.
-
-        Args:
-            counts: Number of times (B, E) that each resampling contains each episode.
         """
         once = np.ones((1, counts.shape[1]))
         value, error = float(self.values(once)[0]), float(self.errors(once)[0])
@@ -227,20 +214,15 @@ def weighted_per_decision(episodes: EpisodeTable) -> RatioEstimate:
 
 
 def doubly_robust(episodes: EpisodeTable) -> RatioEstimate:
-    """Return DR: the mean of sum_t gamma^t (rho_{t-1} V(s_t) + rho_t (r_t - Q(s_t, a_t))).
-
-    See Jiang and Li, equation 10. With a model of zeros, DR is PDIS.
-    """
+    """Return DR: the mean of sum_t gamma^t (rho_{t-1} V(s_t) + rho_t (r_t - Q(s_t, a_t)))."""
+    # Jiang and Li, equation 10. With a model of zeros, DR is PDIS.
     unexplained = episodes.rho * (episodes.rewards - episodes.q)
     per_step = unexplained + episodes.rho_before * episodes.v
     return RatioEstimate.mean((episodes.discounts * per_step).sum(1))
 
 
 def weighted_doubly_robust(episodes: EpisodeTable) -> RatioEstimate:
-    """Return WDR: DR with rho_t divided by its sum over the episodes.
-
-    See Thomas and Brunskill, equation 10.
-    """
+    """Return WDR: DR with rho_t divided by its sum. Thomas and Brunskill, equation 10."""
     rho, before = episodes.rho, episodes.rho_before
     unexplained = rho * (episodes.rewards - episodes.q)
     return RatioEstimate(episodes.discounts, ((unexplained, rho), (before * episodes.v, before)))
@@ -264,10 +246,7 @@ UNBIASED: Final = ("TIS", "PDIS", "DR")
 
 
 def effective_sample_sizes(episodes: EpisodeTable) -> Floats:
-    """Return Kish's effective sample size (T,) of each step: (sum rho_t)^2 / sum rho_t^2.
-
-    The size is E if all weights are equal, 1 if only one is not 0, and 0 if all are 0.
-    """
+    """Return Kish's effective sample size (T,) of each step: (sum rho_t)^2 / sum rho_t^2."""
     return _kish(episodes.rho)
 
 
@@ -293,29 +272,15 @@ def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
 
 
 def usable_steps(episodes: EpisodeTable, lengths: NDArray[np.int64], least: float) -> int:
-    """Return the number of first steps whose effective sample sizes are all at least `least`.
-
-    The result is at most the length of the longest episode. An episode that has ended keeps the
-    weight of its last step, because its rewards of 0 count as well.
-
-    Args:
-        episodes: E episodes.
-        lengths: (E,) number of steps of each episode.
-        least: Smallest sufficient effective number of episodes.
-    """
+    """Return how many first steps all have an effective sample size of at least `least`."""
+    # An ended episode keeps the weight of its last step, because its rewards of 0 count as well.
     few = effective_sample_sizes(episodes)[: int(lengths.max())] < least
     return int(few.argmax()) if few.any() else len(few)
 
 
 def mean_weight(estimator: str, episodes: EpisodeTable) -> RatioEstimate | None:
-    """Return the mean importance weight of an unbiased estimator.
-
-    The expectation of this mean is 1.
-
-    A mean far below 1 shows that the log does not cover the policy's actions: rare episodes with
-    large weights are missing. The result is None for the weighted estimators, because they divide
-    by this mean.
-    """
+    """Return the mean weight of an unbiased estimator, of expectation 1; None of the others."""
+    # A mean far below 1: rare episodes with large weights are missing in the log.
     if estimator not in UNBIASED:
         return None
     if estimator in WHOLE_EPISODE:

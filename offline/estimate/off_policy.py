@@ -222,10 +222,7 @@ class OffPolicyEvaluator:
         return FOLDS * self._config.updates
 
     def _probabilities(self, policy: BasePolicy | None, epsilon: float) -> tuple[Floats, Floats]:
-        """Return a policy's action probabilities (N, A) at the observations and the next ones.
-
-        With probability `epsilon`, the policy takes a random action.
-        """
+        """Return a policy's probabilities (N, A), with `epsilon`, now and in the next states."""
         random = RandomPolicy(self._dataset.action_space)
         pi, pi_next = self._in_states(random, random.action_probabilities)
         policy = policy or random
@@ -255,11 +252,9 @@ class OffPolicyEvaluator:
     def _model(
         self, pi: Floats, pi_next: Floats, on_update: Callable[[], None]
     ) -> tuple[Floats, Floats, Floats]:
-        """Return Q of the actions taken, V of the states, and V of the next states, (N,) each.
-
-        The model that evaluates an episode is trained on the other half of the log (cross-fitting),
-        because a model's values for its own training episodes are biased.
-        """
+        """Return Q of the actions taken, V of the states, and V of the next states, (N,) each."""
+        # The model of an episode is trained on the other half of the log (cross-fitting), because a
+        # model's values for its own training episodes are biased.
         fold = np.repeat(self._fold, self._lengths)
         actions = self._buffer.actions.numpy()
         q, v, v_next = (np.zeros(len(fold)) for _ in range(3))
@@ -328,12 +323,9 @@ class OffPolicyEvaluator:
         )
 
     def _fqe_estimate(self, name: str, v: Floats, weights: Floats) -> Estimate:
-        """Return the model's mean value of the first states.
-
-        The estimate has no interval and is never trusted. Most of its error is the model's bias,
-        which cannot be computed from a log. The model is trained on single steps, so the effective
-        sample size is the number of steps divided by the mean length of an episode.
-        """
+        """Return the model's mean value of the first states, without interval, never trusted."""
+        # Most of its error is the model's bias, which a log does not show. The model is trained on
+        # single steps: the effective sample size is their number divided by the mean length.
         first = v[np.cumsum(self._lengths) - self._lengths]
         steps = weights.sum() ** 2 / max((weights**2).sum(), 1e-300)
         size = float(steps / self._lengths.mean())
@@ -360,13 +352,9 @@ class OffPolicyEvaluator:
 
 
 def ranking(estimates: Sequence[Estimate]) -> dict[str, Any]:
-    """Rank policies by the first estimator of `PREFERENCE` that is trusted for all policies.
-
-    Returns:
-        `estimator`; `policies`, best first; `trusted`; and `close`, the other policies whose values
-        differ from the best one by less than two standard deviations over seeds. If no estimator is
-        trusted for all policies, `trusted` is false and FQE ranks them.
-    """
+    """Rank policies by the first estimator of `PREFERENCE` that is trusted for all policies."""
+    # Without one, FQE ranks them. `close` differ from the best by less than two deviations over
+    # seeds.
     by_estimator = {
         name: [estimate for estimate in estimates if estimate.estimator == name]
         for name in (*PREFERENCE, "FQE")

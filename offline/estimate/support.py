@@ -35,16 +35,7 @@ class Support:
         episodes: NDArray[np.int64],
         seed: int = 0,
     ) -> None:
-        """Compute the distances of the logged actions.
-
-        In a log of more rows, only random subsets are compared: 2,000 rows with 20,000.
-
-        Args:
-            states: (N, V) vector of each state; V is at least 1.
-            actions: (N, n) logged actions.
-            episodes: (N,) number of the episode of each row; there are two or more.
-            seed: Seed of the subsets.
-        """
+        """Compute the distances of the logged actions, of at most 2,000 rows with 20,000."""
         order = np.random.default_rng(seed).permutation(len(states))
         self._queries, self._references = np.sort(order[:_QUERIES]), np.sort(order[:_REFERENCES])
         self._states = _scaled(states, states)
@@ -73,10 +64,7 @@ class Support:
 
 
 def _scaled(logged: NDArray[np.floating[Any]], values: NDArray[np.floating[Any]]) -> Floats:
-    """Divide values (M, n) by the standard deviations of `logged` (N, n), and by the root of n.
-
-    A number that never changes in the log keeps its unit.
-    """
+    """Divide values by `logged`'s deviations (constants: 1) and by the root of n."""
     deviations = np.asarray(logged, np.float64).std(0)
     scale = np.where(deviations > 0, deviations, 1.0) * np.sqrt(logged.shape[1])
     found: Floats = np.asarray(values, np.float64) / scale

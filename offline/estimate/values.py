@@ -70,16 +70,7 @@ def value_columns(
 def action_columns(
     actions: NDArray[Any], taken: NDArray[Any], action_space: spaces.Space[Any]
 ) -> Columns:
-    """Return the fields (T, ...) of `recorder.format.schema.values_schema` of actions alone.
-
-    Args:
-        actions: (T, *shape) actions of a policy whose values and probabilities are unknown.
-        taken: (T, *shape) logged actions.
-        action_space: Action space.
-
-    Raises:
-        PolicyError: An action is not in a finite action space.
-    """
+    """Return the fields (T, ...) of `recorder.format.schema.values_schema` of actions alone."""
     unknown = np.full(len(taken), np.nan, np.float32)
     joint = joint_actions(action_space)
     if joint is None:
@@ -147,10 +138,7 @@ def command_columns(
 
 
 def half_ranges(space: spaces.Space[Any], actions: NDArray[Any]) -> NDArray[np.float64]:
-    """Return half of the range (n,) of each element of a Box; of the actions' where it is infinite.
-
-    An element without a range has 1.
-    """
+    """Return half of each element's range (n,), the actions' where infinite, 1 without one."""
     assert isinstance(space, spaces.Box)
     rows = _flat(actions)
     low, high = (end.ravel().astype(np.float64) for end in (space.low, space.high))
@@ -165,10 +153,7 @@ def _flat(actions: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def policy_inputs(policy: BasePolicy, episode: Episode) -> Any:
-    """Return an episode's observations (T + 1, ...), including the last next observation.
-
-    For a policy with a frame stack of k > 1, they are stacks (T + 1, k, ...), oldest frame first.
-    """
+    """Return observations (T + 1, ...) with the last one, or stacks (T + 1, k, ...) of them."""
     frames = mapped(
         lambda seen, following: np.concatenate([seen, following[-1:]]),
         episode.observations,
@@ -184,15 +169,7 @@ def td_errors(
     terminated: NDArray[np.bool_],
     gamma: float,
 ) -> NDArray[np.float32]:
-    """Return the Q-learning errors (T,): r + gamma max_a Q(s', a) - Q(s, a_data).
-
-    Args:
-        q: (T + 1, A) values at each observation, including the last next observation.
-        actions: (T,) actions taken, counted from 0.
-        rewards: (T,) rewards.
-        terminated: (T,) whether the episode terminated at each step.
-        gamma: Discount per step.
-    """
+    """Return the Q-learning errors (T,): r + gamma max_a Q(s', a) - Q(s, a_data)."""
     target = q_learning_target(
         torch.from_numpy(rewards.astype(np.float32)),
         torch.from_numpy(np.where(terminated, 0.0, gamma).astype(np.float32)),
@@ -219,10 +196,7 @@ def normalized_entropy(probabilities: NDArray[np.float32]) -> NDArray[np.float32
 
 
 def by_rows(function: Callable[[Any], NDArray[Any]], observations: Any) -> NDArray[Any]:
-    """Apply a function to N observations in slices of limited size, and join the results.
-
-    The limit bounds the memory that networks need for images.
-    """
+    """Apply a function to slices of N observations, which bounds the memory for images."""
     starts = range(0, batch_size(observations), _ROWS_AT_ONCE)
     return np.concatenate(
         [function(rows_of(observations, slice(at, at + _ROWS_AT_ONCE))) for at in starts]

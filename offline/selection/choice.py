@@ -60,30 +60,19 @@ _LOW_COVERAGE: Final = 0.5
 
 @dataclass(frozen=True)
 class LogTraits:
-    """Properties of a log that determine which algorithms may work.
-
-    Attributes:
-        episodes: Number of episodes.
-        transitions: Number of transitions.
-        mean_return: Mean undiscounted return of the episodes.
-        return_spread: Standard deviation of these returns.
-        terminated: Fraction of the episodes that end in a terminal state.
-        entropy: Mean entropy of the behavior policy, from 0 (deterministic) to 1 (uniform). If all
-            logged probabilities are valid, it is computed from them, otherwise from the clone.
-        coverage: Mean fraction of the actions that are likely under the behavior policy.
-        probabilities: Whether the log has the probabilities of its actions.
-        problems: Problems that the lint found.
-    """
+    """Properties of a log that determine which algorithms may work."""
 
     episodes: int
     transitions: int
-    mean_return: float
-    return_spread: float
-    terminated: float
+    mean_return: float  # Mean undiscounted return of the episodes
+    return_spread: float  # Standard deviation of these returns
+    terminated: float  # Fraction of the episodes that end in a terminal state
+    # Mean entropy of the behavior policy, from 0 (deterministic) to 1 (uniform). If all logged
+    # probabilities are valid, it is computed from them, otherwise from the clone.
     entropy: float
-    coverage: float
-    probabilities: bool
-    problems: tuple[str, ...]
+    coverage: float  # Mean fraction of the actions that are likely under the behavior policy
+    probabilities: bool  # Whether the log has the probabilities of its actions
+    problems: tuple[str, ...]  # Problems that the lint found
 
     @property
     def is_deterministic(self) -> bool:
@@ -93,21 +82,13 @@ class LogTraits:
 
 @dataclass(frozen=True)
 class Rating:
-    """Estimates of one candidate.
+    """Estimates of one candidate."""
 
-    Attributes:
-        value: Mean estimated discounted return of the episodes.
-        interval: 95 % interval of that mean, by resampling.
-        agreement: Mean over episodes of the fraction of states with the logged action.
-        score: `value`, or `agreement` if the behavior is almost deterministic.
-        best_chance: Fraction of the resamplings in which no other candidate has a larger score.
-    """
-
-    value: float
-    interval: tuple[float, float]
-    agreement: float
-    score: float
-    best_chance: float
+    value: float  # Mean estimated discounted return of the episodes
+    interval: tuple[float, float]  # 95 % interval of that mean, by resampling
+    agreement: float  # Mean over episodes of the fraction of states with the logged action
+    score: float  # `value`, or `agreement` if the behavior is almost deterministic
+    best_chance: float  # Fraction of the resamplings in which no other candidate has a larger score
 
     def __str__(self) -> str:
         """Return the value with its interval."""
@@ -117,26 +98,20 @@ class Rating:
 
 @dataclass(frozen=True)
 class Tried:
-    """Results of one candidate.
+    """Results of one candidate."""
 
-    Attributes:
-        updates: Number of updates at the last evaluation of the candidate. If there was no
-            evaluation, the current number of updates.
-        rating: Its estimate; None if it was not evaluated.
-        support: Fraction of the states in which its action is likely under the behavior policy.
-        bellman_error: Its relative Bellman error; None if it has no Q-values.
-        weighted: Estimate by WPDIS, and the effective number of episodes of this estimate; None
-            if the log has no action probabilities.
-        outcome: `chosen`, `runner-up`, `stopped early`, or why it was not trained.
-        check: What the models predict for the behavior; None for finite action spaces.
-    """
-
+    # Number of updates at the last evaluation of the candidate. If there was no evaluation, the
+    # current number of updates.
     updates: int = 0
-    rating: Rating | None = None
+    rating: Rating | None = None  # Its estimate; None if it was not evaluated
+    # Fraction of the states in which its action is likely under the behavior policy.
     support: float | None = None
-    bellman_error: float | None = None
+    bellman_error: float | None = None  # Its relative Bellman error; None if it has no Q-values
+    # Estimate by WPDIS, and the effective number of episodes of this estimate; None if the log has
+    # no action probabilities.
     weighted: tuple[float, float] | None = None
-    outcome: str = ""
+    outcome: str = ""  # `chosen`, `runner-up`, `stopped early`, or why it was not trained
+    # What the models predict for the behavior; None for finite action spaces.
     check: BehaviorCheck | None = None
 
     def row(self, name: str) -> tuple[str, ...]:
@@ -162,19 +137,9 @@ class Tried:
 def decide(
     ratings: Mapping[str, Rating], prior: Sequence[str], check: BehaviorCheck | None
 ) -> tuple[str, str]:
-    """Choose by the estimates if they can be trusted, else by the prior order.
-
-    The estimates can be trusted if they are right for the behavior, and the interval of the
-    candidate with the largest estimate is above that of the first candidate of the prior order.
-
-    Args:
-        ratings: Ratings by candidate, the best first.
-        prior: All rated candidates in the order in which they are preferred without estimates.
-        check: Estimate of the behavior.
-
-    Returns:
-        The chosen candidate, and the rule that decided.
-    """
+    """Choose by the estimates if they can be trusted, else by the prior; return the rule, too."""
+    # They can if they are right for the behavior, and the interval of the largest estimate is above
+    # that of the first candidate of `prior`.
     best, usual = next(iter(ratings)), prior[0]
     if check is None or not check.passes:
         return usual, PRIOR
@@ -185,27 +150,16 @@ def decide(
 
 @dataclass(frozen=True)
 class Choice:
-    """Policy that `auto` chose, and the reason.
+    """Policy that `auto` chose, and the reason."""
 
-    Attributes:
-        chosen: Name of the candidate.
-        reason: Why it was chosen, in words.
-        confidence: Confidence in the choice, in words.
-        advice: What data would raise this confidence, in words.
-        complete: Whether all planned training and evaluation was done within the budget.
-        traits: Properties of the log.
-        tried: What is known of each candidate, by name, from the best to the worst.
-        rule: Rule that decided: `ESTIMATE`, `AGREEMENT`, `PRIOR` or `UNTESTED`.
-    """
-
-    chosen: str
-    reason: str
+    chosen: str  # Name of the candidate
+    reason: str  # Why it was chosen, in words
     confidence: str
-    advice: tuple[str, ...]
-    complete: bool
-    traits: LogTraits
-    tried: dict[str, Tried]
-    rule: str = ""
+    advice: tuple[str, ...]  # What data would raise this confidence, in words
+    complete: bool  # Whether all planned training and evaluation was done within the budget
+    traits: LogTraits  # Properties of the log
+    tried: dict[str, Tried]  # What is known of each candidate, by name, from the best to the worst
+    rule: str = ""  # Rule that decided: `ESTIMATE`, `AGREEMENT`, `PRIOR` or `UNTESTED`
 
     @classmethod
     def of(

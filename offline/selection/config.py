@@ -65,23 +65,14 @@ class AutoConfig(BootstrapConfig):
 
     @property
     def candidate_interval(self) -> int:
-        """Number of updates between checkpoints of a candidate.
-
-        The number is at most a quarter of the updates of the short training, so that a candidate
-        has a policy when its time is up.
-        """
+        """Number of updates between checkpoints of a candidate."""
+        # At most a quarter of the short training, so that it has a policy when its time is up.
         quarter = round(self.updates * self.short_fraction / 4)
         return max(1, min(self.checkpoint_interval, quarter))
 
 
 def default_configs() -> dict[str, TrainingConfig]:
-    """Return the default settings of `auto`, of the built-in and of installed algorithms.
-
-    Where an algorithm has other settings for a Box, these have the key `NAME (Box)`.
-
-    Raises:
-        UsageError: An entry point is broken.
-    """
+    """Return the default settings of all algorithms; others for a Box as `NAME (Box)`."""
     configs = dict(CONFIGS)
     for name, config_type in BOX_CONFIGS.items():
         configs[f"{name} (Box)" if name in CONFIGS else name] = config_type

@@ -110,25 +110,16 @@ _LEAST_MODEL_UPDATES: Final = 100
 
 @dataclass(frozen=True)
 class Candidate:
-    """Algorithm with settings that differ from the shared ones.
+    """Algorithm with settings that differ from the shared ones."""
 
-    Attributes:
-        name: Name in tables and of the folder of its run.
-        algo: Name of the algorithm.
-        special: Settings that differ from the shared ones.
-        is_box: Whether the algorithm is that for the actions of a Box.
-    """
-
-    name: str
+    name: str  # Name in tables and of the folder of its run
     algo: str
-    special: Mapping[str, Any]
-    is_box: bool = False
+    special: Mapping[str, Any]  # Settings that differ from the shared ones
+    is_box: bool = False  # Whether the algorithm is that for the actions of a Box
 
     def config(self, shared: AutoConfig) -> TrainingConfig:
-        """Return the settings of the algorithm. Its special settings override the shared ones.
-
-        For a Box, the shared settings are those that differ from the defaults of `auto`.
-        """
+        """Return the settings of the algorithm. Its special settings override the shared ones."""
+        # For a Box, the shared settings are those that differ from the defaults of `auto`.
         defaults = (BOX_CONFIGS if self.is_box else CONFIGS)[self.algo]()
         names = {field.name for field in fields(defaults)}.difference(_OWN)
         given = {
@@ -164,11 +155,7 @@ BOX_PORTFOLIO: Final = (
 
 
 def portfolio(space: spaces.Space[Any]) -> tuple[Candidate, ...]:
-    """Return the candidates for an action space.
-
-    Raises:
-        SpaceError: No candidate learns the actions of this space.
-    """
+    """Return the candidates for an action space."""
     if isinstance(space, spaces.Box):
         return BOX_PORTFOLIO
     discrete_actions(space, AUTO)
@@ -189,15 +176,9 @@ def rate(
     imitate: bool,
     seed: int = 0,
 ) -> dict[str, Rating]:
-    """Rate candidates by their values or by their agreement with the log, the best first.
-
-    Episodes are resampled, together with the networks and models. The chances include the noise of
-    the log and of the networks, but not the bias of the models, which a log does not show.
-
-    `values` has arrays (M, E) by candidate: the value of the first state of each of E episodes, for
-    each of M pairs of a network and a model. `agreements` has the fractions of the states of each
-    episode in which the candidate takes the logged action. They are the scores with `imitate`.
-    """
+    """Rate candidates by their values or by their agreement with the log, the best first."""
+    # Arrays are (M, E): pairs of a network and a model, and episodes. Both are resampled, so that
+    # the chances include the noise of the log and of the networks, but not the models' bias.
     random = np.random.default_rng(seed)
     counts = _counts(random, next(iter(values.values())).shape[1])
     members = {name: _counts(random, len(mine)) for name, mine in values.items()}
@@ -231,10 +212,7 @@ def select(
     device: str = "cpu",
     progress: ProgressCallback = lambda now: None,
 ) -> tuple[Choice, list[OfflineSummary]]:
-    """Train all candidates, choose one from the log alone; return it and a summary per seed.
-
-    The arguments are those of `mcaprl.offline.train` and `mcaprl.train`.
-    """
+    """Train all candidates, choose one from the log alone; return it and a summary per seed."""
     if config.report:
         import_extra("jinja2", "report")
     known = [one.name for one in portfolio(dataset.action_space)]
@@ -330,11 +308,8 @@ class _Race:
         return choice, self._summaries(choice.chosen, trying[choice.chosen].algo)
 
     def _going(self, order: list[str]) -> list[str]:
-        """Return the candidates that are trained with all updates, given the best first.
-
-        For a Box, the first one of the portfolio is among them, because it is chosen if the
-        estimates do not decide.
-        """
+        """Return the candidates that get all updates; for a Box, the portfolio's first is one."""
+        # It is chosen if the estimates do not decide.
         going = order[: self._config.survivors]
         usual = BOX_PORTFOLIO[0].name
         is_box = isinstance(self._dataset.action_space, spaces.Box)
@@ -384,10 +359,7 @@ class _Race:
         return read_policy(policy_files(folder)[0].parent)
 
     def _train(self, candidates: Sequence[Candidate], until: int, share: float) -> None:
-        """Train candidates until they have `until` updates or their equal times are used.
-
-        The first one is trained even if no time is left, so that there is a policy.
-        """
+        """Train candidates until `until` updates or their times are used; the first one anyway."""
         for k, candidate in enumerate(candidates):
             left_s = self._left_s(share) / (len(candidates) - k)
             if self._updates(candidate.name) >= until:

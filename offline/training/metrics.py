@@ -24,14 +24,7 @@ class ScalarsWriter:
     """Writer of scalars to CSV and TensorBoard, one row per call of `write`."""
 
     def __init__(self, path: Path, index: str, done: int, prefix: str = "") -> None:
-        """Open both files; rows of a CSV file after `done` are those of a broken-off session.
-
-        Args:
-            path: CSV file; TensorBoard's file is in the same folder.
-            index: Column with the number of updates or steps, the first one.
-            done: Number of updates or steps of earlier sessions.
-            prefix: Prefix of the names in TensorBoard.
-        """
+        """Open both files; rows of a CSV file after `done` are those of a broken-off session."""
         # Imported here because a process that only handles summaries does not need torch.
         from torch.utils.tensorboard import SummaryWriter
 
@@ -76,11 +69,7 @@ class ScalarsWriter:
 
 
 class MetricsWriter(ScalarsWriter):
-    """Writer of metrics, one row per call of `write`.
-
-    The CSV has the columns `update`, `learning_rate` and the algorithm's terms. Each value comes
-    from one batch and is not a running average, so the same seed writes the same file.
-    """
+    """Writer of one row of a batch's terms per `write`: the same seed writes the same file."""
 
     def __init__(self, folder: Path, first_update: int) -> None:
         """Open both files in `folder`."""
@@ -146,12 +135,7 @@ _LEARNED, _HELD_OUT = COLORS[:2]
 
 
 def draw_curves(folder: Path) -> Path:
-    """Write RUN/curves.png from the metrics of all seeds; return its path.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-        ReportError: There are no metrics, or the image cannot be written.
-    """
+    """Write RUN/curves.png from the metrics of all seeds; return its path."""
     panels = curve_panels(folder)
     if not panels:
         raise ReportError(f"{folder} has no {METRICS_NAME} to draw: was the folder removed?")

@@ -61,17 +61,11 @@ from mcaprl.storage.tensor_files import read_tensors, write_tensors
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Stored state of the training of one seed.
-
-    Attributes:
-        path: Path of the file.
-        step: Number of finished updates.
-        tensors: State as `Learner.state` returns it.
-    """
+    """Stored state of the training of one seed."""
 
     path: Path
-    step: int
-    tensors: dict[str, Tensor]
+    step: int  # Number of finished updates
+    tensors: dict[str, Tensor]  # State as `Learner.state` returns it
 
     def restore(self, learner: Learner, seed: int) -> None:
         """Load this state into a seed of a fresh learner."""
@@ -171,10 +165,7 @@ def train_seeds(
     device: str,
     report: ProgressCallback,
 ) -> list[OfflineSummary]:
-    """Train some seeds of a run that another process has locked and started.
-
-    The seeds continue from their checkpoints. The other arguments are those of `train`.
-    """
+    """Train some seeds of a run that another process started, from their checkpoints."""
     run = _prepared(dataset, algorithm, folder, identity, device, reuses=True)
     return run.train(seeds, report)
 
@@ -207,10 +198,7 @@ def start_run(
 
 
 def facts_of(dataset: Dataset, identity: RunIdentity) -> dict[str, Any]:
-    """Return what `config.json` says of the data.
-
-    `source` is the data of which these were made by a selection, weights or masks of actions.
-    """
+    """Return what `config.json` says of the data."""
     found: dict[str, Any] = {"env_id": dataset.env_id, "transitions": len(dataset)}
     if dataset.origin.selection is not None:
         found["source"] = dict(dataset.origin.selection)
@@ -249,27 +237,16 @@ def _prepared(
 
 @dataclass(frozen=True)
 class _Run:
-    """Data and settings shared by all seeds of a run.
-
-    Attributes:
-        folder: Folder of the run.
-        identity: Algorithm, settings and data of the run.
-        algorithm: Algorithm and settings.
-        dataset: Training data, including held-out episodes, without the masks of `mask_from`.
-        buffer: The same data as tensors.
-        held_out: Transitions for validation, if any.
-        limit: Upper bound on the absolute value of a return.
-        held_out_episodes: Numbers of the held-out episodes.
-    """
+    """Data and settings shared by all seeds of a run."""
 
     folder: Path
-    identity: RunIdentity
+    identity: RunIdentity  # Algorithm, settings and data of the run
     algorithm: Algorithm
-    dataset: Dataset
-    buffer: TransitionBuffer
-    held_out: HeldOut | None
-    limit: float
-    held_out_episodes: NDArray[np.int64]
+    dataset: Dataset  # Training data, including held-out episodes, without the masks of `mask_from`
+    buffer: TransitionBuffer  # The same data as tensors
+    held_out: HeldOut | None  # Transitions for validation, if any
+    limit: float  # Upper bound on the absolute value of a return
+    held_out_episodes: NDArray[np.int64]  # Numbers of the held-out episodes
 
     def train(self, seeds: range, report: ProgressCallback) -> list[OfflineSummary]:
         """Train seeds, in parallel if their checkpoints are at the same update."""
@@ -349,10 +326,7 @@ class _Run:
         return values
 
     def _with_new_episodes(self, learner: Learner) -> Learner:
-        """Add new episodes every `CHECK_INTERVAL` updates.
-
-        If there are any, return a new learner.
-        """
+        """Add new episodes every `CHECK_INTERVAL` updates; then return a new learner."""
         if self.dataset.origin.grow is None or learner.step % CHECK_INTERVAL:
             return learner
         grown = self.dataset.grow()
@@ -362,11 +336,7 @@ class _Run:
         return with_more_data(learner, grown, self.held_out_episodes)
 
     def _save(self, learner: Learner) -> None:
-        """Write each seed's policy and then its checkpoint.
-
-        The checkpoint is written last. If the process is killed before that, updates are lost, but
-        the policy of a finished run is never outdated.
-        """
+        """Write policies, then checkpoints: a finished run's policy is never outdated."""
         for seed in learner.seeds:
             folder = seed_folder(self.folder, seed)
             data = self.dataset
@@ -396,10 +366,7 @@ class _Run:
 
 
 class Scales(NamedTuple):
-    """Scales of other data that a learner continues with; None for those of the training data.
-
-    The members are those of `TransitionBuffer`.
-    """
+    """Scales as in `TransitionBuffer`, of other data; None for those of the training data."""
 
     encoder: ObservationEncoder | None = None
     reward_scale: float | None = None
@@ -429,19 +396,8 @@ def _packed(
 
 
 def best_episodes(dataset: Dataset, fraction: float, by: str = "") -> NDArray[np.bool_]:
-    """Return a mask (E,) of the fraction of the episodes with the largest values, at least one.
-
-    All episodes with the value of the last one are in it, and none without a value.
-
-    Args:
-        dataset: Dataset with E episodes.
-        fraction: Fraction of all episodes.
-        by: Expression of an episode, as of `mcaprl.filter`; empty for the return.
-
-    Raises:
-        UsageError: No episode has a value, or the expression is not one.
-        UnknownNameError: The expression has an unknown name.
-    """
+    """Return a mask (E,) of the fraction of the episodes with the largest values, at least one."""
+    # All with the last one's value are in it. `by` is an expression, or empty for the return.
     lengths = dataset.episode_lengths
     if fraction == 1 or not len(lengths):
         return np.ones(len(lengths), bool)

@@ -63,17 +63,8 @@ class HeldOut:
 
 
 def choose_held_out(wholes: NDArray[np.int64], fraction: float) -> NDArray[np.int64]:
-    """Choose about `fraction` of the episodes, but never all of them.
-
-    If `fraction` is above 0 and there are ten or more episodes, at least one is chosen.
-
-    The choice depends only on the number of episodes, so it is the same for all seeds. Of an
-    episode that was divided, all parts are chosen or none.
-
-    Args:
-        wholes: (E,) numbers of the episodes; see `Dataset`.
-        fraction: Fraction to choose.
-    """
+    """Choose about `fraction` of the episodes, for all seeds the same, but never all of them."""
+    # Of ten or more, at least one. Of a divided episode (`wholes`), all parts are chosen or none.
     found, number = np.unique(wholes, return_inverse=True)
     n_episodes = len(found)
     count = round(fraction * n_episodes)
@@ -87,12 +78,8 @@ def choose_held_out(wholes: NDArray[np.int64], fraction: float) -> NDArray[np.in
 def monte_carlo_returns(
     dataset: Dataset, episodes: NDArray[np.int64], gamma: float
 ) -> NDArray[np.float64]:
-    """Return the discounted sum of rewards from each transition to the end of its episode.
-
-    Returns:
-        One sum for each transition of these episodes. The sum is NaN if the episode was truncated
-        and the discount factor of the first missing reward is above 5 %.
-    """
+    """Return the discounted sum of rewards from each transition to the end of its episode."""
+    # NaN after a truncation, if the discount of the first missing reward is above 5 %.
     returns = []
     ends = np.cumsum(dataset.episode_lengths)
     for number in episodes:
