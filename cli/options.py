@@ -126,10 +126,8 @@ def keep_options(command: F) -> F:
 
 
 def bag_reader(data: tuple[str, ...], bag: dict[str, Any]) -> Any:
-    """Return a function that reads a bag by these options; without a mapping, return `data`.
-
-    Functions that report what a mapping leaves out need no warnings of it.
-    """
+    """Return a function that reads a bag by these options; without a mapping, return `data`."""
+    # Functions that report what a mapping leaves out need no warnings of it.
 
     def read() -> Any:
         from mcaprl.recorder.source import read_mapped

@@ -65,12 +65,8 @@ class SettingsCommand(Command):
 def setting_options(
     configs: Mapping[str, Settings], tuned: Mapping[str, Mapping[str, Any]]
 ) -> list[click.Option]:
-    """Return one option for each field of the given settings.
-
-    The help comes from the first algorithm that has the field. It shows the default of this
-    algorithm, and the defaults of other algorithms and of sims if they differ. An omitted option is
-    None, so that the default of the algorithm, or of the sim, is used.
-    """
+    """Return one option for each field of the given settings; an omitted one is None."""
+    # The help is that of the first algorithm with the field, and shows the defaults that differ.
     lines: dict[str, str] = {}
     defaults: dict[str, dict[str, Any]] = {}
     for algo, config in configs.items():

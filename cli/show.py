@@ -39,10 +39,7 @@ _OPTIONS = {
 
 
 def echo(text: object, *, err: bool = False) -> None:
-    """Print a line to stdout or stderr, with control characters escaped; see `as_options`.
-
-    In a terminal, a long line is wrapped between words.
-    """
+    """Print a line with control characters escaped, wrapped in a terminal; see `as_options`."""
     line = printable(as_options(str(text))).replace("\n", r"\n")
     if _is_terminal(sys.stderr if err else sys.stdout):
         line = "\n".join(_wrapped(line, shutil.get_terminal_size().columns)) or line
@@ -124,11 +121,9 @@ def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
 def print_wide(
     title: str, columns: list[str], rows: list[list[str]], *, last: int = 0, width: int = 100
 ) -> None:
-    """Print a table that may have many columns and rows; print nothing without rows.
-
-    The first column and the `last` ones are always shown. Of the others, as many are shown as fit
-    into `width` characters, or into the terminal; the names of the rest follow the table.
-    """
+    """Print a table that may have many columns and rows; print nothing without rows."""
+    # The first column and the `last` ones are always shown, others as far as they fit into `width`
+    # or the terminal; the names of the rest follow.
     if not rows:
         return
     space = min(width, _console().width) - 1
@@ -151,12 +146,8 @@ def print_wide(
 
 
 def _widths(columns: Iterable[Sequence[str]], available: int) -> Sequence[int | None]:
-    """Return the width of each column of texts, such that no word is broken.
-
-    Each column is at least as wide as its longest word. The remaining space is first given to the
-    columns that need the least of it. If the longest words do not fit, the widths are None, and
-    rich breaks words.
-    """
+    """Return the width of each column of texts, so that no word breaks; None if that fails."""
+    # Space beyond the longest words goes first to the columns that need the least of it.
     from rich.cells import cell_len
 
     texts = [[printable(text) for text in column] for column in columns]

@@ -266,10 +266,7 @@ class Agent(ABC):
         write_tensors(self._checkpoint, tensors, description)
 
     def _restore(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
-        """Restore a checkpoint.
-
-        The best policy's files may be newer; the evaluations after the checkpoint are repeated.
-        """
+        """Restore a checkpoint; evaluations after it are repeated."""
         try:
             self._prepare(tensors)
             self._load(tensors, description)

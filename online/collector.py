@@ -50,16 +50,12 @@ class Episodes:
 
 
 class VectorEnvironments:
-    """Environments of a Gymnasium `VectorEnv` with autoreset in the same step.
-
-    Attributes:
-        episodes: Statistics of the finished episodes.
-    """
+    """Environments of a Gymnasium `VectorEnv` with autoreset in the same step."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], encoder: ObservationEncoder) -> None:
         """Encode the observations of `env` with `encoder`."""
         self._env, self._encoder = env, encoder
-        self.episodes = Episodes()
+        self.episodes = Episodes()  # Statistics of the finished episodes
         self._returns, self._lengths = np.zeros(env.num_envs), np.zeros(env.num_envs, np.int64)
 
     def reset(self, seed: int) -> Observations:
@@ -129,18 +125,14 @@ class DeviceEnvironments:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Actions of one step, and what is known about them.
+    """Actions of one step, and what is known about them."""
 
-    Attributes:
-        actions: (W, *shape) actions of the action space.
-        behavior: Function that returns the probabilities (W,) of the actions under the behavior
-            policy; for the actions of a Box, the natural logarithms of their densities.
-        values: Values (W, A) of all actions from the forward pass that chose them; None if there
-            was none, or if the actions are not finite in number.
-    """
-
-    actions: Tensor
+    actions: Tensor  # (W, *shape) actions of the action space
+    # Function that returns the probabilities (W,) of the actions under the behavior policy; for the
+    # actions of a Box, the natural logarithms of their densities.
     behavior: Callable[[], Tensor]
+    # Values (W, A) of all actions from the forward pass that chose them; None if there was none, or
+    # if the actions are not finite in number.
     values: Tensor | None = None
 
 

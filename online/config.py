@@ -402,19 +402,12 @@ BOX_ALGOS: Final = ("sac", "td3", "tqc", "ppo", "a2c")
 
 @dataclass(frozen=True)
 class Preset:
-    """Published settings of one program.
-
-    Attributes:
-        algo: Name of the algorithm.
-        sim: Short name of the sim.
-        sim_options: Arguments of the sim.
-        settings: Settings that differ from the algorithm's defaults.
-    """
+    """Published settings of one program."""
 
     algo: str
-    sim: str
+    sim: str  # Short name of the sim
     sim_options: dict[str, Any]
-    settings: dict[str, Any]
+    settings: dict[str, Any]  # Settings that differ from the algorithm's defaults
 
 
 _AUTONOMYSIM: Final[dict[str, Any]] = {
@@ -602,11 +595,9 @@ def find_preset(name: str) -> Preset:
 
 
 def warm_settings(algo: str, *, with_logs: bool, with_policy: bool) -> dict[str, Any]:
-    """Return the settings that have other defaults if an agent starts from logs or a policy.
-
-    Critics have layer normalization with logs, and no policy (https://arxiv.org/abs/2302.02948). A
-    large temperature would make a policy random again.
-    """
+    """Return the settings that have other defaults if an agent starts from logs or a policy."""
+    # Critics have layer normalization with logs, and no policy (https://arxiv.org/abs/2302.02948).
+    # A large temperature would make a policy random again.
     config_type = CONFIGS[algo]
     if with_policy:
         return {"temperature": 0.01} if issubclass(config_type, SACConfig) else {}
@@ -632,10 +623,7 @@ def _has_images(sim_options: Mapping[str, Any]) -> bool:
 
 
 def settings_for(algo: str, sim: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tuned settings of an algorithm for a sim.
-
-    The dict is empty for classic rules and for other environments.
-    """
+    """Return the tuned settings of an algorithm for a sim; empty for classic rules and others."""
     default_rules = sim_options.get("rules", "default") == "default"
     if not (default_rules and issubclass(CONFIGS[algo], ReplayConfig)):
         return {}

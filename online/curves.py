@@ -56,16 +56,11 @@ class CurvePoint:
 
 @dataclass(frozen=True)
 class RunCurve:
-    """The evaluations of a run.
-
-    Attributes:
-        name: Name of the run folder.
-        seeds: Columns of each seed's curve.
-        finals: Scores of the best checkpoint of each seed on new episodes, if known.
-    """
+    """The evaluations of a run."""
 
     name: str
-    seeds: tuple[Curve, ...]
+    seeds: tuple[Curve, ...]  # Columns of each seed's curve
+    # Scores of the best checkpoint of each seed on new episodes, if known.
     finals: tuple[float, ...]
 
 

@@ -51,21 +51,7 @@ class PenalizedDoubleDQN(CQL):
 
 
 class Agents:
-    """K agents with E environments each: replay buffer, networks, and the loop of their training.
-
-    Attributes:
-        config: Settings of each agent.
-        learner: Learner of all agents.
-        buffer: Replay buffer of all agents.
-        behavior: How actions are selected.
-        collector: Collector of the environments; set by `connect`.
-        generator: Generator of the exploration.
-        steps: Number of finished steps of one agent, summed over its environments.
-        learning_starts: Number of steps before the first update.
-        is_pretrained: Whether the agents explore with the final epsilon from the start, without
-            random steps.
-        terms: Terms of the loss of the last update; empty before the first.
-    """
+    """K agents with E environments each: replay buffer, networks, and the training loop."""
 
     def __init__(
         self,
@@ -76,14 +62,12 @@ class Agents:
         device: torch.device,
         log: Callable[[ReplayBuffer], TransitionBuffer] | None = None,
     ) -> None:
-        """Create agents with new weights.
-
-        `log` returns logged transitions, from which a part of each batch is drawn, in the form in
-        which the buffer stores its own.
-        """
+        """Create agents with new weights."""
+        # `log` returns logged transitions for a part of each batch.
         self.config = config
         learner_type, learner_config = _learner_of(config)
         channels = [image.shape[2] for image in encoder.image_inputs]
+        # Replay buffer of all agents.
         self.buffer = ReplayBuffer.allocate(
             encoder,
             action_space,
@@ -104,11 +88,15 @@ class Agents:
             self.learner.max_grad_norm = config.max_grad_norm
         self.learner.learning_rate_at = lambda _: self.learning_rate
         self.generator = torch.Generator(device).manual_seed(seeds[0])
+        # How actions are selected.
         self.behavior = _behavior_of(config, self.learner, self.generator)
-        self.collector: Collector
+        self.collector: Collector  # Collector of the environments; set by `connect`
+        # Number of finished steps of one agent, summed over its environments.
         self.steps = self._episodes = 0
-        self.learning_starts = config.learning_starts
+        self.learning_starts = config.learning_starts  # Number of steps before the first update
+        # Whether the agents explore with the final epsilon from the start, without random steps.
         self.is_pretrained = False
+        # Terms of the loss of the last update; empty before the first.
         self.terms: dict[str, Tensor] = {}
 
     def connect(self, environments: Environments) -> None:
@@ -137,11 +125,7 @@ class Agents:
         return self.config.learning_rate * (1 - (1 - last) * min(done, 1.0))
 
     def step(self) -> Outcome:
-        """Take a step in each environment; then learn, unless it is too early.
-
-        Raises:
-            NotFiniteError: The loss is NaN or infinite.
-        """
+        """Take a step in each environment; then learn, unless it is too early."""
         config = self.config
         outcome = self.collector.step(self.epsilon)
         before, self.steps = self.steps, self.steps + config.envs
@@ -182,12 +166,7 @@ class Agents:
         }
 
     def load_state(self, tensors: Mapping[str, Tensor], counters: Mapping[str, Any]) -> None:
-        """Restore what `state` and `counters` returned.
-
-        Raises:
-            KeyError: A part is missing.
-            RuntimeError, IndexError: A tensor has another shape.
-        """
+        """Restore what `state` and `counters` returned; KeyError or another if a part is wrong."""
         (seed,) = self.learner.seeds
         if counters["is_pretrained"]:
             self.continue_policy()

@@ -41,10 +41,7 @@ def measure_scale(env: gym.Env[Any, Any], *, episodes: int, seed: int) -> Scale:
 
 
 class Evaluation:
-    """Evaluations of one agent, on the same episodes each time, so that they are comparable.
-
-    All episodes run at the same time, one in each environment of a separate batch.
-    """
+    """Evaluations of one agent, each on the same episodes, which run at the same time."""
 
     def __init__(self, env: FirstEpisodes, scale: Scale) -> None:
         """Evaluate in `env`, with these mean returns for the scores 0 and 1."""
@@ -95,20 +92,17 @@ class _Step(NamedTuple):
 
 
 class FirstEpisodes(VectorWrapper):
-    """Recorder of each environment's first episode since the last reset.
+    """Recorder of each environment's first episode since the last reset."""
 
-    Environments reset themselves in the step after the one that ends an episode. Their later
-    episodes are not recorded, because they would overrepresent short episodes.
-
-    Attributes:
-        progress_m: (N,) distance along the path in the first episodes, meters; NaN if unknown.
-    """
+    # Environments reset themselves in the step after the one that ends an episode. Their later
+    # episodes are not recorded, because they would overrepresent short episodes.
 
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> None:
         """Wrap `env`; `env_id` is stored in the log."""
         super().__init__(env)
         self._env_id = env_id
         self._open = np.ones(env.num_envs, dtype=np.bool_)
+        # (N,) distance along the path in the first episodes, meters; NaN if unknown.
         self.progress_m = np.full(env.num_envs, math.nan)
         self._steps: list[_Step] = []
         self._observations: Any = None
@@ -145,10 +139,8 @@ class FirstEpisodes(VectorWrapper):
         return result
 
     def dataset(self) -> Dataset:
-        """Return the episodes, ordered by environment.
-
-        The actions are greedy: their probabilities are 1, and those of a Box have no density.
-        """
+        """Return the episodes by environment."""
+        # Their actions are greedy: probability 1, no density.
         environments = np.concatenate([step.environments for step in self._steps])
         order = np.argsort(environments, kind="stable")
         columns = {

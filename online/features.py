@@ -25,11 +25,10 @@ from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE
 
 
 class NetworkFeatures(BaseFeaturesExtractor):
-    """Layers of a `Trunk` as a features extractor of SB3.
+    """Layers of a `Trunk` as a features extractor of SB3."""
 
-    The inputs are all images, with channels first, and one vector that joins the other parts. The
-    normalization of the images is saved with the weights.
-    """
+    # The inputs are all images, channels first, and one vector that joins the other parts. The
+    # normalization of the images is saved with the weights.
 
     def __init__(self, observation_space: spaces.Space[Any], architecture: Architecture) -> None:
         """Build the layers, with random weights."""
@@ -94,10 +93,8 @@ def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:
 
 
 def inputs_of(space: spaces.Space[Any]) -> tuple[list[str], list[ImageInput]]:
-    """Return the keys of the vectors, and an `ImageInput` for each channels-first image.
-
-    What SB3 takes for images of fewer than `MIN_IMAGE_EDGE` pixels are vectors.
-    """
+    """Return the keys of the vectors, and an `ImageInput` for each channels-first image."""
+    # What SB3 takes for images of fewer than `MIN_IMAGE_EDGE` pixels are vectors.
     vectors, images = [], []
     for key, part in parts_of_space(space).items():
         if is_image(part) and min(part.shape[1:]) >= MIN_IMAGE_EDGE:
@@ -109,13 +106,7 @@ def inputs_of(space: spaces.Space[Any]) -> tuple[list[str], list[ImageInput]]:
 
 
 def normalize_images(policy: nn.Module, images: Sequence[ImageInput], stack: int) -> None:
-    """Set the image normalization of an SB3 policy with this package's networks.
-
-    Args:
-        policy: Policy of SB3.
-        images: Normalization of each image, in the order of the space.
-        stack: Number of successive images that the network receives.
-    """
+    """Set the image normalization of an SB3 policy with this package's networks."""
     large = [image.stacked(stack) for image in images if min(image.shape[:2]) >= MIN_IMAGE_EDGE]
     for module in policy.modules():
         if isinstance(module, NetworkFeatures):

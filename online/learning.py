@@ -83,10 +83,7 @@ class LearningAgent(Agent):
         encoder: ObservationEncoder,
         log: Callable[[ReplayBuffer], TransitionBuffer] | None = None,
     ) -> None:
-        """Create an agent with new weights that observes through an encoder.
-
-        `log` returns the logged transitions that are a part of each batch, if there are any.
-        """
+        """Create an agent with new weights; `log` returns logged transitions for its batches."""
         config, actions = cast(ReplayConfig, self._task.config), self.env.single_action_space
         if config.image_shift and not encoder.image_inputs:
             raise UsageError("image_shift is for images, but the observations have none")
@@ -333,16 +330,10 @@ class LearningAgent(Agent):
 
 
 def fill_buffer(agents: Agents, dataset: Dataset) -> int:
-    """Copy logged transitions into the empty replay buffer of a single agent.
-
-    The buffer has a column of successive steps for each environment. Therefore, the log is split
-    into parts of equal length, one for each environment. An episode that continues beyond the end
-    of a part counts as truncated at that end. If the log has more transitions than the buffer can
-    store, only the last ones are copied.
-
-    Returns:
-        Number of copied transitions, a multiple of the number of environments.
-    """
+    """Copy logged transitions into one agent's empty replay buffer; return their number."""
+    # The buffer has a column of successive steps for each environment, so the log is split into as
+    # many parts of equal length. An episode beyond the end of a part counts as truncated there. Of
+    # a log that is longer than the buffer, the last transitions are copied.
     buffer = agents.buffer
     _check_spaces(dataset, buffer.encoder.space, buffer.action_space)
     envs = buffer.width
@@ -414,11 +405,9 @@ def _check_layers(policy: Policy, theirs: nn.Module, ours: nn.Module) -> None:
 
 @torch.no_grad()
 def _copy_actor(policy: Policy, head: BoxHead, ours: nn.Module, size: int) -> None:
-    """Copy an actor for actions of `size` numbers.
-
-    Outputs are means, and the logarithms of the deviations if both networks have them. Where only
-    the agent's has them, they become those of the policy, or 0.
-    """
+    """Copy an actor for actions of `size` numbers."""
+    # Outputs are means, and the logarithms of the deviations if both networks have them. Where only
+    # the agent's has them, they become those of the policy, or 0.
     (*theirs, their_last), (*layers, last) = _layers(head.networks["actor"]), _layers(ours)
     if [layer.weight.shape for layer in theirs] != [layer.weight.shape for layer in layers]:
         _check_layers(policy, head.networks["actor"], ours)

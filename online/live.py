@@ -123,11 +123,7 @@ class LiveTraining:
             self.stream.close()
 
     def _source_of(self, batch: Any) -> Callable[[object], object]:
-        """Return a function that maps the last action to the object whose scene is shown.
-
-        The action is that of the watched environment, or None after a reset. The function returns
-        None if no scene can be shown.
-        """
+        """Return a function from the last action (None: a reset) to the shown object or None."""
         single = self._shown.unwrapped
         if isinstance(batch, BatchedEnv) and isinstance(single, VehicleEnv):
 
@@ -142,12 +138,7 @@ class LiveTraining:
 
 
 class WatchedBatch(VectorWrapper):
-    """Wrapper of a batch of environments that shows the first one in the live view.
-
-    Attributes:
-        shown: Agent that trains in these environments; nothing is shown before it is set.
-        score: Score of the last evaluation; NaN before the first one.
-    """
+    """Wrapper of a batch of environments that shows the first one in the live view."""
 
     def __init__(
         self,
@@ -156,14 +147,11 @@ class WatchedBatch(VectorWrapper):
         algo: str,
         source: Callable[[object], object],
     ) -> None:
-        """Wrap `env`, and store the source of the scene.
-
-        `source` returns an object with the scene of the watched environment. Its argument is the
-        last action of this environment, or None after a reset.
-        """
+        """Wrap `env`; `source` maps its last action, None after a reset, to the scene's object."""
         super().__init__(env)
+        # Agent that trains in these environments; nothing is shown before it is set.
         self.shown: Shown | None = None
-        self.score = math.nan
+        self.score = math.nan  # Score of the last evaluation; NaN before the first one
         self._stream, self._algo, self._source = stream, algo, source
         self._observations: Any = None
         self._last_action: NDArray[Any] | None = None
@@ -248,14 +236,7 @@ class WatchedBatch(VectorWrapper):
 
 
 def numbered_values(q: Tensor, preference: Tensor, value: float, taken: int) -> dict[str, Any]:
-    """Return the fields of `values_schema` for one of A actions.
-
-    Args:
-        q: (A,) values of the actions; NaN if unknown.
-        preference: (A,) probabilities of the actions; softmax of q if the policy is greedy.
-        value: Value of the state.
-        taken: Number of the action that was taken.
-    """
+    """Return the fields of `values_schema` for one of A actions."""
     best = int(preference.argmax())
     entropy = torch.special.entr(preference).sum() / math.log(max(len(preference), 2))
     return {
@@ -279,16 +260,7 @@ def command_values(
     q: float = math.nan,
     value: float = math.nan,
 ) -> dict[str, Any]:
-    """Return the fields of `values_schema` for one action of a Box.
-
-    Args:
-        command: Greedy action of the policy.
-        taken: Action that was taken.
-        space: Space of both.
-        log_prob: Log density of the action that was taken.
-        q: Value of the action that was taken.
-        value: Value of the greedy action.
-    """
+    """Return the fields of `values_schema` for one action of a Box."""
     columns = command_columns(command[None], taken[None], space)
     return {
         **{name: column[0] for name, column in columns.items()},

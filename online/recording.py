@@ -35,17 +35,9 @@ def log_paths(record: Path, seeds: range, resume: bool) -> dict[int, Path]:
 def recorded(
     env: VectorEnv[Any, Any, Any], path: Path, *, algo: str, seed: int, episodes: int | None = None
 ) -> RecordVecMcap:
-    """Wrap a batch of environments to record each step of training.
-
-    Args:
-        env: Environments.
-        path: Log to write.
-        algo: Name of the algorithm.
-        seed: Seed of the agent.
-        episodes: Number of episodes that an existing log keeps, -1 for all, before the new ones are
-            appended; None for a new log. An unfinished log is recovered first. The files before the
-            recovery and before the cut are kept beside the log.
-    """
+    """Wrap a batch of environments to record each step of training."""
+    # An existing log keeps `episodes`, -1 for all; None makes a new log. An unfinished log is
+    # recovered first. The files before the recovery and before the cut are kept beside the log.
 
     def wrap(append: bool) -> RecordVecMcap:
         return RecordVecMcap(env, path, policy=algo, policy_version=0, seed=seed, append=append)

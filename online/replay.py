@@ -30,22 +30,15 @@ from mcaprl.recorder.dataset.dataset import Dataset
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Outcome of one step of W environments that reset themselves when an episode ends.
+    """Outcome of one step of W environments that reset themselves when an episode ends."""
 
-    Attributes:
-        rewards: (W,) float32.
-        terminated: (W,) bool.
-        truncated: (W,) bool.
-        observations: W observations, the first ones of new episodes where an episode ended.
-        finals: Last observations of the episodes that ended.
-        ended: (E,) int64, environments of `finals`; None if `finals` has a row for each.
-    """
-
-    rewards: Tensor
-    terminated: Tensor
-    truncated: Tensor
+    rewards: Tensor  # (W,) float32
+    terminated: Tensor  # (W,) bool
+    truncated: Tensor  # (W,) bool
+    # W observations, the first ones of new episodes where an episode ended.
     observations: Observations
-    finals: Observations
+    finals: Observations  # Last observations of the episodes that ended
+    # (E,) int64, environments of `finals`; None if `finals` has a row for each.
     ended: Tensor | None
 
 
@@ -368,14 +361,10 @@ class MixedBuffer(ReplayBuffer):
 
     See "Efficient Online Reinforcement Learning with Offline Data",
     https://arxiv.org/abs/2302.02948. Row i of the log has the number `len(self) + i`.
-
-    Attributes:
-        log: Logged transitions.
-        fraction: Part of each batch that is drawn from the log.
     """
 
-    log: TransitionBuffer
-    fraction: float
+    log: TransitionBuffer  # Logged transitions
+    fraction: float  # Part of each batch that is drawn from the log
 
     @classmethod
     def of(cls, buffer: ReplayBuffer, log: TransitionBuffer, fraction: float) -> MixedBuffer:
@@ -424,12 +413,7 @@ def _log_parts(log: TransitionBuffer) -> Iterator[tuple[str, Tensor]]:
 
 
 def packed_log(dataset: Dataset, buffer: ReplayBuffer) -> TransitionBuffer:
-    """Return logged transitions in the form in which a replay buffer stores its own.
-
-    Raises:
-        SpaceError: The log has other spaces, or actions outside the Box.
-        TrainingError: There are no transitions, or a number is NaN or infinite.
-    """
+    """Return logged transitions in the form in which a replay buffer stores its own."""
     packed = TransitionBuffer.from_dataset(
         dataset, buffer.packing, encoder=buffer.encoder, reward_scale=1.0, box=buffer.box
     )
@@ -439,11 +423,7 @@ def packed_log(dataset: Dataset, buffer: ReplayBuffer) -> TransitionBuffer:
 
 
 def restored_log(tensors: Mapping[str, Tensor], buffer: ReplayBuffer) -> TransitionBuffer:
-    """Return the log of a `MixedBuffer` from its state, without the prefix `log.`.
-
-    Raises:
-        KeyError: A tensor is missing.
-    """
+    """Return the log of a `MixedBuffer` from its state, without the prefix `log.`."""
     count = sum(name.startswith("frames.") for name in tensors)
     vector, *images = (tensors[f"frames.{number}"] for number in range(count))
     parts: dict[str, Any] = {name: tensors[name] for name in _LOG_PARTS}

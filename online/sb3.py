@@ -111,11 +111,7 @@ _COUNTERS = (
 
 
 class ModelAgent(Agent):
-    """Agent of one seed, trained by a model of SB3.
-
-    Attributes:
-        model: Model of SB3.
-    """
+    """Agent of one seed, trained by a model of SB3."""
 
     best_files = (BEST_NAME,)
     repeats_steps = False
@@ -254,10 +250,7 @@ class ModelAgent(Agent):
         return float(behavior_of(self.model, self._actions)[WATCHED])
 
     def values(self, taken: NDArray[Any]) -> dict[str, Any]:
-        """Return the fields of `values_schema` for the action of the watched environment.
-
-        The values of the actions of a Box are unknown.
-        """
+        """Return the fields of `values_schema` for the watched action; unknown values for a Box."""
         model = self.model
         observation: Any = rows_of(model._last_obs, slice(WATCHED, WATCHED + 1))
         if isinstance(model.action_space, spaces.Box):
@@ -421,15 +414,9 @@ def behavior_of(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArray[np.float
 
 
 def behavior_log_densities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the log densities (N,) with which the model chose these actions of a Box.
-
-    PPO, A2C and TD3 clip their normal distributions, so an action with a number at a bound has a
-    probability instead of a density: NaN.
-
-    Args:
-        model: Model in training, which chose `actions` for its last observations.
-        actions: Actions (N, *shape).
-    """
+    """Return the log densities (N,) with which the model chose these actions of a Box."""
+    # PPO, A2C and TD3 clip their normal distributions, so an action with a number at a bound has a
+    # probability instead of a density: NaN.
     box = BoxActions.of(cast(spaces.Box, model.action_space))
     numbers = torch.from_numpy(box.scaled(actions)).double()
     if exploration(model) == 1.0:
@@ -456,16 +443,9 @@ def behavior_log_densities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArr
 
 
 def behavior_probabilities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the probabilities with which the model chose these actions of a finite space.
-
-    With a Q-network and A actions, the probability of each action is epsilon / A, plus 1 - epsilon
-    for the greedy action. At each step, SB3 explores either in all environments or in none; the
-    result is the marginal probability.
-
-    Args:
-        model: Model in training, which chose `actions` for its last observations.
-        actions: Actions (N,).
-    """
+    """Return the probabilities with which the model chose these actions of a finite space."""
+    # With a Q-network, they are epsilon / A, plus 1 - epsilon for the greedy action. SB3 explores
+    # either in all environments or in none; these are the marginal probabilities.
     policy = model.policy
     with torch.inference_mode():
         if isinstance(model, DQN):
@@ -556,16 +536,11 @@ def _load_generators(model: BaseAlgorithm, states: Mapping[str, Any]) -> None:
 
 
 class BatchedVecEnv(VecEnv):
-    """A `gymnasium.vector.VectorEnv` with SB3's interface.
+    """A `gymnasium.vector.VectorEnv` with SB3's interface."""
 
-    At an episode's end, `infos[i]` contains the entries that SB3 reads: `terminal_observation`,
-    `TimeLimit.truncated`, and `episode` with the entries of SB3's `Monitor`. It also contains
-    `reason` and `progress_m` if the environment reports them. At other steps, `infos[i]` is
-    empty.
-
-    Attributes:
-        before_step: Callback that receives the actions (N,) before each step, if any.
-    """
+    # At an episode's end, `infos[i]` has what SB3 reads: `terminal_observation`,
+    # `TimeLimit.truncated`, and `episode` as of SB3's `Monitor`; also `reason` and `progress_m` if
+    # reported.
 
     def __init__(self, env: Any) -> None:
         """Adapt `env`. In the step that ends an episode, it must also reset that environment."""
@@ -573,6 +548,7 @@ class BatchedVecEnv(VecEnv):
         assert env.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP
         self.env: Any = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        # Callback that receives the actions (N,) before each step, if any.
         self.before_step: Callable[[NDArray[Any]], None] | None = None
         self._actions: NDArray[Any] = np.zeros(0)
         self._returns = np.zeros(env.num_envs)

@@ -83,13 +83,7 @@ def default_algo(sim: str, sim_options: Mapping[str, Any]) -> str:
 
 
 def choose_engine(algo: str, engine: str | None) -> str:
-    """Return the engine that trains an algorithm; None selects the first one that has it.
-
-    Raises:
-        UnknownNameError: There is no such engine.
-        UsageError: The engine does not have the algorithm.
-        MissingExtraError: The package of the algorithm is not installed.
-    """
+    """Return the engine that trains an algorithm; None selects the first one that has it."""
     if algo == "tqc":
         import_extra("sb3_contrib", "contrib")
     if engine is None:
@@ -248,10 +242,8 @@ def choose_task(
     with_logs: bool = False,
     with_policy: bool = False,
 ) -> Task:
-    """Return the task that the arguments of a command line describe.
-
-    `with_logs` and `with_policy` say what the agents start from.
-    """
+    """Return the task that arguments describe."""
+    # `with_logs`, `with_policy` are what it starts from.
     is_resumed = resumed is not None and run_to_resume(resumed)
     if sim is not None and preset is None and not is_resumed:
         algo = algo or default_algo(sim, sim_options)

@@ -85,39 +85,10 @@ def train(
     live: LiveTraining | None = None,
     progress: ProgressCallback | None = None,
 ) -> list[OnlineSummary]:
-    """Train in an environment; the same seed and machine produce the same curve.
-
-    Args:
-        task: Task such as `Task.for_sim("lane")`.
-        out: Folder of the run; it must be empty or not exist.
-        seeds: Number of agents to train, one after the other. None selects 1; with `resume`, that
-            of the run.
-        seed: Seed of the first agent; agent k uses seed + k. None selects 0; with `resume`, that of
-            the run.
-        record: Path of a log of every transition, written during training. With several seeds, this
-            is a folder with one log for each seed.
-        data: Logged transitions that initialize the replay buffer.
-        policy: Trained policy with Q-values whose weights initialize the agents, or a list with one
-            policy for each seed.
-        sources: Paths of `data` and `policy`, for `sources_to_resume`.
-        resume: Whether to resume from the checkpoints in `out`. Seeds without one start at step 0,
-            from `data` and `policy`.
-        live: Live view of the training; its layout is written into `out`.
-        progress: Callback for progress; None shows a bar if stderr is a terminal.
-
-    Returns:
-        One summary for each seed.
-
-    Raises:
-        UnknownNameError: There is no such sim.
-        UsageError: The run to resume has other seeds, a seed is too large, or `record` is not the
-            name of a log.
-        OutputExistsError: `out` or `record` exists.
-        SpaceError: The algorithm does not support these observations or actions.
-        PolicyError: The networks of `policy` and the agent differ.
-        TrainingError: `out` cannot be written, another training process uses it, or it contains a
-            run of another task. Or there is no run to resume.
-    """
+    """Train in an environment; the same seed and machine produce the same curve."""
+    # The arguments, results and errors are those of `mcaprl.train_online`. `data` fills the replay
+    # buffer; `policy` has weights for all agents, or one for each seed; `sources` are the paths of
+    # both, for `sources_to_resume`.
     folder = Path(out)
     numbers = choose_seeds(folder, seeds, seed, resume)
     if numbers.stop > _SEEDS:
@@ -142,10 +113,7 @@ def train(
 
 
 def sources_to_resume(folder: Path, seeds: range) -> list[str]:
-    """Return the paths of the logs and the policy that a run still needs.
-
-    Seeds with a checkpoint need none, so the list is empty if all have one.
-    """
+    """Return the paths of the logs and the policy of seeds that have no checkpoint yet."""
     places = (folder / f"seed-{seed}" / CHECKPOINT_NAME for seed in seeds)
     return [] if all(path.exists() for path in places) else _sources_of(folder)
 

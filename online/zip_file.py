@@ -107,13 +107,7 @@ _KNOWN_KWARGS = {"net_arch", "activation_fn", "optimizer_kwargs", "optimizer_cla
 
 
 def write_model(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -> None:
-    """Save a model in a file that plain SB3 loads, and that this package loads without unpickling.
-
-    Args:
-        path: File to replace.
-        model: Model of SB3.
-        description: JSON object that `read_model` returns.
-    """
+    """Save a model in a file that plain SB3 loads, and this package without unpickling."""
     content = io.BytesIO()
     model.save(content, exclude=_LEFT_OUT)
     with zipfile.ZipFile(content, "a") as archive:
@@ -122,12 +116,7 @@ def write_model(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -
 
 
 def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any], dict[str, Tensor]]:
-    """Read a model's file.
-
-    Returns:
-        The description given to `write_model` (empty for files of plain SB3); SB3's own data, whose
-        pickled values are not unpickled; and the weights by name.
-    """
+    """Read a file: description, SB3's data (pickled values stay pickled), and weights by name."""
     try:
         check_regular(path)
         with zipfile.ZipFile(path) as archive:
@@ -290,10 +279,7 @@ def _build(
 
 
 def policy_of(network: BasePolicy, description: dict[str, Any], name: str) -> Policy:
-    """Return the greedy policy of a model in training, which shares the weights of `network`.
-
-    `description` is that of `describe_run`.
-    """
+    """Return the greedy policy of a model in training, which shares the weights of `network`."""
     found: _Description = as_type(_Description, {"network": "", **description}, OWN_NAME)
     return _policy(network, found, name, exact=True)
 
@@ -369,10 +355,7 @@ def _policy_type(network: str, space: spaces.Space[Any]) -> type[BasePolicy]:
 
 
 class ModelEncoder(ObservationEncoder):
-    """Encoder for SB3's networks, which normalize images and have no masks.
-
-    Images in the files and observations of SB3 may have their channels first.
-    """
+    """Encoder for SB3's networks: no masks, normalized images, which may have channels first."""
 
     is_image = staticmethod(is_image)
     layout = ""
@@ -437,11 +420,10 @@ class ClampedGaussian(SquashedGaussian):
 
 
 class ClippedGaussian(BoxHead):
-    """Normal distributions of SB3's PPO and A2C, whose actions are clipped to the Box.
+    """Normal distributions of SB3's PPO and A2C, whose actions are clipped to the Box."""
 
-    Outputs (B, 2, n) are means and log deviations, for actions scaled to [-1, 1]. An action with a
-    number at a bound has a probability instead of a density: NaN.
-    """
+    # Outputs (B, 2, n) are means and log deviations, for actions scaled to [-1, 1]. An action with
+    # a number at a bound has a probability instead of a density: NaN.
 
     @staticmethod
     def output_shape(size: int) -> tuple[int, ...]:
@@ -577,12 +559,8 @@ def _are_weights(found: object) -> bool:
 
 
 def describe_sb3(data: Mapping[str, Any], weights: Mapping[str, Any]) -> dict[str, Any]:
-    """Derive the description of a policy from a file of plain SB3.
-
-    Returns:
-        Description as `save_policy` writes it. The bounds of observations are unknown; they are set
-        to 0 and 255 for uint8, else to infinity.
-    """
+    """Derive the description of a policy, as `save_policy` writes it, from plain SB3's file."""
+    # Unknown bounds of observations are set to 0 and 255 for uint8, else to infinity.
     kwargs = data.get("policy_kwargs") or {}
     own = {key: value for key, value in kwargs.items() if not key.startswith(":")}
     unknown = sorted(set(own) - _KNOWN_KWARGS)
