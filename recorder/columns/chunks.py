@@ -172,18 +172,12 @@ _IDLE_BYTES = 2**20
 
 
 class Scratch:
-    """Memory that one thread reuses for each chunk it decompresses.
-
-    The first access to new memory costs as much as the decompression itself, so chunks whose
-    records are used only briefly share memory.
-
-    Attributes:
-        kept: Offset and records of the last decompressed chunk; the caller sets them.
-    """
+    """Memory that one thread reuses, as first access costs as much as decompression."""
 
     def __init__(self) -> None:
         """Create empty scratch memory."""
         self._memory = np.empty(0, np.uint8)
+        # Offset and records of the last decompressed chunk; the caller sets them.
         self.kept = _NOTHING
 
     def take(self, size: int) -> memoryview:
@@ -197,10 +191,8 @@ class Scratch:
 
 
 def chunk_records(file: memoryview, offset: int, scratch: Scratch | None = None) -> memoryview:
-    """Return the records of the chunk at `offset`, decompressed and checked against their CRC.
-
-    The records are valid until the next use of `scratch`; without `scratch`, they get new memory.
-    """
+    """Return the records of the chunk at `offset`, decompressed and checked against their CRC."""
+    # The records are valid until the next use of `scratch`; without it, they get new memory.
     header = chunk_header(file, offset)
     records = _decompress(file[header.data], header, offset, scratch or Scratch())
     if len(records) != header.uncompressed_bytes:
@@ -234,10 +226,7 @@ def _decompress(data: memoryview, header: ChunkHeader, offset: int, scratch: Scr
 
 
 def _inflate_zstd(data: memoryview, scratch: Scratch, limit: int) -> memoryview:
-    """Decompress at most `limit` bytes.
-
-    If the frame header states the size, one call of the decompressor is enough.
-    """
+    """Decompress at most `limit` bytes."""
     memory, count = scratch.take(limit), 0
     try:
         # Creating a decompressor takes a tenth as long as decompressing a chunk.
@@ -340,12 +329,8 @@ def parse_chunk_index(content: memoryview) -> ChunkIndex:
 
 
 def indexes_of_one(summary: memoryview) -> NDArray[Any]:
-    """Return the leading ChunkIndex records of chunks with one channel and zstd compression.
-
-    Returns:
-        Copy of the records, an array of `_INDEX_OF_ONE`. Parsing many records takes a hundredth of
-        the time of `parse_chunk_index`.
-    """
+    """Return a copy of the leading ChunkIndex records of zstd chunks with one channel."""
+    # Parsing many records takes a hundredth of the time of `parse_chunk_index`.
     size = _INDEX_OF_ONE.itemsize
     rows = np.frombuffer(summary, _INDEX_OF_ONE, len(summary) // size)
     are_such = np.ones(len(rows) + 1, bool)
@@ -358,10 +343,7 @@ def indexes_of_one(summary: memoryview) -> NDArray[Any]:
 
 
 class ChunkIndexes(LazySequence[ChunkIndex]):
-    """Indexes of chunks, in file order.
-
-    A log of 100 million transitions has 24,000 chunks, and reading an episode needs two of them.
-    """
+    """Indexes of chunks in file order, parsed on demand: a long log has many thousands."""
 
     def __init__(self, rows: NDArray[Any], others: Sequence[ChunkIndex] = ()) -> None:
         """Sort indexes by the offset of their chunk."""

@@ -53,11 +53,7 @@ def full_name(name: str) -> str:
 
 
 def parsed_types(name: str, text: str, encoding: str) -> dict[str, Any]:
-    """Parse a definition.
-
-    Returns:
-        Constants and fields of each type by its name, as rosbags describes them.
-    """
+    """Parse a definition: constants and fields of each type by name, as rosbags describes them."""
     text = text.replace("\r\n", "\n").replace("\r", "\n").strip("\ufeff\0")
     try:
         if encoding != "ros2idl":
@@ -184,24 +180,18 @@ class TypeSource(Hashable, Protocol):
 
 
 class Definitions:
-    """A type and all types that are nested in it.
-
-    Attributes:
-        name: Full name of the type.
-        types: Constants and fields of each type by its full name, as rosbags describes them,
-            without the fields that cannot be read.
-        unreadable: Reason by dotted path for each field that cannot be read: a wide string, and
-            all fields after it.
-        whole: As `types`, with the fields that cannot be read.
-        is_own: Whether the file defines all types.
-    """
+    """A type and all types that are nested in it."""
 
     def __init__(self, name: str, types: dict[str, Any], *, is_own: bool = True) -> None:
         """Check the parsed definitions; see `definitions_of`."""
-        self.name, self.is_own = name, is_own
+        self.name, self.is_own = name, is_own  # Whether the file defines all types
         check_size(types, name)
+        # Reason by dotted path for each field that cannot be read: a wide string, and all fields
+        # after it.
         self.unreadable: dict[str, str] = {}
-        self.whole = types
+        self.whole = types  # As `types`, with the fields that cannot be read
+        # Constants and fields of each type by its full name, as rosbags describes them, without the
+        # fields that cannot be read.
         self.types = _readable(types, name, self.unreadable)
 
     @property
@@ -248,11 +238,7 @@ class Definitions:
         return self._store.generate_msgdef(self.name, ros_version=1)[1]
 
     def encode(self, message: Any, *, is_ros1: bool = False) -> bytes:
-        """Encode a dict, or an object with an attribute for each field; absent fields are zeros.
-
-        Raises:
-            LogError: A value does not fit its field.
-        """
+        """Encode a dict, or an object with an attribute for each field; absent fields are zeros."""
         store = self._store
         try:
             encoded = store.serialize_ros1 if is_ros1 else store.serialize_cdr
@@ -280,11 +266,7 @@ def definitions_of(
     distribution: str = "",
     others: TypeSource | None = None,
 ) -> Definitions:
-    """Return a type and all types that are nested in it.
-
-    The definition of each type is that of the file, or else that of `others`, or else that of the
-    distribution.
-    """
+    """Return a type and its nested types: those of the file, of `others`, of the distribution."""
     if len(text) > MAX_DEFINITION_BYTES:
         raise LogError(
             f"the definition of {name} has {len(text)} characters; at most"
@@ -338,12 +320,9 @@ def _collected(
 def leaf_kinds(
     types: Mapping[str, Any], name: str, prefix: str = "", *, inner: bool = False
 ) -> dict[str, str]:
-    """Return the kind of each leaf field of a type by its dotted path.
-
-    Kinds of numbers, strings and arrays are, for example, `float64`, `string`, `float32[36]` and
-    `uint8[]`. Times and durations have the kind `time`; their fields `sec` and `nanosec` are leaf
-    fields as well. The kind of an array of messages is, for example, `geometry_msgs/msg/Point[]`.
-    """
+    """Return the kind of each leaf field of a type by its dotted path."""
+    # Kinds are such as `float64`, `string`, `float32[36]`, `uint8[]`, `geometry_msgs/msg/Point[]`,
+    # and `time` for times and durations, whose `sec` and `nanosec` are leaf fields as well.
     found = dict[str, str]()
     for field, description in types[name][1]:
         found |= _field_kinds(types, description, f"{prefix}{field}", inner=inner)
@@ -390,11 +369,9 @@ def _nested(description: Any) -> list[str]:
 
 
 def _readable(types: dict[str, Any], name: str, unreadable: dict[str, str]) -> dict[str, Any]:
-    """Return the types without the fields that cannot be read, which are added to `unreadable`.
-
-    The encoding of a wide string depends on the DDS of the robot, so that the positions of all
-    fields after it are unknown.
-    """
+    """Return the types without the fields that cannot be read, which are added to `unreadable`."""
+    # The encoding of a wide string depends on the DDS of the robot, so that the positions of all
+    # fields after it are unknown.
     found = dict(types)
     is_wide: dict[str, bool] = {}
 
@@ -459,19 +436,12 @@ def element_of(description: Any) -> tuple[Any, Any]:
 
 
 class _Size(NamedTuple):
-    """Size of a type.
+    """Size of a type."""
 
-    Attributes:
-        leaves: Number of leaf fields, with those in arrays of messages.
-        depth: Number of levels of nested messages.
-        messages: Number of nested messages in the smallest message of the type.
-        least_bytes: Number of bytes of the smallest message of the type, without padding.
-    """
-
-    leaves: int
-    depth: int
-    messages: int
-    least_bytes: int
+    leaves: int  # Number of leaf fields, with those in arrays of messages
+    depth: int  # Number of levels of nested messages
+    messages: int  # Number of nested messages in the smallest message of the type
+    least_bytes: int  # Number of bytes of the smallest message of the type, without padding
 
 
 class _Sizes:

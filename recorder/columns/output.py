@@ -59,11 +59,7 @@ except ImportError:
 
 
 class HoldSignals:
-    """Context manager that delays signals until its end, where they are handled as usual.
-
-    A context has an effect only in the main thread, where Python runs all handlers. A nested
-    context has no effect.
-    """
+    """Context that delays signals to its end, in the main thread alone; nested, it does nothing."""
 
     _is_held: ClassVar[bool] = False
 
@@ -117,10 +113,8 @@ _COPIED_BYTES = 2**20
 
 
 def create(path: Path, *, overwrite: bool) -> FileIO:
-    """Create and lock a file and the missing folders of its path.
-
-    If a file is overwritten, processes that have it open still read the old contents.
-    """
+    """Create and lock a file and the missing folders of its path."""
+    # If a file is overwritten, processes that have it open still read the old contents.
     check_target(path, overwrite=overwrite)
     try:
         if path.exists():
@@ -158,15 +152,8 @@ def release(file: FileIO) -> None:
 
 
 def replaced(path: Path, locked: FileIO, length: int) -> FileIO:
-    """Replace a file with a locked copy of its first bytes. Current readers keep the old file.
-
-    The old file is released once the copy is in place; an error leaves the old file unchanged.
-
-    Args:
-        path: Path of the file; a symbolic link is followed.
-        locked: The file, locked by the caller.
-        length: Number of bytes to copy; the returned file is positioned after them.
-    """
+    """Replace a file with a locked copy of its first bytes. Current readers keep the old file."""
+    # The old file is released once the copy is in place; an error leaves it unchanged.
     path = path.resolve()
     with work_folder(path) as folder:
         unfinished = folder / path.name
@@ -208,16 +195,12 @@ _JOINED_BYTES = 2**16
 
 
 class OutputFile:
-    """Locked file to which whole records are written.
-
-    Attributes:
-        path: Path of the file.
-        position: Length of the file so far.
-    """
+    """Locked file to which whole records are written."""
 
     def __init__(self, path: Path, file: FileIO) -> None:
         """Start at the beginning of an empty file."""
         self.path, self._file = path, file
+        # Length of the file so far.
         self.position, self._crc, self._summary, self._data_end = 0, 0, Summary(), 0
 
     def is_at(self, path: str | Path) -> bool:
@@ -237,15 +220,7 @@ class OutputFile:
         data: bytes | memoryview,
         compression: str,
     ) -> None:
-        """Write a chunk and its message indexes.
-
-        Args:
-            records: Records of the chunk.
-            indexes: Entries of `records.INDEX_ENTRY` as bytes, by channel id.
-            times: Smallest and largest log_time, nanoseconds.
-            data: Compressed records.
-            compression: Name of the compression in the Chunk record.
-        """
+        """Write a chunk and its message indexes; `times` are its smallest and largest log_time."""
         assert len(records) <= MAX_CHUNK_BYTES, "readers refuse larger chunks"
         header = ChunkHeader(
             *times, len(records), crc32(records), compression, data=slice(0, len(data))
@@ -352,10 +327,8 @@ _CHUNK_RECORDS = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX)
 def compact(
     path: Path, file: FileIO, summary: Summary, data_end: int, compressors: Compressors
 ) -> None:
-    """Rewrite a finished file with larger chunks if it has many small chunks.
-
-    An error while writing leaves the original unchanged.
-    """
+    """Rewrite a finished file of many small chunks with larger ones."""
+    # An error leaves it unchanged.
     groups = groups_of(summary.chunks)
     saved = len(summary.chunks) - len(groups)
     if saved < _MIN_CHUNKS_SAVED or data_end > saved * _MAX_BYTES_PER_CHUNK:
@@ -375,11 +348,9 @@ def compact(
 
 
 def groups_of(chunks: Iterable[ChunkIndex]) -> list[list[ChunkIndex]]:
-    """Group the source chunks, so that each group becomes one chunk of the compacted file.
-
-    Groups are in file order. A merged chunk takes the place of its last source chunk. Thus all
-    top-level records that the merged chunk needs come before it.
-    """
+    """Group the source chunks, so that each group becomes one chunk of the compacted file."""
+    # A merged chunk takes the place of its last source chunk. Thus all top-level records that it
+    # needs come before it.
     chunks = list(chunks)
     kinds = _kinds(chunks)
     groups: list[list[ChunkIndex]] = []

@@ -490,11 +490,9 @@ class McapReader:
         chunk: ChunkIndex | None,
         unchunked: UnindexedMessages,
     ) -> list[ChunkIndex]:
-        """Read the records from `start` to `stop` (None: to the end) and return the chunks found.
-
-        Message indexes before the first of these chunks belong to `chunk`, which ends at `start`.
-        Messages outside of chunks are added to `unchunked`.
-        """
+        """Read the records from `start` to `stop` (or the end), and return the chunks found."""
+        # Message indexes before the first of these chunks belong to `chunk`, which ends at `start`.
+        # Messages outside of chunks are added to `unchunked`.
         self.data_end, found = start, []
         for offset, opcode, content in records_of(self._view, start, stop):
             if opcode == Opcode.CHUNK:

@@ -102,10 +102,9 @@ def message_record(
 
 
 class FieldCopy:
-    """Compiled check of messages of one size, and copy of their fields to columns.
+    """Compiled check of messages of one size, and copy of their fields to columns."""
 
-    Without the compiled module, calls return False.
-    """
+    # Without the compiled module, calls return False.
 
     def __init__(
         self,
@@ -114,14 +113,7 @@ class FieldCopy:
         constants: Iterable[tuple[int, bytes]] = (),
         columns: Iterable[tuple[int, NDArray[Any]]] = (),
     ) -> None:
-        """Store what is expected and copied.
-
-        Args:
-            channel_id: Channel of the messages.
-            size: Number of bytes of each record.
-            constants: Offsets in the payload, with the bytes that must be there.
-            columns: Offsets in the payload, with the contiguous column for the field there.
-        """
+        """Store what is expected and copied, by offsets in the payload."""
         payload = MESSAGE_HEADER.itemsize
         self._size = size
         self._expected = [(0, _head(channel_id, size))]
@@ -129,12 +121,7 @@ class FieldCopy:
         self._targets = [(payload + offset, column) for offset, column in columns]
 
     def __call__(self, records: memoryview, index: NDArray[Any], row: int = 0) -> bool:
-        """Check and copy messages, in one pass.
-
-        Returns:
-            Whether all messages are in the chunk and have the times of the index, the channel, the
-            size and the constants; if not, the contents of the rows are undefined.
-        """
+        """Check and copy messages in one pass; if it is False, the rows are undefined."""
         if copy_fields is None:
             return False
         return copy_fields(records, index, self._size, self._expected, self._targets, row)
@@ -186,16 +173,13 @@ def message_index(file: memoryview, offset: int, channel_id: int) -> NDArray[Any
 
 
 class MessageRange:
-    """Messages of one channel, in one chunk or outside of chunks. `len()` returns their number.
-
-    Attributes:
-        chunk: Chunk with the messages; None for unchunked messages.
-    """
+    """Messages of one channel, in one chunk or outside of chunks. `len()` returns their number."""
 
     def __init__(
         self, chunk: ChunkIndex | None, count: int, read: Callable[[MessageRange], NDArray[Any]]
     ) -> None:
         """Store the number of messages, and the function that reads the index of a range."""
+        # Chunk with the messages; None for unchunked messages.
         self.chunk, self._count, self._read = chunk, count, read
 
     @classmethod
@@ -205,10 +189,7 @@ class MessageRange:
 
     @cached_property
     def index(self) -> NDArray[Any]:
-        """Array of `INDEX_ENTRY`, one entry for each message.
-
-        It is read from the file at first use.
-        """
+        """Array of `INDEX_ENTRY`, one per message; read from the file at first use."""
         return self._read(self)
 
     def __len__(self) -> int:
@@ -245,12 +226,7 @@ class LazySequence(ABC, Generic[Item]):
 
 
 class MessageRanges(LazySequence[MessageRange]):
-    """Message ranges of one channel, in file order.
-
-    Attributes:
-        counts: (P,) number of messages of each range.
-        chunks: (P,) number of the chunk of each range; -1 for unchunked messages.
-    """
+    """Message ranges of one channel, in file order."""
 
     def __init__(
         self,
@@ -264,6 +240,8 @@ class MessageRanges(LazySequence[MessageRange]):
         if made and len(kept) < len(counts):
             made = {new: made[old] for new, old in enumerate(kept.tolist()) if old in made}
         super().__init__(len(kept), made)
+        # (P,) number of the chunk of each range; -1 for unchunked messages.
+        # (P,) number of messages of each range.
         self.counts, self.chunks = counts[kept], chunks[kept]
         self._range_of = range_of
 
@@ -272,21 +250,16 @@ class MessageRanges(LazySequence[MessageRange]):
 
 
 def as_items(column: NDArray[Any]) -> NDArray[Any]:
-    """Return a view of vectors (K, n) as (K,) items; other columns are returned unchanged.
-
-    Copying whole vectors as items is faster than copying their numbers one by one.
-    """
+    """Return a view of vectors (K, n) as (K,) items, which are copied faster; others unchanged."""
     if column.ndim != 2 or not column.size:
         return column
     return column.view(np.dtype((np.void, column.shape[1] * column.itemsize)))[:, 0]
 
 
 def gather(records: memoryview, index: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return the messages at the entries of `index` as one structured array.
-
-    Adjacent messages are not copied. Other messages are copied by fancy indexing of void items, at
-    the speed of memcpy; fancy indexing of structured items takes twenty times as long.
-    """
+    """Return the messages at the entries of `index` as one structured array."""
+    # Adjacent messages are not copied. Others are copied as void items, at the speed of memcpy;
+    # fancy indexing of structured items takes twenty times as long.
     offsets, size = index["offset"], dtype.itemsize
     if len(offsets) == 0:
         return np.empty(0, dtype)
@@ -316,10 +289,7 @@ def are_adjacent(offsets: NDArray[Any], size: int, end: int) -> bool:
 
 @lru_cache(maxsize=2)
 def adjacent_offsets(first: int, last: int, size: int) -> NDArray[np.uint64]:
-    """Return the offsets of adjacent messages.
-
-    They are cached, because full chunks have equal offsets.
-    """
+    """Return the offsets of adjacent messages, cached, because full chunks have equal ones."""
     return np.arange(first, last + 1, size, dtype=np.uint64)
 
 
@@ -442,10 +412,7 @@ def map_unchanged(path: Path) -> tuple[memoryview, os.stat_result]:
 def records_of(
     view: memoryview, start: int, stop: int | None = None
 ) -> Iterator[tuple[int, int, memoryview]]:
-    """Yield offset, opcode and content of each record from `start` on.
-
-    Stops before a record that extends beyond `stop`, by default the end of the view.
-    """
+    """Yield offset, opcode and content of records from `start` on, all that end by `stop`."""
     offset, stop = start, len(view) if stop is None else stop
     while offset + RECORD_HEADER.size <= stop:
         opcode, length = RECORD_HEADER.unpack_from(view, offset)
@@ -466,10 +433,7 @@ def parse_record(opcode: int, content: memoryview) -> Any:
 
 
 def is_intact_attachment(content: memoryview) -> bool:
-    """Return whether an Attachment record matches its CRC or has no CRC.
-
-    Bytes after the CRC are ignored.
-    """
+    """Return whether an Attachment record matches its CRC, if any; later bytes are ignored."""
     end = _ATTACHMENT_TIMES_BYTES
     try:
         for length in (_TEXT_LENGTH, _TEXT_LENGTH, _DATA_LENGTH):
@@ -507,15 +471,10 @@ class UnindexedMessages:
 
 @dataclass
 class ChunkContents:
-    """Contents of a chunk.
+    """Contents of a chunk."""
 
-    Attributes:
-        topics: Schemas and channels.
-        indexes: Arrays of `INDEX_ENTRY` by channel id.
-    """
-
-    topics: list[Schema | Channel]
-    indexes: dict[int, NDArray[Any]]
+    topics: list[Schema | Channel]  # Schemas and channels
+    indexes: dict[int, NDArray[Any]]  # Arrays of `INDEX_ENTRY` by channel id
 
 
 def contents_of(chunk: memoryview) -> ChunkContents:

@@ -97,11 +97,7 @@ def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidReco
 
 
 def _ends_data(view: memoryview, offset: int, content: memoryview) -> bool:
-    """Return whether a DataEnd record is the end of the data section.
-
-    The CRC in the record must match all data before the record. If the record has no CRC, no chunk
-    may follow it.
-    """
+    """Return whether a DataEnd record is the end: by its CRC, or else as no chunk follows."""
     (crc,) = struct.unpack("<I", content)
     if crc:
         return bool(crc32(view[:offset]) == crc)

@@ -47,22 +47,14 @@ from mcaprl.recorder.columns.records import (
 
 @dataclass
 class Summary:
-    """Summary of a file.
-
-    Attributes:
-        schemas: Schemas by id.
-        channels: Channels by id.
-        counts: Message counts by channel id.
-        chunks: Chunk indexes in file order.
-        metadata: Metadata indexes in file order.
-        attachments: Attachment indexes in file order.
-    """
+    """Summary of a file."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
-    chunks: list[ChunkIndex] = field(default_factory=list)
-    metadata: list[MetadataIndex] = field(default_factory=list)
+    counts: dict[int, int] = field(default_factory=dict)  # Message counts by channel id
+    chunks: list[ChunkIndex] = field(default_factory=list)  # Chunk indexes in file order
+    metadata: list[MetadataIndex] = field(default_factory=list)  # Metadata indexes in file order
+    # Attachment indexes in file order.
     attachments: list[AttachmentIndex] = field(default_factory=list)
 
     def add(self, record: McapRecord, offset: int, length: int) -> None:
@@ -141,19 +133,12 @@ _DATA_END = struct.Struct("<BQI")
 
 @dataclass
 class WrittenState:
-    """State in which a writer left a finished file.
-
-    Attributes:
-        summary: Summary of the file.
-        end: First byte after the data, where a writer can append.
-        crc: CRC-32 of the data.
-        top_level: Top-level records in file order.
-    """
+    """State in which a writer left a finished file."""
 
     summary: Summary
-    end: int
+    end: int  # First byte after the data, where a writer can append
     crc: int
-    top_level: list[TopLevelRecord]
+    top_level: list[TopLevelRecord]  # Top-level records in file order
 
 
 def written_state(path: Path) -> WrittenState:
@@ -229,11 +214,8 @@ def check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> l
 
 
 def _has_only(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
-    """Return whether a chunk contains exactly the messages that its indexes list.
-
-    A chunk that also contains other records can be valid. If this function returns False, the
-    caller therefore compares each message with the indexes.
-    """
+    """Return whether a chunk contains exactly the messages that its indexes list."""
+    # A chunk that also contains other records can be valid: the caller then compares each message.
     if _has_alike(records, indexes):
         return True
     ids = np.repeat(list(indexes), [len(index) for index in indexes.values()])
@@ -263,10 +245,8 @@ def _has_only(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
 
 
 def _has_alike(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
-    """Return whether a chunk contains exactly the messages of one index, all of one size.
-
-    Return False if the compiled module was not built.
-    """
+    """Return whether a chunk has exactly one index's messages of one size."""
+    # False if not compiled.
     if len(indexes) != 1:
         return False
     ((channel_id, index),) = indexes.items()

@@ -47,27 +47,18 @@ Rows = slice | NDArray[np.int64]
 
 @dataclass
 class Target:
-    """Columns that are filled.
+    """Columns that are filled."""
 
-    Attributes:
-        columns: Columns by field name.
-        copies: Layout of the last messages with this channel and length, and their compiled copy;
-            None if they have no layout, or cannot be copied by compiled code.
-    """
-
-    columns: Columns
+    columns: Columns  # Columns by field name
+    # Layout of the last messages with this channel and length, and their compiled copy; None if
+    # they have no layout, or cannot be copied by compiled code.
     copies: dict[tuple[int, int], tuple[Layout | None, FieldCopy | None]] = field(
         default_factory=dict
     )
 
 
 class Decoder:
-    """Decoder of the messages of one channel to columns.
-
-    Attributes:
-        channel: Channel of the messages.
-        type: Type of the messages.
-    """
+    """Decoder of the messages of one channel to columns."""
 
     def __init__(self, reader: McapReader, channel: Channel) -> None:
         """Parse the message type."""
@@ -89,10 +80,7 @@ class Decoder:
         messages: MessageRange,
         scratch: Scratch | None = None,
     ) -> Columns:
-        """Return empty columns of `count` rows for the wanted fields.
-
-        The first message determines the dtypes and shapes.
-        """
+        """Return empty columns of `count` rows, as the first message has dtypes and shapes."""
         records = self._reader.records_of(messages, scratch)
         layout = self.type.layout(self._message(records, messages.index[0]), wanted)
         if layout is not None:
@@ -290,10 +278,7 @@ def _nanoseconds(times: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def _value_at(message: Any, path: str) -> Any:
-    """Return the value of the field with this dotted path.
-
-    Timestamps are converted to nanoseconds.
-    """
+    """Return the value of the field with this dotted path; times become nanoseconds."""
     found = message
     for name in path.split("."):
         found = getattr(found, name)
@@ -332,11 +317,7 @@ class _Selected(NamedTuple):
 
 
 class Topic:
-    """Topic of a file: types and positions of its messages.
-
-    Attributes:
-        name: Name of the topic.
-    """
+    """Topic of a file: types and positions of its messages."""
 
     def __init__(self, reader: McapReader, name: str) -> None:
         """Find the messages without reading chunks that have an index."""
@@ -403,10 +384,7 @@ class Topic:
 
     @cached_property
     def fields(self) -> dict[str, np.dtype[Any]]:
-        """Dtypes of the top-level fields.
-
-        The dtype is `object` for all fields except numbers, arrays of numbers, and times.
-        """
+        """Dtypes of the top-level fields; `object` but for numbers, their arrays, and times."""
         dtypes = [decoder.type.dtypes for decoder in self._decoders]
         if any(other != dtypes[0] for other in dtypes[1:]):
             raise LogError(
@@ -423,10 +401,8 @@ class Topic:
     def read(
         self, wanted: Collection[str], order: NDArray[np.int64] | None = None, *, threads: int = 1
     ) -> Columns:
-        """Read columns: `log_time` and the wanted fields.
-
-        A time or duration is an int64 in nanoseconds. Arrays of strings and of messages are lists.
-        """
+        """Read columns: `log_time` and the wanted fields."""
+        # Times and durations are int64 nanoseconds.
         self._check(wanted)
         if self._reader.is_remote:
             self._reader.fetch_chunks(self._needed(order))
@@ -517,10 +493,8 @@ class Topic:
 
 
 def _blocks(parts: Sequence[_Selected], threads: int) -> Iterator[Sequence[_Selected]]:
-    """Divide parts into blocks, each of which one thread reads.
-
-    Threads that read neighboring chunks would write to new memory in the same large page at the
-    same time, and each of them would clear this page.
-    """
+    """Divide parts into blocks, each of which one thread reads."""
+    # Threads that read neighboring chunks would write to new memory in the same large page at the
+    # same time, and each of them would clear this page.
     size = min(-(-len(parts) // threads), _BLOCK_CHUNKS)
     return (parts[start : start + size] for start in range(0, len(parts), size))

@@ -139,11 +139,8 @@ class McapWriter(OutputFile):
             self._write_top_level(record)
 
     def write_rows(self, rows: NDArray[Any]) -> None:
-        """Write messages of one channel and length as one chunk.
-
-        `rows` is an array of `records.record_dtype` with log_time; this function sets its
-        sequence numbers and publish times.
-        """
+        """Write messages of one channel and length as a chunk."""
+        # Set sequence numbers and publish times.
         if len(rows) == 0:
             return
         channel_id, size = int(rows["channel_id"][0]), rows.itemsize
@@ -168,10 +165,7 @@ class McapWriter(OutputFile):
         schema: tuple[str, str, bytes],
         metadata: dict[str, str] | None = None,
     ) -> int:
-        """Write a new channel of any encoding, and return its id.
-
-        `schema` has encoding, name and data of the schema; without an encoding, there is none.
-        """
+        """Write a new channel, and return its id; `schema` has encoding (if any), name and data."""
         schema_encoding, name, data = schema
         schema_id = self._schema_ids().get(schema, 0) if schema_encoding else 0
         if schema_encoding and not schema_id:
@@ -188,10 +182,8 @@ class McapWriter(OutputFile):
     def write_messages(
         self, messages: Sequence[tuple[int, int, bytes]], publish_ns: Sequence[int] = ()
     ) -> None:
-        """Write messages (channel id, log_time in nanoseconds, data) as one chunk.
-
-        `publish_ns` has the publish_time of each message; default: its log_time.
-        """
+        """Write messages (channel id, log_time, data) as one chunk."""
+        # Publish_time is log_time if None.
         if not messages:
             return
         records = bytearray()
@@ -281,10 +273,7 @@ class McapWriter(OutputFile):
         self.position, self._crc = written.end, written.crc
 
     def _replace_summary(self) -> None:
-        """Replace the file with a copy that has no summary section.
-
-        The file is not changed in place, because readers may have mapped it into memory.
-        """
+        """Replace the file with a copy without summary; readers may have mapped the old one."""
         try:
             self._file = replaced(self.path, self._file, self.position)
         except OSError as error:

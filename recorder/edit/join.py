@@ -59,21 +59,13 @@ Fields = Mapping[str, Any]
 
 
 class Delay:
-    """Callable that adds a delay to the timestamps in messages.
+    """Callable that adds a delay to the timestamps in messages."""
 
-    It changes the timestamps in `/rl/episode` and the fields of type `builtin_interfaces/Time`. A
-    field is changed only if its value is in the range of the file's log_times, extended by 10 s on
-    each side.
-    """
+    # These are those of `/rl/episode` and fields of type `builtin_interfaces/Time`, if a value is
+    # in the range of the file's log_times, extended by 10 s on each side.
 
     def __init__(self, reader: McapReader, span: tuple[int, int], delay_ns: int) -> None:
-        """Find the timestamps in the message types of all channels.
-
-        Args:
-            reader: Reader of the file.
-            span: First and last log_time of the file, nanoseconds.
-            delay_ns: Number of nanoseconds that is added.
-        """
+        """Find the timestamps in the message types of all channels."""
         self._reader, self._delay_ns = reader, delay_ns
         self._span = span[0] - _MARGIN_NS, span[1] + _MARGIN_NS
         self._changes: dict[int, Callable[[memoryview], None] | None] = {}
@@ -204,10 +196,7 @@ class _Walk:
 
 @lru_cache(maxsize=256)
 def _flat(descriptions: tuple[Any, ...]) -> tuple[int, int] | None:
-    """Return the size of one field in bytes, and the number of fields.
-
-    Return None if not all fields are numbers of the same size.
-    """
+    """Return the bytes of a field, and the number of fields, if all are numbers of one size."""
     names = {what[0] if kind == Nodetype.BASE else None for kind, what in descriptions}
     sizes = {_SIZES.get(name or "") for name in names}
     if len(sizes) != 1 or None in sizes:
@@ -263,10 +252,7 @@ def merge_logs(
 
 
 def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
-    """Return the metadata of the joined log; None if none of the logs has metadata.
-
-    If a field differs between the logs and is allowed to differ, it is empty in the result.
-    """
+    """Return the joined log's metadata; None without any. Fields that may differ become empty."""
     found = [described(log.reader) for log in logs]
     described_ones = [(log, one) for log, one in zip(logs, found, strict=True) if one is not None]
     if not described_ones:
@@ -376,11 +362,9 @@ def _overlapped(logs: Sequence[FinishedLog], log: FinishedLog) -> Path:
 
 
 def _leave_out_repeated(logs: Sequence[FinishedLog], sources: Sequence[Source]) -> None:
-    """Exclude from each source the messages that an earlier source also has.
-
-    Two messages of a channel are the same if their times and bytes are equal. If a log was split,
-    several parts contain the messages that are valid in all of them, such as the static scene.
-    """
+    """Exclude from each source the messages that an earlier source also has."""
+    # These have equal times and bytes. The parts of a split log all contain the messages that are
+    # valid in all of them, such as the static scene.
     bounds = [log.span_of_messages() for log in logs]
     starts_ends = [
         (first + source.delay_ns, last + source.delay_ns)
@@ -399,10 +383,7 @@ def _leave_out_repeated(logs: Sequence[FinishedLog], sources: Sequence[Source]) 
 
 
 def _repeated(source: Source, other: Source) -> dict[int, Times]:
-    """Find the messages that are in both sources.
-
-    The result maps channel ids in `other` to the log_times of these messages in `other`.
-    """
+    """Find the messages that are in both sources: log_times in `other` by its channel ids."""
     by_new = {new: old for old, new in source.ids.items()}
     found = {}
     for old, new in other.ids.items():

@@ -76,13 +76,7 @@ class Edited:
 
 
 class FinishedLog:
-    """A finished log of whole episodes, or a finished MCAP file without `/rl/step`.
-
-    Attributes:
-        path: Path of the file.
-        reader: Reader of the file.
-        top_level: Metadata records, schemas, channels and attachments, in this order.
-    """
+    """A finished log of whole episodes, or a finished MCAP file without `/rl/step`."""
 
     def __init__(self, path: str | Path) -> None:
         """Open the file; a remote file is first downloaded completely."""
@@ -93,6 +87,7 @@ class FinishedLog:
         except CorruptLogError as error:
             what = str(error).removeprefix(f"{self.path}: ")
             raise self._unusable(what) from error
+        # Metadata records, schemas, channels and attachments, in this order.
         self.top_level = [
             *(record for record in top_level if isinstance(record, Metadata)),
             *(record for record in top_level if not isinstance(record, Metadata | Attachment)),
@@ -161,12 +156,8 @@ class FinishedLog:
         return min(starts, default=0), max(ends, default=0)
 
     def spans_of(self, episodes: NDArray[np.int64]) -> Times:
-        """Return the time ranges of the episodes' messages: (S, 2) first and last log_times.
-
-        An episode has all messages from its first record until the next episode. Messages before
-        the first episode belong to the first episode. The ranges of adjacent episodes are merged
-        into one range.
-        """
+        """Return the time ranges (S, 2) of the episodes' messages, merged if adjacent."""
+        # An episode has all messages until the next one; the first has those before it, too.
         starts = self.spans[:, 0].copy()
         starts[0] = 0
         stops = np.append(starts[1:] - 1, _LAST_TIME)
@@ -175,18 +166,9 @@ class FinishedLog:
         return np.stack([starts[episodes[begins]], stops[episodes[ends]]], axis=1)
 
     def states(self, spans: Times) -> dict[int, Times]:
-        """Return the times of the messages that are still valid at the start of each time range.
-
-        Display topics that are not repeated at each step, such as the static scene, have such
-        messages. The topics that ROS calls latched or transient local also have such messages. On
-        these topics, the last message before a range is still valid.
-
-        Args:
-            spans: (S, 2) first and last log_times of the S copied time ranges.
-
-        Returns:
-            Times by channel id.
-        """
+        """Return, by channel, the times of messages still valid at each range's start."""
+        # These are the last messages before a range of display topics that are not repeated at each
+        # step, such as the static scene, and of latched (transient local) topics.
         found = {}
         for channel in self.reader.channels.values():
             if channel.topic in _STATES or _is_latched(channel.metadata):
@@ -222,19 +204,12 @@ Bounds = tuple[float | None, float | None]
 
 @dataclass(frozen=True)
 class _Piece:
-    """Part of one episode.
-
-    Attributes:
-        episode: Index of the episode.
-        start: Step of the first record.
-        stop: Step of the last record; the part has the transitions from `start` to `stop` - 1.
-        length: Number of transitions of the whole episode.
-    """
+    """Part of one episode."""
 
     episode: int
-    start: int
-    stop: int
-    length: int
+    start: int  # Step of the first record
+    stop: int  # Step of the last record; the part has the transitions from `start` to `stop` - 1
+    length: int  # Number of transitions of the whole episode
 
     @property
     def is_whole(self) -> bool:
@@ -301,10 +276,7 @@ def slice_log(
 
 
 def _window_of_steps(log: FinishedLog, steps: Bounds) -> tuple[int, int]:
-    """Return the first and last log_time of a part.
-
-    The bounds in `steps` count the transitions of all episodes.
-    """
+    """Return the first and last log_time of a part, by transitions of all episodes."""
     log.need_steps()
     count = int(log.lengths.sum())
     if any(bound is not None and bound != int(bound) for bound in steps):
@@ -325,10 +297,7 @@ def _window_of_steps(log: FinishedLog, steps: Bounds) -> tuple[int, int]:
 
 
 def _window_of_time(log: FinishedLog, time: Bounds | None) -> tuple[int, int]:
-    """Return the first and last log_time of a part.
-
-    The bounds in `time` are seconds since the first message.
-    """
+    """Return the first and last log_time of a part, by seconds since the first message."""
     assert time is not None
     begin_ns, end_ns = log.span_of_messages()
     start, stop = time
@@ -474,12 +443,7 @@ def _table(
 
 
 def episode_values(expression: str, dataset: Dataset) -> NDArray[np.float64]:
-    """Return the (E,) values of an expression that has the columns of `mcaprl.filter`.
-
-    Raises:
-        UsageError: The expression is not one, or uses labels of data that grow.
-        UnknownNameError: There is no such column.
-    """
+    """Return the (E,) values of an expression that has the columns of `mcaprl.filter`."""
     parsed = Expression(expression)
 
     def labels() -> Labels | None:
@@ -492,15 +456,7 @@ def episode_values(expression: str, dataset: Dataset) -> NDArray[np.float64]:
 
 
 def selected(dataset: Dataset, only: str | None = None, mask: Sequence[str] = ()) -> Dataset:
-    """Return the episodes for which an expression of `mcaprl.filter` is true.
-
-    The steps in intervals of the names in `mask` are left out; see `Dataset.without`.
-
-    Raises:
-        UsageError: The dataset grows, or has not exactly the episodes of its logs.
-        NoEpisodesError: The expression is true for no episode.
-        UnknownNameError: There are no intervals of such a name.
-    """
+    """Return the episodes for which an expression is true, without the intervals in `mask`."""
     if only is None and not mask:
         return dataset
     if dataset.origin.grow is not None:

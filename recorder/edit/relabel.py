@@ -35,10 +35,8 @@ def relabeled(dataset: Dataset, reward: str) -> Dataset:
 
 
 def _columns(dataset: Dataset) -> dict[str, NDArray[Any]]:
-    """Return what an expression can use, with a row for each observation of the episodes.
-
-    Later names do not replace earlier ones.
-    """
+    """Return what an expression can use, by observation."""
+    # Later names do not replace earlier ones.
     rows, count = dataset.frame_of_step, len(dataset.frame_of_step) + len(dataset.episodes)
     columns: dict[str, NDArray[Any]] = {}
 

@@ -30,24 +30,15 @@ _Values = TypeVar("_Values")
 
 @dataclass(frozen=True)
 class BehaviorField:
-    """Meaning of the behavior column of an action space.
+    """Meaning of the behavior column: `LOG_DENSITY` of actions of floats, else `PROBABILITY`."""
 
-    `LOG_DENSITY` is that of actions of floats, and `PROBABILITY` that of all others.
-
-    Attributes:
-        name: Name of the field in `/rl/step`, and of the column of a table. The array of all steps
-            has this name with an `s`.
-        low: Smallest possible value.
-        high: Largest possible value.
-        expected: Range of the values, for errors.
-        what: Name of the values in texts.
-    """
-
+    # Name of the field in `/rl/step`, and of the column of a table. The array of all steps has this
+    # name with an `s`.
     name: str
-    what: str
-    low: float
-    high: float
-    expected: str
+    what: str  # Name of the values in texts
+    low: float  # Smallest possible value
+    high: float  # Largest possible value
+    expected: str  # Range of the values, for errors
 
     @property
     def plural(self) -> str:
@@ -74,10 +65,8 @@ class BehaviorField:
         )
 
     def column(self, probs: Any, log_probs: Any) -> NDArray[np.float32] | None:
-        """Return the column of probabilities, or of logarithms of probabilities or densities.
-
-        Values of the other kind are converted. The result is None if both arguments are None.
-        """
+        """Return the column from either kind of values, converted if necessary."""
+        # None without both.
         own, other = (log_probs, probs) if self == LOG_DENSITY else (probs, log_probs)
         if own is None and other is None:
             return None

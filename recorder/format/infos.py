@@ -26,15 +26,7 @@ Masked: TypeAlias = "np.ma.MaskedArray[Any, Any]"
 
 
 def read_infos(reader: McapReader, times_ns: NDArray[np.int64]) -> dict[str, Masked]:
-    """Read the infos of a log.
-
-    Args:
-        reader: Reader of the log.
-        times_ns: (F,) log_time of each observation.
-
-    Returns:
-        (F, *shape) array of each info by dotted name, masked where the info is missing.
-    """
+    """Read the infos of a log, masked (F, *shape) by dotted name, for log_times (F,)."""
     channels = [one for one in reader.channels.values() if one.topic.startswith(INFO_TOPICS)]
     found: dict[str, Masked] = {}
     if not channels or not len(times_ns):

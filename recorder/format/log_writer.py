@@ -119,23 +119,16 @@ class MessageSink(Protocol):
 
 
 class LogTopics:
-    """Topics of a log, which are announced and written to a sink.
-
-    Attributes:
-        sink: Receiver of the messages.
-        metadata: Metadata of the log.
-        action: Shape and dtype of an action.
-        behavior: Meaning of the behavior column of `/rl/step`.
-        image_leaves: Leaves of the observation that are images.
-    """
+    """Topics of a log, which are announced and written to a sink."""
 
     def __init__(
         self, metadata: LogMetadata, sink: MessageSink, *, names_actions: bool = True
     ) -> None:
         """Announce the topics that every log has."""
         leaves = observation_leaves(metadata.observation_space)
-        self.metadata, self.sink = metadata, sink
-        self.action = action_leaf(metadata.action_space)
+        self.metadata, self.sink = metadata, sink  # Receiver of the messages
+        self.action = action_leaf(metadata.action_space)  # Shape and dtype of an action
+        # Meaning of the behavior column of `/rl/step`.
         self.behavior = behavior_field(metadata.action_space)
         self.image_leaves = tuple(leaf for leaf in leaves if leaf.encoding is not None)
         strings = metadata.to_strings()
@@ -220,11 +213,7 @@ class LogTopics:
 
 
 class LogWriter(LogTopics):
-    """Writer of one log of format version 1.
-
-    Attributes:
-        mcap: Writer of the file; the same object as `sink`.
-    """
+    """Writer of one log of format version 1."""
 
     def __init__(
         self,
@@ -245,6 +234,7 @@ class LogWriter(LogTopics):
             # An interruption must not leave a file without topics, which readers refuse. With
             # `source`, signals are not delayed, because copying it may take long.
             with HoldSignals() if source is None else nullcontext():
+                # Writer of the file; the same object as `sink`.
                 self.mcap = McapWriter(
                     path,
                     compression=compression,
@@ -324,29 +314,20 @@ def info_array(values: Sequence[Any] | NDArray[Any]) -> NDArray[Any] | None:
 
 
 class InfoTopics:
-    """Writer of infos to a log. The topic of an info is created when its first value is written.
-
-    A recording that is appended to a log uses the log's existing topics.
-
-    Attributes:
-        refused: Names of the infos that were not written, with the reason.
-        warned: Names of the infos for which a warning was given.
-    """
+    """Writer of infos, whose topics are created with the first value, or are those of the log."""
 
     def __init__(self, log: LogWriter) -> None:
         """Find the infos that the log already has."""
         self._log = log
         self._channels = _channels_of(log)
         self._topics = {one.topic for one in log.mcap.channels.values()}
+        # Names of the infos that were not written, with the reason.
         self.refused: dict[str, str] = {}
-        self.warned: set[str] = set()
+        self.warned: set[str] = set()  # Names of the infos for which a warning was given
 
     def write(self, infos: Mapping[str, tuple[Sequence[int], NDArray[Any]]]) -> None:
-        """Write the log_times (K,) and values (K, *shape) of each info, given by name.
-
-        If values do not have the type of the info's first value in the log, they are not written,
-        and the info's name is added to `refused`.
-        """
+        """Write the log_times (K,) and values (K, *shape) of each info, given by name."""
+        # Values of another type than the info's first one are not written, but noted in `refused`.
         messages: list[Message] = []
         for name, (times_ns, values) in infos.items():
             if name not in self._channels:

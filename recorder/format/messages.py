@@ -161,10 +161,7 @@ def log_message(time_ns: int, text: str, level: int = INFO) -> bytes:
 
 
 def _string(text: str) -> bytes:
-    """Encode a CDR string: length, characters and NUL.
-
-    A NUL in the text is replaced by U+FFFD, and lone surrogates are escaped.
-    """
+    """Encode a CDR string; a NUL in it becomes U+FFFD, and lone surrogates are escaped."""
     encoded = text.encode(errors="backslashreplace").replace(_NUL, _REPLACEMENT) + _NUL
     return len(encoded).to_bytes(4, "little") + encoded
 
@@ -181,20 +178,13 @@ def _padded(string: bytes) -> bytes:
 
 
 def _seconds(time_ns: int) -> tuple[int, int]:
-    """Return seconds and nanoseconds of a time.
-
-    The 32-bit seconds of ROS wrap around; the log_time of the record does not.
-    """
+    """Return seconds and nanoseconds of a time; the 32-bit seconds of ROS wrap around."""
     sec, nanosec = divmod(time_ns, 10**9)
     return sec % 2**32, nanosec
 
 
 class CdrWriter:
-    """Encoder of one message, whose fields are added in their order.
-
-    rosbags needs an object for each nested message, for example for each point of a line, and takes
-    ten times as long.
-    """
+    """Encoder of one message, field by field, ten times as fast as rosbags' objects."""
 
     def __init__(self) -> None:
         """Begin a message."""
@@ -310,14 +300,8 @@ def begin_line(episode: int, policy: str) -> str:
 
 
 def add_up(rewards: NDArray[np.float64], start: float = 0.0) -> float:
-    """Add up rewards in order, with bit-identical results on every machine.
-
-    `np.sum` adds pairwise, and `sum` compensates rounding errors since Python 3.12.
-
-    Args:
-        rewards: (T,) rewards.
-        start: Sum of all earlier rewards.
-    """
+    """Add up rewards in order, with bit-identical results on every machine."""
+    # `np.sum` adds pairwise, and `sum` compensates rounding errors since Python 3.12.
     if start:
         rewards = np.concatenate([[start], rewards])
     return add_up_each(rewards, [0], [len(rewards)])[0]

@@ -75,14 +75,10 @@ Command = tuple[float | str, ...]
 
 @dataclass(frozen=True)
 class ActionCommands:
-    """Command of each discrete action.
+    """Command of each discrete action."""
 
-    Attributes:
-        fields: Paths of the K fields of a command, such as `/cmd_vel.linear.x`.
-        commands: K values for each action, in the order of the actions; None if unknown.
-    """
-
-    fields: tuple[str, ...]
+    fields: tuple[str, ...]  # Paths of the K fields of a command, such as `/cmd_vel.linear.x`
+    # K values for each action, in the order of the actions; None if unknown.
     commands: tuple[Command | None, ...]
 
     def to_json(self) -> dict[str, Any]:
@@ -220,11 +216,9 @@ class LogMetadata:
         return leaves_of(self.observation_space)
 
     def action_names(self) -> dict[int, str]:
-        """Return the names of the discrete actions by value; empty for other action spaces.
-
-        If each action has a distinct meaning, the meanings are the names. Otherwise, the numbers
-        are the names, or the dict is empty for more than `MAX_NUMBERED_ACTIONS` actions.
-        """
+        """Return the names of the discrete actions by value; empty for other action spaces."""
+        # Without a distinct meaning of each action, the numbers are the names, or above
+        # `MAX_NUMBERED_ACTIONS` the dict is empty.
         space = self.action_space
         if not isinstance(space, spaces.Discrete):
             return {}
@@ -236,11 +230,9 @@ class LogMetadata:
         return dict(zip(values, meanings, strict=True))
 
     def action_labels(self) -> tuple[str, ...]:
-        """Return the named parts of an action with bounds and units; empty if they have no names.
-
-        A label is such as `speed (0 to 2 m/s)`, or `steering (-1 right, 1 left)` if the unit names
-        both directions, as `right | left` does.
-        """
+        """Return the named parts of an action with bounds and units."""
+        # Empty if they have no names. Such as `speed (0 to 2 m/s)`, or `steering (-1 right, 1
+        # left)` of the unit `right | left`.
         names, space = self.action_part_names, self.action_space
         if not isinstance(space, spaces.Box) or len(names) != math.prod(space.shape):
             return ()
@@ -249,10 +241,7 @@ class LogMetadata:
         return tuple(map(_label, names, units, bounds))
 
     def is_failure(self, reason: str) -> bool:
-        """Return whether `reason` is the end reason of a failure.
-
-        Return False if that is unknown.
-        """
+        """Return whether `reason` is the end reason of a failure; False if that is unknown."""
         return bool(self.success_reasons) and reason not in (*self.success_reasons, INTERRUPTED)
 
     def to_strings(self) -> dict[str, str]:
@@ -342,13 +331,11 @@ class LogMetadata:
 
     @classmethod
     def common(cls, parts: Sequence[LogMetadata]) -> LogMetadata:
-        """Return metadata that describes several logs; fields that differ have the default value.
-
-        The spaces of all logs must be equal. `behavior_prob` is `ESTIMATED`, and `times` is
-        `NO_TIMES`, if any of the logs has this value. The commands of the actions are those of the
-        first log that has them, if those of the others have the same fields. `robot` is that of the
-        first log, if the others differ in the commands only.
-        """
+        """Return metadata that describes several logs."""
+        # Fields that differ have the default value. Their spaces must be equal. `ESTIMATED` and
+        # `NO_TIMES` of any log hold for all. The commands are the first log's that has them, if the
+        # others' fields are the same; `robot` is that of the first log, if the others differ in the
+        # commands only.
         first, *others = parts
         blank = cls(first.observation_space, first.action_space)
         differing = {
@@ -379,13 +366,9 @@ class LogMetadata:
         epsilon: str = "",
         seed: str = "",
     ) -> LogMetadata:
-        """Create the metadata of an environment's recording.
-
-        A vector environment is described by one of its sub-environments. The step duration is the
-        first available value of: the argument, the environment's `step_duration_s`,
-        1 / `metadata["render_fps"]`, 0.1 s. Arguments of the environment that are not JSON are left
-        out with a warning.
-        """
+        """Create the metadata of an environment's recording, or of one of a vector's."""
+        # The step duration is the first of: the argument, the environment's `step_duration_s`, 1 /
+        # `metadata["render_fps"]`, 0.1 s. Arguments that are not JSON are left out with a warning.
         one = _one_of(env)
         inner = one.unwrapped
         if step_duration_s is None:
@@ -452,11 +435,7 @@ def _label(name: str, unit: str, bounds: tuple[float, float]) -> str:
 
 
 def _split_kwargs(spec: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return the arguments of an environment that are JSON, and the names of the others.
-
-    Other arguments that have the environment's default are omitted, because the default is used
-    anyway.
-    """
+    """Return the arguments that are JSON, and the names of others that are no defaults."""
     kept: dict[str, Any] = {}
     others = []
     for name, value in (spec.kwargs if spec else {}).items():
@@ -512,11 +491,9 @@ def _env_id(env: Any) -> str:
 
 
 def _registering_module(spec: EnvSpec) -> str:
-    """Return a module whose import registers an id; empty if none is needed, or none is known.
-
-    It is the module of the entry point: its import also imports the packages that contain it, one
-    of which usually registers the id.
-    """
+    """Return a module whose import registers an id; empty if none is needed, or none is known."""
+    # The module of the entry point: its import also imports the packages that contain it, one of
+    # which usually registers the id.
     entry = spec.entry_point
     module = entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "")
     found = sys.modules.get(module or "")
@@ -535,9 +512,7 @@ def _self_registering() -> frozenset[str]:
 
 
 def same_env(first: str, second: str) -> bool:
-    """Return whether two ids name the same environment.
-
-    The ids in older logs have no module; others name a package, or a module in it.
+    """Return whether two ids name the same environment: with no module, a package, or one in it.
 
     >>> same_env("highway_env:racetrack-v1", "racetrack-v1"), same_env("a:Env-v0", "b:Env-v0")
     (True, False)

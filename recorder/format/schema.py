@@ -124,10 +124,8 @@ def step_schema(
 def earlier_step_schemas(
     observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
 ) -> list[tuple[str, str]]:
-    """Return the type names and definitions of `/rl/step` that earlier versions wrote.
-
-    The first does not name the actions. The second has the probabilities of all actions.
-    """
+    """Return names and definitions of `/rl/step` of earlier versions: no names."""
+    # All probabilities.
     both = observation_space, action_space
     return [step_schema(*both), step_schema(*both, behavior=PROBABILITY)]
 
@@ -145,11 +143,7 @@ def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
 
 
 def telemetry_message(values: Iterable[float]) -> bytes:
-    """Encode a message of `telemetry_schema`.
-
-    Values are rounded to 16 significant bits (more than four digits), which is enough for plots and
-    compresses better.
-    """
+    """Encode a message of `telemetry_schema`, in 16 significant bits, which compress better."""
     mantissas, exponents = np.frexp(np.fromiter(values, np.float64))
     rounded = np.ldexp(np.rint(mantissas * 2**16), exponents - 16)
     return struct.pack(f"<I{len(rounded)}f", ENCAPSULATION, *rounded.tolist())
@@ -158,12 +152,10 @@ def telemetry_message(values: Iterable[float]) -> bytes:
 def action_constants(names: Mapping[int, str]) -> dict[str, int]:
     """Return ROS constants that name the actions, so that viewers display `BRAKE (0)` for 0.
 
-    Names are converted to upper case; text in parentheses is removed, and characters other than
-    letters and digits become underscores. Names without letters have no constant.
-
     >>> action_constants({0: "brake", 1: "slightly left", 2: "faster north (+x)"})
     {'BRAKE': 0, 'SLIGHTLY_LEFT': 1, 'FASTER_NORTH': 2}
     """
+    # Text in parentheses is removed. Names without letters have no constant.
     words: dict[str, int] = {}
     for value, name in names.items():
         word = _constant(re.sub(r"\(.*?\)", "", name)) or _constant(name)
@@ -266,18 +258,7 @@ def is_intact(name: str, text: bytes) -> bool:
 def image_dtype(
     height: int, width: int, channels: int, encoding: str, frame_id: str, item_bytes: int = 1
 ) -> np.dtype[Any]:
-    """Return the memory layout of a `sensor_msgs/msg/Image` of known size and strings.
-
-    The strings are constant, so all messages of the topic have the same length.
-
-    Args:
-        height: Number of rows.
-        width: Number of columns.
-        channels: Number of values per pixel.
-        encoding: Encoding, such as `mono8`.
-        frame_id: Frame of the header.
-        item_bytes: Number of bytes per value.
-    """
+    """Return the layout of a `sensor_msgs/msg/Image`, whose strings, and length, are constant."""
     layout: list[tuple[str, Any]] = [("encapsulation", "<u4"), ("sec", "<i4"), ("nanosec", "<u4")]
     used = 12
 
@@ -336,10 +317,7 @@ def _named(
     constants: Mapping[str, Mapping[str, int]] | None = None,
     comments: Mapping[str, Sequence[str]] | None = None,
 ) -> tuple[str, str]:
-    """Return type name and definition of a message.
-
-    The constants and comments of a field precede it.
-    """
+    """Return type name and definition of a message; constants and comments precede their field."""
     lines = []
     for kind, count, name in fields:
         lines += [f"# {comment}" for comment in (comments or {}).get(name, ())]
@@ -387,15 +365,12 @@ _FINAL = {
 
 
 class TopicRows:
-    """Message records of one topic.
-
-    Attributes:
-        fields: Views of the fields of all rows, by field name.
-    """
+    """Message records of one topic."""
 
     def __init__(self, rows: NDArray[Any], write: Write) -> None:
         """Create views of `rows`. The caller has set the constant fields."""
         payload = rows["payload"]
+        # Views of the fields of all rows, by field name.
         self.fields = {name: payload[name] for name in payload.dtype.names or ()}
         self._rows, self._write, self._log_time = rows, write, rows["log_time"]
 
@@ -423,25 +398,15 @@ class TopicRows:
         return self._rows.itemsize
 
     def put(self, field: str, where: Any, values: Any) -> None:
-        """Set values of a field.
-
-        Args:
-            field: Name in the message.
-            where: Index of K rows.
-            values: (K, *shape) values, or one scalar for all K rows.
-        """
+        """Set values (K, *shape), or one scalar, of a field in K rows."""
         column = self.fields[field]
         if column.ndim > 1:
             values = np.reshape(values, (-1, column.shape[-1]))
         column[where] = values
 
     def from_field(self, fields: Sequence[str]) -> tuple[NDArray[np.void], np.dtype[Any]]:
-        """Describe the part of the rows from the first of these fields to the end of the message.
-
-        Returns:
-            A view of that part of each row as one item, (N,), and a dtype for buffers of these
-            fields. An item of the dtype begins with the bytes of the part. Its fields are aligned.
-        """
+        """Describe the rows from these fields on: items (N,), and a dtype for buffers."""
+        # An item of the aligned dtype begins with the bytes of the part.
         payload = self._rows.dtype["payload"]
         assert payload.fields is not None, "messages have fields"
         offsets = {name: payload.fields[name][1] for name in fields}
@@ -465,12 +430,7 @@ class TopicRows:
         self._write(self._rows[where])
 
     def write_columns(self, times_ns: NDArray[Any], columns: Mapping[str, Any]) -> None:
-        """Write a message for each log_time, in chunks of at most `len(self)` messages.
-
-        Args:
-            times_ns: (K,) log_times.
-            columns: (K, ...) values of each field that is not constant.
-        """
+        """Write a message for each log_time (K,), in chunks of at most `len(self)` messages."""
         for first in range(0, len(times_ns), len(self)):
             chunk = slice(first, min(first + len(self), len(times_ns)))
             where = slice(chunk.stop - first)
@@ -480,21 +440,13 @@ class TopicRows:
 
 
 class StepRows(TopicRows):
-    """Rows of `/rl/step`: the T transitions of an episode, then its final record.
+    """Rows of `/rl/step`: the T transitions of an episode, then its final record."""
 
-    First, `number` sets the counters of consecutive rows and clears their end flags. Then `put`
-    sets the other fields, `finish` turns the last rows into final records, and `write` adds the
-    times.
-    """
+    # First, `number` sets counters and clears end flags. Then `put` sets the other fields, `finish`
+    # turns the last rows into final records, and `write` adds the times.
 
     def number(self, where: Any, episode: Any, steps: Any) -> None:
-        """Set `episode` and `step` of consecutive rows, and clear their end flags.
-
-        Args:
-            where: Index of K rows.
-            episode: Index of the episode in the log, or one index for each row, (K,).
-            steps: (K,) index of each step in its episode.
-        """
+        """Set `episode` (one or K) and `step` (K,) of rows, and clear their end flags."""
         fields = self.fields
         fields["episode"][where], fields["step"][where] = episode, steps
         for name in ("terminated", "truncated", "final"):
@@ -530,10 +482,7 @@ class ImageRows(TopicRows):
 
 
 def part_of(rows: NDArray[Any], part: slice) -> NDArray[np.void]:
-    """Return a view of these bytes of each structured item, as items.
-
-    Copying items is twice as fast as copying rows of bytes.
-    """
+    """Return a view of these bytes of each item, as items: copied twice as fast as bytes."""
     item, itemsize = np.dtype((np.void, part.stop - part.start)), rows.itemsize
     layout = np.dtype(
         {"names": ["part"], "formats": [item], "offsets": [part.start], "itemsize": itemsize}
@@ -549,35 +498,24 @@ def make_final(message: NDArray[Any]) -> None:
 
 
 class Part(NamedTuple):
-    """Part of an episode that becomes an episode.
+    """Part of an episode that becomes an episode."""
 
-    Attributes:
-        start_ns: log_time of the first record.
-        end_ns: log_time of the last record.
-        first_step: Step of the first record, which becomes step 0.
-        length: Number of transitions.
-        is_cut: Whether the episode went on after the part, or its end is missing.
-    """
-
-    start_ns: int
-    end_ns: int
-    first_step: int
-    length: int
-    is_cut: bool
+    start_ns: int  # log_time of the first record
+    end_ns: int  # log_time of the last record
+    first_step: int  # Step of the first record, which becomes step 0
+    length: int  # Number of transitions
+    is_cut: bool  # Whether the episode went on after the part, or its end is missing
 
 
 class Shorten:
-    """Callable that changes records of `/rl/step` of parts of episodes into those of episodes.
-
-    Attributes:
-        spans: (P, 2) first and last log_time of each part, increasing.
-    """
+    """Callable that changes records of `/rl/step` of parts of episodes into those of episodes."""
 
     def __init__(self, parts: Sequence[Part], dtypes: Mapping[int, np.dtype[Any]]) -> None:
         """Store the parts, which do not overlap, and the dtype of the messages by channel id."""
         self._parts = sorted(parts, key=lambda part: part.end_ns)
         self._dtypes = dtypes
         found = [(part.start_ns, part.end_ns) for part in self._parts]
+        # (P, 2) first and last log_time of each part, increasing.
         self.spans = np.array(found, np.int64).reshape(-1, 2)
 
     def __call__(self, channel: Channel, time_ns: int, payload: memoryview) -> None:

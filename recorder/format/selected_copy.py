@@ -52,31 +52,23 @@ _HEADER = struct.Struct("<BQHIQQ")
 
 @dataclass
 class Source:
-    """File from which messages are copied. Times are log_times in nanoseconds.
-
-    Attributes:
-        reader: Reader of the file.
-        ids: Channel id in the new file, by channel id in this file.
-        spans: (S, 2) first and last time of each kept time range, increasing.
-        also: Times of additional messages to keep, by channel id.
-        without: Times of messages to drop, by channel id, even if `spans` or `also` contains these
-            times.
-        choice: Function that selects the messages, in place of `spans`, `also` and `without`.
-        changed: (S, 2) first and last time of each time range whose messages are passed to
-            `change`, by channel id. Messages that get other times or ids are always passed to it.
-        change: Function that changes a message.
-        delay_ns: Number that is added to the log_time and publish_time of each message.
-    """
+    """File from which messages are copied. Times are log_times in nanoseconds."""
 
     reader: McapReader
-    ids: Mapping[int, int]
+    ids: Mapping[int, int]  # Channel id in the new file, by channel id in this file
+    # (S, 2) first and last time of each kept time range, increasing.
     spans: Times = field(default_factory=lambda: ALL_TIMES)
+    # Times of additional messages to keep, by channel id.
     also: Mapping[int, Times] = field(default_factory=dict)
+    # Times of messages to drop, by channel id, even if `spans` or `also` contains these times.
     without: Mapping[int, Times] = field(default_factory=dict)
+    # Function that selects the messages, in place of `spans`, `also` and `without`.
     choice: Choice | None = None
+    # (S, 2) first and last time of each time range whose messages are passed to `change`, by
+    # channel id. Messages that get other times or ids are always passed to it.
     changed: Mapping[int, Times] = field(default_factory=dict)
-    change: Change | None = None
-    delay_ns: int = 0
+    change: Change | None = None  # Function that changes a message
+    delay_ns: int = 0  # Number that is added to the log_time and publish_time of each message
 
     def keeps(self, chunk: ChunkIndex, channel_id: int, index: NDArray[Any]) -> NDArray[np.bool_]:
         """Return a mask of the messages of a channel that are kept, given their message index."""
@@ -100,26 +92,15 @@ class Source:
 
 @dataclass
 class Copied:
-    """Numbers of chunks and messages of a copy.
+    """Numbers of chunks and messages of a copy."""
 
-    Attributes:
-        whole: Number of chunks that were copied without decompressing them.
-        rewritten: Number of chunks whose kept messages were written as a new chunk.
-        messages: Number of messages.
-    """
-
-    whole: int = 0
-    rewritten: int = 0
+    whole: int = 0  # Number of chunks that were copied without decompressing them
+    rewritten: int = 0  # Number of chunks whose kept messages were written as a new chunk
     messages: int = 0
 
 
 class NewTopics:
-    """Schemas and channels of the new file.
-
-    Attributes:
-        schemas: Schemas by id.
-        channels: Channels by id.
-    """
+    """Schemas and channels of the new file."""
 
     def __init__(self) -> None:
         """Start without topics."""
@@ -129,11 +110,8 @@ class NewTopics:
     def add(
         self, reader: McapReader, metadata: Mapping[str, dict[str, str]] | None = None
     ) -> dict[int, int]:
-        """Add the channels of a file; return the new id of each channel by its id in the file.
-
-        A channel that equals a channel of an earlier file gets the id of that channel. Any other
-        channel keeps its id if the id is free.
-        """
+        """Add the channels of a file; return the new id of each channel by its id in the file."""
+        # An equal channel of an earlier file shares its id; others keep theirs if it is free.
         found: dict[int, int] = {}
         earlier = dict(self.channels)
         for channel in reader.channels.values():
@@ -183,10 +161,7 @@ def copy_selected(
     *,
     like: McapReader | None = None,
 ) -> Copied:
-    """Write the selected messages of files to a new file.
-
-    Chunks are ordered by their start times.
-    """
+    """Write the selected messages of files to a new file, with chunks by their start times."""
     like = like or sources[0].reader
     with writer_like(like.view, like.records(len(MAGIC)), target) as writer:
         for record in top_level:
@@ -288,10 +263,8 @@ class _Copy:
         return not any(((start <= times) & (times <= end)).any() for times in also)
 
     def _embeds_topics(self, source: Source) -> bool:
-        """Return whether chunks may contain Channel records whose id differs in the new file.
-
-        Most other writers store each channel in the chunk of its first message.
-        """
+        """Return whether chunks may contain Channel records whose id differs in the new file."""
+        # Most other writers store each channel in the chunk of its first message.
         reader = source.reader
         key = id(reader)
         if key not in self._embedding:
@@ -343,11 +316,7 @@ def _top_level_ids(reader: McapReader) -> set[int]:
 def _taken(
     source: Source, records: memoryview, indexes: Mapping[int, NDArray[Any]]
 ) -> tuple[memoryview, dict[int, NDArray[Any]]]:
-    """Copy the messages in `indexes`, with the ids, times and changes for the new file.
-
-    Returns:
-        Message records in the order of the chunk, and their message indexes by new channel id.
-    """
+    """Return the messages in `indexes` for the new file, and their indexes by new channel id."""
     wanted = sorted(
         (offset, channel_id, time_ns)
         for channel_id, index in indexes.items()

@@ -34,20 +34,14 @@ _MAX_DIMENSIONS = 64
 
 @dataclass(frozen=True)
 class Leaf:
-    """One array of an observation or action.
+    """One array of an observation or action."""
 
-    Attributes:
-        name: Name of the field in `/rl/step`; for an image, the last part of its topic.
-        path: Keys from the root of a Dict space to the leaf; empty for the root itself.
-        shape: Shape of one value; empty for a scalar.
-        dtype: Data type of the environment's values.
-        encoding: Encoding of an image (`mono8`, `rgb8`, `rgba8`); None for any other leaf.
-    """
-
-    name: str
+    name: str  # Name of the field in `/rl/step`; for an image, the last part of its topic
+    # Keys from the root of a Dict space to the leaf; empty for the root itself.
     path: tuple[str, ...]
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
+    shape: tuple[int, ...]  # Shape of one value; empty for a scalar
+    dtype: np.dtype[Any]  # Data type of the environment's values
+    # Encoding of an image (`mono8`, `rgb8`, `rgba8`); None for any other leaf.
     encoding: str | None = None
 
     @property
@@ -90,10 +84,7 @@ def leaves_of(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
 
 
 def select(leaves: Sequence[Leaf], keys: Sequence[str] | None) -> list[Leaf]:
-    """Select leaves of a Dict space by key.
-
-    The key `joints/q` selects one leaf, and the key `joints` selects all leaves below it.
-    """
+    """Select leaves of a Dict space by key: `joints/q` one, `joints` all below it."""
     if keys is None:
         return list(leaves)
     names = {leaf: "/".join(leaf.path) for leaf in leaves}
@@ -167,10 +158,7 @@ def action_leaf(space: spaces.Space[Any]) -> Leaf:
 
 
 def part_names(space: spaces.Space[Any], names: Sequence[str]) -> tuple[str, ...]:
-    """Return the name of each number of an action, in C order.
-
-    These are `names` if there is one for each number, otherwise `action[0]` and so on.
-    """
+    """Return the name of each number of an action, in C order: `names`, or else `action[0]` etc."""
     shape = tuple(space.shape or ())
     if len(names) == math.prod(shape):
         return tuple(names)

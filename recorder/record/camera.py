@@ -33,10 +33,7 @@ class VideoEncoder:
         self._count = 0
 
     def encode(self, image: NDArray[np.uint8], time_ns: int) -> bytes:
-        """Return the message of an image (H, W, 3) at a time.
-
-        An odd height or width is cut by one pixel, because H.264 has even ones.
-        """
+        """Return the message of an image (H, W, 3), cut to the even sizes of H.264."""
         height, width = (edge // 2 * 2 for edge in image.shape[:2])
         if self._context is None:
             self._context = self._av.CodecContext.create("libx264", "w")
@@ -58,12 +55,7 @@ class VideoEncoder:
 
 
 def rendering_env(env: gym.Env[Any, Any], camera: bool | str) -> gym.Env[Any, Any] | None:
-    """Return the environment whose images are recorded as video; None for no video.
-
-    Raises:
-        UsageError: `camera` is another text than `h264`, or the environment renders no images.
-        MissingExtraError: PyAV is not installed.
-    """
+    """Return the environment whose images are recorded as video; None for no video."""
     if isinstance(camera, bool):
         return None
     if camera != "h264":
@@ -78,11 +70,7 @@ def rendering_env(env: gym.Env[Any, Any], camera: bool | str) -> gym.Env[Any, An
 
 
 def rendered(env: Any) -> NDArray[np.uint8]:
-    """Return the image that an environment renders.
-
-    Raises:
-        LogError: It does not render an image (H, W, 3) of 8 bits.
-    """
+    """Return the image that an environment renders."""
     image = np.asarray(env.render())
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape) < 2:
         raise LogError(

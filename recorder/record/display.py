@@ -73,19 +73,13 @@ _SCENE_PERIOD_NS = 100_000_000
 
 
 class ShownTopics:
-    """The scene and telemetry topics of an environment, whose channels are added to a log.
-
-    Attributes:
-        channels: Channel id of each topic.
-        telemetry_names: Fields of `/telemetry`.
-        follow_frame: Frame that the 3D view moves with; empty for none.
-    """
+    """The scene and telemetry topics of an environment, whose channels are added to a log."""
 
     def __init__(self, log: LogTopics, source: object) -> None:
         """Add a channel for each topic that `source` provides; `source` must have been reset."""
         types: dict[str, str] = {}
         self.telemetry_names: tuple[str, ...] = ()
-        self.follow_frame = ""
+        self.follow_frame = ""  # Frame that the 3D view moves with; empty for none
         self._world_m = log.metadata.view.get("world_m", AROUND_M)
         if isinstance(source, SceneSource):
             self.follow_frame = next((frame.name for frame in source.frames()), "")
@@ -121,16 +115,8 @@ class Display:
         camera: bool,
         rendering: gym.Env[Any, Any] | None = None,
     ) -> None:
-        """Select the topics to record.
-
-        Args:
-            log: Log to write to.
-            source: Unwrapped environment, which implements any of the protocols in `scene.py`.
-            scene: Whether to record shapes, frames and telemetry.
-            camera: Whether to record the depth camera. If observations contain images, the depth
-                camera is recorded even without this flag.
-            rendering: Environment whose rendered images are recorded as video; None for no video.
-        """
+        """Select the topics to record."""
+        # The depth camera is also recorded if observations have images.
         self._log, self._source = log, source if scene else None
         self._messages: list[tuple[int, int, bytes]] = []
         self._bytes = 0
@@ -198,12 +184,7 @@ class Display:
             self._emit_changed(CAMERA_INFO, start_ns, self._camera)
 
     def observe(self, step: int, reward: float) -> None:
-        """Add the display messages for the state after `step` steps.
-
-        Args:
-            step: Number of steps since the start of the episode.
-            reward: Reward of the last step.
-        """
+        """Add the display messages for the state after `step` steps, with the last reward."""
         self._return_so_far += reward
         time_ns = self._start_ns + step * self._step_ns
         if self._scene is not None:

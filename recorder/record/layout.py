@@ -73,18 +73,8 @@ def layout_of(
     episodes: int = 0,
     sensors: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Return the layout for a log with these topics.
-
-    Args:
-        metadata: Description of the log.
-        topics: Names of the topics.
-        telemetry_names: Fields of the telemetry.
-        follow_frame: Frame that the 3D view follows; empty for none.
-        training: Titles of the metrics of a training that is shown live, by field.
-        without_q: Topics of policies without Q-values.
-        episodes: Number of episodes; 0 if it is unknown.
-        sensors: Types of a robot's own topics, by name.
-    """
+    """Return the layout for a log with these topics."""
+    # `training`: titles of live metrics by field. `sensors`: types of a robot's topics by name.
     # A policy with Q-values is shown first.
     ordered = sorted(topics, key=lambda topic: (is_values_topic(topic), topic in without_q))
     found = (metadata, ordered, telemetry_names, follow_frame, training or {}, without_q, episodes)
@@ -198,11 +188,7 @@ class _Screens:
         return self._put("3D!scene", panels.three_d("scene", shown, camera, followed))
 
     def _above(self) -> Node:
-        """Add the view from above.
-
-        The view shows the whole world if the log contains the size of the world, otherwise the
-        surroundings of the vehicle.
-        """
+        """Add the view from above: of the world if its size is known, else the surroundings."""
         view = self.metadata.view
         height_m = view.get("world_m", AROUND_M)
         camera = {
@@ -301,10 +287,7 @@ class _Screens:
         return [self._put("Gauge!speed", panel)]
 
     def _indicator(self) -> list[Node]:
-        """Add how the last episode ended, which stays until the next end.
-
-        If the success reasons are known, failures are red.
-        """
+        """Add how the last episode ended; failures are red if the success reasons are known."""
         successes = self.metadata.success_reasons
         colors = {
             INTERRUPTED: panels.NEUTRAL,

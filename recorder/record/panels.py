@@ -169,23 +169,14 @@ def points_by_index(title: str, paths: Mapping[str, str]) -> Panel:
 
 
 def curve(title: str, x_path: str, y_path: str) -> Panel:
-    """Return a plot of one number over another.
-
-    The numbers must be from different topics, because Lichtblick otherwise draws nothing.
-    """
+    """Return a plot of a number over one of another topic; Lichtblick cannot plot one topic's."""
     x_axis = {"value": x_path, "enabled": True}
     return plot(title, {"y": y_path}, xAxisVal="custom", xAxisPath=x_axis, isSynced=False)
 
 
 def state_transitions(title: str, paths: Mapping[str, str], last_s: float | None = None) -> Panel:
-    """Return a panel with one labeled row of discrete values per message path.
-
-    Args:
-        title: Title of the panel.
-        paths: Message path of each row, by label.
-        last_s: Number of seconds before the current time to show; None for all. If limited, the
-            panel is not synchronized, because that would also limit the range of other panels.
-    """
+    """Return a panel with one labeled row of discrete values per message path."""
+    # With `last_s`, it is not synchronized: that would also limit the range of other panels.
     rows = [_series(label, path) for label, path in paths.items()]
     if last_s is None:
         return _titled(title, paths=rows, isSynced=True)

@@ -84,11 +84,7 @@ def one_each(what: str, values: NDArray[Any], count: int) -> NDArray[Any]:
 def final_observation(
     infos: Mapping[str, Any], number: int, count: int, space: spaces.Space[Any]
 ) -> Any:
-    """Return the last observation of one environment that was reset in the same step.
-
-    Returns:
-        The observation; None if the infos do not contain it.
-    """
+    """Return the last observation of one environment reset in the same step; None without one."""
     for name in _FINAL_NAMES:
         mask = infos.get(f"_{name}")
         if infos.get(name) is not None and (mask is None or bool(mask[number])):
@@ -163,13 +159,7 @@ class EpisodeInfos:
                 values.append(_copied(value))
 
     def end(self, length: int, start_ns: int, step_ns: int) -> None:
-        """Write the infos of the episode.
-
-        Args:
-            length: Number of recorded transitions; infos of later steps are not written.
-            start_ns: log_time of the first observation.
-            step_ns: Time between two observations, nanoseconds.
-        """
+        """Write the infos of an episode of `length` transitions, without those of later steps."""
         found, refused = {}, self._topics.refused
         for name, (steps, values) in self._values.items():
             count = sum(step <= length for step in steps)
@@ -207,13 +197,9 @@ def _copied(value: Any) -> Any:
 
 
 def info_of(infos: Any, number: int, count: int) -> dict[str, Any]:
-    """Return the info of one of `count` environments from the infos of a vector environment.
-
-    Gymnasium stores the values of all environments in one array per info. The mask `_name` selects
-    the environments that returned the info `name`. A value with another length is the info of
-    each environment. Some vector environments return a sequence with one dict for each
-    environment.
-    """
+    """Return the info of one of `count` environments from the infos of a vector environment."""
+    # Gymnasium stores one array per info, whose mask `_name` selects the environments with it. A
+    # value of another length belongs to each environment. Some return a sequence of dicts.
     if not isinstance(infos, Mapping):
         one = infos[number] if len(infos) == count else None
         return dict(one) if isinstance(one, Mapping) else {}
@@ -327,20 +313,14 @@ def _advice(env: Any) -> str:
 
 
 class RecordedSpace(NamedTuple):
-    """The part of an observation space that a log stores.
+    """The part of an observation space that a log stores."""
 
-    Attributes:
-        space: Observation space of the log.
-        leaves: Leaves of this space.
-        paths: Path of each leaf in an observation of the environment. Keys of a Dict are strings,
-            indexes of a Tuple are integers.
-        texts: Path of each text by the name of its info.
-    """
-
-    space: spaces.Space[Any]
+    space: spaces.Space[Any]  # Observation space of the log
     leaves: tuple[Leaf, ...]
+    # Path of each leaf in an observation of the environment. Keys of a Dict are strings, indexes of
+    # a Tuple are integers.
     paths: tuple[tuple[str | int, ...], ...]
-    texts: dict[str, tuple[str | int, ...]]
+    texts: dict[str, tuple[str | int, ...]]  # Path of each text by the name of its info
 
     def of(self, observation: Any) -> Any:
         """Return an observation of the environment, or a batch of them, in the form of the log."""
@@ -353,10 +333,7 @@ class RecordedSpace(NamedTuple):
         return [*([wanted] if isinstance(wanted, str) else wanted or []), *self.texts]
 
     def info(self, info: Any, observation: Any, number: int | None = None) -> Any:
-        """Return an info with the texts of an observation.
-
-        For a batch of observations, `number` is that of the environment.
-        """
+        """Return an info with the texts of an observation, of environment `number` of a batch."""
         if not self.texts:
             return info
         found = {name: value_at(observation, path) for name, path in self.texts.items()}

@@ -188,12 +188,9 @@ class PinholeSource(Protocol):
 
 
 def marker_array(shapes: Iterable[Shape]) -> bytes:
-    """Encode shapes as one `visualization_msgs/msg/MarkerArray`.
-
-    The first marker deletes all earlier markers, so that a viewer shows only these shapes after it
-    seeks to this message. Stamps are 0, so that equal shapes encode to equal messages. A stamp of 0
-    refers to the latest transform of the frame.
-    """
+    """Encode shapes as one `visualization_msgs/msg/MarkerArray`."""
+    # The first marker deletes all earlier ones, so that a viewer that seeks shows only these.
+    # Stamps of 0 refer to the latest transform, and make equal shapes equal messages.
     shapes = list(shapes)
     message = messages.CdrWriter()
     message.add_count(1 + len(shapes))
@@ -222,13 +219,8 @@ def timed_transforms(frames: Sequence[tuple[int, Frame]]) -> bytes:
 
 
 def camera_info(focal_px: tuple[float, float], shape: tuple[int, ...]) -> bytes:
-    """Encode a pinhole camera as `sensor_msgs/msg/CameraInfo`, without distortion.
-
-    Args:
-        focal_px: Focal lengths in pixel widths and pixel heights.
-        shape: Height and width of the image, pixels. The optical axis passes through the middle of
-            the image. Pixel coordinates are 0 in the middle of the first pixel.
-    """
+    """Encode a pinhole camera as `sensor_msgs/msg/CameraInfo`, without distortion."""
+    # The axis passes through the middle; (0, 0) is the middle of the first pixel.
     height, width = shape[:2]
     matrix = np.array([[focal_px[0], 0, width / 2 - 0.5], [0, focal_px[1], height / 2 - 0.5]])
     matrix = np.vstack([matrix, [0.0, 0.0, 1.0]])
@@ -335,13 +327,8 @@ _TOLERANCE_ROTATION = 0.01
 
 
 def motion_transforms(moments: Sequence[Moment], *, thins: bool = True) -> bytes:
-    """Encode the moments of a step as one `tf2_msgs/msg/TFMessage`, in order of time.
-
-    Args:
-        moments: Moments in order of time; all contain the same frames.
-        thins: Whether to omit an intermediate pose if linear interpolation between the remaining
-            poses differs from it by at most 0.04 m and 0.02 rad.
-    """
+    """Encode the moments of a step as one `tf2_msgs/msg/TFMessage`, in order of time."""
+    # `thins` omits poses that interpolation reproduces within 0.04 m and 0.02 rad.
     times = np.array([time_ns for time_ns, _ in moments], np.float64) - moments[0][0]
     kept = []
     for number in range(len(moments[0][1])):
@@ -354,14 +341,7 @@ def motion_transforms(moments: Sequence[Moment], *, thins: bool = True) -> bytes
 
 
 def knots(times: NDArray[np.float64], values: NDArray[np.float64]) -> list[int]:
-    """Select rows from which linear interpolation reproduces the others with errors up to 1.
-
-    Args:
-        times: (N,) increasing times; N is at least 2.
-        values: (N, K) numbers.
-
-    Returns:
-        Increasing indices of the selected rows; the first is 0 and the last N - 1.
+    """Select rows (N,) from which linear interpolation reproduces the others within 1.
 
     >>> times = np.arange(5.0)
     >>> knots(times, times[:, None] * 7), knots(times, np.array([[0.0], [0], [0], [4], [8]]))
@@ -416,14 +396,7 @@ class TrackShape(NamedTuple):
 
 
 def map_shapes(source: object, frame: str, world_m: float, tracks: Tracks) -> list[Shape]:
-    """Return the shapes for a view from above: the route, this episode's track, and the vehicle.
-
-    Args:
-        source: Environment, which may be a `MapSource`.
-        frame: Frame of the vehicle; empty if there is none.
-        world_m: Visible height of the view from above, to which the sizes are adapted.
-        tracks: Tracks, whose current one is shown.
-    """
+    """Return the shapes for a view from above: the route, this episode's track, and the vehicle."""
     shapes: list[Shape] = [*source.map_scene()] if isinstance(source, MapSource) else []
     shapes += tracks.so_far(world_m / _WIDTHS_PER_WORLD)
     if frame:
@@ -454,11 +427,8 @@ class Tracks:
         self._due = 1
 
     def add(self, position_m: Vector) -> bool:
-        """Add a position (x, y, z) of the vehicle in the map, meters.
-
-        Returns:
-            Whether to show the track so far again: at first, and when it is a sixteenth longer.
-        """
+        """Add a position (x, y, z), meters."""
+        # Return whether to show the track: if a sixteenth longer.
         self._points_m.append(position_m)
         count = len(self._points_m)
         is_due = count >= self._due

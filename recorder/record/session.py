@@ -48,14 +48,7 @@ class OpenEpisode:
 
 
 class EpisodeLog:
-    """A log of numbered episodes with increasing times.
-
-    Attributes:
-        log: Writer of the file.
-        step_ns: Simulated time between two observations.
-        next_start_ns: log_time of the next episode's first message.
-        episodes: Number of finished episodes, which is also the index of the next one.
-    """
+    """A log of numbered episodes with increasing times."""
 
     def __init__(
         self,
@@ -73,7 +66,7 @@ class EpisodeLog:
         # Relative paths are resolved in this folder, even if the process later changes to another
         # folder.
         self._folder = os.getcwd()
-        self.step_ns = description.step_duration_ns
+        self.step_ns = description.step_duration_ns  # Simulated time between two observations
         if not isinstance(start_time_ns, int | np.integer | None):
             raise UsageError(f"start_time_ns is {start_time_ns}: it must be an integer")
         first_ns = time.time_ns() if start_time_ns is None else int(start_time_ns)
@@ -88,12 +81,14 @@ class EpisodeLog:
         if max_file_bytes is not None:
             self._parts = _Parts(Path(path), max_file_bytes, overwrite=overwrite, append=append)
             path = self._parts.current
+        # Writer of the file.
         self.log = LogWriter(
             path, description, compression=compression, overwrite=overwrite, append=append
         )
         try:
             if self._parts is not None:
                 self._parts.remove_replaced()
+            # Number of finished episodes, which is also the index of the next one.
             self.episodes = _episodes_in(self.log) if append else 0
             end_ns = self.log.mcap.end_time_ns
             if end_ns >= MAX_TIME_NS:
@@ -109,6 +104,7 @@ class EpisodeLog:
         # Index of the first episode in this file.
         self._first_in_file = 0
         follows = start_time_ns is None and end_ns >= 0
+        # log_time of the next episode's first message.
         self.next_start_ns = max(first_ns, end_ns + self.step_ns) if follows else first_ns
 
     @property
@@ -130,11 +126,7 @@ class EpisodeLog:
                 raise UsageError(f"seed {seed}: a seed must be from 0 to 2**64 - 2")
 
     def begin(self, display: Display) -> None:
-        """Begin the next episode, and write its first display messages.
-
-        If the current file is full, the episode begins a new file. The layout is written with the
-        first episode.
-        """
+        """Begin the next episode, if necessary in a new file, and write its first messages."""
         mcap, start_ns, parts = self.log.mcap, self.next_start_ns, self._parts
         has_episodes = self.episodes > self._first_in_file
         if parts is not None and has_episodes and mcap.position >= parts.max_file_bytes:
@@ -167,10 +159,7 @@ class EpisodeLog:
         reason: str,
         after: EpisodeSummary | None = None,
     ) -> EpisodeSummary:
-        """Return the summary of an episode that ends now.
-
-        It follows the episode `after`, by default the last episode in the log.
-        """
+        """Return the summary of an episode that ends now, after `after` or the log's last."""
         number, start_ns = self.episodes, self.next_start_ns
         if after is not None:
             number, start_ns = after.episode + 1, after.end_time_ns + self.step_ns

@@ -84,15 +84,12 @@ class Arrays:
 
 
 class Integers:
-    """A buffer of 64-bit integers.
-
-    Attributes:
-        append: Function that stores an integer; raises TypeError or OverflowError for other values.
-    """
+    """A buffer of 64-bit integers."""
 
     def __init__(self) -> None:
         """Create an empty buffer."""
         self._waiting = array("q")
+        # Function that stores an integer; raises TypeError or OverflowError for other values.
         self.append: Store = self._waiting.append
 
     def store(self, leaf: Leaf) -> Store:
@@ -117,14 +114,7 @@ class Integers:
 
 
 class StepColumns:
-    """The rows of `/rl/step` of one episode that are not on disk yet.
-
-    Attributes:
-        take_action: Fast function that stores an action; raises TypeError or OverflowError for
-            actions that only `store_action` accepts.
-        store_action: Function that stores an action of any type.
-        store_reward: Function that stores a reward of any numeric type.
-    """
+    """The rows of `/rl/step` of one episode that are not on disk yet."""
 
     def __init__(self, log: LogTopics) -> None:
         """Preallocate a chunk of rows."""
@@ -133,17 +123,18 @@ class StepColumns:
         self._rewards, self._behavior = array("d"), array("d")
         self._behavior_name = log.behavior.name
         self._waiting: dict[str, Arrays | Integers] = {}
+        # Function that stores an action of any type.
+        # Fast function that stores an action; raises TypeError or OverflowError for actions that
+        # only `store_action` accepts.
         self.store_action = self.take_action = self.store(log.action)
         actions = self._waiting[log.action.name]
         if isinstance(actions, Integers):
             self.take_action = actions.append
+        # Function that stores a reward of any numeric type.
         self.store_reward: Store = self._rewards.append
 
     def store_behavior(self, value: float) -> None:
-        """Store the probability or log density of the latest action.
-
-        Earlier actions without a value get NaN.
-        """
+        """Store the behavior of the latest action; earlier ones without a value get NaN."""
         unknown = len(self._rewards) - len(self._behavior)
         if unknown:
             self._behavior.extend([math.nan] * unknown)
@@ -168,10 +159,7 @@ class StepColumns:
         return self._first_step + len(self._rows)
 
     def make_room(self, step: int) -> None:
-        """Write all rows before the transition that leads to `step`.
-
-        This transition stays in memory, because it may end the episode.
-        """
+        """Write all rows before the transition to `step`, which may end the episode."""
         count = step - self._first_step - 1
         self._total_reward = self.total_reward(step - 1)
         self._fill(count, count)
@@ -248,10 +236,7 @@ class ImageColumn:
         return self._first_step + len(self._rows)
 
     def append(self, image: NDArray[Any]) -> None:
-        """Store the image of the next step.
-
-        The dtypes of the image and of the space must have the same number of bytes.
-        """
+        """Store the image of the next step; its dtype must have as many bytes as the space's."""
         self._images.append(image)
 
     def flush(self, stop: int) -> None:
@@ -286,10 +271,7 @@ def observation_store(
 
 
 def converters(recorded: RecordedSpace, count: int | None = None) -> list[Converter]:
-    """Return one function per leaf, which reads the leaf's value from an observation.
-
-    If a `count` of environments is given, it reads their values from a batch of observations.
-    """
+    """Return a function per leaf that reads its value from an observation or `count` of them."""
     batch = () if count is None else (count,)
     return [
         converter(replace(leaf, shape=(*batch, *leaf.shape)), path)
@@ -311,10 +293,7 @@ def converter(leaf: Leaf, path: tuple[str | int, ...] = ()) -> Converter:
 
 
 def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
-    """Convert a value to the dtype and shape that its space declares.
-
-    Arrays of another float type are converted with a warning; other values must convert exactly.
-    """
+    """Convert a value to its space's dtype and shape: floats with a warning, others exactly."""
     where = _where(leaf)
     try:
         array = as_array(value)
@@ -394,10 +373,7 @@ class OpenRows(Generic[Rows]):
         self._use(np.empty((2 ** (first.bit_length() - 1), environments), dtype))
 
     def make_room(self, count: int, row: int) -> None:
-        """Grow the array until `count` rows fit.
-
-        The rows up to `row` are kept.
-        """
+        """Grow the array until `count` rows fit, and keep the rows up to `row`."""
         kept = np.arange(max(row - self.capacity + 1, 0), row + 1)
         capacity = self.capacity
         while capacity < count:
@@ -407,14 +383,7 @@ class OpenRows(Generic[Rows]):
         self._items[kept % capacity] = self._items_of(old)[old_places]
 
     def put(self, field: str, row: int, values: Any, environments: Any = ...) -> None:
-        """Set a field in one row.
-
-        Args:
-            field: Name of the message field.
-            row: Number of the row.
-            values: (K, *shape) values; for a field without a shape, also one scalar for all.
-            environments: Index of K environments, by default all.
-        """
+        """Set a field in one row to values (K, *shape), or a scalar, of all or K environments."""
         column = self._columns[field]
         if column.ndim > 2:
             values = values.reshape(-1, column.shape[-1])
@@ -428,15 +397,7 @@ class OpenRows(Generic[Rows]):
         starts_ns: NDArray[np.int64],
         step_ns: int,
     ) -> None:
-        """Write rows of environments, one environment after the other.
-
-        Args:
-            environments: K indexes of environments.
-            firsts: K first rows.
-            counts: K numbers of rows.
-            starts_ns: (K,) log_time of each environment's first row.
-            step_ns: Time between two rows, nanoseconds.
-        """
+        """Write K environments' rows from `firsts`, one environment after the other."""
         for which, steps in self._chunks(environments, firsts, counts):
             self._chunk.write(slice(len(steps)), starts_ns[which] + steps * step_ns)
 
@@ -453,13 +414,8 @@ class OpenRows(Generic[Rows]):
     def _chunks(
         self, environments: Sequence[int], firsts: Sequence[int], counts: Sequence[int]
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Copy rows of environments to the message records of one chunk after the other.
-
-        Environments share a chunk if all their rows fit.
-
-        Yields:
-            For each row of a chunk, its position in `environments` and its step.
-        """
+        """Copy rows to message records by chunks; yield each row's environment and step."""
+        # Environments share a chunk if all their rows fit.
         parts: list[_Part] = []
         used, most = 0, len(self._chunk)
         for position, first in enumerate(firsts):

@@ -62,16 +62,11 @@ class _Ended(NamedTuple):
 
 
 class _Now(NamedTuple):
-    """State of the open episodes.
+    """State of the open episodes."""
 
-    Attributes:
-        row: Row of the latest observations in the buffers. The next step sets its actions and
-            rewards.
-        returns: (N,) sum of the rewards so far, added from the first to the last.
-    """
-
+    # Row of the latest observations in the buffers. The next step sets its actions and rewards.
     row: int
-    returns: NDArray[np.float64]
+    returns: NDArray[np.float64]  # (N,) sum of the rewards so far, added from the first to the last
 
 
 class RecordVecMcap(FinishesAtExit, VectorWrapper):
@@ -331,12 +326,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             self._learner.put("policy_version", row, version)
 
     def _checked_behavior(self) -> NDArray[np.float32]:
-        """Return the probabilities or log densities as an array, () or (N,).
-
-        Raises:
-            SpaceError: The shape is wrong.
-            UsageError: A value is not possible.
-        """
+        """Return the probabilities or log densities as an array, () or (N,)."""
         given, shape, field = as_array(self._behavior), (self.num_envs,), self._field
         with np.errstate(over="ignore"):
             values = given.astype(np.float32)
@@ -391,10 +381,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
             self._infos[number].add(step, info)
 
     def _begin(self, numbers: NDArray[np.int64], infos: dict[str, Any], observations: Any) -> None:
-        """Begin an episode of each of these environments.
-
-        Its first observation is already in the current row.
-        """
+        """Begin an episode of each of these environments, whose first observations are stored."""
         for number in numbers.tolist():
             self._open[number] = OpenEpisode(self.policy, self.epsilon)
             if self._infos:
@@ -411,10 +398,7 @@ class RecordVecMcap(FinishesAtExit, VectorWrapper):
         flags: tuple[NDArray[np.bool_], NDArray[np.bool_]],
         infos: dict[str, Any],
     ) -> None:
-        """End the episodes of these environments; `flags` are `terminated` and `truncated`.
-
-        In same-step mode, also begin their next episodes.
-        """
+        """End these environments' episodes, and in same-step mode begin their next ones."""
         terminated, truncated = flags
         same_step = self._autoreset is AutoresetMode.SAME_STEP
         infos_of_ended = final_info(infos) if same_step else infos

@@ -293,11 +293,9 @@ _LISTED = 3
 
 
 def check_messages(path: Path) -> list[Problem]:
-    """Decode all messages of a bag file, or of a rosbag2 folder; return the problems by topic.
-
-    One message is in memory at a time. If the file can be opened, the last finding is a note that
-    it is a bag.
-    """
+    """Decode all messages of a bag file or rosbag2 folder, one at a time."""
+    # Return problems by topic. If the file can be opened, the last finding is a note that it is a
+    # bag.
     try:
         with closing(open_bag(path)) as bag:
             found = Shortlist[Problem]()
@@ -350,13 +348,7 @@ _Read = memoryview | CorruptLogError
 
 
 def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
-    """Check the structure, CRCs, indexes, episodes and metadata of one log.
-
-    If the file is another robot's bag, its messages are decoded instead of the episodes.
-
-    Returns:
-        Problems in file order; for a bag, a note follows them.
-    """
+    """Check the structure, CRCs, indexes, episodes and metadata of one log, or a bag's messages."""
     path = as_path(path)
     is_other = path.is_dir() or (is_bag_file(path) and path.suffix != ".mcap")
     if is_other and not isinstance(path, RemotePath):
@@ -417,10 +409,7 @@ def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: i
 
 
 def _decompressed(reader: McapReader, threads: int) -> Iterator[tuple[ChunkIndex, _Read]]:
-    """Yield each chunk and its records, or the error if it is damaged.
-
-    The records are valid until the caller requests the next chunk.
-    """
+    """Yield each chunk and its records, valid until the next, or the error if it is damaged."""
     chunks = iter(reader.chunks)
     if threads == 1:
         scratch = Scratch()

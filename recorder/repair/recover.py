@@ -87,25 +87,21 @@ class DroppedEpisode:
 
 @dataclass
 class EpisodePlan:
-    """Selection of the records to keep.
+    """Selection of the records to keep."""
 
-    Attributes:
-        kept: Mask of the records of `/rl/step` in file order, by `Place`.
-        spans: (E, 2) first and last log_time of the kept episodes, increasing.
-        dropped: Episodes that are not kept.
-        ended: Parts of kept episodes whose end is missing, up to their last whole transition.
-        new_summaries: Summaries of kept episodes that `/rl/episode` does not contain.
-        strays: Number of messages on other `/rl/` topics that do not belong to a kept episode.
-        is_in_order: Whether the records are in time order.
-    """
-
+    # Mask of the records of `/rl/step` in file order, by `Place`.
     kept: dict[Place, NDArray[np.bool_]] = field(default_factory=dict)
+    # (E, 2) first and last log_time of the kept episodes, increasing.
     spans: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    # Episodes that are not kept.
     dropped: Shortlist[DroppedEpisode] = field(default_factory=Shortlist)
+    # Parts of kept episodes whose end is missing, up to their last whole transition.
     ended: list[Part] = field(default_factory=list)
+    # Summaries of kept episodes that `/rl/episode` does not contain.
     new_summaries: list[EpisodeSummary] = field(default_factory=list)
+    # Number of messages on other `/rl/` topics that do not belong to a kept episode.
     strays: int = 0
-    is_in_order: bool = True
+    is_in_order: bool = True  # Whether the records are in time order
 
     @property
     def episodes(self) -> int:
@@ -128,11 +124,7 @@ class EpisodePlan:
 
 
 def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan | None:
-    """Find the whole episodes of a log.
-
-    Returns:
-        Plan; None if the file is not a log because `/rl/step` or its required fields are missing.
-    """
+    """Find the whole episodes of a log; None if `/rl/step` or its required fields are missing."""
     steps = Topic(reader, STEP_TOPIC)
     if not len(steps):
         return EpisodePlan() if _is_log(reader) else None
@@ -183,21 +175,13 @@ def write_planned(reader: McapReader, target: Path, plan: EpisodePlan) -> Copied
 
 @dataclass(frozen=True)
 class _Run:
-    """A gapless series of records of one episode.
+    """A gapless series of records of one episode."""
 
-    Attributes:
-        start: Row of the first record.
-        last: Row before the first record that lacks an image; if there is none, the last row.
-        records: Number of records, including records without their images.
-        begins: Whether the run begins with step 0.
-        is_whole: Whether the run is a whole episode.
-    """
-
-    start: int
-    last: int
-    records: int
-    begins: bool
-    is_whole: bool
+    start: int  # Row of the first record
+    last: int  # Row before the first record that lacks an image; if there is none, the last row
+    records: int  # Number of records, including records without their images
+    begins: bool  # Whether the run begins with step 0
+    is_whole: bool  # Whether the run is a whole episode
 
     @property
     def can_end(self) -> bool:
@@ -282,10 +266,7 @@ def _listed_episodes(reader: McapReader) -> dict[int, int]:
 
 
 def _missing(columns: Columns, listed: Iterable[int]) -> Iterator[DroppedEpisode]:
-    """Yield the episodes without records.
-
-    The number of such an episode is in `listed`, or is missing between two numbers in the log.
-    """
+    """Yield the episodes without records: numbers in `listed`, or between two in the log."""
     known = np.unique(columns["episode"]).astype(np.int64)
     gaps = np.diff(known)
     between = [
@@ -397,10 +378,7 @@ def recover_log(
 def _keep_whole_episodes(
     copied: Path, result: Path, recovery: Recovery, keep_unfinished: bool
 ) -> None:
-    """Write the file `copied` to `result`, without its incomplete episodes.
-
-    If `keep_unfinished` is set, episodes without an end are kept up to their last whole transition.
-    """
+    """Write `copied` to `result` without incomplete episodes, or with their whole transitions."""
     reader = McapReader(copied)
     recovery.messages = _count_messages(reader)
     if recovery.messages == 0:
