@@ -27,12 +27,10 @@ def raise_interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def is_postponed(number: int, frame: FrameType | None) -> bool:
-    """Return whether a signal handler must not raise now; the signal is then sent again later.
-
-    In an import, an exception could be lost, changed, or leave a module incomplete. In a function
-    that llvmlite's C code calls, it would be lost. A signal is postponed for at most 5 s, because
-    an imported script may never end.
-    """
+    """Return whether a signal handler must not raise now; the signal is then sent again later."""
+    # In an import, an exception could be lost, changed, or leave a module incomplete; in a function
+    # that llvmlite's C code calls, it would be lost. A signal is postponed for at most 5 s, because
+    # an imported script may never end.
     global _postponed_since
     now = time.monotonic()
     since = _postponed_since or now
@@ -48,10 +46,8 @@ def is_postponed(number: int, frame: FrameType | None) -> bool:
 
 
 def repeat_lost_interrupt(lost: sys.UnraisableHookArgs) -> None:
-    """Send a signal again if its KeyboardInterrupt was lost; this is a `sys.unraisablehook`.
-
-    Python ignores an exception that is raised in a finalizer or in a callback of C code.
-    """
+    """Send a signal again if its KeyboardInterrupt was lost; this is a `sys.unraisablehook`."""
+    # Python ignores exceptions in finalizers and callbacks of C code.
     if lost.exc_type is not KeyboardInterrupt:
         sys.__unraisablehook__(lost)
         return

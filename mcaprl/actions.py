@@ -45,17 +45,11 @@ _INFO = "info:"
 
 @dataclass(frozen=True, eq=False)
 class JointActions:
-    """Numbering of the actions of a finite space.
+    """Numbering of the actions of a finite space."""
 
-    Attributes:
-        space: Discrete, MultiDiscrete or MultiBinary space.
-        sizes: Number of values of each element.
-        starts: (K,) int64, smallest value of each element.
-    """
-
-    space: spaces.Space[Any]
-    sizes: tuple[int, ...]
-    starts: NDArray[np.int64]
+    space: spaces.Space[Any]  # Discrete, MultiDiscrete or MultiBinary space
+    sizes: tuple[int, ...]  # Number of values of each element
+    starts: NDArray[np.int64]  # (K,) int64, smallest value of each element
 
     @classmethod
     def of(cls, space: spaces.Space[Any]) -> JointActions:
@@ -117,17 +111,11 @@ class JointActions:
 
 @dataclass(frozen=True, eq=False)
 class BoxActions:
-    """Scaling of the actions of a Box to numbers in [-1, 1].
-
-    Attributes:
-        space: Box of floats.
-        low: (n,) float64, numbers of an action that are scaled to -1.
-        high: (n,) float64, numbers of an action that are scaled to 1.
-    """
+    """Scaling of the actions of a Box to numbers in [-1, 1]."""
 
     space: spaces.Box
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
+    low: NDArray[np.float64]  # (n,) float64, numbers of an action that are scaled to -1
+    high: NDArray[np.float64]  # (n,) float64, numbers of an action that are scaled to 1
 
     @classmethod
     def of(
@@ -136,17 +124,7 @@ class BoxActions:
         actions: NDArray[Any] | None = None,
         names: Sequence[str] = (),
     ) -> BoxActions:
-        """Return the scaling of a space.
-
-        Args:
-            space: Box of floats.
-            actions: (N, *shape) logged actions, whose minimum and maximum replace infinite bounds.
-            names: Names of the n parts of an action, for messages.
-
-        Raises:
-            SpaceError: The space has integers, a bound is infinite and there are no actions, or a
-                part of the actions never changes.
-        """
+        """Return the scaling of a space; the range of `actions` replaces infinite bounds."""
         if np.dtype(space.dtype).kind != "f":
             raise SpaceError(
                 f"{space} has integers: learning needs numbers or numbered actions; declare a Box"
@@ -240,11 +218,9 @@ def joint_actions(space: spaces.Space[Any] | None) -> JointActions | None:
 
 
 def allowed_actions(observations: Any) -> NDArray[np.bool_] | None:
-    """Return the mask (..., A) of one or more observations; None if they have no mask.
-
-    After an episode's end, a mask may allow no action. Then all actions are allowed, because the
-    values and actions of that state are never used.
-    """
+    """Return the mask (..., A) of one or more observations; None if they have no mask."""
+    # After an episode's end, a mask may allow no action. Then all actions are allowed, because the
+    # values and actions of that state are never used.
     if not isinstance(observations, dict) or MASK_KEY not in observations:
         return None
     allowed = np.asarray(observations[MASK_KEY]).astype(bool)

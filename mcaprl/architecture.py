@@ -23,17 +23,12 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class Encoder:
-    """Convolutions of an encoder.
+    """Convolutions of an encoder."""
 
-    Attributes:
-        channels: Default output channels of the convolutions.
-        kernels: Kernel size and stride of each convolution, in pixels.
-        edge: Approximate length in pixels of an image's shorter edge after average pooling by an
-            integer factor; None for no pooling.
-    """
-
-    channels: tuple[int, ...]
-    kernels: tuple[tuple[int, int], ...]
+    channels: tuple[int, ...]  # Default output channels of the convolutions
+    kernels: tuple[tuple[int, int], ...]  # Kernel size and stride of each convolution, in pixels
+    # Approximate length in pixels of an image's shorter edge after average pooling by an integer
+    # factor; None for no pooling.
     edge: int | None = None
 
     def pool(self, image_shape: Sequence[int]) -> int:
@@ -74,24 +69,18 @@ def choose_encoder(name: str, widths: Sequence[int], channels: Iterable[int]) ->
 
 @dataclass(frozen=True)
 class Architecture:
-    """Architecture of a network.
+    """Architecture of a network."""
 
-    Attributes:
-        hidden: Widths of the fully connected hidden layers; each input has its own first layer.
-        channels: Output channels of the convolutions over each image; empty selects those of the
-            encoder.
-        layer_norm: Whether the hidden layers are normalized before each ReLU
-            (https://arxiv.org/abs/1607.06450).
-        dueling: Whether outputs are the sum of a value and of advantages with mean 0, computed by
-            separate last hidden layers (https://arxiv.org/abs/1511.06581).
-        encoder: Key of `ENCODERS`, for images that are not small.
-    """
-
+    # Widths of the fully connected hidden layers; each input has its own first layer.
     hidden: tuple[int, ...]
+    # Output channels of the convolutions over each image; empty selects those of the encoder.
     channels: tuple[int, ...] = ()
+    # Whether the hidden layers are normalized before each ReLU (https://arxiv.org/abs/1607.06450).
     layer_norm: bool = False
+    # Whether outputs are the sum of a value and of advantages with mean 0, computed by separate
+    # last hidden layers (https://arxiv.org/abs/1511.06581).
     dueling: bool = False
-    encoder: str = "nature"
+    encoder: str = "nature"  # Key of `ENCODERS`, for images that are not small
 
     def encoder_of(self, image_shape: Sequence[int]) -> Encoder:
         """Return the encoder for an image (height, width, ...), with its output channels."""

@@ -82,13 +82,9 @@ class ChunkExecution:
             self._ages[list(rows)] = self._chunks.length
 
     def act(self, count: int, predict: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-        """Return the next actions (B, *shape).
-
-        Args:
-            count: Number of episodes B. If it is not that of the last call, all begin.
-            predict: Function that returns the chunks (B, H, *shape) from the current observations;
-                it is called if an episode needs a prediction.
-        """
+        """Return the next actions (B, *shape), with a new prediction where one is needed."""
+        # With another `count` B than in the last call, all episodes begin. `predict` returns the
+        # chunks (B, H, *shape) from the current observations.
         length, every = self._chunks.length, np.arange(count)
         if len(self._ages) != count:
             self._ages = np.full(count, length)
@@ -126,9 +122,6 @@ class ChunkExecution:
 
 
 def planned(chunks: Chunks, predictions: NDArray[Any]) -> NDArray[Any]:
-    """Return the actions (T, *shape) of one episode, given the chunks (T, H, *shape) of its steps.
-
-    The chunks are those that the policy predicts at each step, of which only some are executed.
-    """
+    """Return the actions (T, *shape) of an episode, given its steps' chunks (T, H, *shape)."""
     execution, steps = ChunkExecution(chunks), range(len(predictions))
     return np.concatenate([execution.act(1, predictions[at : at + 1].copy) for at in steps])

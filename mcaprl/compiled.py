@@ -36,23 +36,16 @@ def compiled(function: AnyFunction) -> AnyFunction:
 
 
 def inlined(function: AnyFunction) -> AnyFunction:
-    """Compile a function and inline it into each compiled function that calls it.
-
-    Loops over vehicles can then be vectorized. With `compiled` instead, the compiler inlines only
-    short functions.
-    """
+    """Compile a function and inline it into compiled callers, whose loops then vectorize."""
     return _compiled(function, forceinline=True)
 
 
 def ready(
     function: Callable[..., Result], *arguments: Any, examples: tuple[Any, ...] = ()
 ) -> Callable[..., Result]:
-    """Bind the first arguments of a compiled function, arrays or constants, for faster calls.
-
-    A normal call inspects the type of each argument. For a single vehicle, this takes as long as
-    the step itself. This function inspects the types once. The contents of the bound arrays may
-    change, but not their shape or memory.
-    """
+    """Bind the first arguments of a compiled function, arrays or constants, for faster calls."""
+    # A normal call inspects the type of each argument, which for a single vehicle takes as long as
+    # the step itself. The contents of the bound arrays may change, but not their shape or memory.
     if not isinstance(function, numba.core.dispatcher.Dispatcher):
         return partial(function, *arguments)
     kinds = tuple(numba.typeof(argument) for argument in (*arguments, *examples))
@@ -70,11 +63,9 @@ def ready_at(
     *constants: Any,
     examples: tuple[Any, ...] = (),
 ) -> Callable[..., Result]:
-    """Bind the first arguments of a compiled function like `ready`, but its arrays as one address.
-
-    For each array that is passed in a call, numba checks its type and counts a reference. For four
-    arrays, this takes nearly as long as computing a car's step.
-    """
+    """Bind the first arguments of a compiled function as `ready`, but its arrays as one address."""
+    # For each array in a call, numba checks its type and counts a reference. For four arrays, this
+    # takes nearly as long as computing a car's step.
     if not isinstance(function, numba.core.dispatcher.Dispatcher):
         return partial(function, arrays, *constants)
     addresses = np.array([array.ctypes.data for array in arrays], dtype=np.intp)
@@ -141,11 +132,8 @@ class _Announcer(event.Listener):  # type: ignore[misc]
 
 @cache
 def _replace_conversion() -> None:
-    """Replace numba's conversion of a returned NamedTuple to an object for those of this package.
-
-    numba's conversion runs Python code for each NamedTuple and does not check for errors. If a
-    signal handler raises KeyboardInterrupt in that code, the process crashes.
-    """
+    """Replace numba's conversion of a returned NamedTuple to an object, for our own ones."""
+    # It runs Python code without checks for errors: a KeyboardInterrupt there crashes the process.
     # The conversions are loaded only to compile, because the import takes time.
     from numba.core import boxing
 
@@ -160,11 +148,7 @@ def _replace_conversion() -> None:
 
 
 def _box_named_tuple(kind: Any, value: Any, context: Any) -> Any:
-    """Return code that converts a NamedTuple to an object and runs no Python code.
-
-    Returns:
-        LLVM value of the pointer to the object.
-    """
+    """Return code (an LLVM value) that makes a NamedTuple an object and runs no Python code."""
     python, constants = context.pyapi, context.env_manager
     fields = python.tuple_new(kind.count)
     for i, field_kind in enumerate(kind):

@@ -38,23 +38,16 @@ def rows_of(observations: Any, rows: Any) -> Any:
 def frame_rows(rows: Any, first: Any, ages: Any) -> Any:
     """Return the row of each frame (N, k) of the stacks that end with rows (N,).
 
-    Args:
-        rows: (N,) NumPy array or tensor, newest frame of each stack.
-        first: (N,) first frame of each stack's episode.
-        ages: (k,) number of steps by which the frames are older than `rows`.
-
     >>> frame_rows(np.array([5, 9]), np.array([4, 0]), np.array([2, 1, 0])).tolist()
     [[4, 4, 5], [7, 8, 9]]
     """
+    # `first` (N,) are the first frames of the episodes, `ages` (k,) steps before `rows`.
     places = rows[:, None] - ages
     return places + (first[:, None] - places).clip(0)
 
 
 def stacked_frames(frames: Any, count: int) -> Any:
-    """Return the stacks (T, count, *shape) that end with each of an episode's frames (T, *shape).
-
-    If `count` is 1, no axis is added.
-    """
+    """Return the stacks (T, count, *shape) that end with each frame (T, *shape); no axis for 1."""
     if count == 1:
         return frames
 
@@ -66,14 +59,11 @@ def stacked_frames(frames: Any, count: int) -> Any:
 
 
 class FrameStack:
-    """Last k observations of each of B episodes.
-
-    Attributes:
-        frames: Arrays (B, k, *shape) by key, oldest first; empty before the first observation.
-    """
+    """Last k observations of each of B episodes."""
 
     def __init__(self, count: int) -> None:
         """Store the last `count` observations."""
+        # Arrays (B, k, *shape) by key, oldest first; empty before the first observation.
         self.frames: dict[Any, NDArray[Any]] = {}
         self._count = count
 
@@ -82,10 +72,8 @@ class FrameStack:
         self.frames = {}
 
     def see(self, parts: dict[Any, NDArray[Any]]) -> dict[Any, NDArray[Any]]:
-        """Store the next observations (B, *shape) by key, and return the stacks.
-
-        Without frames, or with frames of another number of episodes, they start new episodes.
-        """
+        """Store the next observations (B, *shape) by key, and return the stacks."""
+        # Without frames, or with frames of another number of episodes, they start new episodes.
         key, part = next(iter(parts.items()))
         continues = len(self.frames.get(key, ())) == len(part)
         self.frames = {
@@ -125,10 +113,7 @@ def whole_of(parts: dict[str, Any]) -> Any:
 
 
 def stack_axis(space: spaces.Space[Any]) -> int:
-    """Return the axis along which frames are joined, as a negative index.
-
-    Images with channels first are those that Stable-Baselines3 recognizes.
-    """
+    """Return the (negative) axis along which frames are joined; channels first are as of SB3."""
     is_first = is_image(space) and int(np.argmin(cast(spaces.Box, space).shape)) == 0
     return -3 if is_first else -1
 
@@ -155,12 +140,7 @@ def stacked_space(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
 
 
 def joined(frames: Any, space: spaces.Space[Any]) -> Any:
-    """Join the frames of each row into one observation of `stacked_space`.
-
-    Args:
-        frames: Arrays (B, k, *shape), oldest first, or a dict of such arrays.
-        space: Space of a single observation.
-    """
+    """Join the frames (B, k, *shape) of each row, oldest first, to one of `stacked_space`."""
     found = {
         key: np.concatenate(list(np.moveaxis(parts_of(frames)[key], 1, 0)), stack_axis(part))
         for key, part in parts_of_space(space).items()

@@ -42,13 +42,7 @@ def installed(group: str) -> dict[str, EntryPoint]:
 
 
 def load(entry: EntryPoint, base: type[Any], built_in: Container[str]) -> Any:
-    """Import the class of an entry point, a subclass of `base`.
-
-    Args:
-        entry: Entry point, which has the `name` of its class.
-        base: Class that the class is derived from.
-        built_in: Names that an entry point cannot have.
-    """
+    """Import the class of an entry point, a subclass of `base` with a name not in `built_in`."""
     try:
         found = entry.load()
     except Exception as error:  # Importing a module can raise any exception.

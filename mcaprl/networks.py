@@ -31,17 +31,12 @@ the computed variance of equal images may be above 0."""
 
 @dataclass(frozen=True, eq=False)
 class ImageInput:
-    """Shape and normalization of one camera's images: (pixels - shift) / scale.
+    """Shape and normalization of one camera's images: (pixels - shift) / scale."""
 
-    Attributes:
-        shape: (height, width, channels).
-        shift: (height, width, channels) float32, from 0 to 255; None is all zeros.
-        scale: Divisor of the shifted pixels.
-    """
-
-    shape: tuple[int, ...]
+    shape: tuple[int, ...]  # (height, width, channels)
+    # (height, width, channels) float32, from 0 to 255; None is all zeros.
     shift: NDArray[np.float32] | None = None
-    scale: float = 255.0
+    scale: float = 255.0  # Divisor of the shifted pixels
 
     def stacked(self, count: int) -> ImageInput:
         """Return the input for `count` images that are stacked along the channel axis."""
@@ -50,11 +45,8 @@ class ImageInput:
         return replace(self, shape=(height, width, channels * count), shift=shift)
 
     def normalized_to(self, images: NDArray[np.uint8]) -> ImageInput:
-        """Return the input with the mean image as shift and the standard deviation as scale.
-
-        All pixels of the images (N, height, width) or (N, height, width, channels) share one scale.
-        Pixels that hardly change therefore keep small values.
-        """
+        """Return the input with the mean image as shift and the standard deviation as scale."""
+        # All pixels share one scale. Pixels that hardly change therefore keep small values.
         number = len(images)
         used = np.linspace(0, number - 1, min(number, _MAX_IMAGES)).astype(np.int64)
         total = np.zeros(self.shape)
@@ -82,11 +74,7 @@ class Inputs(Protocol):
 
 
 class Trunk(nn.Module):
-    """Layers before the head of a network; they map observations to features (B, width).
-
-    Attributes:
-        width: Number of features.
-    """
+    """Layers before the head of a network; they map observations to features (B, width)."""
 
     def __init__(
         self, vector_width: int, images: Sequence[ImageInput], architecture: Architecture
@@ -129,10 +117,7 @@ class Network(Trunk):
         output_shape: tuple[int, ...],
         architecture: Architecture,
     ) -> None:
-        """Build the layers, with random weights.
-
-        `vector_width` is 0 if there is no vector; `output_shape` is (A, ...) for A actions.
-        """
+        """Build the layers; `vector_width` may be 0, `output_shape` is (A, ...) for A actions."""
         super().__init__(vector_width, images, architecture)
         self.output_shape = output_shape
         self.head: nn.Module = make_head(self.width, output_shape, architecture)
@@ -150,17 +135,12 @@ class Network(Trunk):
 
 
 class Convolutions(nn.Module):
-    """Convolutions of an encoder: images (B, height, width, channels) to features (B, n_features).
+    """Convolutions of an encoder: images (B, height, width, channels) to features (B, n)."""
 
-    Images are first averaged over squares of pixels, unless they already have the averaged size.
+    # Images are first averaged over squares of pixels, unless they have the averaged size.
 
-    Attributes:
-        shift: Tensor (channels, height, width) that is subtracted from the averaged pixels.
-        scale: Divisor of the shifted pixels.
-    """
-
-    shift: Tensor
-    scale: Tensor
+    shift: Tensor  # Tensor (channels, height, width) that is subtracted from the averaged pixels
+    scale: Tensor  # Divisor of the shifted pixels
 
     def __init__(self, image: ImageInput, architecture: Architecture) -> None:
         """Build the convolutions for an image input."""

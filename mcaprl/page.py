@@ -105,11 +105,7 @@ def save_panels(path: Path, panels: Sequence[Panel], title: str = "") -> None:
 
 
 def to_svg(figure: Any) -> str:
-    """Convert a figure to SVG, and replace three colors by those of the HTML page.
-
-    `INK` becomes the page's text color. `PALE` and `BACKGROUND` become the CSS variables `--pale`
-    and `--card`, which is the color of a figure's card.
-    """
+    """Convert a figure to SVG, with `INK`, `PALE` and `BACKGROUND` as colors of the page."""
     matplotlib = import_extra("matplotlib", "report")
     text = io.StringIO()
     _make_literal(figure)
@@ -144,14 +140,9 @@ _MAX_SHORT = 30
 
 @dataclass(frozen=True)
 class Figure:
-    """Figure in a page.
+    """Figure in a page."""
 
-    Attributes:
-        caption: Text above the figure.
-        svg: SVG element.
-    """
-
-    caption: str
+    caption: str  # Text above the figure
     svg: str
 
     @classmethod
@@ -162,15 +153,10 @@ class Figure:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text.
+    """Rows of text."""
 
-    Attributes:
-        columns: Names of the columns; all empty for a table without a header.
-        rows: Rows, each with one cell per column.
-    """
-
-    columns: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    columns: Sequence[str]  # Names of the columns; all empty for a table without a header
+    rows: Sequence[Sequence[str]]  # Rows, each with one cell per column
 
     @property
     def kinds(self) -> list[str]:
@@ -181,19 +167,12 @@ class Table:
 
 @dataclass(frozen=True)
 class Card:
-    """Block with a thumbnail in a grid.
-
-    Attributes:
-        title: Title of the card.
-        text: Text below the title.
-        svg: Thumbnail, an SVG element.
-        command: Shell command to show; empty if there is none.
-    """
+    """Block with a thumbnail in a grid."""
 
     title: str
-    text: str
-    svg: str = ""
-    command: str = ""
+    text: str  # Text below the title
+    svg: str = ""  # Thumbnail, an SVG element
+    command: str = ""  # Shell command to show; empty if there is none
 
 
 @dataclass(frozen=True)

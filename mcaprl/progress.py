@@ -55,11 +55,8 @@ def terminal_bar(description: str, total: int | None) -> Iterator[Advance]:
 
 @contextmanager
 def terminal_wait(description: str) -> Iterator[ProgressBar]:
-    """Show that a command is working: a bar without a total, and the elapsed time.
-
-    Yields:
-        Function that opens another bar, as `terminal_bar` does, and hides this one until it ends.
-    """
+    """Show that a command works: a bar without a total, and the time; yield what opens another."""
+    # That one is as of `terminal_bar`, and hides this one until it ends.
     if not _stderr_is_terminal():
         with printed_lines(Work(printable(description), None).line):
             yield terminal_bar
@@ -101,12 +98,7 @@ def _bars(*columns: ProgressColumn, transient: bool = False) -> Progress:
 
 
 class Work:
-    """A long operation, and the line that says how far it is.
-
-    Args:
-        description: What is done.
-        total: Amount of work; None if it is unknown.
-    """
+    """A long operation of `total` work (None: unknown), and the line that says how far it is."""
 
     def __init__(self, description: str, total: int | None) -> None:
         """Begin the operation."""
@@ -137,10 +129,8 @@ _shown: list[Callable[[], str]] = []
 
 @contextmanager
 def printed_lines(line: Callable[[], str]) -> Iterator[None]:
-    """Print what a function returns to stderr after 5 s and then every 10 s, by a thread.
-
-    A unit of work, such as a compilation, may take minutes.
-    """
+    """Print what a function returns to stderr after 5 s and then every 10 s, by a thread."""
+    # A unit of work, such as a compilation, may take minutes.
     ended = threading.Event()
     thread = threading.Thread(target=_print_lines, args=(ended,), daemon=True)
     is_outermost = not _shown
@@ -208,10 +198,8 @@ ProgressCallback = Callable[[TrainingProgress], None]
 
 @contextmanager
 def terminal_progress(unit: str, *terms: str) -> Iterator[ProgressCallback]:
-    """Show a progress bar for each seed on a terminal: rate, one term and remaining time.
-
-    If stderr is not a terminal, print a line about the seeds that are being trained every 10 s.
-    """
+    """Show a progress bar for each seed on a terminal: rate, one term and remaining time."""
+    # If stderr is not a terminal, print a line about the trained seeds every 10 s.
     if not _stderr_is_terminal():
         training = Training(unit, terms)
         with printed_lines(training.line):
@@ -249,12 +237,7 @@ def terminal_progress(unit: str, *terms: str) -> Iterator[ProgressCallback]:
 
 
 class Training:
-    """The training of seeds, and the line that says how far it is.
-
-    Args:
-        unit: What is counted, such as `updates`.
-        terms: Names of terms, of which the first with a value is shown.
-    """
+    """The training of seeds in `unit`, and the line with progress and the first known term."""
 
     def __init__(self, unit: str, terms: Sequence[str]) -> None:
         """Begin the training."""

@@ -76,27 +76,17 @@ class RunSummary:
 
 @dataclass(frozen=True)
 class RunIdentity:
-    """Parts of a run that must match for the run to be resumed.
+    """Parts of a run that must match for the run to be resumed."""
 
-    Attributes:
-        parts: Algorithm (`algo`), settings (`config`), and the data or sim, as plain JSON types.
-        other_data: Whether `parts["data"]`, the fingerprint of the data, may differ.
-        longer: Whether the run may be continued to a larger number of `updates`.
-        defaults: Default settings, which runs of earlier versions had without storing them.
-    """
-
+    # Algorithm (`algo`), settings (`config`), and the data or sim, as plain JSON types.
     parts: dict[str, Any]
-    other_data: bool = False
-    longer: bool = False
+    other_data: bool = False  # Whether `parts["data"]`, the fingerprint of the data, may differ
+    longer: bool = False  # Whether the run may be continued to a larger number of `updates`
+    # Default settings, which runs of earlier versions had without storing them.
     defaults: dict[str, Any] = field(default_factory=dict)
 
     def check_same(self, found: Mapping[str, Any], where: Path) -> None:
-        """Check that the identity in a file is equal to this identity.
-
-        Args:
-            found: Identity in the file; it may have further parts.
-            where: Path of the file.
-        """
+        """Check that the identity in a file is equal to this identity."""
         mine = self.parts
         theirs: dict[str, Any] = {name: found.get(name) for name in mine}
         if isinstance(theirs.get("config"), dict):
@@ -150,18 +140,9 @@ def writing(path: Path) -> Iterator[None]:
 def open_run(
     folder: Path, identity: RunIdentity, resume: bool, seeds: range, **source: Any
 ) -> None:
-    """Create a run folder, or check that it belongs to this run, and write `config.json`.
-
-    Files of a run that ended before its first checkpoint are removed. A run that is resumed with
-    other versions of PyTorch, NumPy or SB3 than it was started with causes a warning.
-
-    Args:
-        folder: Folder of the run.
-        identity: Identity of the run.
-        resume: Whether to continue the run in the folder, even if it has not written a file yet.
-        seeds: Seeds of the run.
-        **source: Further entries of `config.json`.
-    """
+    """Create a run folder, or check that it belongs to this run, and write `config.json`."""
+    # Files of a run that ended before its first checkpoint are removed. A resumed run that was
+    # started with other versions of PyTorch, NumPy or SB3 warns.
     found = run_to_resume(folder) if resume else {}
     leftovers = _leftovers(folder)
     if leftovers is None and not resume:
@@ -211,14 +192,7 @@ def _warn_of_versions(folder: Path, started_with: object) -> None:
 
 
 def choose_seeds(folder: Path, seeds: int | None, seed: int | None, resume: bool) -> range:
-    """Return the seeds to train. A resumed run may get further seeds, but keeps its own.
-
-    Args:
-        folder: Folder of the run.
-        seeds: Number of seeds; None selects that of the resumed run, or else 1.
-        seed: First seed; None selects that of the resumed run, or else 0.
-        resume: Whether to resume the run in the folder.
-    """
+    """Return the seeds to train. A resumed run may get further seeds, but keeps its own."""
     if (seeds is not None and seeds < 1) or (seed is not None and seed < 0):
         raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
     earlier = _seeds_of_run(folder) if resume else range(0)
@@ -233,11 +207,7 @@ def choose_seeds(folder: Path, seeds: int | None, seed: int | None, resume: bool
 
 
 def _seeds_of_run(folder: Path) -> range:
-    """Return the seeds of a run.
-
-    Earlier versions did not write them into the config. The result is then the seeds that have a
-    folder.
-    """
+    """Return the seeds of a run; those with a folder if an earlier version wrote the config."""
     match run_to_resume(folder):
         case {"seeds": int(count), "seed": int(first)}:
             return range(first, first + count)
@@ -298,10 +268,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def read_updates(folder: Path) -> int | None:
-    """Return the number of updates with which an offline run was started or last continued.
-
-    The result is None if the run ended before writing its config.
-    """
+    """Return the number of updates of an offline run as last started; None without config."""
     match run_to_resume(folder):
         case {"config": {"updates": int(updates)}}:
             return updates
@@ -309,13 +276,7 @@ def read_updates(folder: Path) -> int | None:
 
 
 def check_kind(folder: Path, config: Mapping[str, Any], kind: str) -> None:
-    """Check that a run is of the kind that a command trains.
-
-    Args:
-        folder: Folder of the run.
-        config: Contents of its `config.json`.
-        kind: `online` or `offline`.
-    """
+    """Check that a run is of the kind that a command trains, `online` or `offline`."""
     other, source = ("offline", "data") if kind == "online" else ("online", "sim")
     if source in config:
         raise TrainingError(f"{folder} is an {other} run: resume it with mcaprl train-{other}")
@@ -329,11 +290,7 @@ def broken_checkpoint(path: Path, error: Exception) -> TrainingError:
 
 
 def policy_files(path: Path) -> list[Path]:
-    """Return the existing policy files of a run, sorted by seed.
-
-    Args:
-        path: Run folder, folder of one seed, or a policy file, whose path is returned unchanged.
-    """
+    """Return the existing policy files of a run, a seed's folder or a file, sorted by seed."""
     if path.is_file():
         return [path]
     numbered = _seed_folders(path)
@@ -359,12 +316,7 @@ class _Saved:
 
 
 def saved_updates(run: Path, seeds: int) -> int:
-    """Return the number of updates that all saved policies of a run have.
-
-    Args:
-        run: Run folder.
-        seeds: Number of seeds. If fewer have a saved policy, the result is 0.
-    """
+    """Return the number of updates that all saved policies have; 0 with fewer than `seeds`."""
     files = policy_files(run)
     if len(files) < seeds:
         return 0
@@ -394,10 +346,7 @@ def read_curves(run: Path, name: str, columns: Iterable[str] = ()) -> list[Curve
 
 
 def _leftovers(folder: Path) -> list[Path] | None:
-    """Return the files in the folder of a run that has no checkpoint.
-
-    Return None if the folder contains any other file.
-    """
+    """Return the files of a run without checkpoint; None if the folder has any other file."""
     if not folder.exists():
         return []
     if not folder.is_dir():

@@ -86,16 +86,7 @@ def _is_of(value: object, kind: object) -> bool:
 
 
 def check_settings(algo: str, config: Settings | type[Settings], given: Iterable[str]) -> None:
-    """Check that an algorithm has the given settings.
-
-    Args:
-        algo: Name of the algorithm.
-        config: Settings of the algorithm, or their type.
-        given: Names of the settings that the user chose.
-
-    Raises:
-        UsageError: The algorithm has no such setting.
-    """
+    """Check that an algorithm has the given settings."""
     known = [field.name for field in fields(config)]
     for name in given:
         if name not in known:
@@ -143,10 +134,7 @@ def _lines_under_fields(config_type: type) -> dict[str, str]:
 
 @functools.cache
 def _classes_of(module: str) -> dict[str, ast.ClassDef]:
-    """Return the parsed classes of a module by qualified name.
-
-    Python does not store the docstrings of fields, so the source is parsed.
-    """
+    """Return the parsed classes of a module by name: Python keeps no docstrings of fields."""
     found: dict[str, ast.ClassDef] = {}
     parts: list[tuple[str, ast.AST]] = [("", ast.parse(inspect.getsource(sys.modules[module])))]
     while parts:

@@ -33,10 +33,8 @@ END: Final = signal.SIGTERM if hasattr(signal, "pthread_kill") else signal.SIGIN
 
 
 def lock_descriptor(descriptor: int, *, wait: bool = False) -> bool | None:
-    """Lock an open file; return False if another process has, and None if there are no locks.
-
-    Some network file systems have no locks either.
-    """
+    """Lock an open file; return False if another process has, and None if there are no locks."""
+    # Some network file systems have no locks either.
     if fcntl is None:
         return None
     try:

@@ -13,9 +13,7 @@ _UNPRINTABLE: Final = re.compile(
 
 
 def printable(text: object) -> str:
-    r"""Return a text that cannot control the terminal: its control characters are escaped.
-
-    Line feeds and tabs are kept.
+    r"""Return a text without control characters but line feeds and tabs; others are escaped.
 
     >>> print(printable(f"a{chr(27)}[2J"))
     a\x1b[2J

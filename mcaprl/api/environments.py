@@ -30,9 +30,6 @@ def all_options(
 ) -> dict[str, Any]:
     """Return the arguments of a sim, except arguments that are None.
 
-    Raises:
-        UsageError: An argument is given twice.
-
     >>> all_options("depth", None, None, {"road": "racetrack-v0"})
     {'observation': 'depth', 'road': 'racetrack-v0'}
     """
@@ -44,11 +41,7 @@ def all_options(
 
 
 def name_of(sim: str | gym.Env[Any, Any]) -> str:
-    """Return the name of a sim, or the id or class of an environment.
-
-    Raises:
-        UsageError: This is not a single environment.
-    """
+    """Return the name of a sim, or the id or class of an environment."""
     if isinstance(sim, str):
         return sim
     if not isinstance(sim, gym.Env):
@@ -57,11 +50,7 @@ def name_of(sim: str | gym.Env[Any, Any]) -> str:
 
 
 def check_names(*given: object) -> None:
-    """Check that sims and policies are given by names, which other processes can use.
-
-    Raises:
-        UsageError: One of them is an object.
-    """
+    """Check that sims and policies are given by names, which other processes can use."""
     objects = [each for each in given if not isinstance(each, str)]
     if objects:
         raise UsageError(
@@ -77,21 +66,9 @@ def trained_options(
     *,
     trust_env: bool,
 ) -> dict[str, Any]:
-    """Return the arguments of an environment in which policies act.
-
-    If no arguments are given, these are the arguments with which the policies were trained in the
-    same environment.
-
-    Args:
-        names: Names or paths of policies.
-        sim: Short name or Gymnasium id, or an environment, which has no other arguments.
-        options: Given arguments.
-        trust_env: Whether the arguments in the files of policies may be passed to environments
-            other than the sims of `SIMS`. If not, a warning names the arguments.
-
-    Raises:
-        UsageError: There are arguments for an environment that has been made.
-    """
+    """Return the arguments of an environment in which policies act."""
+    # If none are given, they are those of the policies' training in the same environment. Without
+    # `trust_env`, arguments in files are passed to the sims of `SIMS` only; a warning names them.
     if not isinstance(sim, str):
         if options:
             raise UsageError(
@@ -134,21 +111,9 @@ def sim_of(
     sim_options: Mapping[str, Any] | None = None,
     render_mode: str | None = None,
 ) -> gym.Env[Any, Any]:
-    """Make the environment in which a log was recorded.
-
-    Args:
-        dataset: Dataset of the log.
-        path: Path of the log.
-        sim: Short name or Gymnasium id to use instead of the logged one.
-        trust_env: Whether to import the module that the logged id names, and to pass the logged
-            arguments to environments other than sims of `SIMS`.
-        sim_options: Arguments of the environment that replace the logged ones.
-        render_mode: Render mode of the environment.
-
-    Raises:
-        UsageError: The log has no environment id, its environment needs `trust_env`, an argument
-            was not stored, or the environment cannot be made.
-    """
+    """Make the environment in which a log was recorded."""
+    # `sim` and `sim_options` replace what the log says. `trust_env` imports the module that the
+    # logged id names, and passes logged arguments to environments other than the sims of `SIMS`.
     name, given = sim or dataset.env_id, dict(sim_options or {})
     if not name:
         raise UsageError(f"{path} has no environment id: pass `sim=NAME`")
@@ -191,13 +156,7 @@ def _needs_trust(name: str) -> bool:
 
 
 def _special(arguments: Mapping[str, Any], name: str, *, imports: bool) -> dict[str, Any]:
-    """Return the arguments that differ from the defaults with which an environment is registered.
-
-    Args:
-        arguments: Arguments of JSON types.
-        name: Short name or Gymnasium id.
-        imports: Whether to import the module in the id.
-    """
+    """Return the arguments that differ from the defaults of an environment's registration."""
     env_id = SIMS.get(name, name)
     module, _, registered = env_id.rpartition(":")
     if registered not in gym.registry and module and imports:
@@ -219,11 +178,7 @@ def _shown(arguments: Mapping[str, Any]) -> str:
 
 
 def check_episode(dataset: Dataset, episode: int | None, path: Path) -> None:
-    """Check that a log has an episode with this index, or that the index is None.
-
-    Raises:
-        UsageError: The log has fewer episodes.
-    """
+    """Check that a log has an episode with this index, or that the index is None."""
     last = len(dataset.episodes) - 1
     if episode is not None and not 0 <= episode <= last:
         raise UsageError(f"`episode={episode}`: {path} has episodes 0 to {last}")

@@ -61,19 +61,7 @@ def results_on_ray(
     advance: Advance,
     **setting: Any,
 ) -> dict[str, list[list[EpisodeResult]]]:
-    """Run the episodes of each policy and training seed on Ray workers, and return them.
-
-    Args:
-        found: Policies of the training seeds, by name or path.
-        episodes: Number of episodes of each policy.
-        options: Cluster and workers.
-        advance: Function called with the number of finished episodes.
-        **setting: Named arguments of `_run_part`.
-
-    Raises:
-        ClusterError: The cluster cannot be used, or workers died repeatedly.
-        MissingExtraError: Ray is not installed.
-    """
+    """Run the episodes of each policy and training seed on Ray workers, and return them."""
     from mcaprl.ray.tasks import WorkerDiedError, run_tasks
 
     # Workers have other working directories, so all paths must be absolute.
@@ -357,11 +345,7 @@ def _set_policy(recorder: RecordMcap | None, name: str) -> None:
 
 
 def _behavior(data: Data, env: gym.Env[Any, Any], record: Path | None) -> LoggedReturns:
-    """Compute statistics of the returns in logs.
-
-    Raises:
-        UsageError: A log was recorded in another environment, or is the output log `record`.
-    """
+    """Compute statistics of the returns in logs."""
     dataset, name = opened(data), named(data)
     if record is not None and record.resolve() in [path.resolve() for path in dataset.sources]:
         raise UsageError(f"{record} is in `behavior={name!r}`: record the episodes elsewhere")
@@ -400,11 +384,8 @@ def _write_report(
 
 
 def learning_curves(names: Sequence[str]) -> list[Figure]:
-    """Return the learning curves of runs; ignore names that do not belong to a run.
-
-    A name is the path of a run folder, or of a folder or policy file in a run folder.
-    Online runs are compared in one figure; an offline run has one figure for each term of its loss.
-    """
+    """Return the learning curves of runs; ignore names that do not belong to a run."""
+    # Online runs share a figure; an offline run has one figure for each term of its loss.
     folders = dict.fromkeys(filter(None, (_run_folder(Path(name)) for name in names)))
     online = [folder for folder in folders if any(folder.glob("seed-*/curve.csv"))]
     figures = []

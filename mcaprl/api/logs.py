@@ -549,11 +549,7 @@ def _date(time_ns: int) -> str:
 def bag_info(
     data: Paths, definitions: Definitions = (), *, quality: bool = False
 ) -> BagInfo | None:
-    """Return facts about a bag; None if the data is a log, or not a bag.
-
-    Raises:
-        LogError: The data is a bag, but is damaged.
-    """
+    """Return facts about a bag; None if the data is a log, or not a bag."""
     from mcaprl.recorder.bags.overview import recordings_in, topics_of
 
     bag = _opened(data, definitions)
@@ -625,11 +621,7 @@ def _argument(name: str | Path) -> str:
 
 
 def logs_or_bags(data: str | Path) -> list[Path]:
-    """Return the files of logs; if there are no logs, those of bags.
-
-    Raises:
-        LogError: There are neither logs nor bags.
-    """
+    """Return the files of logs; if there are no logs, those of bags."""
     try:
         logs = find_logs(data)
     except LogError:

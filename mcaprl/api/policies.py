@@ -80,9 +80,6 @@ def _name(path: str | PathLike[str]) -> str:
 def by_name(policies: Any) -> dict[str, str | BasePolicy]:
     """Return the names and objects of one or more policies, by names for tables.
 
-    Raises:
-        UsageError: An object is not a policy.
-
     >>> by_name("runs/cql"), list(by_name([RandomPolicy(None), RandomPolicy(None), "pilot"]))
     ({'runs/cql': 'runs/cql'}, ['random-2', 'random-3', 'pilot'])
     """
@@ -165,17 +162,7 @@ def export(
 
 
 def policies_of(name: str | BasePolicy, env: gym.Env[Any, Any]) -> list[BasePolicy]:
-    """Return the policies that a name refers to; a run has one policy per training seed.
-
-    Args:
-        name: `pilot`, `random` or a path, or a policy itself.
-        env: Environment in which the policies will act.
-
-    Raises:
-        UnknownNameError: There is no such policy.
-        UsageError: The sim has no pilot, or there is no such path.
-        PolicyError: The path contains no policy, or the policy's spaces differ from those of `env`.
-    """
+    """Return the policies of a name; a run has one policy per training seed."""
     if isinstance(name, BasePolicy):
         return [_fitted(name, env)]
     if name == "random":
@@ -203,13 +190,7 @@ class _PartPolicy(BasePolicy):
 
 
 def _fitted(policy: BasePolicy, env: gym.Env[Any, Any]) -> BasePolicy:
-    """Return a policy that acts in an environment.
-
-    The environment may have more observations than the policy needs, or a Tuple instead of a Dict.
-
-    Raises:
-        PolicyError: The policy's spaces differ from those of `env`.
-    """
+    """Return a policy that acts in `env`, which may have more observations, or a Tuple."""
     space = policy.observation_space
     if isinstance(space, spaces.Dict) and not same_form(space, env.observation_space):
         with suppress(McaprlError):
@@ -221,13 +202,7 @@ def _fitted(policy: BasePolicy, env: gym.Env[Any, Any]) -> BasePolicy:
 
 
 def trained_policies(name: str, dataset: Dataset) -> list[Policy]:
-    """Load the policies of all seeds of a run, and check that they fit a log.
-
-    Raises:
-        UsageError: The policy is scripted, or there is no such path.
-        UnknownNameError: There is no such policy.
-        PolicyError: The path contains no policy, or the policy's spaces differ from the log's.
-    """
+    """Load the policies of all seeds of a run, and check that they fit a log."""
     if name in SCRIPTED:
         raise UsageError(
             f"{name} has no network to evaluate on a log: pass the path of a trained run"

@@ -16,13 +16,6 @@ def check_least(least: int, **numbers: int | None) -> None:
     >>> check_least(1, episodes=None, envs=0)
     Traceback (most recent call last):
     mcaprl.errors.UsageError: `envs=0`: give a number of at least 1
-
-    Args:
-        least: Smallest number that is accepted.
-        **numbers: Numbers by the name of their argument.
-
-    Raises:
-        UsageError: A number is below `least`.
     """
     for name, number in numbers.items():
         if number is not None and number < least:
@@ -30,33 +23,21 @@ def check_least(least: int, **numbers: int | None) -> None:
 
 
 def check_fraction(**numbers: float | None) -> None:
-    """Check that numbers are from 0 to 1; skip numbers that are None.
-
-    Raises:
-        UsageError: A number is outside the range, or NaN.
-    """
+    """Check that numbers are from 0 to 1; skip numbers that are None."""
     for name, number in numbers.items():
         if number is not None and not 0 <= number <= 1:
             raise UsageError(f"`{name}={number}`: give a number from 0 to 1")
 
 
 def check_positive(**numbers: float) -> None:
-    """Check that numbers are above 0 and finite.
-
-    Raises:
-        UsageError: A number is 0, negative, infinite or NaN.
-    """
+    """Check that numbers are above 0 and finite."""
     for name, number in numbers.items():
         if not 0 < number < math.inf:
             raise UsageError(f"`{name}={number}`: give a number above 0")
 
 
 def check_port(port: int) -> None:
-    """Check that a port number is valid.
-
-    Raises:
-        UsageError: The number is not from 0 to 65535.
-    """
+    """Check that a port number is valid."""
     if not 0 <= port <= 65535:
         raise UsageError(f"`port={port}`: give a number from 0 to 65535")
 

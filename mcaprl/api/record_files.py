@@ -56,11 +56,7 @@ from mcaprl.texts import counted
 
 @dataclass(frozen=True)
 class FileRequest:
-    """One file to record; its fields are the arguments of `record`.
-
-    Attributes:
-        first_episode: Number of the first episode; an episode's seed depends on its number.
-    """
+    """One file to record; its fields are the arguments of `record`."""
 
     sim: str | gym.Env[Any, Any]
     out: Path
@@ -81,7 +77,7 @@ class FileRequest:
     append: bool
     rotate_mb: float | None
     max_steps: int | None
-    first_episode: int = 0
+    first_episode: int = 0  # Number of the first episode; an episode's seed depends on its number
 
     @property
     def policy_name(self) -> str:
@@ -119,11 +115,7 @@ def record_file(
 
 
 def try_request(request: FileRequest) -> None:
-    """Create the file of a request and remove it, to find errors before the first episode.
-
-    Raises:
-        McaprlError: The sim, the policy or another argument is not valid.
-    """
+    """Create the file of a request and remove it, to find errors before the first episode."""
     with (
         work_folder(request.out) as trial,
         closing(_env(request)) as env,
@@ -173,15 +165,12 @@ _Kind = Literal["message", "done", "interrupted", "error"]
 
 
 class WorkerEndedError(Exception):
-    """A worker ended before its task was done.
-
-    Attributes:
-        index: Index of the worker's request.
-        cause: Cause of the end, such as `was killed by SIGKILL`.
-    """
+    """A worker ended before its task was done."""
 
     def __init__(self, index: int, exit_code: int) -> None:
         """Describe the exit code of a process."""
+        # Cause of the end, such as `was killed by SIGKILL`.
+        # Index of the worker's request.
         self.index, self.cause = index, f"ended with exit code {exit_code}"
         if exit_code < 0:
             with suppress(ValueError):
@@ -194,12 +183,9 @@ def run_workers(
     requests: Sequence[T],
     on_message: Callable[[int, Any], None],
 ) -> None:
-    """Run a task in one process for each request, until all are done.
-
-    If a worker fails, or this process is interrupted, all other tasks receive a KeyboardInterrupt,
-    and this function waits until they end. If this process is killed, all tasks receive a
-    KeyboardInterrupt, too.
-    """
+    """Run a task in one process for each request, until all are done."""
+    # If a worker fails, or this process is interrupted or killed, all other tasks receive a
+    # KeyboardInterrupt; if it was not killed, this function waits until they end.
     context = multiprocessing.get_context("spawn")
     # Only this process has `held`, the write end of the pipe. Therefore, the pipe closes when this
     # process ends.
@@ -307,12 +293,7 @@ _MOST_SHARDS, _LEAST_STEPS = 64, 10_000
 def record_shards(
     whole: FileRequest, processes: int, on_episode: Callable[[EpisodeResult], None]
 ) -> list[EpisodeResult]:
-    """Record episodes in parallel, with one file per process.
-
-    Raises:
-        OutputExistsError: The folder contains logs that may not be replaced.
-        LogError: Another recording is writing to the folder, or a process was killed.
-    """
+    """Record episodes in parallel, with one file per process."""
     shards = _divided(whole, processes)
     with _new_folder(whole, shards[0]):
         results: list[list[EpisodeResult]] = [[] for _ in shards]
@@ -352,11 +333,7 @@ def _divided(whole: FileRequest, parts: int) -> list[FileRequest]:
 
 @contextmanager
 def _new_folder(whole: FileRequest, first: FileRequest) -> Iterator[None]:
-    """Lock the folder of the shards, and remove an earlier recording.
-
-    Before any file is removed, a trial recording checks that the request is valid. Raise the same
-    errors as `record_shards`.
-    """
+    """Lock the shards' folder, check the request by a trial, and remove an earlier recording."""
     if whole.out.is_file():
         raise OutputExistsError(f"{whole.out} exists and is a file: choose the name of a folder")
     with locked_folder(whole.out):
@@ -378,16 +355,8 @@ def _record_shard(request: FileRequest, send: Callable[[EpisodeResult], None]) -
 def record_on_ray(
     whole: FileRequest, parts: int | None, options: ClusterOptions, advance: Advance
 ) -> list[EpisodeResult]:
-    """Record shards on the workers of a Ray cluster, then write the manifest of the folder.
-
-    The number of workers has no effect on the episodes, because the recording is always divided
-    into the same shards.
-
-    Raises:
-        OutputExistsError: The folder contains logs that may not be replaced.
-        LogError: Another recording is writing to the folder, or workers died repeatedly.
-        ClusterError: The cluster cannot be used.
-    """
+    """Record shards on the workers of a Ray cluster, then write the manifest of the folder."""
+    # The shards, and so the episodes, do not depend on the number of workers.
     from mcaprl.ray.tasks import WorkerDiedError, run_tasks
 
     # Workers have other working directories, so all paths must be absolute.
@@ -419,10 +388,8 @@ def record_on_ray(
 
 
 def _record_on_worker(request: FileRequest, send: Callable[[int], None]) -> list[EpisodeResult]:
-    """Record a shard, or continue that of a killed worker. Return all episodes of the shard.
-
-    Until the shard is complete, its log is in the hidden folder.
-    """
+    """Record a shard, or continue that of a killed worker; return all its episodes."""
+    # Until the shard is complete, its log is in the hidden folder.
     unfinished = request.out.parent / UNFINISHED_NAME / request.out.name
     if not request.out.exists():
         kept = _repaired(unfinished)
@@ -452,11 +419,7 @@ def _record_on_worker(request: FileRequest, send: Callable[[int], None]) -> list
 
 
 def _repaired(path: Path) -> list[EpisodeResult]:
-    """Repair the log of a killed worker, so that it can be continued; return its episodes.
-
-    Raises:
-        LogError: A worker is still recording the log, or the log cannot be written.
-    """
+    """Repair the log of a killed worker, so that it can be continued; return its episodes."""
     if not path.exists():
         return []
     repaired = path.with_suffix(".repaired")
@@ -504,12 +467,7 @@ def _absolute(policy: str) -> str:
 
 
 def _replaceable(folder: Path, *, overwrite: bool) -> list[Path]:
-    """Return the shards of an earlier recording.
-
-    Raises:
-        OutputExistsError: The shards may not be replaced, or the folder contains other logs.
-        LogError: A shard is being recorded.
-    """
+    """Return the shards of an earlier recording."""
     old = sorted(folder.glob("*.mcap"))
     foreign = [path.name for path in old if not path.name.startswith("shard-")]
     if foreign:

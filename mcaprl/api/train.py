@@ -377,10 +377,7 @@ def _absolute(sources: list[str]) -> list[str]:
 
 
 def _experience(sources: list[str]) -> tuple[Dataset | None, list[Policy] | None]:
-    """Return the dataset of the logs in `sources`, and the policies of the run in `sources`.
-
-    The dataset is None if there are no logs, and the list of policies is None if there is no run.
-    """
+    """Return the dataset of the logs in `sources`, if any, and the policies of the run, if any."""
     policies = [source for source in sources if is_policy(Path(source))]
     if len(policies) > 1:
         raise UsageError(f"pass at most one policy to start from, not {' and '.join(policies)}")

@@ -189,11 +189,7 @@ def _train(
 
 
 def _rewards_until(agents: Agents, stop: int) -> list[float]:
-    """Step each environment at least once, until `stop` steps are done.
-
-    Returns:
-        Mean reward of each agent.
-    """
+    """Step each environment at least once, until `stop`; return each agent's mean reward."""
     rewards, count = agents.step().rewards.clone(), 1
     while agents.steps < stop:
         rewards += agents.step().rewards

@@ -24,20 +24,10 @@ _RATES = ("m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N m")
 
 
 class Commands(CommandMessages):
-    """Messages of actions.
-
-    Attributes:
-        topics: Topics of the messages.
-        stop: Messages of the stop command.
-    """
+    """Messages of actions."""
 
     def __init__(self, plan: Plan, policy: BasePolicy) -> None:
-        """Find the command of each action, and the limits.
-
-        Raises:
-            PolicyError: The policy has other actions than the mapping.
-            UsageError: The mapping has no command of an action, or none that stops the robot.
-        """
+        """Find the command of each action, and the limits."""
         self._plan, self._action, self._drive = plan, plan.mapping.action, plan.mapping.drive
         if plan.expressions:
             raise UsageError(

@@ -25,26 +25,17 @@ LATE = "the command was late"
 
 
 class Command(NamedTuple):
-    """What to publish at one step.
+    """What to publish at one step."""
 
-    Attributes:
-        messages: Message of each commanded topic, as nested dicts: the stop command if there is a
-            reason.
-        reason: Why the robot has to stop; empty if the policy drives.
-        is_fatal: Whether the reason is an error, so that waiting does not help.
-        time_ns: Time of the step.
-        action: Action of the policy; None if there is a reason.
-        observation: Observation, as in the training; None if it is not complete.
-        log_prob: Log probability of the action, 0 for a policy that selects the best one of a
-            finite number; NaN if the command was limited, or has no density.
-    """
-
+    # Message of each commanded topic, as nested dicts: the stop command if there is a reason.
     messages: dict[str, dict[str, Any]]
-    reason: str
-    is_fatal: bool
+    reason: str  # Why the robot has to stop; empty if the policy drives
+    is_fatal: bool  # Whether the reason is an error, so that waiting does not help
     time_ns: int
-    action: Any = None
-    observation: Any = None
+    action: Any = None  # Action of the policy; None if there is a reason
+    observation: Any = None  # Observation, as in the training; None if it is not complete
+    # Log probability of the action, 0 for a policy that selects the best one of a finite number;
+    # NaN if the command was limited, or has no density.
     log_prob: float = math.nan
 
 
@@ -67,19 +58,13 @@ class CommandField(NamedTuple):
 
 
 class CommandMessages:
-    """Messages of actions, within limits.
+    """Messages of actions, within limits."""
 
-    Attributes:
-        fields: Fields of a command.
-        templates: Message of each topic with zeros.
-        topics: Topics of the messages.
-        is_finite: Whether there is a table of the commands of all actions.
-    """
-
-    is_finite = False
+    is_finite = False  # Whether there is a table of the commands of all actions
 
     def __init__(self, fields: list[CommandField], templates: dict[str, Message]) -> None:
         """Store the fields; the caller sets the table, the limits and the stop command."""
+        # Message of each topic with zeros.
         self.fields, self.templates, self.topics = fields, templates, tuple(templates)
         self._kinds = [field.kind for field in fields for _ in range(field.size)]
         self._table: list[Values] | None = None

@@ -91,12 +91,7 @@ class Enable:
     """Deadman switch: a field of a topic that allows the policy to drive while it is true."""
 
     def __init__(self, path: str, known: dict[str, Definition]) -> None:
-        """Find the topic.
-
-        Args:
-            path: Topic of a Bool, or field of any topic, such as `/joy.buttons[4]`.
-            known: Definitions of topics; a Bool or Joy needs none.
-        """
+        """Find a topic of a Bool, or a field such as `/joy.buttons[4]`, of `known` definitions."""
         self.topic, _, field = path.partition(".")
         name = "sensor_msgs/msg/Joy" if field.startswith(("buttons", "axes")) else ""
         self.field, name = field or "data", name or "std_msgs/msg/Bool"
@@ -169,10 +164,8 @@ class Loop:
         duration_s: float | None = None,
         on_status: Callable[[DriveStatus], None] = lambda _: None,
     ) -> DriveStatus:
-        """Drive until the time is over, the bag ends, or an error or signal ends it.
-
-        The stop command is published at the end in any case, if the robot was moved.
-        """
+        """Drive until the time is over, the bag ends, or an error or signal."""
+        # Then publish the stop.
         transport = self._transport
         watch = threading.Thread(target=self._watch, daemon=True)
         due_s = checked_s = 0.0
@@ -333,10 +326,8 @@ class Loop:
             raise LogError(command.reason)
 
     def _stop(self) -> None:
-        """Publish the stop command if the robot was moved.
-
-        While a person does not enable the policy, other nodes may command the robot.
-        """
+        """Publish the stop command if the robot was moved."""
+        # While a person does not enable the policy, other nodes may command the robot.
         with self._lock:
             if self._moved_ns is not None:
                 self._moved_ns, self._repeats = None, _REPEATS

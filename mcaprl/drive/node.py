@@ -39,12 +39,7 @@ from __future__ import annotations
 
 
 def export_node(driver: Driver, path: Path, *, overwrite: bool = False) -> None:
-    """Write the node of a driver.
-
-    Raises:
-        UsageError: The policy observes a video.
-        OutputExistsError: The file exists.
-    """
+    """Write the node of a driver."""
     for name, reader in driver._plan.images.items():
         if reader.packets_ns is not None:
             raise UsageError(

@@ -60,11 +60,7 @@ class DriveLog:
         is_late: bool,
         overwrite: bool = False,
     ) -> None:
-        """Create the file; `is_late` is that of the episodes.
-
-        Raises:
-            UsageError: The command that stops the robot is not an action of the mapping.
-        """
+        """Create the file; `is_late` is that of the episodes."""
         assert policy.observation_space is not None, "trained policies have spaces"
         assert policy.action_space is not None, "trained policies have spaces"
         found = commands.described
@@ -113,14 +109,7 @@ class DriveLog:
             self._write_messages()
 
     def see(self, step: LiveStep, state: EpisodeState, action: Any, behavior: float) -> None:
-        """Add a step, whose command was chosen.
-
-        Args:
-            step: Step of the robot.
-            state: State of the episodes at the step.
-            action: Action of the command.
-            behavior: Probability or log density of the action; NaN if unknown.
-        """
+        """Add a step, whose command was chosen; `behavior` is NaN if unknown."""
         late = int(self._is_late)
         self._recent = [*self._recent, _Row(step, state.observation, action, behavior)][-2 - late :]
         if len(self._recent) <= late:

@@ -101,13 +101,7 @@ def block_of(columns: Columns, metadata: dict[str, str]) -> pyarrow.Table:
 
 
 def columns_of(data: Dataset, episodes: NDArray[np.int64], names: Sequence[str]) -> Columns:
-    """Return columns of a dataset by name.
-
-    Args:
-        data: Transitions; observations that are not in `names` may be missing.
-        episodes: (E,) numbers of the episodes for the column `episode`.
-        names: Names of the columns.
-    """
+    """Return columns of a dataset; `episodes` (E,) are the numbers in the column `episode`."""
     columns = data._transitions
     found = step_columns(columns, data._description) | {"action": columns.actions}
     found["episode"] = np.repeat(episodes, columns.lengths)
@@ -231,10 +225,7 @@ class LogSink(Datasink[LogFile | None]):  # type: ignore[misc]
         return found
 
     def on_write_complete(self, write_result: Any) -> None:
-        """Move the logs from the hidden folder to the target folder, and write the manifest.
-
-        If the target is a URL, only write the manifest.
-        """
+        """Move the logs from the hidden folder to the target (no URL), and write the manifest."""
         files = sorted(filter(None, write_result.write_returns), key=lambda file: file.name)
         if self._url is not None:
             with temporary_folder() as folder:
@@ -300,12 +291,7 @@ class _Wanted:
 
 
 class LogSource(Datasource):  # type: ignore[misc]
-    """Source of the transitions of logs.
-
-    Attributes:
-        description: Metadata that the logs have in common.
-        groups: Groups of episodes; each becomes one block.
-    """
+    """Source of the transitions of logs."""
 
     def __init__(
         self,
@@ -317,24 +303,23 @@ class LogSource(Datasource):  # type: ignore[misc]
         least: int = 1,
         most_bytes: int = 128 << 20,
     ) -> None:
-        """Read the summaries of the logs, but no transitions.
-
-        There are at least `blocks` blocks, by default as many as the size of the data asks for, but
-        at least `least`. Only a block of a single episode may have more than `most_bytes`. The
-        other arguments, and the errors, are those of `mcaprl.ray.read`.
-        """
+        """Read the summaries of the logs, but no transitions."""
+        # By default, there are as many blocks as the size asks for, but at least `least`. Only a
+        # block of a single episode may have more than `most_bytes`. The rest is as of
+        # `mcaprl.ray.read`.
         super().__init__()
         # The constructor of the base class does not set this attribute.
         self._projection_map = None if columns is None else {name: name for name in columns}
         self._paths = list(paths)
         self._lengths: list[NDArray[np.int64]] = []
-        self.description = self._read_summaries()
+        self.description = self._read_summaries()  # Metadata that the logs have in common
         known = empty_columns(self.description)
         for name in columns or ():
             if name not in known:
                 raise UnknownNameError("column", name, known)
         count = sum(map(len, self._lengths))
         self._chosen = None if episodes is None else episode_indexes(episodes, count)
+        # Groups of episodes; each becomes one block.
         self.groups = list(self._divided(blocks, least, most_bytes))
 
     def _read_summaries(self) -> LogMetadata:

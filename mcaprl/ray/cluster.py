@@ -34,11 +34,8 @@ _TOKENS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
 def local_settings() -> dict[str, str]:
-    """Return the environment variables for a local cluster. Ray reads them when it is imported.
-
-    The cluster listens on the loopback interface. Other users of the machine can also reach this
-    interface, but only processes with the token may connect.
-    """
+    """Return the environment variables for a local cluster. Ray reads them when it is imported."""
+    # Other users can reach the loopback interface, but only processes with the token connect.
     return {
         _LOOPBACK: "0",
         "RAY_AUTH_MODE": "token",
@@ -52,11 +49,8 @@ def local_settings() -> dict[str, str]:
 
 @contextmanager
 def cluster(address: str | None = None, *, workers: int | None = None) -> Iterator[Any]:
-    """Connect to a cluster, yield the module `ray`, and disconnect at the end.
-
-    If this process is already connected, the connection is used and kept. At the end of the
-    context, a local cluster that this function started is stopped.
-    """
+    """Connect to a cluster, yield the module `ray`, and disconnect at the end."""
+    # An existing connection is used and kept. A local cluster that was started is stopped.
     connected = connect(address, workers=workers, store_bytes=SMALL_STORE_BYTES)
     ray = sys.modules["ray"]
     if connected:
@@ -72,11 +66,7 @@ def cluster(address: str | None = None, *, workers: int | None = None) -> Iterat
 def connect(
     address: str | None = None, *, workers: int | None = None, store_bytes: int | None = None
 ) -> bool:
-    """Connect this process to a cluster until the process ends. Keep an existing connection.
-
-    Returns:
-        Whether this call created the connection.
-    """
+    """Connect this process until it ends; return whether there was no connection yet."""
     if "ray" in sys.modules and sys.modules["ray"].is_initialized():
         _check_same(address)
         return False
@@ -90,10 +80,7 @@ def connect(
 
 @contextmanager
 def restored_handlers() -> Iterator[None]:
-    """Restore the signal handlers that Ray Tune replaces and does not restore.
-
-    Without this context, Ctrl-C does not interrupt this process after a run.
-    """
+    """Restore the signal handlers that Ray Tune replaces, so that Ctrl-C works after a run."""
     if threading.current_thread() is not threading.main_thread():
         # Ray, like this function, can set handlers only in the main thread.
         yield

@@ -196,11 +196,8 @@ def _combinations(
 
 
 def _listed(name: str, value: Any, defaults: TrainingConfig) -> list[Any]:
-    """Return the values to try.
-
-    If each value of the setting is a list, a flat list is one value, and a list of lists contains
-    several values.
-    """
+    """Return the values to try."""
+    # Where each value of the setting is a list, a flat list is one value, a list of lists several.
     is_list = isinstance(value, list)
     if isinstance(getattr(defaults, name), tuple):
         return value if is_list and any(isinstance(one, list) for one in value) else [value]
@@ -309,10 +306,7 @@ def sweep_on_ray(
     resume: bool,
     advance: Advance,
 ) -> list[TrialResult]:
-    """Run the trials on the cluster; return the results, best score first.
-
-    The arguments and errors are those of `mcaprl.sweep`; `advance` is called after each trial.
-    """
+    """Run the trials on the cluster, as `mcaprl.sweep`; return the results, best score first."""
     tune = import_extra("ray.tune", "ray")
     logs = logs_of(data, weighted=True)
     identity = {

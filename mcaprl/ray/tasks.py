@@ -61,13 +61,11 @@ def run_tasks(
     advance: Advance = lambda amount: None,
     on_news: Callable[[Any], None] = lambda news: None,
 ) -> list[Result]:
-    """Run a task for each request on the cluster; return the results in the order of the requests.
-
-    At most `workers` tasks run at a time, with one CPU each. Their machines must have the versions
-    of this process, and see `paths`. `advance` is called with the amount of new work, and `on_news`
-    with the news that tasks send; repeated tasks send theirs again. If a task fails, or this
-    process is interrupted, all tasks end.
-    """
+    """Run a task for each request on the cluster."""
+    # Return the results in the order of the requests. At most `workers` tasks run at a time, with
+    # one CPU each, on machines with the versions of this process that see `paths`. `advance` gets
+    # the amount of new work, `on_news` the news that tasks send; repeated tasks send theirs again.
+    # If a task fails, or on an interrupt, all end.
     import ray
     from ray.util.queue import Queue
 

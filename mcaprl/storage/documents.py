@@ -97,11 +97,9 @@ def _check_nesting(found: object, most: float) -> None:
 
 
 def as_type(kind: Any, found: object, name: str = "it") -> Any:
-    """Return parsed JSON as a type: a dataclass, NamedTuple, dict, list, tuple, number or text.
-
-    Whole numbers have at most 64 bits. A missing float is null in JSON, and becomes NaN. Further
-    keys of a JSON object are not read.
-    """
+    """Return parsed JSON as a type: a dataclass, NamedTuple, dict, list, tuple, number or text."""
+    # Whole numbers have at most 64 bits. A missing float is null in JSON, and becomes NaN. Further
+    # keys of a JSON object are not read.
     parts = get_args(kind)
     if get_origin(kind) is types.UnionType:
         return None if found is None else as_type(parts[0], found, name)

@@ -20,10 +20,7 @@ _CONTENT_RANGE = re.compile(r"bytes (\d+)-(\d+)/")
 
 
 class BoundedAnswer(aiohttp.ClientResponse):
-    """Answer that is read up to the end of the requested range.
-
-    Without a range, at most `limits.MAX_LISTING_BYTES` are read.
-    """
+    """Answer that is read up to the end of the range, or to `limits.MAX_LISTING_BYTES`."""
 
     async def start(self, connection: Any) -> aiohttp.ClientResponse:
         """Read the status and the headers."""

@@ -92,11 +92,9 @@ def hold(file: Lockable, *, records: bool = False) -> None:
 
 
 def try_lock(descriptor: int) -> bool:
-    """Lock an open file or folder; return False if it is locked already.
-
-    The lock is advisory and ends when the file is closed. On systems without `flock`, such as
-    Windows and some network file systems, nothing is locked, and the result is True.
-    """
+    """Lock an open file or folder; return False if it is locked already."""
+    # The lock is advisory and ends when the file is closed. On systems without `flock`, such as
+    # Windows and some network file systems, nothing is locked, and the result is True.
     return lock_descriptor(descriptor) is not False
 
 
@@ -114,10 +112,8 @@ def taken(path: Path, descriptor: int | None = None) -> LogError:
 
 @contextmanager
 def waiting_lock(file: BinaryIO | FileIO) -> Iterator[None]:
-    """Lock an open file; if another process has locked it, wait. Unlock it at the end.
-
-    On systems without `flock`, nothing is locked; see `try_lock`.
-    """
+    """Lock an open file, after another process that has it."""
+    # Unlock it at the end. See `try_lock`.
     lock_descriptor(file.fileno(), wait=True)
     try:
         yield
@@ -168,10 +164,7 @@ def read_file(path: str | Path) -> bytes:
 
 
 def check_plain(path: str | Path) -> None:
-    """Check that a path is a regular file, or a folder of nothing but regular files and folders.
-
-    Libraries that open the files by their names would wait for the writer of a FIFO.
-    """
+    """Check that a path is a regular file, or a folder of such; libraries would wait for a FIFO."""
     if not os.path.isdir(path):
         check_regular(path)
         return

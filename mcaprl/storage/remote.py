@@ -45,13 +45,7 @@ def is_url(name: object) -> bool:
 
 
 class RemoteFile:
-    """A remote file with its local copy of the parts that were fetched.
-
-    Attributes:
-        url: URL of the file.
-        size: Size of the file, bytes.
-        local: Path of the local file.
-    """
+    """A remote file with its local copy of the parts that were fetched."""
 
     def __init__(self, url: str) -> None:
         """Request the size of the remote file, and create the local file."""
@@ -280,11 +274,7 @@ def upload(path: str | Path, url: str) -> None:
 
 
 def upload_all(paths: Sequence[Path], url: str) -> None:
-    """Copy files to a URL; see `upload`.
-
-    If there is one file and the URL ends with its suffix, it is copied to this URL. Otherwise, the
-    copies have the files' names in the folder at the URL.
-    """
+    """Copy files to a URL: one file if it ends with its suffix, else into that folder."""
     if len(paths) == 1 and url.endswith(paths[0].suffix):
         upload(paths[0], url)
         return
@@ -345,11 +335,8 @@ class _Errors:
 
 
 def _is_failed_request(cause: BaseException | None) -> TypeGuard[Exception]:
-    """Return whether a FileNotFoundError with this cause does not mean that the file is missing.
-
-    fsspec raises a FileNotFoundError for every HTTP request that fails: without a connection, or
-    with a status such as 403.
-    """
+    """Return whether a FileNotFoundError with this cause does not mean that the file is missing."""
+    # fsspec raises one for every HTTP request that fails, also offline or with a status as 403.
     if isinstance(cause, OSError):
         return not isinstance(cause, FileNotFoundError)
     return getattr(cause, "status", 404) != 404
@@ -384,10 +371,8 @@ def _version_of(facts: dict[str, Any]) -> str:
 
 
 def _folder_of(url: str, version: str, size: int) -> tuple[Path, TemporaryFolder | None]:
-    """Return the local folder for a remote file; the second value is None if it is kept.
-
-    Without a version, a later process could not notice that the remote file has changed.
-    """
+    """Return the local folder for a remote file; the second value is None if it is kept."""
+    # Without a version, a later process could not notice that the remote file has changed.
     name = hashlib.sha256(f"{url} {version} {size}".encode()).hexdigest()[:24]
     kept = os.environ.get(CACHE_VARIABLE)
     if kept and version:

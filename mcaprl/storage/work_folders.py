@@ -51,11 +51,8 @@ _searched: set[Path] = set()
 
 @contextmanager
 def work_folder(path: Path, *, concurrent: bool = False) -> Iterator[Path]:
-    """Create and lock the work folder of a target, and yield an empty folder in it.
-
-    The work folder is removed at the end. What killed writers left in the same folder is removed
-    first.
-    """
+    """Create and lock the work folder of a target, and yield an empty folder in it."""
+    # It is removed at the end; before, what killed writers left in the same folder.
     check_local(path)
     folder = _work_path(path, f".{os.getpid()}.part" if concurrent else ".part")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -96,10 +93,7 @@ def is_leftover(folder: Path) -> bool:
 
 
 def remove_leftovers(parent: Path) -> None:
-    """Remove the work folders and temporary folders that killed processes left in a folder.
-
-    Each process searches a folder once. Where locks do not work, nothing is removed.
-    """
+    """Remove work and temporary folders that killed processes left, once; none without locks."""
     parent = Path(os.path.abspath(parent))
     if parent in _searched:
         return
@@ -112,14 +106,9 @@ def remove_leftovers(parent: Path) -> None:
 
 
 class TemporaryFolder:
-    """Folder for temporary files of this process.
+    """Folder for temporary files, removed by `remove`, with the object, or when Python exits."""
 
-    It is removed by `remove`, when the object is deleted, or when Python exits. If the process is
-    killed, the next one that makes a temporary folder removes it.
-
-    Attributes:
-        path: Path of the folder.
-    """
+    # If the process is killed, the next one that makes a temporary folder removes it.
 
     def __init__(self) -> None:
         """Create the folder."""
@@ -154,10 +143,7 @@ def temporary_folder() -> Iterator[Path]:
 
 
 def fresh_folder(path: Path) -> Path:
-    """Create a hidden folder that other processes fill, or empty the one of an earlier run.
-
-    The caller must hold a lock that keeps out other runs.
-    """
+    """Create a hidden folder for other processes, or empty it; the caller holds a lock."""
     path.parent.mkdir(parents=True, exist_ok=True)
     opened = _opened(path)
     try:
@@ -252,10 +238,8 @@ def _opened(folder: Path, *, create: bool = True) -> OpenFolder:
 
 
 def _problem(folder: Path, opened: OpenFolder) -> str:
-    """Return why an existing folder is not one of this package; empty if it is one.
-
-    Earlier versions made no mark: their folders contain nothing but the target.
-    """
+    """Return why an existing folder is not one of this package; empty if it is one."""
+    # Earlier versions made no mark: their folders contain nothing but the target.
     if HAS_FOLDER_DESCRIPTORS and is_of_another_user(os.fstat(opened.fileno())):
         return "belongs to another user"
     entries = _entries(folder, opened)
@@ -326,11 +310,9 @@ def _remove(folder: Path, opened: OpenFolder) -> None:
 
 
 def _remove_left(folder: Path, *, marked: bool = False) -> None:
-    """Remove a folder of this package if no process has locked it.
-
-    Its process locks a new folder before it writes the mark. An empty folder is therefore left
-    alone: locking it here could refuse its process.
-    """
+    """Remove a folder of this package if no process has locked it."""
+    # A new folder is locked before it is marked, so an empty one is left alone: locking it here
+    # could refuse its process.
     opened = _opened(folder, create=False)
     try:
         entries = _entries(folder, opened)
@@ -344,10 +326,7 @@ def _remove_left(folder: Path, *, marked: bool = False) -> None:
 
 @contextmanager
 def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Iterator[None]:
-    """Create a folder if it is missing, and lock it against other writers.
-
-    If the folder is new and empty at the end, it is removed.
-    """
+    """Create a folder if it is missing, and lock it; a new one that stays empty is removed."""
     check_local(folder)
     is_new, opened = not folder.exists(), None
     try:
@@ -442,11 +421,9 @@ def replacing(
     overwrite: bool = True,
     concurrent: bool = False,
 ) -> Iterator[Path]:
-    """Yield a path in a work folder; move the file written there to `path` at the end.
-
-    The content is synced to disk before the move. `path` is left as it was if the body raises an
-    error, or if another writer has locked or created the file in the meantime.
-    """
+    """Yield a path in a work folder; move the file written there to `path` at the end."""
+    # It is synced before. `path` is left as it was if the body raises an error, or if another
+    # writer has locked or created the file in the meantime.
     check_target(path, overwrite=overwrite)
     try:
         with work_folder(path, concurrent=concurrent) as folder:
@@ -465,11 +442,7 @@ def replacing(
 def replacing_folder(
     path: Path, error_type: type[McaprlError] = LogError, *, overwrite: bool = False
 ) -> Iterator[Path]:
-    """Yield an empty folder in a work folder; move it to `path` at the end.
-
-    The files are synced to disk before the move. If the body raises an error, `path` is left as it
-    was.
-    """
+    """Yield an empty folder in a work folder; sync it and move it to `path`, but not on errors."""
     _check_folder(path, overwrite=overwrite)
     try:
         with work_folder(path) as work:

@@ -184,7 +184,7 @@ class Definitions:
 
     def __init__(self, name: str, types: dict[str, Any], *, is_own: bool = True) -> None:
         """Check the parsed definitions; see `definitions_of`."""
-        self.name, self.is_own = name, is_own  # Whether the file defines all types
+        self.name, self.is_own = name, is_own  # `is_own`: whether the file defines all types
         check_size(types, name)
         # Reason by dotted path for each field that cannot be read: a wide string, and all fields
         # after it.

@@ -126,7 +126,7 @@ class LogTopics:
     ) -> None:
         """Announce the topics that every log has."""
         leaves = observation_leaves(metadata.observation_space)
-        self.metadata, self.sink = metadata, sink  # Receiver of the messages
+        self.metadata, self.sink = metadata, sink
         self.action = action_leaf(metadata.action_space)  # Shape and dtype of an action
         # Meaning of the behavior column of `/rl/step`.
         self.behavior = behavior_field(metadata.action_space)

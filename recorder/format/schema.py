@@ -124,8 +124,8 @@ def step_schema(
 def earlier_step_schemas(
     observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
 ) -> list[tuple[str, str]]:
-    """Return names and definitions of `/rl/step` of earlier versions: no names."""
-    # All probabilities.
+    """Return names and definitions of `/rl/step` of earlier versions."""
+    # The first did not name the actions, the second had the probabilities of all.
     both = observation_space, action_space
     return [step_schema(*both), step_schema(*both, behavior=PROBABILITY)]
 

@@ -46,33 +46,21 @@ class Transport(Protocol):
 
 
 class Wire:
-    """Type of a topic as a robot sends it: ROS 1 or ROS 2.
-
-    Attributes:
-        type_name: Full name of the type, such as `geometry_msgs/msg/Twist`.
-        definition: Definition of the type; without a text, it is that of the ROS distribution.
-        is_own: Whether the robot's bag has the same encoding.
-    """
+    """Type of a topic as a robot sends it: ROS 1 or ROS 2."""
 
     def __init__(self, topic: str, definition: Definition, encoding: str) -> None:
-        """Use the definition of a bag, or for a bag of another kind that of the ROS distribution.
-
-        Args:
-            topic: Name of the topic.
-            definition: Definition of the bag.
-            encoding: Encoding of the transport; empty for that of the definition.
-
-        Raises:
-            UsageError: The topic's type is not known as a type of ROS.
-        """
+        """Use the definition of a bag, or of another kind of bag that of the distribution."""
         encoding = encoding or definition.encoding
+        # Whether the robot's bag has the same encoding.
         self.is_own = definition.encoding == encoding
         if not self.is_own:
             definition = Definition(definition.type_name, encoding)
         forms = {"ros1": ROS1, "cdr": "ros2msg"}
         form = definition.schema_encoding or forms.get(encoding, "")
+        # Definition of the type; without a text, it is that of the ROS distribution.
         self.definition, self._form = definition, form
         try:
+            # Full name of the type, such as `geometry_msgs/msg/Twist`.
             self.type_name = definition.type_name
             if encoding in forms:
                 self.type_name = full_name(self.type_name)

@@ -53,11 +53,7 @@ class BagTransport:
         record: str | Path | None = None,
         overwrite: bool = False,
     ) -> None:
-        """Open the bag; `record` is an MCAP file for the commands of both.
-
-        Raises:
-            OutputExistsError: The file exists.
-        """
+        """Open the bag; `record` is an MCAP file for the commands of both."""
         if record is not None:
             check_target(Path(record), overwrite=overwrite)
         self._bag = open_bag(bag, definitions=definitions)
@@ -69,11 +65,7 @@ class BagTransport:
     def open(
         self, inputs: Mapping[str, Wire], outputs: Mapping[str, Wire], receive: Receive
     ) -> None:
-        """Check the topics.
-
-        Raises:
-            UsageError: The bag lacks a topic.
-        """
+        """Check the topics."""
         missing = [topic for topic in inputs if topic not in self._bag.topics]
         if missing:
             raise UsageError(f"{self._name} has no topic {', '.join(missing)}")

@@ -40,12 +40,7 @@ class DdsTransport:
     encoding = "cdr"
 
     def __init__(self, *, domain_id: int | None = None, interface: str | None = None) -> None:
-        """Choose the domain.
-
-        Args:
-            domain_id: Number of the domain; None for that of ROS_DOMAIN_ID, or 0.
-            interface: Network interface, such as `eth0`; None for this machine alone.
-        """
+        """Choose the domain, by default ROS_DOMAIN_ID or 0; no interface: this machine."""
         given = os.environ.get("ROS_DOMAIN_ID", "") or "0" if domain_id is None else str(domain_id)
         if not given.isdecimal() or int(given) > _MAX_DOMAIN:
             raise UsageError(f"a domain ID is a number from 0 to {_MAX_DOMAIN}: '{given}'")
@@ -59,12 +54,7 @@ class DdsTransport:
     def open(
         self, inputs: Mapping[str, Wire], outputs: Mapping[str, Wire], receive: Receive
     ) -> None:
-        """Join the domain.
-
-        Raises:
-            MissingExtraError: cyclonedds is not installed.
-            UsageError: The network interface does not exist.
-        """
+        """Join the domain."""
         core = import_extra("cyclonedds.core", "dds")
         self._wires = {f"rt{topic}": (topic, wire) for topic, wire in {**inputs, **outputs}.items()}
         self._join(core)

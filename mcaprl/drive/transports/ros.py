@@ -26,11 +26,7 @@ class Ros2Transport:
     def open(
         self, inputs: Mapping[str, Wire], outputs: Mapping[str, Wire], receive: Receive
     ) -> None:
-        """Start a node.
-
-        Raises:
-            UsageError: No ROS 2 is sourced, or it lacks the package of a type.
-        """
+        """Start a node."""
         rclpy = _imported("rclpy", "source a ROS 2, or drive by DDS, which needs none")
         signals, executors = import_module("rclpy.signals"), import_module("rclpy.executors")
         types = {topic: _ros2_type(wire) for topic, wire in {**inputs, **outputs}.items()}
@@ -103,11 +99,7 @@ class Ros1Transport:
     def open(
         self, inputs: Mapping[str, Wire], outputs: Mapping[str, Wire], receive: Receive
     ) -> None:
-        """Start a node.
-
-        Raises:
-            UsageError: rospy is not installed, or no master answers.
-        """
+        """Start a node."""
         rospy = _imported("rospy", "source a ROS 1, or install python3-rospy")
         rosgraph = import_module("rosgraph")
         if not rosgraph.is_master_online():
