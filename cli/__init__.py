@@ -47,8 +47,7 @@ __all__ = ["EXIT_CODES", "cli", "main", "run"]
 
 
 @click.group(
-    cls=Program,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    cls=Program, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
 )
 @click.version_option(__version__, prog_name="mcaprl", message="%(prog)s %(version)s")
 def cli() -> None:

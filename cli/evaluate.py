@@ -55,11 +55,7 @@ _OF_DATA = (
 
 @click.command(cls=Command)
 @click.argument(
-    "policies",
-    nargs=-1,
-    required=True,
-    metavar="POLICY...",
-    type=Name(policies, is_path=True),
+    "policies", nargs=-1, required=True, metavar="POLICY...", type=Name(policies, is_path=True)
 )
 @click.option(
     "--sim", type=Name(sims), help="lane, powerline, racer, highway-lane, or any Gymnasium id."

@@ -74,10 +74,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
         "mcaprl drive runs/robot --ros2 --enable /joy.buttons[4]",
     ),
     "export": ("mcaprl export runs/cql --out policy.onnx",),
-    "info": (
-        "mcaprl info data",
-        "mcaprl info data/pilot.mcap --report report",
-    ),
+    "info": ("mcaprl info data", "mcaprl info data/pilot.mcap --report report"),
     "replay": (
         "mcaprl replay replay.mcap",
         "mcaprl replay replay.mcap --browser",

@@ -89,10 +89,7 @@ def _option(
 
 
 def _all_defaults(
-    name: str,
-    default: Any,
-    defaults: Mapping[str, Any],
-    tuned: Mapping[str, Mapping[str, Any]],
+    name: str, default: Any, defaults: Mapping[str, Any], tuned: Mapping[str, Mapping[str, Any]]
 ) -> str:
     """Return the default, then each other value with the algorithms and sims that use it."""
     others: dict[Any, list[str]] = {}

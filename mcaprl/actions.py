@@ -119,10 +119,7 @@ class BoxActions:
 
     @classmethod
     def of(
-        cls,
-        space: spaces.Box,
-        actions: NDArray[Any] | None = None,
-        names: Sequence[str] = (),
+        cls, space: spaces.Box, actions: NDArray[Any] | None = None, names: Sequence[str] = ()
     ) -> BoxActions:
         """Return the scaling of a space; the range of `actions` replaces infinite bounds."""
         if np.dtype(space.dtype).kind != "f":

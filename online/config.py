@@ -182,10 +182,7 @@ class DQNConfig(ReplayConfig):
             "exploration_initial_eps",
             "exploration_final_eps",
         )
-        return {
-            **super().arguments(),
-            **{name: getattr(self, name) for name in same},
-        }
+        return {**super().arguments(), **{name: getattr(self, name) for name in same}}
 
 
 @dataclass(frozen=True)

@@ -29,13 +29,7 @@ from mcaprl.base_policy import BasePolicy
 from mcaprl.errors import PolicyError, SpaceError, TrainingError, UsageError
 from mcaprl.frames import mapped
 from mcaprl.offline.algorithms.actor_critic import ActorCritic
-from mcaprl.offline.algorithms.heads import (
-    ENCODER,
-    BoxHead,
-    Deterministic,
-    Gaussian,
-    build_head,
-)
+from mcaprl.offline.algorithms.heads import ENCODER, BoxHead, Deterministic, Gaussian, build_head
 from mcaprl.offline.algorithms.learner import NotFiniteError
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import ObservationEncoder
@@ -115,10 +109,7 @@ class LearningAgent(Agent):
             frame_stack=self._task.config.frame_stack,
             encoder=self._encoder,
             head=build_head(
-                learner.acts_by,
-                networks,
-                self.env.single_action_space,
-                box=self.agents.buffer.box,
+                learner.acts_by, networks, self.env.single_action_space, box=self.agents.buffer.box
             ).eval(),
         )
 

@@ -12,13 +12,7 @@ from gymnasium import Env, spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from mcaprl.actions import BoxActions, joint_actions, short_name
-from mcaprl.errors import (
-    SpaceError,
-    TrainingError,
-    UnknownNameError,
-    UsageError,
-    import_extra,
-)
+from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError, import_extra
 from mcaprl.frames import parts_of_space
 from mcaprl.online.config import (
     BOX_ALGOS,

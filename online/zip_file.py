@@ -409,10 +409,7 @@ class ClampedGaussian(SquashedGaussian):
 
     @staticmethod
     def log_density(
-        outputs: Tensor,
-        actions: Tensor,
-        log_std: Tensor | None = None,
-        known: Tensor | None = None,
+        outputs: Tensor, actions: Tensor, log_std: Tensor | None = None, known: Tensor | None = None
     ) -> Tensor:
         """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
         found = squashed_normal_log_density(unsquashed(actions), *outputs.unbind(1))
@@ -437,10 +434,7 @@ class ClippedGaussian(BoxHead):
 
     @staticmethod
     def log_density(
-        outputs: Tensor,
-        actions: Tensor,
-        log_std: Tensor | None = None,
-        known: Tensor | None = None,
+        outputs: Tensor, actions: Tensor, log_std: Tensor | None = None, known: Tensor | None = None
     ) -> Tensor:
         """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
         mean, log_std = outputs.unbind(1)

@@ -60,11 +60,7 @@ def check_names(*given: object) -> None:
 
 
 def trained_options(
-    names: Iterable[str],
-    sim: str | gym.Env[Any, Any],
-    options: dict[str, Any],
-    *,
-    trust_env: bool,
+    names: Iterable[str], sim: str | gym.Env[Any, Any], options: dict[str, Any], *, trust_env: bool
 ) -> dict[str, Any]:
     """Return the arguments of an environment in which policies act."""
     # If none are given, they are those of the policies' training in the same environment. Without

@@ -216,11 +216,7 @@ def _check_request(request: FileRequest, envs: int) -> None:
     if request.rotate_mb is not None:
         check_positive(rotate_mb=request.rotate_mb)
     check_least(
-        1,
-        episodes=request.episodes,
-        steps=request.steps,
-        max_steps=request.max_steps,
-        envs=envs,
+        1, episodes=request.episodes, steps=request.steps, max_steps=request.max_steps, envs=envs
     )
     check_least(0, seed=request.seed)
     if envs > 1 and request.append:

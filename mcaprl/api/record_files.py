@@ -116,10 +116,7 @@ def record_file(
 
 def try_request(request: FileRequest) -> None:
     """Create the file of a request and remove it, to find errors before the first episode."""
-    with (
-        work_folder(request.out) as trial,
-        closing(_env(request)) as env,
-    ):
+    with work_folder(request.out) as trial, closing(_env(request)) as env:
         behavior = _behavior(request, env)
         _recorder(replace(request, out=trial / "trial.mcap"), env, behavior).close()
 
@@ -367,11 +364,7 @@ def record_on_ray(
         paths = [hidden] if whole.policy in SCRIPTED else [hidden, Path(str(whole.policy))]
         try:
             results = run_tasks(
-                _record_on_worker,
-                shards,
-                workers=options.workers,
-                paths=paths,
-                advance=advance,
+                _record_on_worker, shards, workers=options.workers, paths=paths, advance=advance
             )
         except WorkerDiedError as error:
             raise LogError(

@@ -37,12 +37,7 @@ from mcaprl.recorder.record.panels import bounded_actions
 from mcaprl.recorder.record.scene import DepthSource
 from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.recorder.source import Paths, open_data
-from mcaprl.recorder.viewer.annotate import (
-    Comparison,
-    Verification,
-    attached_layout,
-    write_labels,
-)
+from mcaprl.recorder.viewer.annotate import Comparison, Verification, attached_layout, write_labels
 from mcaprl.recorder.viewer.annotate import verify as verify_dataset
 from mcaprl.recorder.viewer.foxglove_server import (
     DEFAULT_PORT,

@@ -73,17 +73,9 @@ def sweep(
     on_cluster = ClusterOptions(True, workers, address)
     on_cluster.check()
     wanted, folder = read_plan(plan), Path(out)
-    with (
-        progress("trials", len(wanted.trials)) as advance,
-        on_cluster.connected(),
-    ):
+    with progress("trials", len(wanted.trials)) as advance, on_cluster.connected():
         results = sweep_on_ray(
-            data,
-            wanted,
-            folder.absolute(),
-            workers=workers,
-            resume=resume,
-            advance=advance,
+            data, wanted, folder.absolute(), workers=workers, resume=resume, advance=advance
         )
     with suppress(MissingExtraError):
         write_sweep(results, wanted, folder)

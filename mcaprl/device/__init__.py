@@ -13,8 +13,5 @@ if TYPE_CHECKING:
 __all__ = ["device_task", "fast_products", "make_agents", "train"]
 
 __getattr__ = lazy_attributes(
-    __name__,
-    {
-        "mcaprl.device.training": ("device_task", "fast_products", "make_agents", "train"),
-    },
+    __name__, {"mcaprl.device.training": ("device_task", "fast_products", "make_agents", "train")}
 )

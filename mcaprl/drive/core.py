@@ -196,12 +196,7 @@ class DriverCore:
     """A policy that drives a robot; see `Driver`."""
 
     def __init__(
-        self,
-        plan: Any,
-        live: LiveSteps,
-        episodes: LiveEpisodes,
-        commands: Any,
-        policy: Any,
+        self, plan: Any, live: LiveSteps, episodes: LiveEpisodes, commands: Any, policy: Any
     ) -> None:
         """Connect the parts."""
         self.policy, self.mapping = policy, plan.mapping
@@ -253,11 +248,7 @@ class DriverCore:
         """Do something with a command."""
 
     def command(
-        self,
-        now_ns: int,
-        *,
-        enabled: bool = True,
-        is_late: Callable[[], bool] = lambda: False,
+        self, now_ns: int, *, enabled: bool = True, is_late: Callable[[], bool] = lambda: False
     ) -> Command:
         """Return what to publish at a step.
 

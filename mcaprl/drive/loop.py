@@ -307,9 +307,7 @@ class Loop:
             return (self._transport.now_ns() - step_ns) / _NS_PER_S
 
         command = self._driver.command(
-            step_ns,
-            enabled=allowed,
-            is_late=lambda: self._is_live and late_s() > self._deadline_s,
+            step_ns, enabled=allowed, is_late=lambda: self._is_live and late_s() > self._deadline_s
         )
         self._steps += 1
         self._latencies_ms.append(late_s() * 1e3)

@@ -362,10 +362,7 @@ class LogSource(Datasource):  # type: ignore[misc]
         columns, metadata = self._columns(), described(self.description)
         schema = block_of(columns, metadata).schema
         wanted = _Wanted(
-            list(columns),
-            keys_of(self.description, list(columns)),
-            metadata,
-            installed_versions(),
+            list(columns), keys_of(self.description, list(columns)), metadata, installed_versions()
         )
         tasks = []
         for group in self.groups:
@@ -403,9 +400,7 @@ class LogSource(Datasource):  # type: ignore[misc]
                 yield _Group(path, episodes[start:stop], first, int(ends[stop - 1]) - begin)
                 start = stop
 
-    def _chosen_episodes(
-        self,
-    ) -> Iterator[tuple[Path, int, NDArray[np.int64], NDArray[np.int64]]]:
+    def _chosen_episodes(self) -> Iterator[tuple[Path, int, NDArray[np.int64], NDArray[np.int64]]]:
         """Yield each log, the index of its first episode, and its chosen indexes and lengths."""
         first = 0
         for path, lengths in zip(self._paths, self._lengths, strict=True):

@@ -298,13 +298,7 @@ class TrialResult:
 
 
 def sweep_on_ray(
-    data: Data,
-    plan: SweepPlan,
-    out: Path,
-    *,
-    workers: int | None,
-    resume: bool,
-    advance: Advance,
+    data: Data, plan: SweepPlan, out: Path, *, workers: int | None, resume: bool, advance: Advance
 ) -> list[TrialResult]:
     """Run the trials on the cluster, as `mcaprl.sweep`; return the results, best score first."""
     tune = import_extra("ray.tune", "ray")
@@ -568,10 +562,7 @@ def write_sweep(results: Sequence[TrialResult], plan: SweepPlan, out: Path) -> T
         f" {results[0].trial.name}."
     )
     drawn = Figure.of("Off-policy score during training", figure)
-    sections = [
-        Section("Scores", figures=[drawn]),
-        Section("Trials", text=text, table=table),
-    ]
+    sections = [Section("Scores", figures=[drawn]), Section("Trials", text=text, table=table)]
     write_page(out / PAGE_NAME, "Sweep", lead, sections)
     return table
 

@@ -66,10 +66,7 @@ class TrainingConfig(NetworkSettings):
     def packing(self) -> Packing:
         """Settings for building transitions from the log."""
         return Packing(
-            self.frame_stack,
-            self.normalize,
-            self.center_images,
-            clip_actions=self.clip_actions,
+            self.frame_stack, self.normalize, self.center_images, clip_actions=self.clip_actions
         )
 
     @property

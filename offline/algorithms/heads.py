@@ -217,10 +217,7 @@ class BoxHead(Head):
 
     @staticmethod
     def log_density(
-        outputs: Tensor,
-        actions: Tensor,
-        log_std: Tensor | None = None,
-        known: Tensor | None = None,
+        outputs: Tensor, actions: Tensor, log_std: Tensor | None = None, known: Tensor | None = None
     ) -> Tensor:
         """Return log densities (B,) of actions (B, n), of the numbers with a 1 in `known`."""
         raise PolicyError("a deterministic policy has no density of actions")
@@ -295,10 +292,7 @@ class Gaussian(BoxHead):
 
     @staticmethod
     def log_density(
-        outputs: Tensor,
-        actions: Tensor,
-        log_std: Tensor | None = None,
-        known: Tensor | None = None,
+        outputs: Tensor, actions: Tensor, log_std: Tensor | None = None, known: Tensor | None = None
     ) -> Tensor:
         """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
         raw = outputs[:, 1] if log_std is None else log_std
@@ -311,10 +305,7 @@ class SquashedGaussian(Gaussian):
 
     @staticmethod
     def log_density(
-        outputs: Tensor,
-        actions: Tensor,
-        log_std: Tensor | None = None,
-        known: Tensor | None = None,
+        outputs: Tensor, actions: Tensor, log_std: Tensor | None = None, known: Tensor | None = None
     ) -> Tensor:
         """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
         mean, raw = outputs.unbind(1)
@@ -351,10 +342,7 @@ class Mixture(BoxHead):
 
     @staticmethod
     def log_density(
-        outputs: Tensor,
-        actions: Tensor,
-        log_std: Tensor | None = None,
-        known: Tensor | None = None,
+        outputs: Tensor, actions: Tensor, log_std: Tensor | None = None, known: Tensor | None = None
     ) -> Tensor:
         """Return the log densities (B,) of actions (B, n) in [-1, 1]."""
         mean, raw = Mixture._components(outputs).unbind(2)

@@ -14,11 +14,7 @@ from numpy.typing import NDArray
 from mcaprl import limits
 from mcaprl.errors import LogError, UsageError
 from mcaprl.offline.batches.items import Arrays, ItemOptions, Items
-from mcaprl.offline.batches.loading import (
-    Tensors,
-    joined_arrays,
-    tensors_of,
-)
+from mcaprl.offline.batches.loading import Tensors, joined_arrays, tensors_of
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 from mcaprl.recorder.dataset.open import find_logs

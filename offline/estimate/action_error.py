@@ -310,11 +310,7 @@ class _Errors:
         return "below" if interval[1] < 0 else "above" if interval[0] > 0 else "as large as"
 
     def _error(
-        self,
-        name: str,
-        unit: str,
-        reduce: Callable[[Floats], Floats],
-        draws: NDArray[np.int64],
+        self, name: str, unit: str, reduce: Callable[[Floats], Floats], draws: NDArray[np.int64]
     ) -> Error:
         def mean(which: str, step: int) -> tuple[float, tuple[float, float] | None]:
             return _mean([reduce(one[:, step]) for one in self.errors[which]], draws)

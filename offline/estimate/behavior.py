@@ -196,10 +196,7 @@ def estimate_behavior(
 
 
 def _of_probabilities(
-    dataset: Dataset,
-    predicted: Floats,
-    actions: NDArray[np.int64],
-    folds: tuple[FoldScore, ...],
+    dataset: Dataset, predicted: Floats, actions: NDArray[np.int64], folds: tuple[FoldScore, ...]
 ) -> BehaviorEstimate:
     """Return the result for rows (N, A) of the probabilities of all actions."""
     taken = predicted[np.arange(len(actions)), actions].astype(np.float32)

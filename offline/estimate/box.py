@@ -26,12 +26,7 @@ from mcaprl.base_policy import BasePolicy, RandomPolicy
 from mcaprl.errors import PolicyError, UsageError
 from mcaprl.frames import rows_of
 from mcaprl.offline.estimate.fqe import BoxFQE, BoxFQEConfig, FQEConfig
-from mcaprl.offline.estimate.importance import (
-    EpisodeTable,
-    Floats,
-    RatioEstimate,
-    usable_steps,
-)
+from mcaprl.offline.estimate.importance import EpisodeTable, Floats, RatioEstimate, usable_steps
 from mcaprl.offline.estimate.off_policy import (
     FOLDS,
     LEAST_SAMPLE_SIZE,
@@ -180,13 +175,7 @@ class BoxEvaluator(OffPolicyEvaluator):
                 f" {high:.2f}"
             )
         fqe = Estimate(
-            name,
-            "FQE",
-            float(values.mean()),
-            None,
-            None,
-            verdict,
-            spread=float(values.std(ddof=1)),
+            name, "FQE", float(values.mean()), None, None, verdict, spread=float(values.std(ddof=1))
         )
         weights, refused = self._ratios(policy)
         nothing = np.zeros(len(here))
@@ -195,11 +184,7 @@ class BoxEvaluator(OffPolicyEvaluator):
         return PolicyEstimates(name, None, (fqe, *self._marked(tuple(found))), support)
 
     def _fitted(
-        self,
-        next_actions: Tensor,
-        values: _Values,
-        weights: Floats,
-        on_update: Callable[[], None],
+        self, next_actions: Tensor, values: _Values, weights: Floats, on_update: Callable[[], None]
     ) -> Floats:
         """Return values (SEEDS, C * E) by networks that were not trained on the episode."""
         # `values` gives C values of each of the E episodes, from a trained learner.

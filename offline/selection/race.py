@@ -170,11 +170,7 @@ def eligible(config: AutoConfig, trying: Sequence[Candidate]) -> frozenset[str]:
 
 
 def rate(
-    values: Mapping[str, Floats],
-    agreements: Mapping[str, Floats],
-    *,
-    imitate: bool,
-    seed: int = 0,
+    values: Mapping[str, Floats], agreements: Mapping[str, Floats], *, imitate: bool, seed: int = 0
 ) -> dict[str, Rating]:
     """Rate candidates by their values or by their agreement with the log, the best first."""
     # Arrays are (M, E): pairs of a network and a model, and episodes. Both are resampled, so that
@@ -350,12 +346,7 @@ class _Race:
         )
         ends = time.perf_counter() + self._left_s(SHARES[0] / 2)
         folder = self._out / "clone"
-        self._train_into(
-            folder,
-            clone.config(config),
-            range(1),
-            lambda now: self._stop_after(ends),
-        )
+        self._train_into(folder, clone.config(config), range(1), lambda now: self._stop_after(ends))
         return read_policy(policy_files(folder)[0].parent)
 
     def _train(self, candidates: Sequence[Candidate], until: int, share: float) -> None:

@@ -484,11 +484,7 @@ class McapReader:
             self.chunks = chunks.plus(found)
 
     def _read_records(
-        self,
-        start: int,
-        stop: int | None,
-        chunk: ChunkIndex | None,
-        unchunked: UnindexedMessages,
+        self, start: int, stop: int | None, chunk: ChunkIndex | None, unchunked: UnindexedMessages
     ) -> list[ChunkIndex]:
         """Read the records from `start` to `stop` (or the end), and return the chunks found."""
         # Message indexes before the first of these chunks belong to `chunk`, which ends at `start`.

@@ -36,13 +36,7 @@ from mcaprl.recorder.format.reading import (
     full_name,
 )
 from mcaprl.recorder.format.schema import STEP_TOPIC
-from mcaprl.recorder.format.selected_copy import (
-    NewTopics,
-    Source,
-    Times,
-    copy_selected,
-    times_of,
-)
+from mcaprl.recorder.format.selected_copy import NewTopics, Source, Times, copy_selected, times_of
 
 _NS_PER_S = 10**9
 _TIME = "builtin_interfaces/msg/Time"

@@ -261,10 +261,7 @@ def slice_log(
     _check_videos(log, cut)
     spans = np.array([window], np.int64)
     source = Source(
-        log.reader,
-        {id_: id_ for id_ in log.reader.channels},
-        spans,
-        also=log.states(spans),
+        log.reader, {id_: id_ for id_ in log.reader.channels}, spans, also=log.states(spans)
     )
     summaries = _shorten(log, cut, source) if cut else []
     with replacing(Path(out), LogError, overwrite=overwrite) as unfinished:
@@ -429,9 +426,7 @@ def _chosen(
 
 
 def _table(
-    expression: Expression,
-    summaries: Sequence[EpisodeSummary],
-    labels: Callable[[], Labels | None],
+    expression: Expression, summaries: Sequence[EpisodeSummary], labels: Callable[[], Labels | None]
 ) -> dict[str, Column]:
     """Return the columns of episodes that an expression can use."""
     if expression.uses_next:

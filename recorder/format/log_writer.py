@@ -69,12 +69,7 @@ from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.behavior import PROBABILITY, behavior_field
 from mcaprl.recorder.format.infos import INFO_TOPICS, is_exact, shape_of
 from mcaprl.recorder.format.messages import TEXT_TYPE, EpisodeSummary, begin_line, text_message
-from mcaprl.recorder.format.metadata import (
-    METADATA_NAME,
-    SAME_WHEN_APPENDED,
-    LogMetadata,
-    same_env,
-)
+from mcaprl.recorder.format.metadata import METADATA_NAME, SAME_WHEN_APPENDED, LogMetadata, same_env
 from mcaprl.recorder.format.schema import (
     EPISODE_TOPIC,
     IMAGES_PER_CHUNK,
@@ -236,11 +231,7 @@ class LogWriter(LogTopics):
             with HoldSignals() if source is None else nullcontext():
                 # Writer of the file; the same object as `sink`.
                 self.mcap = McapWriter(
-                    path,
-                    compression=compression,
-                    overwrite=overwrite,
-                    append=append,
-                    source=source,
+                    path, compression=compression, overwrite=overwrite, append=append, source=source
                 )
                 at_error.callback(self.mcap.close)
                 if self.mcap.untouched:

@@ -284,11 +284,7 @@ def image_dtype(
 
 
 def fill_image_constants(
-    messages: np.ndarray[Any, Any],
-    height: int,
-    width: int,
-    encoding: str,
-    frame_id: str,
+    messages: np.ndarray[Any, Any], height: int, width: int, encoding: str, frame_id: str
 ) -> None:
     """Set the fields that are the same in every image of a topic."""
     data_bytes = messages.dtype["data"].itemsize

@@ -31,12 +31,7 @@ from mcaprl.recorder.format.messages import EpisodeSummary
 from mcaprl.recorder.format.schema import telemetry_message, telemetry_schema
 from mcaprl.recorder.format.video_messages import VIDEO_TEXT, VIDEO_TYPE
 from mcaprl.recorder.format.writing import HoldSignals
-from mcaprl.recorder.record.camera import (
-    VIDEO,
-    VIDEO_PERIOD_NS,
-    VideoEncoder,
-    rendered,
-)
+from mcaprl.recorder.record.camera import VIDEO, VIDEO_PERIOD_NS, VideoEncoder, rendered
 from mcaprl.recorder.record.layout import AROUND_M, RETURN_SO_FAR
 from mcaprl.recorder.record.scene import (
     DepthSource,

@@ -17,12 +17,7 @@ from gymnasium import spaces
 
 from mcaprl.recorder.format.messages import INTERRUPTED
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.schema import (
-    EPISODE_TOPIC,
-    IMAGE_FRAME,
-    LOG_TOPIC,
-    STEP_TOPIC,
-)
+from mcaprl.recorder.format.schema import EPISODE_TOPIC, IMAGE_FRAME, LOG_TOPIC, STEP_TOPIC
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.record import panels
 from mcaprl.recorder.record.camera import VIDEO

@@ -39,12 +39,7 @@ from mcaprl.recorder.dataset.log_reader import described
 from mcaprl.recorder.dataset.log_video import LogVideo, is_video_leaf
 from mcaprl.recorder.format.messages import INTERRUPTED, EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import METADATA_NAME
-from mcaprl.recorder.format.reading import (
-    LOG_TIME,
-    Columns,
-    McapReader,
-    Topic,
-)
+from mcaprl.recorder.format.reading import LOG_TIME, Columns, McapReader, Topic
 from mcaprl.recorder.format.schema import EPISODE_TOPIC, STEP_TOPIC, Part, Shorten, message_dtype
 from mcaprl.recorder.format.selected_copy import Copied, Source, copy_selected, within
 from mcaprl.recorder.format.spaces import observation_leaves

@@ -13,16 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.scene import (
-    Color,
-    Frame,
-    Kind,
-    Shape,
-    coarse,
-    path,
-    raised,
-    yaw_rotation,
-)
+from mcaprl.sims.drawing.scene import Color, Frame, Kind, Shape, coarse, path, raised, yaw_rotation
 from mcaprl.sims.geometry import wrap_angle
 
 Vector = tuple[float, float, float]

@@ -137,11 +137,7 @@ def quantile(
 
 
 def log_density(
-    actions: Floats,
-    mean: Floats,
-    sigma: Floats | float,
-    low: Floats | float,
-    high: Floats | float,
+    actions: Floats, mean: Floats, sigma: Floats | float, low: Floats | float, high: Floats | float
 ) -> Floats:
     """Return the log densities of numbers under normal distributions truncated to [low, high].
 

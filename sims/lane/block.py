@@ -195,11 +195,7 @@ def _observe_block(block: NDArray[np.float64]) -> None:
 def _motion_in(block: NDArray[np.float64], lane: int) -> Motion:
     heading = Heading(block[_COS * LANES + lane], block[_SIN * LANES + lane])
     return Motion(
-        block[lane],
-        block[LANES + lane],
-        block[2 * LANES + lane],
-        block[3 * LANES + lane],
-        heading,
+        block[lane], block[LANES + lane], block[2 * LANES + lane], block[3 * LANES + lane], heading
     )
 
 

@@ -229,10 +229,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     def scene(self) -> Sequence[Shape]:
         """Return the shapes that change with each step."""
         return lane_scene.moving_shapes(
-            self.car,
-            self.trail,
-            has_rays=self.fleet.has_rays,
-            has_barriers=self.fleet.has_barriers,
+            self.car, self.trail, has_rays=self.fleet.has_rays, has_barriers=self.fleet.has_barriers
         )
 
     def static_frames(self) -> Sequence[Frame]:

@@ -302,6 +302,5 @@ def _turned(rates_rad_s: Vector, thrusts: Rotors) -> Vector:
     net = minus(torque, cross(rates_rad_s, angular_momentum(rates_rad_s)))
     about_x, about_y, about_z = INERTIA_KG_M2
     return plus(
-        rates_rad_s,
-        times(TIME_STEP_S, Vector(net.x / about_x, net.y / about_y, net.z / about_z)),
+        rates_rad_s, times(TIME_STEP_S, Vector(net.x / about_x, net.y / about_y, net.z / about_z))
     )

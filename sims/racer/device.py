@@ -110,14 +110,7 @@ def _start_car(batch: Batch, world: World, seed: Any, i: int, block: Any) -> Non
 
 
 @compiled
-def _step_car(
-    batch: Batch,
-    world: World,
-    seed: Any,
-    max_steps: int,
-    i: int,
-    block: Any,
-) -> None:
+def _step_car(batch: Batch, world: World, seed: Any, max_steps: int, i: int, block: Any) -> None:
     row, command, track = batch.states[i], ACTION_COMMANDS[batch.actions[i]], world.track
     car, reward, end = advance(track, row, command, False, world.drift)
     observe_with(track, car, False, block, batch.observations[i])

@@ -68,10 +68,7 @@ ACTION_COMMANDS = (
     Command(1.0, 1.0),
     Command(1.0, -1.0),
 )
-COMMAND_UNITS = (
-    "2 px/step backward | 2 px/step forward",
-    "15 degrees right | 15 degrees left",
-)
+COMMAND_UNITS = ("2 px/step backward | 2 px/step forward", "15 degrees right | 15 degrees left")
 
 STEP_S = 0.1
 TURN_RAD = math.radians(15.0)
