@@ -48,17 +48,11 @@ _BROKEN = (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeErr
 
 
 class Agent(ABC):
-    """Agent of one seed, with its training and evaluation environments.
+    """Agent of one seed, with its training and evaluation environments."""
 
-    Attributes:
-        best_files: Names of the files of the best policy.
-        repeats_steps: Whether a resumed run repeats the steps after its checkpoint to the same
-            bits, so that they are removed from the log.
-        resumed_at: Number of steps done by earlier sessions.
-        points: All evaluations, including those of earlier sessions.
-    """
-
-    best_files: ClassVar[tuple[str, ...]]
+    best_files: ClassVar[tuple[str, ...]]  # Names of the files of the best policy
+    # Whether a resumed run repeats the steps after its checkpoint to the same bits, so that they
+    # are removed from the log.
     repeats_steps: ClassVar[bool]
 
     def __init__(
@@ -73,23 +67,9 @@ class Agent(ABC):
         resume: bool = False,
         live: LiveTraining | None = None,
     ) -> None:
-        """Create an agent with new weights, its environments, and its log.
-
-        Args:
-            task: Algorithm, settings and environment.
-            env_id: Gymnasium id of the environment.
-            folder: Existing folder of this seed, RUN/seed-K.
-            seed: Seed of the agent.
-            scale: Mean returns that define the scores 0 and 1.
-            record: Log to write; None records neither training nor evaluations.
-            resume: Whether to continue from the folder's checkpoint and log, if they exist.
-            live: Live view of the training.
-
-        Raises:
-            SpaceError, OutputExistsError, LogError: The log cannot be written.
-            TrainingError: The checkpoint belongs to another task, or is broken.
-        """
-        self.points: list[CurvePoint] = []
+        """Create an agent with new weights, or of the checkpoint; its environments, and its log."""
+        self.points: list[CurvePoint] = []  # All evaluations, including those of earlier sessions
+        # Number of steps done by earlier sessions.
         self.resumed_at, self._reported_at, self._began_s = 0, -1, 0.0
         self._task, self._env_id, self._folder, self._seed = task, env_id, folder, seed
         self._scalars: ScalarsWriter | None = None
@@ -139,20 +119,9 @@ class Agent(ABC):
 
     @abstractmethod
     def start_from(self, data: Dataset | None, policy: Any) -> None:
-        """Fill the replay buffer with logged transitions, copy a policy's weights, or do both.
-
-        With data, the agent takes no random steps before learning. With a policy, the agent always
-        explores with the final epsilon, and takes `learning_starts` steps before learning.
-
-        Args:
-            data: Logged transitions, if any.
-            policy: Policy with Q-values, if any.
-
-        Raises:
-            UsageError: The algorithm cannot start from data or policies.
-            SpaceError: The spaces differ.
-            PolicyError: The policy's network differs from the agent's.
-        """
+        """Fill the replay buffer with logged transitions, copy a policy's weights, or do both."""
+        # With data, the agent takes no random steps before learning. With a policy, it explores
+        # with the final epsilon, and takes `learning_starts` steps before learning.
 
     @abstractmethod
     def scalars(self) -> dict[str, float]:
@@ -179,15 +148,7 @@ class Agent(ABC):
         self._envs.close()
 
     def learn(self, report: ProgressCallback) -> None:
-        """Train and evaluate until all steps are done.
-
-        Args:
-            report: Callback for progress, called every `LOG_INTERVAL` steps, and where a resumed
-                training continues.
-
-        Raises:
-            TrainingError: The loss is not finite, or a file cannot be written.
-        """
+        """Train and evaluate until all steps are done; report every `LOG_INTERVAL` steps."""
         self.resumed_at = self.steps
         if self.steps >= self._task.config.steps:
             return

@@ -145,10 +145,7 @@ class Behavior(ABC):
 
 
 class EpsilonGreedy(Behavior):
-    """Random actions with probability epsilon, else those with the largest value.
-
-    Each environment explores on its own. Only allowed actions are selected.
-    """
+    """Allowed random actions with probability epsilon in each environment, else the best ones."""
 
     def __init__(self, learner: Learner, generator: torch.Generator) -> None:
         """Select by the Q-network of `learner`; `generator` is on its device."""
@@ -274,19 +271,14 @@ class NoisyActions(BoxBehavior):
 
 
 class Collector:
-    """Steps environments and stores their transitions in a replay buffer.
-
-    Attributes:
-        buffer: The replay buffer.
-        environments: The environments.
-        before_step: Called with the choice of each step before the environments take it.
-    """
+    """Steps environments and stores their transitions in a replay buffer."""
 
     def __init__(
         self, environments: Environments, buffer: ReplayBuffer, behavior: Behavior
     ) -> None:
         """Connect the parts; call `begin` before the first step."""
         self.environments, self.buffer, self._behavior = environments, buffer, behavior
+        # Called with the choice of each step before the environments take it.
         self.before_step: Callable[[Choice], None] = lambda choice: None
 
     def begin(self, seed: int) -> None:

@@ -30,28 +30,17 @@ VALUES: Final = {
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """One evaluation during training, a row of `curve.csv`.
+    """One evaluation during training, a row of `curve.csv`."""
 
-    Attributes:
-        step: Number of finished environment steps.
-        mean_return: Mean return of the evaluation's episodes.
-        score: Mean return, scaled so that random is 0 and pilot is 1; NaN without a pilot.
-        lowest_return: Lowest return of an episode.
-        highest_return: Highest return of an episode.
-        mean_length: Mean number of steps of an episode.
-        mean_progress_m: Mean distance along the path or line in meters; NaN where the environment
-            reports none.
-        best: Whether the mean return is the highest so far.
-    """
-
-    step: int
-    mean_return: float
-    score: float
+    step: int  # Number of finished environment steps
+    mean_return: float  # Mean return of the evaluation's episodes
+    score: float  # Mean return, scaled so that random is 0 and pilot is 1; NaN without a pilot
     lowest_return: float
     highest_return: float
-    mean_length: float
+    mean_length: float  # Mean number of steps of an episode
+    # Mean distance along the path or line in meters; NaN where the environment reports none.
     mean_progress_m: float
-    best: bool
+    best: bool  # Whether the mean return is the highest so far
 
 
 @dataclass(frozen=True)
@@ -88,11 +77,7 @@ def write_curve(path: Path, points: Sequence[CurvePoint]) -> None:
 
 
 def read_run(folder: Path) -> RunCurve:
-    """Read the curves of all seeds of a run, finished or not.
-
-    Raises:
-        TrainingError: The run has no curves, or they cannot be read.
-    """
+    """Read the curves of all seeds of a run, finished or not."""
     seeds = tuple(read_curves(folder, CURVE_NAME, ["step", *VALUES]))
     if not seeds:
         raise TrainingError(f"{folder} has no curves: no seed-K/{CURVE_NAME}")
@@ -100,20 +85,9 @@ def read_run(folder: Path) -> RunCurve:
 
 
 def draw_curves(path: Path, runs: Sequence[RunCurve], title: str, value: str | None = None) -> None:
-    """Draw curves of runs: each seed, the median over the seeds, and their range.
-
-    Dots to the right of score curves are scores of the best checkpoints on new episodes.
-
-    Args:
-        path: PNG file to write.
-        runs: Runs to compare.
-        title: Title of the image.
-        value: Key of `VALUES`; None selects the score if it is known, else the mean return.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-        ReportError: The image cannot be written.
-    """
+    """Draw curves of runs: each seed, the median over the seeds, and their range."""
+    # Dots on the right are scores of the best checkpoints on new episodes. `value` is a key of
+    # `VALUES`, by default the score if it is known, else the mean return.
     save_png(curve_figure(runs, title, value), path)
 
 

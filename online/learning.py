@@ -277,11 +277,7 @@ class LearningAgent(Agent):
         return float(self._choice.behavior()[WATCHED])
 
     def values(self, taken: NDArray[Any]) -> dict[str, Any]:
-        """Return the fields of `values_schema` for the action of the watched environment.
-
-        Q-values of numbered actions are those of the forward pass that chose the action, if there
-        was one.
-        """
+        """Return the fields of `values_schema` for the watched action, if possible of its pass."""
         assert self._choice is not None
         values, behavior = self._choice.values, self.agents.behavior
         if not isinstance(behavior, EpsilonGreedy):

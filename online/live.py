@@ -80,20 +80,7 @@ class LiveTraining:
         speed: float = DEFAULT_SPEED,
         pace: Pace | None = None,
     ) -> None:
-        """Listen for viewers.
-
-        Args:
-            task: Task of the run.
-            port: Port on 127.0.0.1; 0 selects a free one.
-            origins: Origins of other web pages that may connect; known viewers may always connect.
-            speed: Simulated seconds per second in the episodes that are shown.
-            pace: Limit on the time that is spent on the view.
-
-        Raises:
-            MissingExtraError: foxglove-sdk is not installed.
-            SpaceError: The algorithm does not support the environment's spaces.
-            UsageError: The port is in use, or the environment cannot be created.
-        """
+        """Listen for viewers at a port of 127.0.0.1, 0 for a free one."""
         self._task = task
         self._shown = env = make_sim(task.sim, **task.sim_options)
         try:

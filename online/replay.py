@@ -58,27 +58,19 @@ class ReplayBuffer(TransitionBuffer):
     step replaces the oldest slot. Row `slot * W + environment` has the transition of a step, and
     the frame with this number its observation. The frame `S * W + row` is the last observation of
     an episode that ended with the transition `row`. The newest slot has observations only.
-
-    Attributes:
-        agents: Number of agents K.
-        slots: Number of slots S.
-        capacity: Number of the newest slots from which transitions are drawn. More slots are
-            stored, so that the frame stacks of these are complete.
-        goes_on: (S, W) bool, whether the episode continues after the transition.
-        ages: (S, W) int64, number of earlier frames in the stack of each observation.
-        pools: Factor by which the images of each camera are averaged when they are stored.
-        image_shift: Largest shift of the images in a batch, in pixels of the stored size.
-        generator: Generator of the draws and shifts, on the device of the buffer.
     """
 
-    agents: int
-    slots: int
+    agents: int  # Number of agents K
+    slots: int  # Number of slots S
+    # Number of the newest slots from which transitions are drawn. More slots are stored, so that
+    # the frame stacks of these are complete.
     capacity: int
-    goes_on: Tensor
-    ages: Tensor
+    goes_on: Tensor  # (S, W) bool, whether the episode continues after the transition
+    ages: Tensor  # (S, W) int64, number of earlier frames in the stack of each observation
+    # Factor by which the images of each camera are averaged when they are stored.
     pools: tuple[int, ...]
-    image_shift: int
-    generator: torch.Generator
+    image_shift: int  # Largest shift of the images in a batch, in pixels of the stored size
+    generator: torch.Generator  # Generator of the draws and shifts, on the device of the buffer
     counts: _Counts
 
     @classmethod
@@ -96,20 +88,7 @@ class ReplayBuffer(TransitionBuffer):
         seed: int,
         image_shift: int = 0,
     ) -> ReplayBuffer:
-        """Reserve the memory. On a CPU, the operating system allocates it when it is filled.
-
-        Args:
-            encoder: Encoder of the environments' observations.
-            action_space: Action space of one environment.
-            packing: Settings for building transitions.
-            architecture: Architecture of the networks, which defines the size of stored images.
-            agents: Number of agents K.
-            envs: Number of environments E of one agent.
-            size: Number of transitions of one agent, summed over its environments.
-            device: Device of the buffer.
-            seed: Seed of the draws.
-            image_shift: Largest shift of the images in a batch.
-        """
+        """Reserve the memory. On a CPU, the operating system allocates it when it is filled."""
         width = agents * envs
         capacity = max(size // envs, 1)
         slots = max(capacity + packing.frame_stack, packing.n_steps + 1)
@@ -171,10 +150,7 @@ class ReplayBuffer(TransitionBuffer):
         return min(self.steps, self.capacity)
 
     def begin(self, observations: Observations) -> None:
-        """Start new episodes in all environments, with these W observations.
-
-        Episodes that were going on count as truncated.
-        """
+        """Start episodes in all environments with W observations; open ones count as truncated."""
         if self.steps:
             self._truncate()
         slot = self.steps % self.slots
@@ -282,12 +258,7 @@ class ReplayBuffer(TransitionBuffer):
         }
 
     def load_state(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `state` returned.
-
-        Raises:
-            KeyError: A tensor is missing.
-            RuntimeError, IndexError: A tensor has another shape.
-        """
+        """Restore what `state` returned; KeyError, RuntimeError or IndexError if it is wrong."""
         finals, used = tensors["finals"], len(tensors["next_places"])
         assert isinstance(self.frames, Observations)
         for number, part in enumerate(self.frames.parts()):

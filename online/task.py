@@ -92,25 +92,17 @@ def choose_engine(algo: str, engine: str | None) -> str:
 
 @dataclass(frozen=True)
 class Task:
-    """An algorithm with its settings, and the environment in which it learns.
-
-    Attributes:
-        algo: Name of the algorithm.
-        config: Settings of the algorithm.
-        sim: Short name or Gymnasium id.
-        sim_options: Arguments of the environment.
-        max_steps: Steps after which an episode is truncated, in training and evaluation. None
-            selects the environment's own limit; evaluations of environments without one then have
-            the limit of `mcaprl.sims.evaluation.rollout`.
-        engine: Key of `ENGINES`; empty selects the first one that has the algorithm.
-    """
+    """An algorithm with its settings, and the environment in which it learns."""
 
     algo: str
-    config: OnlineConfig
-    sim: str
-    sim_options: dict[str, Any]
+    config: OnlineConfig  # Settings of the algorithm
+    sim: str  # Short name or Gymnasium id
+    sim_options: dict[str, Any]  # Arguments of the environment
+    # Steps after which an episode is truncated, in training and evaluation. None selects the
+    # environment's own limit; evaluations of environments without one then have the limit of
+    # `mcaprl.sims.evaluation.rollout`.
     max_steps: int | None = None
-    engine: str = ""
+    engine: str = ""  # Key of `ENGINES`; empty selects the first one that has the algorithm
 
     @property
     def is_sb3(self) -> bool:
@@ -125,18 +117,7 @@ class Task:
         sim_options: Mapping[str, Any] | None = None,
         **settings: Any,
     ) -> Task:
-        """Return a task with the settings that `SIM_SETTINGS` has for the sim, else SB3's defaults.
-
-        Args:
-            sim: Short name or Gymnasium id.
-            algo: Key of `CONFIGS`; None selects the default for the actions of the sim.
-            sim_options: Arguments of the environment.
-            **settings: Settings that replace the defaults.
-
-        Raises:
-            UnknownNameError: There is no such algorithm.
-            UsageError: The algorithm has no such setting, or a setting is outside its range.
-        """
+        """Return a task with the settings of `SIM_SETTINGS` for the sim, else SB3's defaults."""
         options = dict(sim_options or {})
         algo = algo or default_algo(sim, options)
         find_config(algo)
@@ -146,27 +127,14 @@ class Task:
     def of_preset(
         cls, name: str, sim_options: Mapping[str, Any] | None = None, **settings: Any
     ) -> Task:
-        """Return a task with the published settings of a preset, except those that are given.
-
-        Raises:
-            UnknownNameError: There is no such preset.
-            UsageError: The algorithm has no such setting, or a setting is outside its range.
-        """
+        """Return a task with the published settings of a preset, except those that are given."""
         preset = find_preset(name)
         options = {**preset.sim_options, **(sim_options or {})}
         return cls._checked(preset.algo, preset.sim, options, preset.settings, settings)
 
     @classmethod
     def of_run(cls, folder: Path, **settings: Any) -> Task:
-        """Return the task of an earlier session.
-
-        Args:
-            folder: Folder of the run.
-            **settings: Settings that the user repeats; they must have the same values in the run.
-
-        Raises:
-            TrainingError: The folder has no online run, or a run on a device.
-        """
+        """Return an earlier session's task; repeated `settings` must have the same values."""
         found = read_config(folder)
         check_kind(folder, found, "online")
         if "device" in found:

@@ -153,13 +153,7 @@ def _load_weights(file: io.BytesIO) -> Any:
 
 
 def save_policy(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -> None:
-    """Save a model with a description of its policy, so that it loads without unpickling.
-
-    Args:
-        path: `.zip` file to replace.
-        model: Model of SB3.
-        description: Description as `describe_run` returns it.
-    """
+    """Save a model with its policy's description, so that it loads without unpickling."""
     kind = "tqc" if is_tqc(model.policy) else _kind_of(model.policy)
     own = {
         "format_version": FORMAT_VERSION,
@@ -193,10 +187,7 @@ def describe_run(
     frame_stack: int = 1,
     architecture: Architecture | None = None,
 ) -> dict[str, Any]:
-    """Return the description that all policies of a run share, as plain JSON types.
-
-    `architecture` is None if the network is one of SB3's.
-    """
+    """Return a run's description as JSON types; `architecture` is None of a network of SB3."""
     own = {} if architecture is None else {"architecture": asdict(architecture)}
     return {
         **own,
@@ -227,11 +218,7 @@ class _Description:
 
 
 def read_policy(path: Path) -> Policy:
-    """Read the policy in a `.zip` of this package or of plain SB3.
-
-    Raises:
-        PolicyError: There is no such file, or it is broken.
-    """
+    """Read the policy in a `.zip` of this package or of plain SB3."""
     own, data, weights = read_model(path)
     try:
         if own and own.get("format_version") != FORMAT_VERSION:

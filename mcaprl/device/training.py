@@ -62,11 +62,7 @@ _ROWS_PER_SAVE: Final = 10
 
 
 def device_task(sim: str, sim_options: Mapping[str, Any] | None = None, **settings: Any) -> Task:
-    """Return a task with the settings of the sim and of this module, except those that are given.
-
-    Raises:
-        UsageError: There is no such setting, it is not used here, or it is outside its range.
-    """
+    """Return a task with the settings of the sim and this module, except those given."""
     for name in settings:
         if name in _UNUSED:
             raise UsageError(f"`{name}=` has no effect with `device=`: omit it")
@@ -82,29 +78,10 @@ def train(
     seed: int = 0,
     progress: ProgressCallback | None = None,
 ) -> list[OnlineSummary]:
-    """Train K agents at once, and score their last policies on new episodes.
-
-    The run folder contains the policy and metrics of each seed, in the format of offline runs, and
-    `scores.json`. Nothing is recorded, and a training cannot be resumed.
-
-    Args:
-        task: Task of `device_task`.
-        out: Folder of the run; it must be empty or not exist.
-        device: `cpu` or `cuda`.
-        seeds: Number of agents K.
-        seed: Seed of the first agent; agent k uses seed + k for its initial weights. Starting
-            states, exploration and batches depend on `seed` and on the number of agents.
-        progress: Callback for progress; None shows a bar if stderr is a terminal.
-
-    Returns:
-        One summary for each seed.
-
-    Raises:
-        UnknownNameError: There is no such sim or device.
-        OutputExistsError: `out` exists.
-        UsageError: The sim or the device is not supported.
-        TrainingError: The loss is NaN or infinite, or `out` cannot be written.
-    """
+    """Train K agents at once, and score their last policies on new episodes."""
+    # The run folder contains the policy and metrics of each seed, as of offline runs, and
+    # `scores.json`; nothing is recorded. Agent k has initial weights of seed + k; starts,
+    # exploration and batches depend on `seed` and the number of agents.
     place = choose_device(device)
     folder = Path(out)
     config = task.config

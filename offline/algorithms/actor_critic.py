@@ -32,35 +32,24 @@ from mcaprl.offline.batches.observations import Observations
 
 
 class ActorCritic(Learner):
-    """Learner with the models `actor` and `q`; a subclass defines the losses of both.
-
-    Attributes:
-        actor_starts: Number of updates before the first one of the actor.
-        first_models: Actor, and encoder if there is one, of the policy that training continues.
-    """
+    """Learner with the models `actor` and `q`; a subclass defines the losses of both."""
 
     acts_by: str = "deterministic"
     policy_models = ("actor", "q")
     continuous = True
     critics = ("q",)
     shares_encoder: ClassVar[bool] = False
-    actor_starts = 0
+    actor_starts = 0  # Number of updates before the first one of the actor
+    # Actor, and encoder if there is one, of the policy that training continues.
     first_models: Mapping[str, Model] = MappingProxyType({})
     _anchor = 0.0
     _first_actions: Tensor
     config: ActorCriticConfig
 
     def continue_actor(self, starts: int, rate: float, anchor: float) -> None:
-        """Continue the current policy: train the critics alone at first, and the actor slowly.
-
-        The critics have errors beside the actions that they learned from, and an actor that learns
-        at once follows these errors, as one does that goes far from these actions.
-
-        Args:
-            starts: Number of updates before the first one of the actor.
-            rate: Learning rate of the actor, as a multiple of the critics'.
-            anchor: Weight of `anchor_loss`.
-        """
+        """Continue the current policy: train the critics alone at first, and the actor slowly."""
+        # The critics have errors beside the actions that they learned from, and an actor that
+        # learns at once follows these errors, as one does that goes far from these actions.
         self.actor_starts, self._anchor = starts, anchor
         self.set_rate_factor("actor", rate)
         if anchor:
@@ -94,10 +83,7 @@ class ActorCritic(Learner):
         return encoded(self.models[ENCODER], observations) if self._has_encoder else observations
 
     def encoded(self, batch: Batch) -> Batch:
-        """Return a batch of the buffer with the `inputs` of the networks, for `losses`.
-
-        Gradients flow to the encoder from the observations, and not from the next ones.
-        """
+        """Return a batch with the networks' `inputs`; only observations have gradients."""
         if self.first_models:
             self._first_actions = self._actions_of_first(batch.observations)
         if not self._has_encoder:
@@ -124,10 +110,7 @@ class ActorCritic(Learner):
         return BOX_HEADS[self.acts_by].best(self.models["actor"](observations.detached()))
 
     def smoothness_loss(self, batch: Batch, weight: float) -> Tensor | float:
-        """Return the weighted change (R,) of the actor's action until the next observation.
-
-        With n-step returns, that is the observation n steps later.
-        """
+        """Return the weighted change (R,) of the actor's action until the next observation."""
         if not weight:
             return 0.0
         actions, next_actions = self.act(batch.observations), self.act(batch.next_observations)
@@ -140,11 +123,9 @@ class ActorCritic(Learner):
         return BOX_HEADS[self.acts_by].best(self.first_models["actor"](observations))
 
     def anchor_loss(self, batch: Batch, q_tm1: Tensor) -> Tensor | float:
-        """Return the weighted squared difference (R,) from the actions of the continued policy.
-
-        The weight is multiplied by the mean absolute value of each seed's batch, so that it has no
-        unit. `q_tm1` are the values (2, R) of the logged actions.
-        """
+        """Return the weighted squared difference (R,) from the actions of the continued policy."""
+        # The weight is multiplied by the mean absolute value (2, R) of the logged actions, so that
+        # it has no unit.
         if not self.first_models:
             return 0.0
         change = (self.act(batch.observations) - self._first_actions).square().mean(1)
@@ -152,12 +133,8 @@ class ActorCritic(Learner):
         return self._anchor * scale.repeat_interleave(len(change) // len(scale)) * change
 
     def validate(self, batch: Batch) -> dict[str, Tensor]:
-        """Return metrics of the values in units of the logged rewards, and the actor's error.
-
-        In addition to the values of the logged actions and their TD errors, these are the values of
-        the actor's actions, which show whether it exploits errors of the critics, and the mean
-        absolute difference between both actions, which are scaled to [-1, 1].
-        """
+        """Return metrics of the values in units of the logged rewards, and the actor's error."""
+        # The values of the actor's actions show whether it exploits errors of the critics.
         q_tm1 = self.models["q"](batch.observations.with_actions(batch.actions)).amin(0)
         actions = self.act(batch.observations)
         policy_q = self.models["q"](batch.observations.with_actions(actions)).amin(0)

@@ -63,10 +63,7 @@ class CQL(DoubleDQN):
         return terms
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the loss of Double DQN plus alpha times the penalty.
-
-        With a target gap, the gradient of the loss also changes alpha.
-        """
+        """Return Double DQN's loss plus alpha times the penalty; a target gap changes alpha."""
         q_tm1 = self.outputs("q", batch.observations)
         mean_q_tm1 = mean_values(q_tm1)
         target_tm1 = self.targets(batch, self.target_outputs(batch))

@@ -62,11 +62,9 @@ class DQN(Learner):
         return {"mean_q": mean_q, "loss": td_loss}
 
     def validate(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the values of the logged actions, and their absolute TD errors.
-
-        The targets are computed with the learning network. The target network is not used, because
-        it may be up to date in one validation and outdated in the next.
-        """
+        """Return the values of the logged actions, and their absolute TD errors."""
+        # The target network is not used: it may be up to date in one validation and outdated in the
+        # next.
         q_a_tm1 = chosen(mean_values(self.outputs("q", batch.observations)), batch.actions)
         target_tm1 = self.targets(batch, self.outputs("q", batch.next_observations))
         mean_target_tm1 = target_tm1.mean(1) if target_tm1.ndim == 2 else target_tm1
@@ -75,13 +73,7 @@ class DQN(Learner):
 
     @torch.no_grad()
     def targets(self, batch: Batch, q_t: Tensor) -> Tensor:
-        """Return the targets (R,) for values, or the targets (R, N) for quantiles.
-
-        Args:
-            batch: Transitions.
-            q_t: Values (R, A) or quantiles (R, A, N) of the next states, usually those of
-                `target_outputs`. DQN uses them both to select and to evaluate actions.
-        """
+        """Return targets (R,) for values, or (R, N) for quantiles (R, A, N), of next states."""
         return q_learning_target(batch.rewards, batch.discounts, q_t)
 
     def target_outputs(self, batch: Batch) -> Tensor:

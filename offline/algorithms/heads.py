@@ -444,22 +444,7 @@ def build_head(
     chunk: int = 1,
     relative: RelativeActions | None = None,
 ) -> Head:
-    """Return the head of a policy file or learner.
-
-    Args:
-        acts_by: Value of `Learner.acts_by`.
-        networks: Networks of the head by name.
-        action_space: Space of the actions.
-        threshold: Threshold of `FilteredQ`.
-        box: Scaling of the actions of a Box.
-        log_std: Logarithms (n,) of the deviations of `Gaussian`, unless the network outputs them.
-        chunk: Number of actions that are predicted from one observation.
-        relative: Conversion of relative actions of a Box.
-
-    Raises:
-        ValueError: There is no such head, or it predicts no chunks.
-        SpaceError: The head does not support the action space.
-    """
+    """Return the head of a policy file or learner, by `Learner.acts_by`."""
     if box is not None and acts_by in BOX_HEADS:
         return BOX_HEADS[acts_by](networks, box, log_std, chunk, relative)
     if acts_by not in HEADS or (chunk > 1 and acts_by != "logits"):

@@ -117,18 +117,8 @@ class EvidenceCollector:
         pessimistic: bool = True,
         seed: int = 0,
     ) -> None:
-        """Prepare a log.
-
-        Args:
-            dataset: Log with discrete actions.
-            clone: Policy that imitates the behavior of the log, such as one trained by BC.
-            config: Settings of FQE; its `gamma` is the discount of all values.
-            pessimistic: Whether an episode ends at a policy's first rare action.
-            seed: Seed of the models, and of the division of the log into halves.
-
-        Raises:
-            UsageError: There are too few episodes.
-        """
+        """Prepare a log of discrete actions; `clone` imitates its behavior, by BC for example."""
+        # With `pessimistic`, an episode ends at a policy's first rare action.
         lengths = dataset.episode_lengths
         if len(lengths) < FOLDS:
             raise UsageError(f"choosing a policy needs {FOLDS} episodes or more in the log")
@@ -154,15 +144,7 @@ class EvidenceCollector:
     def collect(
         self, policies: Sequence[BasePolicy], on_update: Callable[[], None] = lambda: None
     ) -> list[Evidence]:
-        """Return the evidence for each policy.
-
-        Args:
-            policies: Policies to evaluate.
-            on_update: Function called after each update of a model; FOLDS * updates calls in total.
-
-        Raises:
-            PolicyError: The observations do not fit a policy.
-        """
+        """Return the evidence for each policy; `on_update` has FOLDS * updates calls in total."""
         actions, next_actions = (
             np.stack([self._actions(policy, observations) for policy in policies])
             for observations in (self._dataset.observations, self._dataset.next_observations)

@@ -54,10 +54,7 @@ class FQEConfig(TrainingConfig):
 
     @property
     def packing(self) -> Packing:
-        """Settings by which the log is divided into single-step transitions.
-
-        n-step returns are not used, because they depend on the behavior policy.
-        """
+        """Settings of single-step transitions: n-step returns depend on the behavior policy."""
         return Packing(
             normalize=self.normalize,
             gamma=self.gamma,
@@ -67,10 +64,8 @@ class FQEConfig(TrainingConfig):
 
     @property
     def enough_syncs(self) -> bool:
-        """Whether there are enough syncs to propagate rewards through the effective horizon.
-
-        After k syncs, Q is at most (1 - gamma^k) / (1 - gamma) times the largest reward.
-        """
+        """Whether there are enough syncs to propagate rewards through the effective horizon."""
+        # After k syncs, Q is at most (1 - gamma^k) / (1 - gamma) times the largest reward.
         syncs = self.updates / self.target_interval
         return syncs * (1 - self.gamma) >= SYNCS_PER_HORIZON
 

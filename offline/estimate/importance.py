@@ -151,22 +151,15 @@ def divide(numerators: Floats, denominators: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeTable:
-    """E episodes, padded to T steps, one more than the longest episode.
+    """E episodes, padded to T steps, one more than the longest episode."""
 
-    Attributes:
-        rewards: (E, T) reward of step t; 0 past the end.
-        ratios: (E, T) pi(a|s) / mu(a|s) of step t; 1 past the end.
-        q: (E, T) Q(s, a) of the model for the action taken; 0 past the end.
-        v: (E, T) V(s) = sum_a pi(a|s) Q(s, a) of the model; 0 past the end, except for the last
-            next state of an episode that is truncated and not terminated.
-        gamma: Discount per step.
-    """
-
-    rewards: Floats
-    ratios: Floats
-    q: Floats
+    rewards: Floats  # (E, T) reward of step t; 0 past the end
+    ratios: Floats  # (E, T) pi(a|s) / mu(a|s) of step t; 1 past the end
+    q: Floats  # (E, T) Q(s, a) of the model for the action taken; 0 past the end
+    # (E, T) V(s) = sum_a pi(a|s) Q(s, a) of the model; 0 past the end, except for the last next
+    # state of an episode that is truncated and not terminated.
     v: Floats
-    gamma: float
+    gamma: float  # Discount per step
 
     def __post_init__(self) -> None:
         """Check that all arrays have the same shape."""

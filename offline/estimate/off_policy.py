@@ -115,29 +115,12 @@ class PolicyEstimates:
 
 
 class OffPolicyEvaluator:
-    """Evaluator of policies with discrete actions on one log.
-
-    Attributes:
-        gamma: Discount per step.
-        behavior_return: Mean discounted return of the logged episodes.
-        behavior_interval: 95 % bootstrap-t interval of that mean.
-    """
+    """Evaluator of policies with discrete actions on one log."""
 
     config_type: ClassVar[type[FQEConfig]] = FQEConfig
 
     def __init__(self, dataset: Dataset, config: FQEConfig | None = None, seed: int = 0) -> None:
-        """Prepare the evaluation on a log.
-
-        Args:
-            dataset: Dataset with discrete actions.
-            config: Settings of the model; its `gamma` is the discount of all estimates.
-            seed: Seed of the model and of the resampling.
-
-        Raises:
-            SpaceError: The actions are not discrete.
-            TrainingError: There are no transitions, or a number is not finite.
-            UsageError: There are too few episodes for cross-fitting.
-        """
+        """Prepare the evaluation on a log of discrete actions; `config` is that of the model."""
         self._check_space(dataset.action_space)
         self._config = config or self.config_type()
         self._seed = seed
@@ -146,7 +129,7 @@ class OffPolicyEvaluator:
         self._lengths = np.array([len(episode) for episode in dataset.episodes])
         if len(self._lengths) < FOLDS:
             raise UsageError(f"off-policy evaluation needs {FOLDS} episodes or more in the log")
-        self.gamma = self._config.gamma
+        self.gamma = self._config.gamma  # Discount per step
         self._calibration = calibration(dataset.behavior, dataset.action_space)
         random = np.random.default_rng(seed)
         shape = (RESAMPLES, len(self._lengths))
@@ -156,7 +139,9 @@ class OffPolicyEvaluator:
         self._fold = random.permutation(len(self._lengths)) % FOLDS
         rewards = self._padded(dataset.rewards, 0.0)
         returns = rewards @ self.gamma ** np.arange(rewards.shape[1], dtype=np.float64)
+        # Mean discounted return of the logged episodes.
         self.behavior_return = float(returns.mean())
+        # 95 % bootstrap-t interval of that mean.
         self.behavior_interval = RatioEstimate.mean(returns).interval(self._counts)
 
     def _check_space(self, space: spaces.Space[Any]) -> None:
@@ -170,19 +155,9 @@ class OffPolicyEvaluator:
         epsilon: float = 0.0,
         on_update: Callable[[], None] = lambda: None,
     ) -> PolicyEstimates:
-        """Estimate a policy's discounted return with every estimator.
-
-        Args:
-            policy: Policy to evaluate; None is the uniform random policy.
-            name: Name in tables.
-            epsilon: Probability of a random action instead of the policy's; a larger epsilon
-                requires fewer episodes.
-            on_update: Callback for each update of the model; it is called `updates_of_model` times.
-
-        Raises:
-            PolicyError: The observations do not fit the policy.
-            SpaceError: The policy has another number of actions.
-        """
+        """Estimate a policy's return with every estimator; None is the uniform random policy."""
+        # A larger `epsilon` requires fewer episodes. `on_update` is called `updates_of_model`
+        # times.
         pi, pi_next = self._probabilities(policy, epsilon)
         q, v, v_last = self._model(pi, pi_next, on_update)
         own = pi[np.arange(len(pi)), self._buffer.actions.numpy()]

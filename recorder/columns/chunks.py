@@ -62,24 +62,20 @@ def _compressor(
 
 
 class Compressors:
-    """Compression functions for chunk records. They share memory, so they are not thread-safe.
-
-    Attributes:
-        chunk_name: Name of the compression in Chunk records.
-        short: Compressor for short messages of one length.
-        long: Compressor for long messages.
-        mixed: Compressor for messages of different lengths.
-        few: Compressor for a few such messages, or for short texts.
-        rare: Compressor for rare long messages that are not images.
-    """
+    """Compression functions for chunk records. They share memory, so they are not thread-safe."""
 
     def __init__(self, compression: str) -> None:
         """Create the compressors for `zstd`, `lz4` or `none`."""
+        # Name of the compression in Chunk records.
         self.chunk_name = "" if compression == "none" else compression
+        # Compressor for short messages of one length.
         self.short = _compressor(compression, SHORT_RECORDS)
         self.long = _compressor(compression, LONG_RECORDS)
+        # Compressor for messages of different lengths.
         self.mixed = _compressor(compression, MIXED_RECORDS)
+        # Compressor for a few such messages, or for short texts.
         self.few = _compressor(compression, FEW_RECORDS)
+        # Compressor for rare long messages that are not images.
         self.rare = _compressor(compression, RARE_RECORDS)
 
     def of(self, records: memoryview, count: int) -> Callable[[Any], bytes]:
@@ -93,23 +89,14 @@ class Compressors:
 
 
 class ChunkHeader(NamedTuple):
-    """Header of a Chunk record.
+    """Header of a Chunk record."""
 
-    Attributes:
-        start_time: Smallest log_time of the messages, nanoseconds.
-        end_time: Largest log_time of the messages, nanoseconds.
-        uncompressed_bytes: Uncompressed length of the records.
-        crc: CRC-32 of the records; 0 if there is none.
-        compression: `zstd`, `lz4` or empty.
-        data: Position of the compressed records in the file.
-    """
-
-    start_time: int
-    end_time: int
-    uncompressed_bytes: int
-    crc: int
-    compression: str
-    data: slice
+    start_time: int  # Smallest log_time of the messages, nanoseconds
+    end_time: int  # Largest log_time of the messages, nanoseconds
+    uncompressed_bytes: int  # Uncompressed length of the records
+    crc: int  # CRC-32 of the records; 0 if there is none
+    compression: str  # `zstd`, `lz4` or empty
+    data: slice  # Position of the compressed records in the file
 
     def to_record(self) -> bytes:
         """Return the bytes of the Chunk record that precede its data."""
@@ -142,11 +129,7 @@ class ChunkHeader(NamedTuple):
 
 
 def chunk_header(file: memoryview, offset: int) -> ChunkHeader:
-    """Parse the header of the Chunk record at `offset`.
-
-    Raises:
-        CorruptLogError: There is no Chunk record, or its lengths are wrong.
-    """
+    """Parse the header of the Chunk record at `offset`."""
     try:
         opcode, length, start, end, size, crc, name_bytes = _CHUNK_START.unpack_from(file, offset)
         name_start = offset + _CHUNK_START.size

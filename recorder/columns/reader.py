@@ -80,27 +80,10 @@ _TOP_LEVEL = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
 
 
 class McapReader:
-    """MCAP file that is open for reading.
-
-    Attributes:
-        path: Path of the file.
-        complete: Whether the file ends with a footer; if not, it was cut off or is being written.
-        summary_start: First byte of the summary; 0 if there is none.
-        data_end: First byte after the last record that was read from the data section.
-        chunks: Indexes of all chunks, in file order.
-        schemas: Schemas by id.
-        channels: Channels by id.
-        metadata: Metadata records by name. If several have the same name, the first one is kept.
-    """
+    """MCAP file that is open for reading."""
 
     def __init__(self, path: str | Path) -> None:
-        """Map the file, read its summary, and search for records that it does not list.
-
-        Raises:
-            NotMcapError: The file is not an MCAP file.
-            CorruptLogError: The summary is damaged.
-            LogError: The file cannot be opened.
-        """
+        """Map the file, read its summary, and search for records that it does not list."""
         self.path = as_path(path)
         self._remote = self.path.remote if isinstance(self.path, RemotePath) else None
         self._view, self._state = map_unchanged(self.path)
@@ -115,8 +98,9 @@ class McapReader:
         self._named = _Named(self.path)
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
+        # Metadata records by name. If several have the same name, the first one is kept.
         self.metadata: dict[str, dict[str, str]] = {}
-        self.data_end = 0
+        self.data_end = 0  # First byte after the last record that was read from the data section
         self._counts: dict[int, int] = {}
         unchunked = UnindexedMessages()
         # Offset and records of the latest chunk, kept because callers usually read all messages of
@@ -126,12 +110,14 @@ class McapReader:
         self._contents: dict[int, ChunkContents] = {}
         with self._named:
             footer = self._footer()
+        # Whether the file ends with a footer; if not, it was cut off or is being written.
         self.complete = footer is not None
+        # First byte of the summary; 0 if there is none.
         self.summary_start = footer.summary_start if footer is not None else 0
         if not self.summary_start:
             # Without a summary, all records are read.
             self.fetch([(0, size)])
-        self.chunks = self._read_summary()
+        self.chunks = self._read_summary()  # Indexes of all chunks, in file order
         self._summary_has_topics = bool(self.channels)
         self._read_between_chunks(unchunked)
         self._unchunked = unchunked.indexes()
@@ -164,11 +150,7 @@ class McapReader:
         return digest.hexdigest()
 
     def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Fetch ranges of bytes of a remote file. Do nothing for a local file.
-
-        Raises:
-            LogError: The file cannot be reached.
-        """
+        """Fetch ranges of bytes of a remote file. Do nothing for a local file."""
         if self._remote is not None:
             self._remote.fetch(ranges)
 
@@ -188,15 +170,9 @@ class McapReader:
         return footer_of(self._view)
 
     def check_unchanged(self) -> None:
-        """Check that the file was not changed in place since it was opened.
-
-        Reading beyond the end of a truncated file would kill the process. The writers of this
-        library never truncate a finished file: they replace it, and readers keep the old content.
-        An unfinished file may grow.
-
-        Raises:
-            LogError: The file was truncated or written to.
-        """
+        """Check that the file was not changed in place since it was opened."""
+        # Reading beyond the end of a truncated file would kill the process. Our writers replace
+        # finished files, and readers keep the old content. An unfinished file may grow.
         if self._remote is not None:
             # The local copy of a remote file changes whenever parts are fetched, so it is not
             # checked.
@@ -220,11 +196,7 @@ class McapReader:
         return sorted(found, key=lambda channel: channel.id)
 
     def channel_of(self, topic: str) -> Channel | None:
-        """Return the channel of a topic; None if the file does not have the topic.
-
-        Raises:
-            LogError: Several channels have the topic.
-        """
+        """Return the channel of a topic; None if the file does not have the topic."""
         found = self.channels_of(topic)
         if len(found) > 1:
             raise LogError(
@@ -233,26 +205,16 @@ class McapReader:
         return found[0] if found else None
 
     def schema_of(self, channel: Channel) -> Schema:
-        """Return the schema of a channel.
-
-        Raises:
-            CorruptLogError: The file does not have the schema.
-        """
+        """Return the schema of a channel."""
         schema = self.schemas.get(channel.schema_id)
         if schema is None:
             raise CorruptLogError(f"{self.path}: {channel.topic} has no schema")
         return schema
 
     def message_ranges(self, channel: Channel) -> MessageRanges:
-        """Return the positions of the messages of a channel, in file order.
-
-        Only chunks without an index are decompressed. The index of a chunk with a single channel is
-        read when it is first used, if the index lengths agree with the message count in the
-        summary. Reading a few rows of a large file therefore needs only a few indexes.
-
-        Raises:
-            CorruptLogError: An index is damaged, or the indexes and the summary disagree.
-        """
+        """Return the positions of the messages of a channel, in file order."""
+        # Only chunks without an index are decompressed. The index of a chunk of one channel is read
+        # at first use, if its length agrees with the summary, so that a few rows need few indexes.
         if self._remote is not None:
             # Fetch the indexes of all chunks with several channels in one call, not with one
             # request for each chunk.
@@ -319,27 +281,14 @@ class McapReader:
         return np.empty(0, INDEX_ENTRY)
 
     def records_of(self, messages: MessageRange, scratch: Scratch | None = None) -> memoryview:
-        """Return the bytes that contain these messages: the records of a chunk, or the whole file.
-
-        Raises:
-            CorruptLogError: The chunk is damaged.
-        """
+        """Return the bytes with these messages: the records of a chunk, or the whole file."""
         if messages.chunk is not None:
             return self.chunk_records(messages.chunk, scratch)
         self.check_unchanged()
         return self.view
 
     def chunk_records(self, chunk: ChunkIndex, scratch: Scratch | None = None) -> memoryview:
-        """Return the records of a chunk, decompressed and checked against their CRC.
-
-        Args:
-            chunk: Element of `chunks`.
-            scratch: Memory for the records. The records are valid until this memory is used again.
-                Each file needs its own scratch memory.
-
-        Raises:
-            CorruptLogError: The chunk is damaged.
-        """
+        """Return a chunk's checked records, valid until `scratch` is used again; one per file."""
         start = chunk.chunk_start_offset
         last, kept = self._last_chunk if scratch is None else scratch.kept
         if last == start:
@@ -360,22 +309,14 @@ class McapReader:
         return records
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
-        """Yield log_time and bytes of each message of a channel.
-
-        Raises:
-            CorruptLogError: A chunk is damaged, or a message does not match its index entry.
-        """
+        """Yield log_time and bytes of each message of a channel."""
         for part in self.message_ranges(channel):
             records = self.records_of(part)
             for time_ns, offset in part.index.tolist():
                 yield time_ns, self.message(records, channel, time_ns, offset)
 
     def message(self, records: memoryview, channel: Channel, time_ns: int, offset: int) -> bytes:
-        """Return the payload of a message, given the time and offset in its index entry.
-
-        Raises:
-            CorruptLogError: The message does not match the index entry.
-        """
+        """Return the payload of a message, given the time and offset in its index entry."""
         start = offset + MESSAGE_HEADER.itemsize
         if start <= len(records):
             opcode, length = RECORD_HEADER.unpack_from(records, offset)
@@ -390,11 +331,7 @@ class McapReader:
         )
 
     def attachment(self, name: str) -> bytes | None:
-        """Return the data of the last attachment with this name; None if there is none.
-
-        Raises:
-            CorruptLogError: The attachment is damaged.
-        """
+        """Return the data of the last attachment with this name; None if there is none."""
         self.check_unchanged()
         found = None
         with self._named:
@@ -412,10 +349,7 @@ class McapReader:
         return found
 
     def records(self, start: int) -> Iterator[tuple[int, int, memoryview]]:
-        """Yield offset, opcode and content of each record from `start` on.
-
-        Stops before a record that extends beyond the end of the file.
-        """
+        """Yield offset, opcode and content of each whole record from `start` on."""
         return records_of(self.view, start)
 
     def _index_at(self, channel_id: int, offset: int, count: int | None = None) -> NDArray[Any]:

@@ -88,22 +88,8 @@ def step_schema(
     action_labels: Sequence[str] = (),
     behavior: BehaviorField | None = None,
 ) -> tuple[str, str]:
-    """Return the type name and definition of `/rl/step` for a pair of spaces.
-
-    The type name contains a hash of the definition, because a viewer with several open logs expects
-    one layout for each type name.
-
-    Args:
-        observation_space: Observation space of the environment.
-        action_space: Action space of the environment.
-        action_names: Names of the discrete actions by value, for the constants of `action`; see
-            `action_constants`.
-        action_labels: Descriptions of the parts of an action, for comments before `action`.
-        behavior: Behavior column; default: that of the action space.
-
-    Raises:
-        SpaceError: A log cannot store these spaces.
-    """
+    """Return the type name and definition of `/rl/step` for a pair of spaces."""
+    # The name has a hash: a viewer with several logs expects one layout for each type name.
     vectors = [leaf for leaf in observation_leaves(observation_space) if leaf.encoding is None]
     fields = [
         ("float64", 0, "reward"),
@@ -213,15 +199,7 @@ COMMAND_VALUES = ("q", "value", "advantage", "td_error", "distance", "log_prob")
 
 
 def message_dtype(text: str) -> np.dtype[Any] | None:
-    """Return the memory layout of a ROS 2 message, including the encapsulation header.
-
-    Args:
-        text: Definition without nested types.
-
-    Returns:
-        Structured dtype with the fields of the message and `encapsulation`; None if the message has
-        no fixed length.
-    """
+    """Return the layout of a ROS 2 message with its `encapsulation`; None without fixed length."""
     names, offsets = ["encapsulation"], [0]
     formats: list[np.dtype[Any]] = [np.dtype("<u4")]
     end = ENCAPSULATION_BYTES

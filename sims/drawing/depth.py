@@ -31,10 +31,8 @@ _NO_WIRES: Floats = np.empty((0, 2, 3))
 
 
 def encode_depth(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Encode meters as bytes: 255 ln(d / 0.5 m) / ln(100 m / 0.5 m), rounded, within 0 to 255.
-
-    Adjacent codes differ by 2.1 % at any distance. Infinity is 255.
-    """
+    """Encode meters as bytes: 255 ln(d / 0.5 m) / ln(100 m / 0.5 m), rounded, within 0 to 255."""
+    # Adjacent codes differ by 2.1 % at any distance. Infinity is 255.
     values = np.asarray(depth_m)
     if values.dtype != np.float32:
         return _computed_codes(values)
@@ -229,14 +227,7 @@ class DepthCamera:
     def __init__(
         self, mesh: Floats, view: Lens, small: tuple[int, int], wires: Floats = _NO_WIRES
     ) -> None:
-        """Prepare the rendering of a mesh.
-
-        Args:
-            mesh: (T, 3, 3) triangles, meters; see `draw`.
-            view: Lens and size of the rendered images.
-            small: Size (h, w) of the downsampled images, pixels.
-            wires: (S, 2, 3) ends, meters; drawn one pixel wide into the downsampled image.
-        """
+        """Prepare the rendering of triangles (T, 3, 3), and wires (S, 2, 3), meters; see `draw`."""
         self._faces = faces_of(mesh)
         self._wires = wires
         self._view = view
@@ -247,15 +238,8 @@ class DepthCamera:
         self._small_lengths = lengths(small, *self._small_focal_px)
 
     def inverse_depth(self, position_m: tuple[float, float, float], axes: Floats) -> Floats:
-        """Render the image at full size, without wires.
-
-        Args:
-            position_m: Position of the camera.
-            axes: (3, 3) the camera's x, y and z axes as rows, in the mesh's coordinates.
-
-        Returns:
-            (height, width) inverse depth of each pixel, 1/m, 0 where there is no surface.
-        """
+        """Render inverse depths at full size, 1/m, without wires; 0 without a surface."""
+        # `axes` has the camera's x, y and z axes as rows, in the mesh's coordinates.
         inverse_z = np.empty((self._view.height_px, self._view.width_px))
         draw(self._faces, np.array(position_m), axes, self._view.focal_px, inverse_z)
         return inverse_z
@@ -265,10 +249,8 @@ class DepthCamera:
         return self.inverse_depth(position_m, axes) * self._nearness
 
     def image_m(self, position_m: tuple[float, float, float], axes: Floats) -> NDArray[np.float32]:
-        """Render the downsampled image: the distances (h, w) along the rays in meters.
-
-        A distance is infinite if the ray hits nothing.
-        """
+        """Render the downsampled distances (h, w) along the rays, meters."""
+        # Infinite without a hit.
         small = np.empty(self._small, dtype=np.float32)
         shrink(self.inverse_depth(position_m, axes), self._nearness, self._sizes, small)
         if len(self._wires):

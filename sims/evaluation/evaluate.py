@@ -83,11 +83,9 @@ def median(returns: Floats) -> Floats:
 
 
 def interquartile_mean(returns: Floats) -> Floats:
-    """Return the interquartile means of returns (..., S, E) over seeds and episodes.
-
-    A quarter of the returns, rounded down, is dropped at each end. The result is more robust to
-    outliers than the mean, and has less variance than the median.
-    """
+    """Return the interquartile means of returns (..., S, E) over seeds and episodes."""
+    # A quarter of the returns, rounded down, is dropped at each end: more robust to outliers than
+    # the mean, with less variance than the median.
     ordered = np.sort(returns.reshape(*returns.shape[:-2], -1), axis=-1)
     count = ordered.shape[-1]
     cut = count // 4
@@ -125,15 +123,8 @@ def bootstrap_interval(
 
 
 def improvement_probability(first: Floats, second: Floats) -> float:
-    """Return the probability that a return from `first` is higher than a return from `second`.
-
-    A tie counts as half a win. The result is the Mann-Whitney U statistic divided by the number of
-    pairs; it is 0.5 for equal policies.
-
-    Args:
-        first: (S, E) returns of the first policy.
-        second: (S', E') returns of the second policy.
-    """
+    """Return the probability that a return from `first` is higher than one from `second`."""
+    # A tie counts half: the Mann-Whitney U statistic divided by the number of pairs.
     return float(_improvement(first.reshape(1, -1), second.reshape(1, -1))[0])
 
 
@@ -246,10 +237,7 @@ class PolicyScore:
 
     @property
     def has_interval(self) -> bool:
-        """Whether the interval is worth showing.
-
-        That of two seeds rests on one difference, and reaches far beyond all returns.
-        """
+        """Whether the interval is worth showing; that of two seeds rests on one difference."""
         return len(self.results) != 2
 
     @property
@@ -259,10 +247,7 @@ class PolicyScore:
 
     @property
     def command_change(self) -> float | None:
-        """Mean change of the commands a step, in their units; None if they are not those of a Box.
-
-        The smaller it is, the smoother the policy drives.
-        """
+        """Mean change of a Box's commands a step, in their units: the smaller, the smoother."""
         changes = [episode.command_change for seed in self.results for episode in seed]
         return float(np.nanmean(changes)) if np.isfinite(changes).any() else None
 
@@ -387,15 +372,10 @@ def score_of(
 
 @dataclass(frozen=True)
 class Scale:
-    """Mean returns of random actions and of the sim's pilot on the same episodes.
+    """Mean returns of random actions and of the sim's pilot on the same episodes."""
 
-    Attributes:
-        random: Mean return of random actions.
-        pilot: Mean return of the pilot; NaN if the sim has no pilot.
-    """
-
-    random: float
-    pilot: float
+    random: float  # Mean return of random actions
+    pilot: float  # Mean return of the pilot; NaN if the sim has no pilot
 
     @classmethod
     def of(cls, random: PolicyScore, pilot: PolicyScore | None) -> Scale:
@@ -403,10 +383,7 @@ class Scale:
         return cls(random.mean_return, math.nan if pilot is None else pilot.mean_return)
 
     def score(self, mean_return: float) -> float:
-        """Return the normalized score of a mean return: 0 for random, 1 for the pilot.
-
-        Without a pilot, or if the pilot's return is that of random actions, it is NaN.
-        """
+        """Return the score of a mean return: 0 random, 1 the pilot; NaN if they do not differ."""
         span = self.pilot - self.random
         return (mean_return - self.random) / span if span else math.nan
 
@@ -457,11 +434,7 @@ def improvements(scores: Sequence[PolicyScore]) -> list[Improvement]:
 
 
 def make_pilot(env: gym.Env[Any, Any]) -> BasePolicy:
-    """Create the pilot of the sim in `env`, which may be wrapped.
-
-    Raises:
-        UnknownNameError: The environment has no pilot.
-    """
+    """Create the pilot of the sim in `env`, which may be wrapped."""
     spec = _spec_of(env)
     if spec is None:
         raise UnknownNameError("environment with a pilot", _id_of(env), SIMS)

@@ -50,18 +50,8 @@ class NoisyPolicy(BasePolicy):
         *,
         per_episode: bool = False,
     ) -> None:
-        """Add noise to the commands of `policy`.
-
-        Args:
-            policy: Deterministic policy.
-            noise: Standard deviation as a fraction of half the range of each part, above 0.
-            action_space: Bounded Box of floats.
-            per_episode: Whether the standard deviation of each episode is drawn uniformly between 0
-                and `noise`. Densities are those for the standard deviation that was drawn.
-
-        Raises:
-            UsageError: The policy has no command, or the actions have no density.
-        """
+        """Add noise of the deviation `noise`, as a fraction of half the range of each part."""
+        # Or of one drawn uniformly between 0 and `noise` for each episode.
         if not policy.is_deterministic or isinstance(policy, RandomPolicy):
             raise UsageError(
                 f"`noise=` is added to the commands of a deterministic policy, not of {policy.name}"
@@ -103,10 +93,7 @@ class NoisyPolicy(BasePolicy):
         return actions
 
     def log_prob(self, observations: Any, actions: NDArray[Any]) -> Floats:
-        """Return the log densities (B,) of actions (B, *shape), for the episode's deviation.
-
-        The observations of the last call of `act` do not run the policy again.
-        """
+        """Return log densities (B,) for the episode's deviation; observations of `act` run once."""
         last = self._last
         is_last = last is not None and last[0] is observations
         mean = last[1] if last is not None and is_last else self._means(observations)
@@ -295,15 +282,7 @@ class EpsilonGreedy:
         action_space: spaces.Space[Any],
         mask_from: str = "",
     ) -> None:
-        """Follow `policy`, but take a random action with probability `epsilon`.
-
-        Args:
-            policy: Policy; None or a `RandomPolicy` for random actions.
-            epsilon: Probability of a random action, 0 to 1; ignored if there is no policy.
-            action_space: Space of the random actions.
-            mask_from: Source of the mask of random actions if there is no policy; see
-                `mcaprl.actions`. A policy has its own source.
-        """
+        """Follow `policy` (None: random), but act at random with probability `epsilon`."""
         is_random = policy is None or isinstance(policy, RandomPolicy)
         self.policy = None if is_random else as_policy(policy)
         self.epsilon = epsilon if self.policy else 1.0

@@ -85,20 +85,7 @@ class DeviceSims(ABC):
     def __init__(
         self, fleet: Fleet, num_envs: int, device: str, seed: int, max_episode_steps: int
     ) -> None:
-        """Allocate N vehicles; `reset` starts them.
-
-        Args:
-            fleet: Fleet of one vehicle, which defines the spaces.
-            num_envs: Number of vehicles.
-            device: `cpu` or `cuda`, the current CUDA device.
-            seed: Seed of all starting states, at least 0.
-            max_episode_steps: Steps after which an episode is truncated.
-
-        Raises:
-            UnknownNameError: There is no such device.
-            MissingExtraError: The packages for GPUs are not installed.
-            UsageError: There is no GPU, or a number is outside its range.
-        """
+        """Allocate N vehicles with the spaces of `fleet`; `reset` starts them."""
         check_name("device", device, DEVICES)
         if num_envs < 1 or max_episode_steps < 1 or seed < 0:
             raise UsageError(
@@ -130,10 +117,7 @@ class DeviceSims(ABC):
         self._kernels[0](self.batch, self.world, self._seed)
 
     def step(self) -> None:
-        """Advance each vehicle by one step with its action in `batch.actions`.
-
-        On a GPU, the call returns before the step is finished. Actions are not validated.
-        """
+        """Advance each vehicle by a step with its unchecked action; on a GPU, return at once."""
         self._kernels[1](self.batch, self.world, self._seed, self.max_episode_steps)
 
     @property

@@ -39,11 +39,7 @@ class RenderedEnv(gym.Env[Any, Any], Generic[AnyView]):
     """Environment that creates its renderer on first use."""
 
     def __init__(self, render_mode: RenderMode | None) -> None:
-        """Set the render mode.
-
-        Raises:
-            UnknownNameError: There is no such render mode.
-        """
+        """Set the render mode."""
         check_name("render_mode", render_mode, (None, *RENDER_MODES))
         self.render_mode = self._render_mode = render_mode
         self._view: AnyView | None = None
