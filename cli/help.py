@@ -15,8 +15,7 @@ from mcaprl._interrupt import INTERRUPTED
 from mcaprl.cli.progress import quiet_option
 from mcaprl.errors import McaprlError, UsageError
 
-WITH_LOSSES: Final = 3
-"""Exit code of `recover` if data is lost."""
+WITH_LOSSES: Final = 3  # Exit code of `recover` if data is lost
 
 EXIT_CODES: Final[dict[int, str]] = {
     0: "Success.",

@@ -13,8 +13,7 @@ from mcaprl.cli.completion import Name
 from mcaprl.errors import UsageError
 from mcaprl.files import parse_json
 
-PATH: Final = Name(tuple, is_path=True)
-"""Type of a path, a glob or a URL."""
+PATH: Final = Name(tuple, is_path=True)  # Type of a path, a glob or a URL
 _CONSTANTS: Final = {"True": True, "False": False, "None": None}
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from mcaprl.api.replay import LiveAddress
 
 _PIPE_WIDTH = 120
-_MAX_ROWS = 40
-"""Number of rows of a wide table that are printed."""
+_MAX_ROWS = 40  # Number of rows of a wide table that are printed
 _ARGUMENT = re.compile(r"""`([a-z]\w*)=('[^']*'|"[^"]*"|[^`]*)`""")
 _OPTIONS = {
     "sim_options": "--env-arg",

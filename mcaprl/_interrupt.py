@@ -14,8 +14,7 @@ import threading
 import time
 from types import FrameType
 
-INTERRUPTED = 130
-"""Exit code of the program after Ctrl-C, SIGTERM or SIGHUP."""
+INTERRUPTED = 130  # Exit code of the program after Ctrl-C, SIGTERM or SIGHUP
 _RETRY_S, _LONGEST_S = 0.02, 5.0
 _postponed_since: float | None = None
 

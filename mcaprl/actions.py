@@ -36,8 +36,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import PolicyError, SpaceError
 
-MASK_KEY = "action_mask"
-"""Key of the mask, as in PettingZoo; the value has one flag per action."""
+MASK_KEY = "action_mask"  # Key of the mask, as in PettingZoo; the value has one flag per action
 OBSERVATION_KEY = "observation"
 """Key of the environment's observation beside a mask from `mask_from`."""
 _INFO = "info:"

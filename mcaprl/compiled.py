@@ -53,8 +53,7 @@ def ready(
     return partial(function.get_overload(kinds), *arguments)
 
 
-Arrays = Any
-"""Arrays that `ready_at` bound. In a compiled function, this is an address."""
+Arrays = Any  # Arrays that `ready_at` bound. In a compiled function, this is an address.
 
 
 def ready_at(

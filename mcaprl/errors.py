@@ -166,8 +166,7 @@ def require_extra(extra: str, *packages: str) -> None:
 
 
 Severity = Literal["problem", "note"]
-LISTED = 10
-"""Maximum number of listed findings of one kind; further findings are only counted."""
+LISTED = 10  # Maximum number of listed findings of one kind; further findings are only counted
 # Descriptions contain texts from the file. Without a limit, a file could have any number of kinds.
 _MAX_KINDS = 100
 _OTHERS = "other findings"

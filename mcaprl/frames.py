@@ -13,8 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-WHOLE = ""
-"""Key under which `parts_of` returns observations that are not a dict."""
+WHOLE = ""  # Key under which `parts_of` returns observations that are not a dict
 
 
 def mapped(function: Callable[..., Any], tree: Any, *others: Any) -> Any:

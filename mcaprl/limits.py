@@ -12,8 +12,7 @@ MAX_IMAGE_PIXELS: Final = 64_000_000
 """Pixels of one image: more than any camera of a robot has; a few kB of PNG can declare 10^9."""
 MAX_TYPE_FIELDS: Final = 10_000
 """Leaf fields of a message type with all nested types: nested types can multiply them."""
-MAX_TYPE_DEPTH: Final = 64
-"""Levels of nested messages in a type: types are read by recursion."""
+MAX_TYPE_DEPTH: Final = 64  # Levels of nested messages in a type: types are read by recursion
 MAX_FIXED_MESSAGES: Final = 1_000
 """Messages and strings in all fixed arrays of a type: compiling the code for each takes 1 ms."""
 MAX_MESSAGES_PER_BYTE: Final = 16
@@ -31,8 +30,7 @@ MAX_METADATA_BYTES: Final = 2**21
 """Size of a YAML file, such as a bag's `metadata.yaml`: parsing takes seconds per 100 kB."""
 MAX_DOCUMENT_VALUES: Final = 100_000
 """Values in a YAML file, with all aliases: a few hundred bytes can declare any number."""
-MAX_METADATA_DEPTH: Final = 20
-"""Levels of nested values in a bag's `metadata.yaml`."""
+MAX_METADATA_DEPTH: Final = 20  # Levels of nested values in a bag's `metadata.yaml`
 MAX_CHUNK_BYTES: Final = 2**28
 """Decompressed size of a chunk or message: 32 KB of zstd data can become 1 GiB in memory."""
 MAX_UNPACKED_BYTES: Final = 2**30

@@ -21,8 +21,7 @@ from torch import Tensor, nn
 from mcaprl.architecture import ENCODERS, Architecture
 from mcaprl.storage.tensor_files import check_widths
 
-_MAX_IMAGES = 10_000
-"""Maximum number of images, evenly spaced, for computing a mean image."""
+_MAX_IMAGES = 10_000  # Maximum number of images, evenly spaced, for computing a mean image
 _IMAGES_AT_ONCE = 256
 _SMALLEST_VARIANCE = 1e-6
 """Images count as equal up to this variance of their pixels (0 to 255). Because of rounding errors,

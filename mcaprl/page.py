@@ -74,10 +74,8 @@ class Panel(NamedTuple):
     """Part of a report: a figure of its page, and one of several axes of an image."""
 
     caption: str
-    draw: Callable[[Any], None]
-    """Function that draws on axes."""
-    size: tuple[float, float] = (4.4, 2.6)
-    """Width and height of the figure, inches."""
+    draw: Callable[[Any], None]  # Function that draws on axes
+    size: tuple[float, float] = (4.4, 2.6)  # Width and height of the figure, inches
 
     def figure(self) -> Any:
         """Draw the panel alone, without its caption."""
@@ -132,8 +130,7 @@ def _make_literal(figure: Any) -> None:
         text.set_text("\n".join(shortened(line, _MAX_LABEL) for line in lines))
 
 
-PAGE_NAME = "index.html"
-"""Name of the page in the folder of a report."""
+PAGE_NAME = "index.html"  # Name of the page in the folder of a report
 _NUMBER = re.compile(r"[-+]?\d[\d.,]*( to [-+]?\d[\d.,]*)?(%| [%a-zA-Z]{1,3})?")
 _MAX_SHORT = 30
 

@@ -16,15 +16,12 @@ from mcaprl.texts import printable
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn, TaskID
 
-Advance = Callable[[int], None]
-"""Function called with the amount of completed work."""
+Advance = Callable[[int], None]  # Function called with the amount of completed work
 ProgressBar = Callable[[str, int | None], AbstractContextManager[Advance]]
 """Function that accepts a text and a total, and returns a context manager. The context manager
 shows a progress bar, and yields an `Advance`."""
-FIRST_LINE_S: Final = 5.0
-"""Time until the first line of progress if stderr is not a terminal."""
-LINE_INTERVAL_S: Final = 10.0
-"""Time between two such lines."""
+FIRST_LINE_S: Final = 5.0  # Time until the first line of progress if stderr is not a terminal
+LINE_INTERVAL_S: Final = 10.0  # Time between two such lines
 LEAST_SHARE: Final = 0.02
 """Share of the work from which on the remaining time is estimated before `FIRST_LINE_S`."""
 

@@ -47,8 +47,7 @@ BEST_NAME = "best_model.zip"
 _NUMERICAL = ("torch", "numpy", "stable-baselines3")
 """Packages whose version may change the numbers of a training."""
 _MAX_SEEDS = 10_000
-Curve = dict[str, NDArray[np.float64]]
-"""Columns of a `metrics.csv` or `curve.csv` by name."""
+Curve = dict[str, NDArray[np.float64]]  # Columns of a `metrics.csv` or `curve.csv` by name
 
 
 @dataclass(frozen=True)

@@ -51,8 +51,7 @@ FORMAT_VERSION = 2
 _CHUNKS_VERSION = 3
 """Version of a policy with chunks or relative actions, for which earlier versions have no code."""
 _RELATIVE = ("relative.low", "relative.high")
-TWIN = "q_twin"
-"""Name of the second critic of a policy for a Box, which is not used to act."""
+TWIN = "q_twin"  # Name of the second critic of a policy for a Box, which is not used to act
 _WEIGHTS_NAME = "policy.safetensors"
 _IMAGE_SHIFT = "observation.image_{}.shift"
 _IMAGE_SCALE = "observation.image_{}.scale"

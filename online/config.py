@@ -33,8 +33,7 @@ from typing import Any, Final
 from mcaprl.architecture import Architecture, NetworkSettings
 from mcaprl.errors import UnknownNameError
 
-N_QUANTILES: Final = 25
-"""Number of quantiles of each critic of TQC, sb3-contrib's default."""
+N_QUANTILES: Final = 25  # Number of quantiles of each critic of TQC, sb3-contrib's default
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,7 @@ from mcaprl.runs import POLICY_NAME
 from mcaprl.sims.evaluation.rollout import episode_seed
 from mcaprl.storage.tensor_files import below
 
-_CHECKED = 64
-"""Number of observations on which a copied network must produce the same values."""
+_CHECKED = 64  # Number of observations on which a copied network must produce the same values
 
 
 class LearningAgent(Agent):

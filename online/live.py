@@ -43,8 +43,7 @@ TRAINING_LABELS = {
 }
 """Labels of the metrics in `/rl/training`, by name, the most important first."""
 """Names of the metrics in `/rl/training`."""
-WATCHED = 0
-"""Index of the environment in the live view."""
+WATCHED = 0  # Index of the environment in the live view
 
 
 class Shown(Protocol):

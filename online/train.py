@@ -49,8 +49,7 @@ from mcaprl.sims.evaluation.rollout import warn_of_cuts
 
 _SOURCES = "sources"
 """Key of `config.json`. Seeds without a checkpoint start from these paths when a run is resumed."""
-_SEEDS = 2**32
-"""Number of seeds that Stable-Baselines3 accepts."""
+_SEEDS = 2**32  # Number of seeds that Stable-Baselines3 accepts
 
 
 @dataclass(frozen=True)

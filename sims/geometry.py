@@ -14,14 +14,10 @@ from mcaprl.compiled import compiled, inlined
 class Path(NamedTuple):
     """Closed polyline of N legs."""
 
-    points_m: NDArray[np.float64]
-    """(N + 1, 2) corners; the last one equals the first."""
-    along_m: NDArray[np.float64]
-    """(N + 1,) distance of each corner from the start, along the path."""
-    yaw_rad: NDArray[np.float64]
-    """(N,) direction of each leg, counter-clockwise from x."""
-    forward: NDArray[np.float64]
-    """(N, 2) direction of each leg as a unit vector."""
+    points_m: NDArray[np.float64]  # (N + 1, 2) corners; the last one equals the first
+    along_m: NDArray[np.float64]  # (N + 1,) distance of each corner from the start, along the path
+    yaw_rad: NDArray[np.float64]  # (N,) direction of each leg, counter-clockwise from x
+    forward: NDArray[np.float64]  # (N, 2) direction of each leg as a unit vector
     length_m: float
 
 
@@ -29,10 +25,8 @@ class Projection(NamedTuple):
     """Path point nearest to a position."""
 
     along_m: float
-    offset_m: float
-    """Distance of the position from the path, positive to the left of its direction."""
-    yaw_rad: float
-    """Direction of the path at the nearest point."""
+    offset_m: float  # Distance of the position from the path, positive to the left of its direction
+    yaw_rad: float  # Direction of the path at the nearest point
 
 
 def closed_path(corners: ArrayLike) -> Path:
@@ -398,8 +392,7 @@ def rotate(q: Quaternion, a: Vector) -> Vector:
     return plus(a, times(2.0, cross(axis, plus(cross(axis, a), times(q.w, a)))))
 
 
-FAR_M = 100.0
-"""Length of a ray that hits nothing."""
+FAR_M = 100.0  # Length of a ray that hits nothing
 SCALE_M = 1.0
 _FARTHEST = math.log1p(FAR_M / SCALE_M)
 _LN_2 = math.log(2.0)

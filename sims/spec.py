@@ -17,8 +17,7 @@ from mcaprl.lazy import installed
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-GROUP: Final = "mcaprl.sims"
-"""Entry point group; each entry point is named after its sim."""
+GROUP: Final = "mcaprl.sims"  # Entry point group; each entry point is named after its sim
 _installed = functools.cache(functools.partial(installed, GROUP))
 
 

@@ -21,8 +21,7 @@ from mcaprl.storage.remote import check_upload, upload_all
 if TYPE_CHECKING:
     from mcaprl.recorder.mapping.summary import MappingReport
 
-_SHOWN = 5
-"""Number of transitions that a dry run shows."""
+_SHOWN = 5  # Number of transitions that a dry run shows
 
 
 @dataclass(frozen=True)

@@ -63,8 +63,7 @@ from mcaprl.storage.remote import as_path, is_url
 
 _Images = Iterator[NDArray[np.uint8]]
 _STILLS, _MOST_DIALS, _HEIGHTS_PX = 12, 8, (16, 4320)
-_HOLD_S = 1.0
-"""Seconds for which a video shows the last image, which says how the episode ended."""
+_HOLD_S = 1.0  # Seconds for which a video shows the last image, which says how the episode ended
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,7 @@ _UNUSED: Final = (
     "target_update_episodes",
 )
 """Settings that this training does not use."""
-_ROWS: Final = 100
-"""Number of rows of metrics."""
+_ROWS: Final = 100  # Number of rows of metrics
 _ROWS_PER_SAVE: Final = 10
 """Number of rows of metrics between two times that the policies are saved."""
 

@@ -20,8 +20,7 @@ from mcaprl.recorder.mapping.align import NS_PER_S
 from mcaprl.recorder.mapping.live import EpisodeState, LiveEpisodes, LiveStep, LiveSteps
 from mcaprl.recorder.mapping.runs import TIME_LIMIT
 
-LATE = "the command was late"
-"""Reason of a stop command that replaced a late command."""
+LATE = "the command was late"  # Reason of a stop command that replaced a late command
 
 
 class Command(NamedTuple):
@@ -41,8 +40,7 @@ class Command(NamedTuple):
 
 Message = dict[str, Any]
 Values = tuple[float | str, ...]
-_LONGEST_S = 1.0
-"""Longest time for which a command may change at the limit, after a pause."""
+_LONGEST_S = 1.0  # Longest time for which a command may change at the limit, after a pause
 
 
 class CommandField(NamedTuple):

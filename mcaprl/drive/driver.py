@@ -231,8 +231,7 @@ def _check_same(trained: RobotMapping, given: RobotMapping, place: Place) -> Non
             )
 
 
-_FREE = ("representatives", "box")
-"""Keys of an action that the data completes."""
+_FREE = ("representatives", "box")  # Keys of an action that the data completes
 
 
 def _first_difference(

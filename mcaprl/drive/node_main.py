@@ -24,8 +24,7 @@ from mcaprl.recorder.mapping.live import LiveEpisodes, LiveSteps
 from mcaprl.recorder.mapping.observe import Source
 from mcaprl.recorder.mapping.plan import Wanted
 
-_SILENCE_S = 0.5
-"""Time without a message of the clock after which the robot is stopped."""
+_SILENCE_S = 0.5  # Time without a message of the clock after which the robot is stopped
 
 
 class NodeStamp(SimpleNamespace):

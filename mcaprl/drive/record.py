@@ -31,8 +31,7 @@ from mcaprl.recorder.mapping.plan import Plan
 from mcaprl.recorder.mapping.robot import Robot
 from mcaprl.recorder.mapping.runs import END_OF_DATA, GAP
 
-_MOST_ROWS = 1024
-"""Number of steps of an open episode above which the older ones are written."""
+_MOST_ROWS = 1024  # Number of steps of an open episode above which the older ones are written
 _BUFFER_BYTES, _BUFFER_NS = 2**18, int(NS_PER_S)
 """Size and age at which messages of the robot's topics are written."""
 

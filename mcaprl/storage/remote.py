@@ -31,8 +31,7 @@ BLOCK_BYTES = 2**16
 # Blocks at most `_LEAST_GAP` apart are fetched together; ranges above `_MOST_BYTES` are divided.
 _LEAST_GAP, _MOST_BYTES = 2 * BLOCK_BYTES, 8 * 2**20
 
-Range = tuple[int, int]
-"""Half-open range (start, stop) of byte positions."""
+Range = tuple[int, int]  # Half-open range (start, stop) of byte positions
 
 
 def is_url(name: object) -> bool:

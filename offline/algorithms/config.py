@@ -18,10 +18,8 @@ ENTRY_POINT_GROUP: Final = "mcaprl.algorithms"
 HEADS: Final = ("deterministic", "gaussian", "mixture")
 """What the network of a policy for a Box outputs."""
 MAX_CHUNK: Final = 1_000
-ACT_DECAY: Final = 0.01
-"""Coefficient of temporal ensembling in ACT."""
-ALPHA_RANGE: Final = (1e-4, 100.0)
-"""Range of CQL's alpha if it is learned."""
+ACT_DECAY: Final = 0.01  # Coefficient of temporal ensembling in ACT
+ALPHA_RANGE: Final = (1e-4, 100.0)  # Range of CQL's alpha if it is learned
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,7 @@ from mcaprl.offline.algorithms.losses import (
 )
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 
-RATE_FACTOR: Final = 10.0
-"""Learning rate of log alpha, as a multiple of the learning rate of Q."""
+RATE_FACTOR: Final = 10.0  # Learning rate of log alpha, as a multiple of the learning rate of Q
 _ALPHA: Final = "log_alpha"
 
 

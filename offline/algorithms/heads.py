@@ -198,8 +198,8 @@ class BoxHead(Head):
     ) -> None:
         """Wrap the networks."""
         super().__init__(networks, chunk)
-        # Conversion of the networks' numbers, if they are relative to the observations.
-        self.box, self.relative = box, relative  # Scaling of the actions to numbers in [-1, 1]
+        # Scaling of actions to [-1, 1], and conversion of numbers relative to the observations.
+        self.box, self.relative = box, relative
         self.register_buffer("log_std", log_std)
         # In float64, so that the bounds are the same numbers as in the space.
         self.register_buffer("_low", torch.from_numpy(box.low), persistent=False)
@@ -385,8 +385,7 @@ class Mixture(BoxHead):
 
 ENCODER: Final = "encoder"
 """Name of the network that maps the images of all other networks to features."""
-FEATURES: Final = 64
-"""Number of these features."""
+FEATURES: Final = 64  # Number of these features
 
 
 def encoded(encoder: Callable[[Observations], Tensor], observations: Observations) -> Observations:
@@ -396,8 +395,7 @@ def encoded(encoder: Callable[[Observations], Tensor], observations: Observation
     return Observations(torch.cat((features, observations.vector), 1), (), observations.mask)
 
 
-COMPONENTS: Final = 5
-"""Number of components of a mixture."""
+COMPONENTS: Final = 5  # Number of components of a mixture
 _LOG_STD_CENTER, _LOG_STD_HALF = -2.0, 3.0
 _LARGEST: Final = 1 - 1e-6
 """Largest action of which a tanh has a density; larger ones have the same."""

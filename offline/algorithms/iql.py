@@ -38,13 +38,11 @@ from mcaprl.offline.algorithms.losses import (
 )
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 
-MAX_WEIGHT = 100.0
-"""Maximum weight of an action in the policy's loss, as in the paper's code."""
+MAX_WEIGHT = 100.0  # Maximum weight of an action in the policy's loss, as in the paper's code
 _SMALLEST_ADVANTAGE = 1e-6
 """Root mean square up to which advantages count as equal, because of rounding errors."""
 _TWINS = ("q", "q_twin")
-LOG_STD = "log_std"
-"""Name of the deviations in `Learner.scalars`, before `heads.bounded_log_std`."""
+LOG_STD = "log_std"  # Name of the deviations in `Learner.scalars`, before `heads.bounded_log_std`
 
 
 class IQL(Learner):

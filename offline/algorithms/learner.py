@@ -66,8 +66,7 @@ class CapturedUpdate:
         self._step.replay()
 
 
-N_CRITICS = 2
-"""Number of networks of a critic: the twins of TD3."""
+N_CRITICS = 2  # Number of networks of a critic: the twins of TD3
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 _STEPS = "steps"
 

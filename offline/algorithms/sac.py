@@ -32,8 +32,7 @@ from mcaprl.offline.algorithms.losses import (
 )
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 
-LOG_TEMPERATURE = "log_temperature"
-"""Name of the logarithm of alpha in `Learner.scalars`."""
+LOG_TEMPERATURE = "log_temperature"  # Name of the logarithm of alpha in `Learner.scalars`
 
 
 class SAC(ActorCritic):

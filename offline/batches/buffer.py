@@ -38,10 +38,8 @@ if TYPE_CHECKING:
 
 
 DEVICES = ("cpu", "cuda")
-MAX_JOINT_ACTIONS = 1_024
-"""Largest number of combinations of a MultiDiscrete or MultiBinary space."""
-_BLOCK_ROWS = 1 << 18
-"""Rows that are checked at once."""
+MAX_JOINT_ACTIONS = 1_024  # Largest number of combinations of a MultiDiscrete or MultiBinary space
+_BLOCK_ROWS = 1 << 18  # Rows that are checked at once
 _ON_DEVICE = ("frames", "starts", "places", "actions", "returns", "next_rows", "ends")
 
 

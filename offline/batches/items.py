@@ -15,8 +15,7 @@ from mcaprl.recorder.format.spaces import leaves_of, nest
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
-Arrays = dict[str, Any]
-"""Arrays by name; observations of a Dict space are dicts of arrays."""
+Arrays = dict[str, Any]  # Arrays by name; observations of a Dict space are dicts of arrays
 _BLOCK_ROWS = 1 << 18
 
 

@@ -19,8 +19,7 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.source import Data, opened
 
 _COLUMNS = ("log_time_ns", *STEP_COLUMNS)
-Tensors = dict[str, Any]
-"""Tensors by name; observations of a Dict space are dicts of tensors."""
+Tensors = dict[str, Any]  # Tensors by name; observations of a Dict space are dicts of tensors
 
 
 class TransitionDataset(torch.utils.data.Dataset[Tensors]):

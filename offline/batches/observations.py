@@ -134,8 +134,7 @@ class FramesOnDisk:
 class ObservationEncoder:
     """Encoder from observations of one space to tensors, saved with each policy."""
 
-    layout = "C"
-    """Layout in memory of the arrays of images; empty for any."""
+    layout = "C"  # Layout in memory of the arrays of images; empty for any
 
     def __init__(self, space: spaces.Space[Any], n_actions: int, mask_key: str = MASK_KEY) -> None:
         """Create the encoder, without normalization."""

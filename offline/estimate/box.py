@@ -42,8 +42,7 @@ from mcaprl.offline.estimate.values import policy_inputs
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
-SEEDS: Final = 4
-"""Number of networks per half of the log."""
+SEEDS: Final = 4  # Number of networks per half of the log
 PER_DECISION: Final = ("PDIS", "WPDIS")
 _Values = Callable[[BoxFQE], Tensor]
 

@@ -234,8 +234,7 @@ ESTIMATORS: Final[dict[str, Callable[[EpisodeTable], RatioEstimate]]] = {
 WHOLE_EPISODE: Final = ("TIS", "WIS")
 """Estimators with one weight per episode; the others have one per step."""
 
-UNBIASED: Final = ("TIS", "PDIS", "DR")
-"""Estimators that do not divide by the sum of the weights."""
+UNBIASED: Final = ("TIS", "PDIS", "DR")  # Estimators that do not divide by the sum of the weights
 
 
 def effective_sample_sizes(episodes: EpisodeTable) -> Floats:

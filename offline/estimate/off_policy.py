@@ -36,8 +36,7 @@ from mcaprl.recorder.format.behavior import BehaviorField
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
-LEAST_SAMPLE_SIZE: Final = 10.0
-"""Effective number of episodes below which an estimate is refused."""
+LEAST_SAMPLE_SIZE: Final = 10.0  # Effective number of episodes below which an estimate is refused
 LARGEST_WEIGHT: Final = 1e100
 """Importance weight above which sums of squares may overflow, so an estimate is refused."""
 RESAMPLES: Final = 1000

@@ -38,8 +38,7 @@ _OTHERS: Final = (
     "Their estimates are from the first evaluation, after a part of the updates, and cannot be"
     " compared with those of the finalists."
 )
-FINALISTS: Final = ("chosen", "runner-up", "")
-"""Outcomes of the candidates of the last evaluation."""
+FINALISTS: Final = ("chosen", "runner-up", "")  # Outcomes of the candidates of the last evaluation
 _MEANINGS: Final = {
     "return_spread": "standard deviation of the returns of the episodes",
     "terminated": "fraction of the episodes that end in a terminal state",

@@ -16,10 +16,8 @@ from mcaprl.offline.algorithms.config import (
     TrainingConfig,
 )
 
-AUTO: Final = "auto"
-"""Name of the algorithm that chooses among the others."""
-ALL: Final = "all"
-"""Value of `finalists` that allows the choice of every candidate."""
+AUTO: Final = "auto"  # Name of the algorithm that chooses among the others
+ALL: Final = "all"  # Value of `finalists` that allows the choice of every candidate
 
 
 @dataclass(frozen=True)

@@ -100,8 +100,7 @@ ENSEMBLE: Final = 2
 """Number of models that evaluate a policy, each with its own halves of the log and weights."""
 SHARES: Final = (0.35, 0.5, 0.8, 0.95)
 """Fractions of the budget after which the short training, its rating, the full training end."""
-CLONE_UPDATES: Final = 2_000
-"""Maximum number of updates of the clone of the behavior policy."""
+CLONE_UPDATES: Final = 2_000  # Maximum number of updates of the clone of the behavior policy
 _IQL_INTERVAL: Final = 50
 _OWN: Final = ("finalists", "survivors", "short_fraction", "model_updates")
 _PROBE_UPDATES: Final = 10

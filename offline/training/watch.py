@@ -21,8 +21,7 @@ from mcaprl.texts import counted
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
-MAX_ROWS = 256
-"""Number of transitions per validation, spread evenly over the held-out episodes."""
+MAX_ROWS = 256  # Number of transitions per validation, spread evenly over the held-out episodes
 MIN_HORIZON_FRACTION = 0.3
 """Below this `horizon_fraction`, the values of good and bad actions hardly differ."""
 SHORT_HORIZON = ".* of the horizon of gamma "
@@ -113,8 +112,7 @@ def horizon_warning(config: TrainingConfig) -> str | None:
     )
 
 
-ABSOLUTE: Final = ".* absolute actions, though"
-"""Pattern of `relative_warning`."""
+ABSOLUTE: Final = ".* absolute actions, though"  # Pattern of `relative_warning`
 
 
 def relative_warning(relation: Sequence[int | None], learner: str) -> str | None:

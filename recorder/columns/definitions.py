@@ -160,8 +160,7 @@ def _condition(word: str, rest: str, defined: set[str]) -> bool:
 
 
 TIME_TYPES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
-UNREADABLE = ("wstring", "wchar", "float128", "fixed")
-"""Types whose encoding is not known."""
+UNREADABLE = ("wstring", "wchar", "float128", "fixed")  # Types whose encoding is not known
 ARRAYS = (Nodetype.ARRAY, Nodetype.SEQUENCE)
 ROS1 = "ros1msg"
 # The definition of a service event may lack the definitions of the request and the response. By

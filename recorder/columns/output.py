@@ -311,8 +311,7 @@ class OutputFile:
         ) from error
 
 
-SMALL_CHUNK_BYTES = 2**16
-"""Chunks with fewer bytes of uncompressed records than this are merged."""
+SMALL_CHUNK_BYTES = 2**16  # Chunks with fewer bytes of uncompressed records than this are merged
 _MERGED_BYTES = 2**20
 # Compaction must remove at least this many chunks to be worth the time.
 _MIN_CHUNKS_SAVED = 8

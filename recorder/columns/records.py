@@ -361,8 +361,7 @@ class _Map:
 _LIBC = memory_maps()
 
 
-MAGIC = b"\x89MCAP0\r\n"
-"""First and last bytes of an MCAP file."""
+MAGIC = b"\x89MCAP0\r\n"  # First and last bytes of an MCAP file
 RECORD_HEADER = struct.Struct("<BQ")
 # The first fields of a message: channel, sequence number, log_time.
 MESSAGE_START = struct.Struct("<HIQ")

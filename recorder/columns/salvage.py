@@ -41,8 +41,7 @@ from mcaprl.recorder.columns.records import (
 from mcaprl.recorder.columns.writer import COMPRESSIONS, McapWriter
 from mcaprl.texts import counted
 
-ValidRecord = tuple[int, int, memoryview]
-"""Offset, opcode and content of a valid record."""
+ValidRecord = tuple[int, int, memoryview]  # Offset, opcode and content of a valid record
 
 # Records with content that cannot be recomputed from other records.
 _REWRITTEN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)

@@ -41,8 +41,7 @@ _MAX_LAYOUTS = 8
 
 Columns = dict[str, NDArray[Any]]
 """Arrays of equal length by field name. Strings are `str`, and arrays of strings are lists."""
-Rows = slice | NDArray[np.int64]
-"""Selection of rows of a column."""
+Rows = slice | NDArray[np.int64]  # Selection of rows of a column
 
 
 @dataclass

@@ -19,8 +19,7 @@ from mcaprl.errors import CorruptLogError
 from mcaprl.files import as_type, parse_json
 from mcaprl.recorder.format.reading import McapReader, Topic
 
-INFO_TOPICS = "/rl/info/"
-"""Prefix of the topic names of infos."""
+INFO_TOPICS = "/rl/info/"  # Prefix of the topic names of infos
 # A string, because NumPy imports `np.ma` when it is first used.
 Masked: TypeAlias = "np.ma.MaskedArray[Any, Any]"
 

@@ -91,8 +91,7 @@ from mcaprl.recorder.format.schema import (
 from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
 from mcaprl.texts import encodable, shortened
 
-Message = tuple[int, int, bytes]
-"""Channel id, log_time and data of a message."""
+Message = tuple[int, int, bytes]  # Channel id, log_time and data of a message
 
 
 class MessageSink(Protocol):

@@ -49,10 +49,8 @@ string policy
 # Options passed to reset(), as JSON.
 string options
 """
-MAX_SEED = 2**64 - 2
-"""Largest seed that can be stored."""
-INFO, WARN = 20, 30
-"""Levels of log lines."""
+MAX_SEED = 2**64 - 2  # Largest seed that can be stored
+INFO, WARN = 20, 30  # Levels of log lines
 # In CDR, the fields follow the encapsulation header, and are aligned relative to the end of this
 # header.
 _ENCAPSULATION = b"\0\1\0\0"

@@ -69,8 +69,7 @@ from mcaprl.recorder.format.spaces import (
 )
 from mcaprl.texts import encodable
 
-Command = tuple[float | str, ...]
-"""Values of the fields of a command: numbers or texts."""
+Command = tuple[float | str, ...]  # Values of the fields of a command: numbers or texts
 
 
 @dataclass(frozen=True)

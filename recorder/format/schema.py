@@ -54,8 +54,7 @@ LOG_TOPIC = "/rosout"
 PHASE_TOPIC = "/rl/phase"
 RUNNING = "running"
 """Phase of a running episode. At its end, the phase changes to the reason of the end."""
-LABELS_TOPIC = "/rl/labels"
-"""Labels of the running episode and step in annotated logs, as text."""
+LABELS_TOPIC = "/rl/labels"  # Labels of the running episode and step in annotated logs, as text
 # Maximum number of /rl/step rows, of images, and of bytes in one chunk.
 STEPS_PER_CHUNK = 4096
 IMAGES_PER_CHUNK = 100

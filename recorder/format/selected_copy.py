@@ -44,8 +44,7 @@ Choice = Callable[[ChunkIndex, Channel, NDArray[Any]], NDArray[np.bool_]]
 _MAX_CHANNEL_ID = 2**16 - 1
 _NO_TIMES: Times = np.empty(0, np.int64)
 _LAST_TIME = np.iinfo(np.int64).max
-ALL_TIMES: Times = np.array([[0, _LAST_TIME]], np.int64)
-"""Time range that contains all log_times."""
+ALL_TIMES: Times = np.array([[0, _LAST_TIME]], np.int64)  # Time range that contains all log_times
 # A Message record up to its payload; see `MESSAGE_HEADER`.
 _HEADER = struct.Struct("<BQHIQQ")
 

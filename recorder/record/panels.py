@@ -19,8 +19,7 @@ from gymnasium import spaces
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import action_leaf, observation_leaves, part_names
 
-MAX_SERIES = 24
-"""Maximum number of series in a plot; further series are left out."""
+MAX_SERIES = 24  # Maximum number of series in a plot; further series are left out
 STEPS = "/rl/step{final==false}"
 EPISODE_VARIABLE = "episode"
 """Variable of a layout with the number of the episode that the viewer's user chooses."""
@@ -119,10 +118,8 @@ def observation_series(metadata: LogMetadata) -> dict[str, str]:
 
 
 Panel = dict[str, Any]
-Node = dict[str, Any] | str
-"""Node of a layout: the name of a panel, or a split into two nodes."""
-FIELD_OF_VIEW_DEG = 45
-"""Vertical angle of view of a 3D panel, degrees."""
+Node = dict[str, Any] | str  # Node of a layout: the name of a panel, or a split into two nodes
+FIELD_OF_VIEW_DEG = 45  # Vertical angle of view of a 3D panel, degrees
 
 NEUTRAL, GOOD, BAD = "#4e98e2", "#31b57b", "#d64545"
 _COLORS = ("#4e98e2", "#f5774d", "#31b57b", "#a395e2", "#e8c547", "#d65f8a", "#7fd1d8", "#9c755f")

@@ -288,8 +288,7 @@ def _is_image(found: NDArray[Any], leaf: Leaf) -> bool:
     )
 
 
-_LISTED = 3
-"""Number of undecodable messages of a topic that are listed."""
+_LISTED = 3  # Number of undecodable messages of a topic that are listed
 
 
 def check_messages(path: Path) -> list[Problem]:
@@ -343,8 +342,7 @@ def _problems_of(bag: Bag, name: str, file: str) -> Iterator[Problem]:
 # Number of chunks that a thread decompresses before it hands them over. Handing over each one takes
 # more time.
 _BLOCK_CHUNKS = 4
-_Read = memoryview | CorruptLogError
-"""Records of a chunk, or the error if the chunk is damaged."""
+_Read = memoryview | CorruptLogError  # Records of a chunk, or the error if the chunk is damaged
 
 
 def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:

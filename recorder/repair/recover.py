@@ -54,8 +54,7 @@ _EPISODE_TOPICS = "/rl/"
 # If the gap between two episode numbers is larger than this, a new recording is assumed to start.
 _MAX_GAP = 10**6
 
-Place = tuple[int, int]
-"""Offset of a chunk and id of a channel, which identify a message index."""
+Place = tuple[int, int]  # Offset of a chunk and id of a channel, which identify a message index
 
 
 @dataclass(frozen=True)

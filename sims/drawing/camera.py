@@ -18,10 +18,8 @@ from mcaprl.compiled import compiled
 
 Floats = NDArray[np.float64]
 
-_NEAR_M = 0.1
-"""Distance of the near plane."""
-_BACK_M = 1e-6
-"""Tolerance of back-face culling: the camera may be this far behind a face's plane."""
+_NEAR_M = 0.1  # Distance of the near plane
+_BACK_M = 1e-6  # Tolerance of back-face culling: the camera may be this far behind a face's plane
 _FLAT_M = 1e-9
 """Tolerance for merging triangles: maximum distance of a corner from the other triangle's plane."""
 
@@ -85,10 +83,8 @@ class Faces(NamedTuple):
 
     corners: Floats
     """(F, 4, 3) corners, counter-clockwise seen from the front; a triangle's fourth is unused."""
-    counts: NDArray[np.int64]
-    """(F,) number of corners."""
-    planes: Floats
-    """(F, 4) planes of the faces, see `fronts`."""
+    counts: NDArray[np.int64]  # (F,) number of corners
+    planes: Floats  # (F, 4) planes of the faces, see `fronts`
 
 
 def faces_of(mesh: Floats) -> Faces:

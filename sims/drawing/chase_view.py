@@ -28,18 +28,15 @@ from mcaprl.sims.geometry import box_faces
 Floats = NDArray[np.float64]
 Samples = NDArray[np.uint32]
 
-SMOOTH = 2
-"""Number of samples per pixel in each direction."""
-NEAR_M = 0.3
-"""Distance of the near plane."""
+SMOOTH = 2  # Number of samples per pixel in each direction
+NEAR_M = 0.3  # Distance of the near plane
 FAR_M = 400.0
 """Maximum distance at which faces are drawn, for the faces that the argument `far` counts."""
 _WIDEST_PX = 24.0
 """Maximum width of a stroke; a wide stroke close to the camera would hide everything."""
 _SUN = (0.36, 0.28, 0.89)
 _FLAT_M, _LEVEL_M = 0.15, 0.01
-_GROUND_KEY = -1e9
-"""Key of a face on the ground at z = 0; all other faces are nearer than 1e9 m."""
+_GROUND_KEY = -1e9  # Key of a face on the ground at z = 0; all other faces are nearer than 1e9 m
 RIM = np.array([(math.cos(a), math.sin(a)) for a in np.arange(12) * math.pi / 6]) / 2
 """(12, 2) points on a circle of diameter 1."""
 
@@ -47,26 +44,20 @@ RIM = np.array([(math.cos(a), math.sin(a)) for a in np.arange(12) * math.pi / 6]
 class Faces(NamedTuple):
     """Polygons, and strokes between two points."""
 
-    corners_m: Floats
-    """(N, 3) corners of all faces."""
+    corners_m: Floats  # (N, 3) corners of all faces
     starts: NDArray[np.int64]
     """(F + 1,) face k has the corners from `starts[k]` up to, but not including, `starts[k + 1]`.
     A stroke has two corners, a polygon is convex and has up to 12."""
-    colors: Floats
-    """(F, 3) red, green and blue, each 0 to 1."""
-    widths_m: Floats
-    """(F,) widths of strokes; 0 for a polygon."""
+    colors: Floats  # (F, 3) red, green and blue, each 0 to 1
+    widths_m: Floats  # (F,) widths of strokes; 0 for a polygon
 
 
 class Eye(NamedTuple):
     """Camera of an image."""
 
-    at_m: Floats
-    """(3,) position in the map."""
-    axes: Floats
-    """(3, 3) axes of the camera as columns, in the map's coordinates."""
-    focal_px: float
-    """Focal length; the optical axis meets the middle of the image."""
+    at_m: Floats  # (3,) position in the map
+    axes: Floats  # (3, 3) axes of the camera as columns, in the map's coordinates
+    focal_px: float  # Focal length; the optical axis meets the middle of the image
 
 
 def joined(parts: Sequence[Faces]) -> Faces:
@@ -277,8 +268,7 @@ HEIGHT_PX = 540
 BACK_M, ABOVE_M, AHEAD_M = 15.0, 6.5, 7.0
 """The camera is `BACK_M` behind the body and `ABOVE_M` above it. The camera looks at the point
 `AHEAD_M` in front of the body."""
-_FOCAL = 0.9
-"""Focal length divided by the width of an image."""
+_FOCAL = 0.9  # Focal length divided by the width of an image
 _SKY: Color = (0.55, 0.68, 0.80, 1.0)
 _INK, _PLATE = (255, 255, 255), (20, 22, 26)
 _BAR, _MARK, _BAR_PX = (70, 78, 90), (78, 152, 226), 160
@@ -290,10 +280,8 @@ _AT_ORIGIN = (np.eye(3), np.zeros(3))
 class Pose(NamedTuple):
     """Pose of a coordinate frame in the map."""
 
-    axes: Floats
-    """(3, 3) axes of the frame as columns."""
-    at_m: Floats
-    """(3,) position."""
+    axes: Floats  # (3, 3) axes of the frame as columns
+    at_m: Floats  # (3,) position
 
 
 class Dial(NamedTuple):
@@ -308,16 +296,14 @@ class Dial(NamedTuple):
 class _Text(NamedTuple):
     """Text at a position in a frame."""
 
-    at_m: Floats
-    """(3,) position."""
+    at_m: Floats  # (3,) position
     text: str
 
 
 class _Prepared(NamedTuple):
     """Faces and texts of a list of shapes, by frame, in the coordinates of the frame."""
 
-    shapes: Sequence[Shape] | None
-    """The list."""
+    shapes: Sequence[Shape] | None  # The list
     faces: dict[str, Faces]
     texts: dict[str, list[_Text]]
 

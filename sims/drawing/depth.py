@@ -22,10 +22,8 @@ from mcaprl.sims.drawing.camera import (
 
 Floats = NDArray[np.float64]
 
-NEAREST_M = 0.5
-"""Distance of code 0; smaller distances have the same code."""
-FARTHEST_M = 100.0
-"""Distance of code 255; larger distances and infinity have the same code."""
+NEAREST_M = 0.5  # Distance of code 0; smaller distances have the same code
+FARTHEST_M = 100.0  # Distance of code 255; larger distances and infinity have the same code
 _CODES_PER_E = 255.0 / math.log(FARTHEST_M / NEAREST_M)
 _NO_WIRES: Floats = np.empty((0, 2, 3))
 
@@ -60,12 +58,10 @@ code increases at most once among them, because adjacent codes differ by 2.1 %."
 class _CodeTable(NamedTuple):
     """Codes of all float32 distances, in groups of numbers that agree except for the last bits."""
 
-    codes: NDArray[np.uint8]
-    """(G,) code of the first number of each group."""
+    codes: NDArray[np.uint8]  # (G,) code of the first number of each group
     increases_m: NDArray[np.float32]
     """(G,) first number of each group that has the next code; NaN if there is none."""
-    first: int
-    """Bits that the numbers of the first group have in common."""
+    first: int  # Bits that the numbers of the first group have in common
 
 
 @functools.cache

@@ -28,8 +28,7 @@ RAY: Color = (0.98, 0.80, 0.28, 0.8)
 LOOK: Color = (0.99, 0.55, 0.10, 1.0)
 TAIL_LAMP: Color = (0.48, 0.02, 0.03, 1.0)
 
-BORDER_PIECE_M = 3.0
-"""Length of the pieces of painted lines; see `cut`."""
+BORDER_PIECE_M = 3.0  # Length of the pieces of painted lines; see `cut`
 
 
 def ground(color: Color, middle_m: tuple[float, float], size_m: tuple[float, float]) -> Shape:
@@ -112,11 +111,9 @@ def _wheel(name: str, color: Color, hub_m: Vector, radius_m: float, width_m: flo
     return Shape(f"car_wheel_{name}", "triangles", color, points, frame="car")
 
 
-LONGEST_S = 0.05
-"""Longest time between two drawn positions of a vehicle."""
+LONGEST_S = 0.05  # Longest time between two drawn positions of a vehicle
 
-Pose = tuple[float, float, float]
-"""x and y in meters, and yaw in radians."""
+Pose = tuple[float, float, float]  # x and y in meters, and yaw in radians
 
 
 def arc(start: Pose, end: Pose, share: float) -> Pose:

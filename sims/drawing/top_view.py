@@ -23,11 +23,9 @@ _CIRCLE = 0.5 * np.array([[math.cos(a), math.sin(a)] for a in np.arange(16) * ma
 class Patch(NamedTuple):
     """Convex polygon of one color."""
 
-    top_m: float
-    """Height of the shape's top."""
+    top_m: float  # Height of the shape's top
     color: Color
-    corners_m: Floats
-    """(K, 2) corners."""
+    corners_m: Floats  # (K, 2) corners
     frame: str
 
 
@@ -88,8 +86,7 @@ def _stroke(start: Floats, end: Floats, width_m: float) -> Floats:
 
 Rgb = tuple[int, int, int]
 
-_SMOOTH = 2
-"""Factor of supersampling in each direction, for smooth edges."""
+_SMOOTH = 2  # Factor of supersampling in each direction, for smooth edges
 
 
 class Canvas:

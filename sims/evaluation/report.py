@@ -45,8 +45,7 @@ _CARDS = (
     "env.reset(seed=...) starts the same episode. Episodes that are recorded to a log have the"
     " command that replays them instead. A cross marks an end before the time limit."
 )
-_FLAT_M = 1.0
-"""Boxes up to this height are ground and are not drawn."""
+_FLAT_M = 1.0  # Boxes up to this height are ground and are not drawn
 
 
 def comparison_figure(

@@ -27,8 +27,7 @@ from mcaprl.sims import make_sim, make_sims
 Floats = NDArray[np.float64]
 _QUANTILE = np.vectorize(NormalDist().inv_cdf, otypes=[np.float64])
 _ERF = np.vectorize(math.erf, otypes=[np.float64])
-_SMALLEST = 1e-6
-"""Smallest standard deviation of an episode, as a fraction of `noise`."""
+_SMALLEST = 1e-6  # Smallest standard deviation of an episode, as a fraction of `noise`
 
 
 class NoisyPolicy(BasePolicy):
@@ -245,8 +244,7 @@ def _has_time_limit(env: gym.Env[Any, Any]) -> bool:
     return False
 
 
-MOST_NUMBERED = 1 << 62
-"""Largest number of actions that a policy chooses among by their numbers."""
+MOST_NUMBERED = 1 << 62  # Largest number of actions that a policy chooses among by their numbers
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ from mcaprl.sims.vehicle.env import RENDER_MODES, RenderedEnv, RenderMode, Scrip
 
 Floats = NDArray[np.float64]
 
-VIEW_M = 80.0
-"""Width of the ground in the rendered image."""
+VIEW_M = 80.0  # Width of the ground in the rendered image
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}
 ROADS: Final[dict[str, type]] = {
     "lane-keeping-v0": LaneKeepingEnv,
@@ -394,10 +393,8 @@ def _view_from_above(courses: Sequence[Course]) -> dict[str, float]:
 
 
 FASTEST_M_S = 15.0
-FREE_M = 20.0
-"""Minimum distance of random starts from other cars."""
-LAST_START_M = 60.0
-"""Minimum distance of random starts from the end of a road."""
+FREE_M = 20.0  # Minimum distance of random starts from other cars
+LAST_START_M = 60.0  # Minimum distance of random starts from the end of a road
 
 
 def drawn_pose(
@@ -444,8 +441,7 @@ PURSUIT_M, CONTINUOUS_PURSUIT_M = 10.0, 4.0
 """Lookahead distance along the lane for discrete and continuous actions."""
 ROOM_M = 30.0
 """Free distance ahead below which the pilot changes to the lane with the most free distance."""
-BESIDE_M = 9.0
-"""A car that follows at less than this distance also blocks its lane."""
+BESIDE_M = 9.0  # A car that follows at less than this distance also blocks its lane
 
 
 class HighwayPilot(ScriptedPilot[HighwayLaneEnv]):

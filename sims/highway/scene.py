@@ -23,8 +23,7 @@ from mcaprl.sims.drawing.shapes import LAMP, TAIL_LAMP, WHITE, car_part
 Floats = NDArray[np.float64]
 
 SAMPLE_M = 1.0
-FLIP = np.array([1.0, -1.0])
-"""Factors that transform (x, y) of highway-env to ROS axes and back."""
+FLIP = np.array([1.0, -1.0])  # Factors that transform (x, y) of highway-env to ROS axes and back
 
 
 class Place(NamedTuple):
@@ -33,8 +32,7 @@ class Place(NamedTuple):
     along_m: float
     offset_m: float
     """Distance of the position from the course, positive to the left of its direction."""
-    yaw_rad: float
-    """Direction of the course at the nearest point."""
+    yaw_rad: float  # Direction of the course at the nearest point
 
 
 class Course(NamedTuple):
@@ -42,12 +40,9 @@ class Course(NamedTuple):
 
     points_m: Floats
     """(N + 1, 2) points about 1 m apart; on a closed course, the last point equals the first."""
-    along_m: Floats
-    """(N + 1,) distance of each point from the first, along the course."""
-    lengths_m: Floats
-    """(N,) lengths of the legs from each point to the next."""
-    directions: Floats
-    """(2, N) cosines and sines of the legs' directions."""
+    along_m: Floats  # (N + 1,) distance of each point from the first, along the course
+    lengths_m: Floats  # (N,) lengths of the legs from each point to the next
+    directions: Floats  # (2, N) cosines and sines of the legs' directions
     half_width_m: float
     is_closed: bool
 
@@ -132,13 +127,11 @@ ASPHALT: Color = (0.22, 0.23, 0.25, 1.0)
 PAINT: Color = (0.13, 0.55, 0.47, 1.0)
 OTHER_PAINT: Color = (0.86, 0.62, 0.16, 1.0)
 
-MARGIN_M = 60.0
-"""Width of the grass around the road."""
+MARGIN_M = 60.0  # Width of the grass around the road
 CAR_HEIGHT_M = 1.4
 PIECE_M = 3.0
 """Approximate length of the pieces of lanes and lines; dashed lines omit every second piece."""
-STRIPED, CONTINUOUS = 1, 2
-"""Values of highway-env's `LineType`."""
+STRIPED, CONTINUOUS = 1, 2  # Values of highway-env's `LineType`
 
 
 class Car(NamedTuple):

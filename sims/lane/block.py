@@ -34,8 +34,7 @@ from mcaprl.sims.lane.rules import (
     store_car,
 )
 
-LANES = 32
-"""Number of cars in a block."""
+LANES = 32  # Number of cars in a block
 _STEERING, _COS, _SIN, _PEDAL = 4, 9, 10, 11
 _REWARD, _END, _SEEN, _SLIP, _TURN, _BLOCK_NUMBERS = 12, 13, 14, 26, 27, 28
 """Indices of a car's values in a block, and the number of values. Indices 0 to 8 are the fields

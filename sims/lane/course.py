@@ -42,12 +42,10 @@ SECOND_SQUARE_M = float(COURSE.along_m[4])
 """Distance along the path at which the second square begins."""
 
 LANE_HALF_WIDTH_M = 3.5
-RAIL_OFFSET_M = 4.0
-"""Distance from the center line to the inner faces of the rails."""
+RAIL_OFFSET_M = 4.0  # Distance from the center line to the inner faces of the rails
 RAIL_HEIGHT_M = 0.7
 RAIL_THICKNESS_M = 0.12
-BARRIER_HEIGHT_M = 3.0
-"""Height of the barriers, which is above the camera."""
+BARRIER_HEIGHT_M = 3.0  # Height of the barriers, which is above the camera
 GROUND_HALF_SIDE_M = 1000.0
 """Half of the ground's side; large enough to cover the last row of pixels below the horizon."""
 
@@ -55,8 +53,7 @@ CAMERA_FORWARD_M = 0.4
 """Distance of the camera from the middle of the wheelbase, the origin of the car's frame."""
 CAMERA_HEIGHT_M = 1.4
 
-HOUSE_GAP_M = 1.0
-"""Minimum distance between houses."""
+HOUSE_GAP_M = 1.0  # Minimum distance between houses
 
 
 class Box(NamedTuple):

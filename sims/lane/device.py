@@ -17,8 +17,7 @@ from mcaprl.sims.vehicle.device import Batch, DeviceSims, begin_episode, finish_
 class World(NamedTuple):
     """Constants of all cars."""
 
-    on_line: bool
-    """Whether cars start on the start line instead of anywhere."""
+    on_line: bool  # Whether cars start on the start line instead of anywhere
 
 
 class DeviceLane(DeviceSims):

@@ -19,8 +19,7 @@ from mcaprl.sims.lane.rules import DECISION_S, Car, wheel_angle
 from mcaprl.sims.vehicle.batched import BatchedEnv
 from mcaprl.sims.vehicle.env import RENDER_MODES, RenderMode, VehicleEnv
 
-VIEW_M = 55.0
-"""Width of the ground in the rendered image."""
+VIEW_M = 55.0  # Width of the ground in the rendered image
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / DECISION_S)}
 
 

@@ -44,10 +44,8 @@ from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet, Generators, dra
 
 OBSERVATIONS = ("state", "depth", "depth-commands", "dashboard", "rays")
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
-MOTION = slice(2, 4)
-"""Indices of speed and steering in the observed state."""
-STEERING_SEEN = 3
-"""Index of the last steering command in the observed state."""
+MOTION = slice(2, 4)  # Indices of speed and steering in the observed state
+STEERING_SEEN = 3  # Index of the last steering command in the observed state
 COMMANDS = 32
 """Number of decisions whose commands are observed with `depth-commands`: 8 s by default."""
 
@@ -321,10 +319,8 @@ def _space(observation: str, steering: float) -> spaces.Space[Any]:
     return spaces.Box(low, limit)
 
 
-SHARES = 4
-"""Number of random numbers for a start; a start on the line uses the first two."""
-LINE_M = 2.0
-"""Distance of the start line along the path."""
+SHARES = 4  # Number of random numbers for a start; a start on the line uses the first two
+LINE_M = 2.0  # Distance of the start line along the path
 AFTER_CORNER_M, BEFORE_CORNER_M = 2.0, 8.0
 """Minimum distances of random starts after and before corners, so that cars can turn in time."""
 FASTEST_START_M_S = 10.0

@@ -13,8 +13,7 @@ from mcaprl.sims.lane.course import COURSE, SECOND_SQUARE_M, Box, barriers, buil
 from mcaprl.sims.lane.rules import MAX_SPEED_M_S, Car, car_at
 
 BODY_LENGTH_M, BODY_WIDTH_M = 4.3, 1.75
-BODY_FORWARD_M = 0.05
-"""Distance of the body's center ahead of the middle of the wheelbase."""
+BODY_FORWARD_M = 0.05  # Distance of the body's center ahead of the middle of the wheelbase
 
 _FAR_AWAY = Box(1e9, 1e9, 0.0, 0.0, 0.0)
 
@@ -32,8 +31,7 @@ WORLDS_M: NDArray[np.float64] = np.array(
 Set 0 has no barriers. The course consists of two squares; set 1 has the barriers for a car on the
 first square, and set 2 those for a car on the second square."""
 _LENGTH_M = COURSE.length_m
-_HUGE = 1e12
-"""Finite replacement for 1 / 0."""
+_HUGE = 1e12  # Finite replacement for 1 / 0
 
 
 @compiled

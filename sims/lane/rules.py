@@ -68,8 +68,7 @@ _FALL_3 = (STEERING_CURVE[1] - STEERING_CURVE[2]) / (STEERING_CURVE_M_S[2] - STE
 """Decrease of the maximum steering fraction per m/s, in the interval before each knot."""
 
 BACK_M = 4.0
-AHEAD_M = 8.0
-"""Search window for the nearest path point: distances before and after the last one."""
+AHEAD_M = 8.0  # Search window for the nearest path point: distances before and after the last one
 
 STALL_SPEED_M_S = 1.0
 STALL_TIME_S = 3.0
@@ -96,19 +95,13 @@ class Car(NamedTuple):
 
     x_m: float
     y_m: float
-    yaw_rad: float
-    """Yaw counter-clockwise from x, in [-pi, pi)."""
+    yaw_rad: float  # Yaw counter-clockwise from x, in [-pi, pi)
     speed_m_s: float
-    steering: float
-    """Last steering command as a fraction of the maximum angle, left positive."""
-    along_m: float
-    """Distance of the nearest path point along the path, counted over all laps."""
-    offset_m: float
-    """Distance from the path, left positive."""
-    heading_error_rad: float
-    """Yaw relative to the path, left positive, in [-pi, pi)."""
-    slow_s: float
-    """Time for which the car has been slower than the stall speed."""
+    steering: float  # Last steering command as a fraction of the maximum angle, left positive
+    along_m: float  # Distance of the nearest path point along the path, counted over all laps
+    offset_m: float  # Distance from the path, left positive
+    heading_error_rad: float  # Yaw relative to the path, left positive, in [-pi, pi)
+    slow_s: float  # Time for which the car has been slower than the stall speed
 
 
 ALONG, STARTED_AT = Car._fields.index("along_m"), len(Car._fields)

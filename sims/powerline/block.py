@@ -24,13 +24,10 @@ from mcaprl.sims.powerline.quadrotor import (
     store,
 )
 
-LANES = 8
-"""Number of drones in a block, whose states one loop computes together."""
-_MIN_BLOCK = 3
-"""Minimum number of drones that are computed faster as a block than one by one."""
+LANES = 8  # Number of drones in a block, whose states one loop computes together
+_MIN_BLOCK = 3  # Minimum number of drones that are computed faster as a block than one by one
 _COMMAND, _WIND = DRONE_SIZE * LANES, (DRONE_SIZE + 3) * LANES
-_BLOCK_NUMBERS = DRONE_SIZE + 6
-"""Number of values per drone in a block: state, command and wind."""
+_BLOCK_NUMBERS = DRONE_SIZE + 6  # Number of values per drone in a block: state, command and wind
 
 
 @compiled

@@ -48,8 +48,7 @@ GROUND_X_M = np.concatenate(
 )
 GROUND_Y_M = np.linspace(-260, 345, 23)
 """NED grid of the ground mesh: densest on the steep hill; it ends about 200 m beyond the line."""
-TREE_SIDE_M = 0.45
-"""Side of a fir's base as a fraction of its height."""
+TREE_SIDE_M = 0.45  # Side of a fir's base as a fraction of its height
 MAST_FOOT_M = 3.0
 MAST_TOP_M = 0.9
 

@@ -30,23 +30,17 @@ POINTS_M: Floats = np.array(
 LEGS = len(POINTS_M) - 1
 _LEG_M = np.diff(POINTS_M, axis=0)
 LEG_LENGTHS_M: Floats = np.sqrt((_LEG_M**2).sum(axis=1))
-TANGENTS: Floats = _LEG_M / LEG_LENGTHS_M[:, None]
-"""(4, 3) unit vectors along the legs."""
+TANGENTS: Floats = _LEG_M / LEG_LENGTHS_M[:, None]  # (4, 3) unit vectors along the legs
 ALONG_M: Floats = np.concatenate([[0.0], np.cumsum(LEG_LENGTHS_M)])
 """(5,) distance of each point from the first, along the line."""
 LENGTH_M = float(ALONG_M[-1])
 
-BELOW_LINE_M = 6.0
-"""Vertical distance of the conductors' ends from the points of the flight line."""
-PHASES_M = (-4.0, 0.0, 4.0)
-"""Lateral positions of the three conductors, right positive."""
-SAG = 0.02
-"""Sag of a conductor in the middle of its span, as a fraction of the span's length."""
-CHORDS = 16
-"""Number of straight segments of a conductor."""
+BELOW_LINE_M = 6.0  # Vertical distance of the conductors' ends from the points of the flight line
+PHASES_M = (-4.0, 0.0, 4.0)  # Lateral positions of the three conductors, right positive
+SAG = 0.02  # Sag of a conductor in the middle of its span, as a fraction of the span's length
+CHORDS = 16  # Number of straight segments of a conductor
 
-ARM_BELOW_WIRES_M = 1.0
-"""Length of the insulators on the towers' arms."""
+ARM_BELOW_WIRES_M = 1.0  # Length of the insulators on the towers' arms
 ARM_HALF_LENGTH_M = 4.8
 TOWER_HEIGHTS_M = (21.0, 26.0, 24.0, 28.0, 23.0)
 TREE_COUNT = 240
@@ -56,8 +50,7 @@ class Place(NamedTuple):
     """Point of the line that is nearest to a position."""
 
     leg: int
-    along_m: float
-    """Distance from the first point, along the line."""
+    along_m: float  # Distance from the first point, along the line
     point_m: Vector
     distance_m: float
 
@@ -69,8 +62,7 @@ class Tower(NamedTuple):
     y_m: float
     foot_z_m: float
     arm_z_m: float
-    right: tuple[float, float]
-    """Unit vector along the arm, to the right of the line."""
+    right: tuple[float, float]  # Unit vector along the arm, to the right of the line
 
 
 class Tree(NamedTuple):

@@ -233,8 +233,7 @@ def _space(observation: str, classic: bool) -> spaces.Space[Any]:
 POSE_NAMES = ("x_m", "y_m", "z_m", "vx_m_s", "vy_m_s", "vz_m_s")
 FIRST_POINT_NOISE_M = 0.2
 NOISE_M = 1.0
-LAST_START_M = 20.0
-"""Minimum distance of random starts from the line's end."""
+LAST_START_M = 20.0  # Minimum distance of random starts from the line's end
 MAX_SPEED_M_S = 5.0
 
 

@@ -11,8 +11,7 @@ from mcaprl.sims.powerline.env import PowerlineEnv
 from mcaprl.sims.powerline.rules import ACTION_MEANINGS, DIRECTIONS, MAX_COMMAND_M_S, Flight
 from mcaprl.sims.vehicle.env import ScriptedPilot
 
-AIM_M = 6.0
-"""Distance along the line to the target point."""
+AIM_M = 6.0  # Distance along the line to the target point
 OFFSET_GAIN_PER_S = 0.5
 MAX_SPEED_M_S = 5.0
 HALF_TURN_RAD = 0.46

@@ -32,8 +32,7 @@ PLANTS = ("quad", "point")
 QUAD, POINT = 0, 1
 
 GRAVITY_M_S2 = 9.81
-TIME_STEP_S = 0.002
-"""Time step of the quadrotor's equations and controllers, which run at 500 Hz."""
+TIME_STEP_S = 0.002  # Time step of the quadrotor's equations and controllers, which run at 500 Hz
 POINT_LAG_S = 0.5
 
 MASS_KG = 1.0
@@ -45,8 +44,7 @@ MAX_ROTOR_THRUST_N = 5.5
 ROTOR_LAG_S = 0.02
 ROTOR_SHARE = 1.0 - math.exp(-TIME_STEP_S / ROTOR_LAG_S)
 """Fraction of the thrust error that is corrected in one time step."""
-DRAG_PER_S = 0.25
-"""Coefficient of the drag per mass, which is linear in the airspeed."""
+DRAG_PER_S = 0.25  # Coefficient of the drag per mass, which is linear in the airspeed
 
 VELOCITY_GAIN_PER_S = 2.5
 INTEGRAL_GAIN_PER_S2 = 1.5
@@ -72,19 +70,14 @@ class Drone(NamedTuple):
 
     position_m: Vector
     velocity_m_s: Vector
-    attitude: Quaternion
-    """Rotation from the body's axes to the world's."""
-    rates_rad_s: Vector
-    """Angular velocity about the body's axes."""
+    attitude: Quaternion  # Rotation from the body's axes to the world's
+    rates_rad_s: Vector  # Angular velocity about the body's axes
     thrusts_n: Rotors
-    reference_m_s: Vector
-    """Velocity that the drone would have without wind."""
-    integral_m_s2: Vector
-    """Integral of the velocity controller, which compensates for the wind."""
+    reference_m_s: Vector  # Velocity that the drone would have without wind
+    integral_m_s2: Vector  # Integral of the velocity controller, which compensates for the wind
 
 
-DRONE_SIZE = 23
-"""Number of floats in the array row of a `Drone`."""
+DRONE_SIZE = 23  # Number of floats in the array row of a `Drone`
 
 
 @compiled

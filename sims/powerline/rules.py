@@ -43,8 +43,7 @@ DIRECTIONS: NDArray[np.float64] = np.vstack([np.eye(3), -np.eye(3), np.zeros((1,
 AXES = ("north", "east", "down")
 
 DECISION_S = 0.5
-CHECK_S = 0.1
-"""Interval of the checks for collisions and other episode ends."""
+CHECK_S = 0.1  # Interval of the checks for collisions and other episode ends
 VELOCITY_STEP_M_S = 0.5
 MAX_COMMAND_M_S = 8.0
 APPROACH_S = 5.0
@@ -57,12 +56,10 @@ MAX_DISTANCE_M = 7.0
 WIRE_CLEARANCE_M = 0.6
 TOWER_CLEARANCE_M = 1.2
 GROUND_CLEARANCE_M = 0.3
-FINISH_M = 1.0
-"""Distance from the line's end at which an episode is finished."""
+FINISH_M = 1.0  # Distance from the line's end at which an episode is finished
 FAILURE_REWARD = -5.0
 FINISH_REWARD = 5.0
-BEST_PROGRESS_M = 2.5
-"""Progress per decision that has the highest reward; corresponds to 5 m/s."""
+BEST_PROGRESS_M = 2.5  # Progress per decision that has the highest reward; corresponds to 5 m/s
 DISTANCE_SCALE_M = 4.0
 FLYING, OFF_LINE, COLLISION, FINISHED = 0, 1, 2, 3
 REASONS = ("", "off_line", "collision", "finished")
@@ -79,22 +76,17 @@ OBSERVATION_NAMES = (
 OBSERVATION_LIMIT = np.array([2] * 3 + [4] * 3 + [8] * 3 + [1] * 8 + [10], dtype=np.float32)
 
 COMMAND, WIND, GUST, FURTHEST = DRONE_SIZE, DRONE_SIZE + 3, DRONE_SIZE + 6, DRONE_SIZE + 9
-FLIGHT_SIZE = DRONE_SIZE + 10
-"""Number of floats in the array row of a `Flight`."""
+FLIGHT_SIZE = DRONE_SIZE + 10  # Number of floats in the array row of a `Flight`
 
 
 class Flight(NamedTuple):
     """State of one drone on the line."""
 
     drone: Drone
-    command_m_s: Vector
-    """Last commanded velocity."""
-    wind_m_s: Vector
-    """Steady wind of the episode."""
-    gust_m_s: Vector
-    """Current gust, in addition to the steady wind."""
-    furthest_m: float
-    """Maximum progress along the line so far."""
+    command_m_s: Vector  # Last commanded velocity
+    wind_m_s: Vector  # Steady wind of the episode
+    gust_m_s: Vector  # Current gust, in addition to the steady wind
+    furthest_m: float  # Maximum progress along the line so far
 
 
 @compiled

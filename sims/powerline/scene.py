@@ -60,16 +60,13 @@ GROUND_Y_M = np.linspace(-260, 345, 17)
 """NED grid of the drawn ground, coarser than that of the depth camera."""
 FIR_CORNERS = np.array([[1.0, 0.0], [-0.5, 0.75], [-0.5, -0.75]])
 """Base corners (x, y) of a drawn fir, as multiples of half the base's side."""
-SHADES = 8
-"""Number of brightness levels of surfaces; the angle to the sun determines the level."""
+SHADES = 8  # Number of brightness levels of surfaces; the angle to the sun determines the level
 SUN = np.array([0.45, 0.35, 0.82])
 
 DRONE_SCALE = 5.0
-ROUTE_PIECE_M = 12.0
-"""Length of the pieces of the route; see `cut`."""
+ROUTE_PIECE_M = 12.0  # Length of the pieces of the route; see `cut`
 MAP_ROUTE_M, MAP_TOWER_M = 3.0, 9.0
-CROSSINGS = 6
-"""Number of cross-braced sections of a tower."""
+CROSSINGS = 6  # Number of cross-braced sections of a tower
 
 
 def ros(ned: Vector) -> tuple[float, float, float]:
@@ -262,10 +259,8 @@ def telemetry(flight: Flight) -> dict[str, float]:
 
 VIEW_M = 50.0
 STRIP_TOP_PX, STRIP_BOTTOM_PX = 430, SIDE_PX - 34
-STRIP_M = 180.0
-"""Length of the part of the line that the strip shows; heights have the same scale."""
-DRONE_DOWN_PX = 45
-"""Distance of the drone from the top of the strip."""
+STRIP_M = 180.0  # Length of the part of the line that the strip shows; heights have the same scale
+DRONE_DOWN_PX = 45  # Distance of the drone from the top of the strip
 _SKY = (158, 188, 212)
 _GROUND = (88, 112, 74)
 _SAMPLE_M = 2.0

@@ -54,8 +54,7 @@ CONTROL_POINTS_PX = (
 """Control points of the default track, counter-clockwise in the image, from the start line."""
 
 _SAMPLES_PER_SPAN = 32
-_STRAIGHT_PX = 220.0
-"""Length of a straight that is divided into as many walls as a bend of 1 rad."""
+_STRAIGHT_PX = 220.0  # Length of a straight that is divided into as many walls as a bend of 1 rad
 _MARGIN_PX = 6.0
 _TIGHTEST_PX = 62.0
 """Minimum distance of random tracks from the image's edge, and minimum radius of their turns."""
@@ -64,13 +63,11 @@ _TIGHTEST_PX = 62.0
 class Track(NamedTuple):
     """Walls, gates and center line of one track."""
 
-    walls_px: Floats
-    """(W, 4) x1, y1, x2, y2 of each wall."""
+    walls_px: Floats  # (W, 4) x1, y1, x2, y2 of each wall
     gates_px: Floats
     """(G, 4) x1, y1, x2, y2 of each gate, from the left wall to the right one; gate i of G is
     (i + 1/2) / G of a lap after the start line."""
-    path: Path
-    """Center line in the map, in the direction of travel, from the start line."""
+    path: Path  # Center line in the map, in the direction of travel, from the start line
     start_px: tuple[float, float, float]
     """x, y and heading (radians, clockwise from x) on the start line."""
 
@@ -256,23 +253,15 @@ class Car(NamedTuple):
 
     x_px: float
     y_px: float
-    heading_rad: float
-    """Heading clockwise from the image's x, in [-pi, pi)."""
-    course_rad: float
-    """Direction of travel; equals the heading unless the car drifts."""
-    speed_px: float
-    """Speed in the direction `course_rad`, pixels per step; negative when reversing."""
+    heading_rad: float  # Heading clockwise from the image's x, in [-pi, pi)
+    course_rad: float  # Direction of travel; equals the heading unless the car drifts
+    speed_px: float  # Speed in the direction `course_rad`, pixels per step; negative when reversing
     next_gate: float
-    gates: float
-    """Number of gates passed since the start."""
-    idle_steps: float
-    """Number of steps since the last gate."""
-    steps: float
-    """Number of steps since the start."""
-    along_m: float
-    """Distance along the path to the point nearest to the car, summed over all laps."""
-    offset_m: float
-    """Distance from the path, left positive."""
+    gates: float  # Number of gates passed since the start
+    idle_steps: float  # Number of steps since the last gate
+    steps: float  # Number of steps since the start
+    along_m: float  # Distance along the path to the point nearest to the car, summed over all laps
+    offset_m: float  # Distance from the path, left positive
     heading_error_rad: float
     """Heading relative to the path's direction, counter-clockwise, in [-pi, pi)."""
 

@@ -22,8 +22,7 @@ class World(NamedTuple):
 
     track: Track
     drift: bool
-    on_line: bool
-    """Whether cars start near the start line instead of anywhere."""
+    on_line: bool  # Whether cars start near the start line instead of anywhere
 
 
 class DeviceRacer(DeviceSims):

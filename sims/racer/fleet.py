@@ -50,8 +50,7 @@ ACTION_SETS: dict[object, tuple[int, ...]] = {
     5: _EVERY[:5],
 }
 _INFO = (*CAR_INFO, "gates_passed")
-_ONLY = np.zeros(1, dtype=np.int64)
-"""Index of the only car of a fleet of one, as an array."""
+_ONLY = np.zeros(1, dtype=np.int64)  # Index of the only car of a fleet of one, as an array
 
 
 class RacerFleet(Fleet):
@@ -202,8 +201,7 @@ def _track_of(seed: int | None) -> Track:
     return make_track(seed)
 
 
-ANYWHERE, ON_LINE, EXACTLY = 4, 2, 0
-"""Number of random numbers for each kind of start."""
+ANYWHERE, ON_LINE, EXACTLY = 4, 2, 0  # Number of random numbers for each kind of start
 SEARCH_M = 10.0
 """Search window for the nearest path point: maximum distance from the path point of the start."""
 

@@ -22,8 +22,7 @@ from mcaprl.sims.vehicle.env import ScriptedPilot
 
 ROOM_EXPONENT, CONTINUOUS_ROOM_EXPONENT = 1.17, 1.3
 """Exponents of a ray's length in the weight of the ray, for discrete and continuous actions."""
-TURN_BEYOND_RAD = math.radians(7.5)
-"""Minimum aim angle for a turn: half of the turn of one action."""
+TURN_BEYOND_RAD = math.radians(7.5)  # Minimum aim angle for a turn: half of the turn of one action
 STOP_PX, SPEED_PER_PX, SLOWEST_PX = 38.5, 0.296, 2.0
 """Target speed, pixels per step: 0.296 (d - 38.5), at least 2, for a free distance d ahead."""
 

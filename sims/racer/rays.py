@@ -21,8 +21,7 @@ _COS: NDArray[np.float64] = np.cos(CENTER_RAYS_RAD)
 _SIN: NDArray[np.float64] = np.sin(CENTER_RAYS_RAD)
 CENTER_RAYS = len(CENTER_RAYS_DEG)
 RAYS = CENTER_RAYS + 4
-SLOTS = 20
-"""Number of rays in a block: `RAYS`, rounded up to a multiple of 4, the width of AVX2."""
+SLOTS = 20  # Number of rays in a block: `RAYS`, rounded up to a multiple of 4, the width of AVX2
 X, Y, DX, DY, SHARE, BLOCK_SIZE = (SLOTS * part for part in range(6))
 LENGTH = SHARE
 """Indices of the parts of a block. The offsets between parts are constants, so that the compiler

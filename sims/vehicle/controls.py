@@ -85,8 +85,7 @@ def pose_from(options: dict[str, Any], slowest_m_s: float, fastest_m_s: float) -
     return pose
 
 
-KINDS: Final = ("discrete", "continuous")
-"""Values of a sim's argument `actions`."""
+KINDS: Final = ("discrete", "continuous")  # Values of a sim's argument `actions`
 _LIMIT = 1.0 + 1e-6
 """Largest part of a continuous action. A part slightly beyond 1 is a rounding error of a policy
 that scales its actions, and counts as 1."""

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from mcaprl.compiled import compiled, ready
 from mcaprl.sims.vehicle.controls import Controls
 
-GOING_ON = 0
-"""Value of `Fleet.ends` while an episode runs."""
+GOING_ON = 0  # Value of `Fleet.ends` while an episode runs
 CAR_INFO = ("lateral_offset_m", "heading_error_rad", "speed_m_s", "progress_m")
 """Keys of the `info` of cars."""
 
@@ -204,8 +203,7 @@ class _BitGenerator(ctypes.Structure):
     ]
 
 
-_STATE, _NEXT_DOUBLE = 0, 3
-"""Indices of two fields. All fields are pointers."""
+_STATE, _NEXT_DOUBLE = 0, 3  # Indices of two fields. All fields are pointers.
 _capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
     ("PyCapsule_GetPointer", ctypes.pythonapi)
 )

@@ -16,8 +16,7 @@ from mcaprl.errors import UsageError
 from mcaprl.files import check_target
 from mcaprl.recorder.bags.bag import open_bag
 
-PREFIX = "/mcaprl"
-"""Prefix of the topics of what would have been commanded."""
+PREFIX = "/mcaprl"  # Prefix of the topics of what would have been commanded
 
 
 class Compared(NamedTuple):

@@ -27,8 +27,7 @@ _CONFIG = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="{i
 </Discovery></Domain></CycloneDDS>"""
 _PEERS = '<Peers><Peer Address="127.0.0.1"/></Peers>'
 _MAX_DOMAIN = 232
-_KEPT = 100
-"""Number of messages of a topic that wait until they are taken."""
+_KEPT = 100  # Number of messages of a topic that wait until they are taken
 _LATCHED = "tf_static"
 _BLOCKING_NS, _ACKNOWLEDGE_NS = 100_000_000, 500_000_000
 _NAMES = {"bool": bool, "string": str, "octet": "byte", "char": "uint8"}
