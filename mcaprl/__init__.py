@@ -25,11 +25,10 @@ if not is_program():
 if TYPE_CHECKING:
     from mcaprl import ray, torch
     from mcaprl.api.action_errors import action_errors
-    from mcaprl.api.behavior import estimate_behavior
     from mcaprl.api.convert import convert, suggest_mapping
     from mcaprl.api.drive import drive_robot
     from mcaprl.api.edit import annotate, filter, label, merge, relabel, select, slice, split
-    from mcaprl.api.estimate import estimate
+    from mcaprl.api.estimate import estimate, estimate_behavior
     from mcaprl.api.evaluate import evaluate
     from mcaprl.api.logs import check, info, recover
     from mcaprl.api.policies import Run, export, load_policy
@@ -107,9 +106,9 @@ if not TYPE_CHECKING:
 # These names are imported on first use: their modules take long to import.
 __getattr__ = lazy_attributes(
     __name__,
-    {f"mcaprl.api.{name}": [name] for name in ("estimate", "evaluate", "record", "sweep")}
+    {f"mcaprl.api.{name}": [name] for name in ("evaluate", "record", "sweep")}
     | {
-        "mcaprl.api.behavior": ["estimate_behavior"],
+        "mcaprl.api.estimate": ["estimate", "estimate_behavior"],
         "mcaprl.api.convert": ["convert", "suggest_mapping"],
         "mcaprl.recorder.source": ["open_data as open"],
         "mcaprl.api.edit": [

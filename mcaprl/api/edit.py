@@ -27,8 +27,15 @@ from mcaprl.recorder.dataset.labels import (
     labels_to_carry,
 )
 from mcaprl.recorder.edit.join import merge_logs
-from mcaprl.recorder.edit.piece import Bounds, Edited, filter_log, selected, slice_log, split_log
-from mcaprl.recorder.edit.relabel import relabeled
+from mcaprl.recorder.edit.piece import (
+    Bounds,
+    Edited,
+    filter_log,
+    relabeled,
+    selected,
+    slice_log,
+    split_log,
+)
 from mcaprl.recorder.source import (
     Definitions,
     MappingFile,

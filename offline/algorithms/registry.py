@@ -22,8 +22,7 @@ from mcaprl.offline.algorithms.cql import CQL
 from mcaprl.offline.algorithms.dqn import DQN, DoubleDQN
 from mcaprl.offline.algorithms.iql import IQL, BoxIQL
 from mcaprl.offline.algorithms.learner import Learner
-from mcaprl.offline.algorithms.rebrac import ReBRAC
-from mcaprl.offline.algorithms.td3_bc import TD3BC
+from mcaprl.offline.algorithms.td3 import TD3BC, ReBRAC
 from mcaprl.settings import check_settings
 
 ALGORITHMS: dict[str, type[Learner]] = {

@@ -1,4 +1,4 @@
-"""TD3: twin critics of a deterministic actor, which learns less often than they do.
+"""TD3: twin critics of a deterministic actor, which learns less often than they do; and variants.
 
     https://arxiv.org/abs/1802.09477
         Q_e(s,a)  regression to r + gamma min_e Q'_e(s', a'), where a' = pi'(s') + clipped noise
@@ -7,10 +7,30 @@
                   + anchor (pi(s) - action of the continued policy)^2
 
 Q' and pi' are target networks, averages of the learning networks. The actor and the target networks
-are updated every `policy_interval` and `target_interval` updates of the critics. `td3_bc` and
-`rebrac` have other losses of the actor, for learning from logs alone.
+are updated every `policy_interval` and `target_interval` updates of the critics.
 
 Departure from the paper: the actor learns with the critics from before the update.
+
+For learning from logs alone, TD3+BC has an actor that stays close to the logged actions:
+
+    https://arxiv.org/abs/2106.06860
+        pi        minimize |pi(s) - a_data|^2 - alpha Q_1(s, pi(s)) / mean |Q_1(s, pi(s))|
+
+Departures from the paper: the target networks are averaged faster and the learning rate is larger
+and decays, because logs of robots are small and are trained on for thousands of updates instead of
+a million. The mean of |Q| is that of the batch before the update.
+
+ReBRAC has two weights of cloning, and layer normalization in the critics:
+
+    https://arxiv.org/abs/2305.09836
+        Q_e(s,a)  regression to r + gamma (min_e Q'_e(s', a') - critic_weight |a' - a'_data|^2)
+        pi        minimize actor_weight |pi(s) - a_data|^2 - Q(s, pi(s)) / mean |Q(s, pi(s))|
+
+Here Q is the smaller one of the two critics, and a'_data is the logged action of the next state.
+The last step of an episode has no next logged action; its penalty is 0.
+
+Departures from the paper: batches of 256 instead of 1,024, three layers of 128 instead of 256, and
+those of TD3+BC. The weights depend on the data in the paper; here they have one default.
 """
 
 from __future__ import annotations
@@ -21,7 +41,7 @@ import torch
 from torch import Tensor
 
 from mcaprl.offline.algorithms.actor_critic import ActorCritic
-from mcaprl.offline.algorithms.config import TD3Config
+from mcaprl.offline.algorithms.config import ReBRACConfig, TD3BCConfig, TD3Config
 from mcaprl.offline.algorithms.losses import (
     clipped_double_q_target,
     smoothed_actions,
@@ -83,3 +103,46 @@ class TD3(ActorCritic):
         return self.divided(
             values, self.batch_means(values.detach().abs()).clamp_min(_SMALLEST_VALUE)
         )
+
+
+class TD3BC(TD3):
+    """TD3 with behavior cloning."""
+
+    name = "td3-bc"
+    shares_encoder = False
+    config_type = TD3BCConfig
+    config: TD3BCConfig
+
+    def policy_losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the actor's loss: the squared error minus alpha times the relative value."""
+        actions = self.act(batch.observations)
+        inputs = batch.observations.with_actions(actions)
+        q = self.models["q"](inputs, frozen=True, members=1).squeeze(0)
+        cloning_loss = (actions - batch.actions).square().mean(1)
+        policy_loss = cloning_loss - self.config.alpha * self.relative(q)
+        return {"cloning_loss": cloning_loss, "policy_loss": policy_loss}
+
+
+class ReBRAC(TD3):
+    """TD3 with a penalty on unlike actions in the loss of the actor and in the targets."""
+
+    name = "rebrac"
+    shares_encoder = False
+    config_type = ReBRACConfig
+    config: ReBRACConfig
+
+    def policy_losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the actor's loss: the weighted squared distance minus the relative value."""
+        actions = self.act(batch.observations)
+        q = self.models["q"](batch.observations.with_actions(actions), frozen=True).amin(0)
+        cloning_loss = (actions - batch.actions).square().sum(1)
+        policy_loss = self.config.actor_weight * cloning_loss - self.relative(q)
+        return {"cloning_loss": cloning_loss, "policy_loss": policy_loss}
+
+    def next_penalty(self, batch: Batch, next_actions: Tensor) -> Tensor | float:
+        """Return the weighted squared distances (R,) of next actions from the logged ones."""
+        buffer = self.buffer
+        next_rows = buffer.next_rows.index_select(0, batch.rows)
+        logged = buffer.actions.index_select(0, next_rows.clamp_min(0))
+        distance = (next_actions - logged).square().sum(1)
+        return self.config.critic_weight * distance * (next_rows >= 0)

@@ -103,7 +103,7 @@ class PolicyEstimates:
             actions of a Box.
         estimates: One estimate per estimator.
         support: Fraction of the policy's actions, in the states of the log, that are as near to
-            logged ones as 95 % of the log's own actions are; see `estimate.support`. None for
+            logged ones as 95 % of the log's own actions are; see `box.Support`. None for
             discrete actions, and if all observations are images.
     """
 

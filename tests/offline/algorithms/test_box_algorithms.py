@@ -28,9 +28,8 @@ from mcaprl.offline.algorithms.config import (
 )
 from mcaprl.offline.algorithms.iql import LOG_STD, BoxIQL
 from mcaprl.offline.algorithms.learner import Learner
-from mcaprl.offline.algorithms.rebrac import ReBRAC
 from mcaprl.offline.algorithms.registry import ALGORITHMS, BOX_ALGORITHMS, choose_algorithm
-from mcaprl.offline.algorithms.td3_bc import TD3BC
+from mcaprl.offline.algorithms.td3 import TD3BC, ReBRAC
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.policy import Policy, read_policy, save_policy
 from mcaprl.offline.training.train import best_episodes, train, with_more_data

@@ -22,11 +22,9 @@ from mcaprl.offline.algorithms.losses import (
     squashed_normal_log_density,
     temperature_loss,
 )
-from mcaprl.offline.algorithms.rebrac import ReBRAC
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.algorithms.sac import LOG_TEMPERATURE, SAC
-from mcaprl.offline.algorithms.td3 import TD3
-from mcaprl.offline.algorithms.td3_bc import TD3BC
+from mcaprl.offline.algorithms.td3 import TD3, TD3BC, ReBRAC
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.recorder.dataset.dataset import Dataset
 

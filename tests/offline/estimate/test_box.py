@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 import mcaprl
 from mcaprl.base_policy import BasePolicy, RandomPolicy
 from mcaprl.errors import PolicyError, UsageError
-from mcaprl.offline.estimate.box import BehaviorCheck, BoxEvaluator
+from mcaprl.offline.estimate.box import QUANTILE, BehaviorCheck, BoxEvaluator, Support
 from mcaprl.offline.estimate.evidence import fqe_config
 from mcaprl.offline.estimate.fqe import BoxFQE, BoxFQEConfig
 from mcaprl.offline.estimate.importance import EpisodeTable, usable_steps
 from mcaprl.offline.estimate.off_policy import Estimate, PolicyEstimates, ranking
-from mcaprl.offline.estimate.support import QUANTILE, Support
 from tests.support.offline_tasks import A_LQ, B_LQ, BOX_LQ, COST_LQ, GAMMA
 
 NO_MODEL = BoxFQEConfig(updates=1, batch_size=2, target_interval=1, hidden=(2,), gamma=GAMMA)
