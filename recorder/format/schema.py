@@ -140,7 +140,8 @@ def action_constants(names: Mapping[int, str]) -> dict[str, int]:
     >>> action_constants({0: "brake", 1: "slightly left", 2: "faster north (+x)"})
     {'BRAKE': 0, 'SLIGHTLY_LEFT': 1, 'FASTER_NORTH': 2}
     """
-    # Text in parentheses is removed. Names without letters have no constant.
+    # Names are converted to upper case; text in parentheses is removed, and characters other than
+    # letters and digits become underscores. Names without letters have no constant.
     words: dict[str, int] = {}
     for value, name in names.items():
         word = _constant(re.sub(r"\(.*?\)", "", name)) or _constant(name)
