@@ -6,7 +6,7 @@ import importlib.util
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -49,12 +49,14 @@ def grid() -> gym.Env[Any, Any]:
 class Pocket(gym.Env[Any, Any]):
     """Game whose observations are a Tuple: a position, a phase and an image of it."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
-    render_mode = "rgb_array"
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
     observation_space = spaces.Tuple(
         (spaces.Box(0, 1, (2,)), spaces.Discrete(3), spaces.Box(0, 255, (12, 12, 3), np.uint8))
     )
     action_space = spaces.Discrete(3)
+
+    def __init__(self) -> None:
+        self.render_mode = "rgb_array"
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -309,8 +309,8 @@ def test_an_anchor_keeps_the_actions_of_a_continued_policy(tmp_path: Path, algo:
             changes[anchor] = np.abs(agent.policy.act(observations) - first).mean()
             # A resumed agent has the same anchor.
             other.agents.load_state(agent.agents.state(), agent.agents.counters())
-            for each in (learner, other.agents.learner):
-                each.update()
+            for one in (learner, other.agents.learner):
+                one.update()
             for name, model in learner.all_models().items():
                 assert torch.equal(model.weights, other.agents.learner.all_models()[name].weights)
             assert ("actor_first" in learner.all_models()) == (anchor > 0)
