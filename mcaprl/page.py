@@ -1,6 +1,6 @@
 """Self-contained HTML reports, and Matplotlib figures in one style, drawn without a display.
 
-The page adapts to small screens and follows the system's light or dark mode. Extra: `report`.
+The page adapts to small screens and follows the system's light or dark mode.
 
 Extra: `report`.
 """

@@ -179,7 +179,7 @@ class TrainingProgress:
         done: Number of completed updates or steps.
         total: Total number of updates or steps.
         terms: Measured values, such as the loss; empty where a resumed training continues.
-        activity: What is done while the training waits, such as `evaluating 4 candidates`.
+        activity: What is done while the training waits, such as `evaluating on 20 episodes`.
     """
 
     seed: int
@@ -211,8 +211,9 @@ def terminal_progress(unit: str, *terms: str) -> Iterator[ProgressCallback]:
         TextColumn("{task.fields[shown]}"),
         TimeRemainingColumn(),
     )
-    # For each seed: its bar, and the time and the progress at its first report.
-    started: dict[int, tuple[TaskID, float, int]] = {}
+    # For each seed: its bar, and the time and the progress at its first report of training.
+    started: dict[int, TaskID] = {}
+    first: dict[int, tuple[float, int]] = {}
     with ExitStack() as shown, ExitStack() as waiting:
         waiting.enter_context(terminal_wait("preparing"))
 
@@ -221,14 +222,17 @@ def terminal_progress(unit: str, *terms: str) -> Iterator[ProgressCallback]:
                 waiting.close()
                 shown.enter_context(bars)
             if now.seed not in started:
-                bar = bars.add_task("", total=now.total, seed=now.seed, rate=0.0, shown="")
-                started[now.seed] = bar, time.perf_counter(), now.done
-                if resumed := _text_of_resumed(now, unit):
-                    bars.console.print(resumed, markup=False, highlight=False)
-            bar, began, first = started[now.seed]
-            rate = (now.done - first) / max(time.perf_counter() - began, 1e-9)
-            text = now.activity or _shown_term(now, terms)
-            bars.update(bar, completed=now.done, rate=rate, shown=text)
+                started[now.seed] = bars.add_task(
+                    "", total=now.total, seed=now.seed, rate=0.0, shown=""
+                )
+            bar = started[now.seed]
+            if resumed := _text_of_resumed(now, unit):
+                bars.console.print(resumed, markup=False, highlight=False)
+            bars.update(bar, completed=now.done, shown=now.activity or _shown_term(now, terms))
+            if not now.activity:
+                began, done = first.setdefault(now.seed, (time.perf_counter(), now.done))
+                rate = (now.done - done) / max(time.perf_counter() - began, 1e-9)
+                bars.update(bar, rate=rate)
 
         yield show
 

@@ -35,6 +35,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import CHECKPOINT_NAME, CURVE_NAME, broken_checkpoint, writing
 from mcaprl.sims.evaluation.evaluate import Scale
 from mcaprl.storage.tensor_files import read_tensors, write_tensors
+from mcaprl.texts import counted
 
 LOG_INTERVAL = 1_000
 """Number of environment steps between two rows of scalars, and between two progress reports."""
@@ -148,13 +149,15 @@ class Agent(ABC):
         self._envs.close()
 
     def learn(self, report: ProgressCallback) -> None:
-        """Train and evaluate until all steps are done; report every `LOG_INTERVAL` steps."""
+        """Train and evaluate to the end; report every `LOG_INTERVAL` steps and around evaluations."""
         self.resumed_at = self.steps
         if self.steps >= self._task.config.steps:
             return
         self._began_s = time.perf_counter()
         if self.resumed_at:
             report(TrainingProgress(self._seed, self.resumed_at, self._task.config.steps, {}))
+        else:
+            self.tell(report, "preparing")
         path = self._folder / PROGRESS_NAME
         with closing(ScalarsWriter(path, STEPS_COLUMN, self.steps)) as self._scalars:
             self._train(report)
@@ -165,7 +168,9 @@ class Agent(ABC):
         """Evaluate and report if this is due after a step that began at `before` steps."""
         config, now = self._task.config, self.steps
         if is_due(before, now, min(config.eval_interval, config.steps)):
+            self.tell(report, f"evaluating on {counted(config.eval_episodes, 'episode')}")
             self._evaluate()
+            self.tell(report)
         if is_due(before, now, LOG_INTERVAL):
             self._report(report)
 
@@ -199,11 +204,16 @@ class Agent(ABC):
         speed = (self.steps - self.resumed_at) / max(seconds, 1e-9)
         times = {"time/time_elapsed": seconds, "time/fps": float(int(speed))}
         self._write({**times, **self.scalars()})
-        terms = {"score": math.nan, "mean_return": math.nan}
-        if self.points:
-            last = self.points[-1]
-            terms = {"score": last.score, "mean_return": last.mean_return}
-        report(TrainingProgress(self._seed, self.steps, self._task.config.steps, terms))
+        self.tell(report)
+
+    def tell(self, report: ProgressCallback, activity: str = "") -> None:
+        """Report the steps, the results of the last evaluation, and what is done meanwhile."""
+        last = self.points[-1] if self.points else None
+        terms = {
+            "score": last.score if last else math.nan,
+            "mean_return": last.mean_return if last else math.nan,
+        }
+        report(TrainingProgress(self._seed, self.steps, self._task.config.steps, terms, activity))
 
     def _write(self, scalars: dict[str, float]) -> None:
         """Write a row of scalars, without those that are NaN."""

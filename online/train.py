@@ -46,6 +46,7 @@ from mcaprl.runs import (
 )
 from mcaprl.sims.evaluation.evaluate import Scale, evaluate
 from mcaprl.sims.evaluation.rollout import warn_of_cuts
+from mcaprl.texts import counted
 
 _SOURCES = "sources"
 """Key of `config.json`. Seeds without a checkpoint start from these paths when a run is resumed."""
@@ -100,10 +101,10 @@ def train(
         check_spaces(task.algo, env.observation_space, env.action_space)
         run = _Run(folder, task, env, logs, data, policy, list(sources), live, numbers)
         run.open(resume)
-        selection = measure_scale(env, episodes=config.eval_episodes, seed=SELECTION_SEED)
-        fresh = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
         bar = terminal_progress("steps", "score", "mean_return")
         with nullcontext(progress) if progress else bar as report:
+            selection = measure_scale(env, episodes=config.eval_episodes, seed=SELECTION_SEED)
+            fresh = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
             summaries = [
                 run.train_seed(number, selection, fresh, report, resume) for number in numbers
             ]
@@ -181,11 +182,13 @@ class _Run:
         with closing(agent):
             agent.start_from(self.data, self._policy_of(seed))
             agent.learn(report)
+        episodes = self.task.config.final_episodes
+        agent.tell(report, f"evaluating the best checkpoint on {counted(episodes, 'new episode')}")
         score = evaluate(
             self.env,
             [agent.best_policy()],
             name=self.task.algo,
-            episodes=self.task.config.final_episodes,
+            episodes=episodes,
             seed=FRESH_SEED,
         )
         warn_of_cuts(itertools.chain(*score.results), str(folder), self.task.sim)

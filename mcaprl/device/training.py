@@ -30,6 +30,7 @@ from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progres
 from mcaprl.runs import locked_run, open_run, seed_folder
 from mcaprl.sims import DeviceSims, make_device_sims
 from mcaprl.sims.evaluation.evaluate import Scale, evaluate
+from mcaprl.texts import counted
 
 SETTINGS: Final[dict[str, Any]] = {
     "envs": 2_048,
@@ -101,14 +102,19 @@ def train(
                 save_policy(mine, agents.learner, number, env_id, task.sim_options)
 
         bar = terminal_progress("steps", "mean_reward")
-        with nullcontext(progress) if progress else bar as report, fast_products():
-            _train(agents, folder, report, save)
-        seconds = time.perf_counter() - began_s
-        scale = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
-        summaries = [
-            _summary(env, task, seed_folder(folder, number), number, agents.steps, seconds, scale)
-            for number in agents.learner.seeds
-        ]
+        with nullcontext(progress) if progress else bar as report:
+            with fast_products():
+                _train(agents, folder, report, save)
+            seconds = time.perf_counter() - began_s
+            activity = f"evaluating on {counted(config.final_episodes, 'new episode')}"
+            report(TrainingProgress(numbers[-1], agents.steps, config.steps, {}, activity))
+            scale = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
+            summaries = [
+                _summary(
+                    env, task, seed_folder(folder, number), number, agents.steps, seconds, scale
+                )
+                for number in numbers
+            ]
         write_scores(folder, summaries, scale, config.final_episodes)
     return summaries
 

@@ -81,6 +81,13 @@ def test_progress_has_the_results_of_the_last_evaluation(tmp_path: Path) -> None
     assert np.isnan(reported[0].terms["mean_return"])
     assert reported[-1].terms["mean_return"] in curve["mean_return"]
     assert np.isnan(reported[-1].terms["score"]), "CartPole has no pilot"
+    assert [now.activity for now in reported if now.activity] == [
+        "preparing",
+        "evaluating on 3 episodes",
+        "evaluating the best checkpoint on 4 new episodes",
+    ]
+    evaluation = [now.activity for now in reported].index("evaluating on 3 episodes")
+    assert reported[evaluation + 1].terms["mean_return"] == curve["mean_return"][0]
 
 
 def test_the_curve_has_a_row_for_each_evaluation(trained: OnlineSummary) -> None:
