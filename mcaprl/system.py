@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -75,6 +76,12 @@ def read_at(descriptor: int, size: int, place: int) -> bytes:
         return os.read(descriptor, size)
     finally:
         os.lseek(descriptor, before, os.SEEK_SET)
+
+
+def has_display() -> bool:
+    """Return whether programs can open a window."""
+    has_windows = sys.platform in ("win32", "darwin")
+    return has_windows or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
 
 
 def memory_maps() -> Any:

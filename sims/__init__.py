@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -22,6 +23,7 @@ from mcaprl.errors import McaprlError, UnknownNameError, UsageError, import_extr
 from mcaprl.lazy import lazy_attributes
 from mcaprl.sims import highway, lane, powerline, racer
 from mcaprl.sims.spec import SimCatalog, SimSpec
+from mcaprl.system import has_display
 
 if TYPE_CHECKING:
     from mcaprl.base_policy import BasePolicy as Policy
@@ -62,6 +64,9 @@ def make_sim(name: str, /, **kwargs: Any) -> gym.Env[Any, Any]:
         UsageError: The environment does not accept an argument, or creating it fails.
     """
     env_id, spec = _resolve(name)
+    if kwargs.get("render_mode") == "rgb_array" and not has_display():
+        # SDL prints an error while it looks for a display, which images do not need.
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     with _clear_errors(name, spec, kwargs):
         env = gym.make(env_id, **kwargs)
     _set_module([env], env_id)

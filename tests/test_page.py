@@ -21,7 +21,7 @@ from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.recorder.viewer.report import dataset_page, tracks_of
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.evaluate import PolicyScore
-from mcaprl.sims.evaluation.report import comparison_figure, evaluation_page
+from mcaprl.sims.evaluation.report import comparison_figure, comparison_notes, evaluation_page
 from mcaprl.sims.evaluation.rollout import EpisodeResult
 from tests.conftest import need
 
@@ -190,7 +190,7 @@ def test_an_interval_is_drawn_within_the_returns() -> None:
     episodes = tuple((EpisodeResult(k, 3.0 + k, 1, "", np.empty((0, 2))),) for k in range(3))
     for interval, line, has_arrows in (((3.2, 3.9), [3.2, 3.9], False), ((-9, 20), [3, 5], True)):
         score = PolicyScore("cql", episodes, 3.5, interval)
-        axes = comparison_figure([score], "", None).axes[0]
+        axes = comparison_figure([score], "", None, notes=comparison_notes([score])).axes[0]
         drawn = [each.get_xdata().tolist() for each in axes.lines if len(each.get_xdata()) == 2]
         assert line in drawn
         assert ("arrow" in axes.get_xlabel()) is has_arrows

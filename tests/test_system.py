@@ -96,6 +96,18 @@ def test_the_logs_are_those_of_this_system(there: Path, tmp_path: Path) -> None:
     assert (here.rewards == elsewhere.rewards[: len(here)]).all()
 
 
+@pytest.mark.parametrize("display", ["", ":0"])
+def test_images_are_rendered_without_a_display(
+    monkeypatch: pytest.MonkeyPatch, display: str
+) -> None:
+    for name in ("WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("DISPLAY", display)
+    mcaprl.make_sim("CartPole-v1", render_mode="rgb_array").close()
+    assert os.environ.get("SDL_VIDEODRIVER") == (None if display else "dummy")
+
+
 def test_bytes_are_read_at_a_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_bytes(b"0123456789")
     descriptor = os.open(tmp_path / "file", os.O_RDONLY)

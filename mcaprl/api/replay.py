@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 import warnings
 import webbrowser
@@ -60,6 +58,7 @@ from mcaprl.recorder.viewer.video import (
 )
 from mcaprl.sims import SIMS, make_sim
 from mcaprl.storage.remote import as_path, is_url
+from mcaprl.system import has_display
 
 _Images = Iterator[NDArray[np.uint8]]
 _STILLS, _MOST_DIALS, _HEIGHTS_PX = 12, 8, (16, 4320)
@@ -477,7 +476,7 @@ def browse(
     labels = partial(_labels, data)
     with closing(PageServer(page, port=port, labels=labels, label=label, **settings)) as server:
         on_open(server.url)
-        if show and _has_display():
+        if show and has_display():
             webbrowser.open(server.url)
         with suppress(KeyboardInterrupt):
             server.run(stop or threading.Event())
@@ -540,9 +539,3 @@ def _labels(data: str | Path) -> dict[str, Any]:
         return {"labels": read_labels(Path(data)).to_json(), "problem": ""}
     except LogError as error:
         return {"labels": Labels("").to_json(), "problem": str(error)}
-
-
-def _has_display() -> bool:
-    """Return whether a browser can open a window. Otherwise, `webbrowser` runs text browsers."""
-    has_windows = sys.platform in ("win32", "darwin")
-    return has_windows or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))

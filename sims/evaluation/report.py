@@ -53,8 +53,10 @@ def comparison_figure(
     title: str,
     behavior: tuple[float, float, float] | None,
     width: float = 8.0,
+    notes: Sequence[str] = (),
 ) -> Any:
     """Draw mean returns with intervals, a dot per training seed, and `behavior` as a band."""
+    # `notes` are lines below the axis.
     figure, axes = new_figure((width, 0.62 * len(scores) + 1.8))
     if behavior is not None:
         mean, low, high = behavior
@@ -78,16 +80,21 @@ def comparison_figure(
     axes.set_yticks(range(len(scores)), tick_labels(score.policy for score in scores))
     axes.invert_yaxis()
     axes.set_xlim(right=axes.get_xlim()[1] * 1.28)
-    label = "mean return; line: 95 % interval; dots: training seeds"
-    if any(_exceeds_returns(score) for score in scores):
-        label += "\narrow: bootstrap-t interval of few, skewed returns; evaluate more episodes"
-    if not all(score.has_interval for score in scores):
-        label += "\nno interval of 2 seeds, which have one difference; train 3 or more"
-    axes.set_xlabel(label)
+    axes.set_xlabel("\n".join(notes))
     axes.set_title(title)
     if behavior is not None:
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)
     return figure
+
+
+def comparison_notes(scores: Sequence[PolicyScore]) -> list[str]:
+    """Return what the figure of a comparison shows, and what is wrong with its intervals."""
+    notes = ["mean return; line: 95 % interval; dots: training seeds"]
+    if any(_exceeds_returns(score) for score in scores):
+        notes.append("arrow: bootstrap-t interval of few, skewed returns; evaluate more episodes")
+    if not all(score.has_interval for score in scores):
+        notes.append("no interval of 2 seeds, which have one difference; train 3 or more")
+    return notes
 
 
 def _exceeds_returns(score: PolicyScore) -> bool:
@@ -152,9 +159,12 @@ def evaluation_page(
 ) -> None:
     """Write FOLDER/index.html, comparison.png and trajectories.png."""
     # `recorded` is a log, and the number of first policies in `scores` whose episodes it contains.
-    save_png(comparison_figure(scores, "mean return", behavior), folder / "comparison.png")
-    comparison = comparison_figure(scores, "", behavior, width=5.6)
-    figures = [Figure.of("Mean returns", comparison)]
+    notes = comparison_notes(scores)
+    image = comparison_figure(scores, "mean return", behavior, notes=notes)
+    save_png(image, folder / "comparison.png")
+    # Phones show this width with letters of the size of the page's small print.
+    comparison = comparison_figure(scores, "", behavior, width=4.4)
+    figures = [Figure.of("; ".join(notes).capitalize(), comparison)]
     sections = [
         Section("Scores", figures=figures, table=_score_table(scores)),
         Section("Probability of improvement", _PAIRS, table=_improvement_table(compared)),
@@ -191,7 +201,9 @@ def _score_table(scores: Sequence[PolicyScore]) -> Table:
     ]
     # A phone shows the first columns only.
     names = ("policy", "mean return", "score", "success", "95 % interval", "IQM", "median", "ends")
-    return Table(names, rows)
+    # Most environments have neither a pilot nor a known success.
+    shown = [k for k in range(len(names)) if any(row[k] for row in rows)]
+    return Table([names[k] for k in shown], [[row[k] for k in shown] for row in rows])
 
 
 def _improvement_table(compared: Sequence[Improvement]) -> Table:

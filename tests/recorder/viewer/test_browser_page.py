@@ -454,6 +454,18 @@ def test_the_camera_follows_the_vehicle(browser: Browser, log: Path) -> None:
         assert not is_red(center_color(browser)), "the vehicle leaves a camera at rest"
         browser.press("f")
         assert is_red(center_color(browser))
+        # After a drag, the camera is turned back at the first press, and goes on to follow.
+        browser.run("scene.camera.position.x += 40; scene.controls.dispatchEvent({ type: 'end' })")
+        browser.press("f")
+        assert is_red(center_color(browser))
+        assert browser.run("get('follow').getAttribute('aria-pressed')") == "true"
+        # The walls of a building around the camera do not hide the vehicle.
+        browser.run("""(() => {
+          const building = mesh(UNIT.box, { color: new libraries.Color("#00f"), opacity: 1 });
+          building.position.copy(scene.camera.position);
+          scene.scene.add(building);
+        })()""")
+        assert is_red(center_color(browser))
         assert browser.problems == []
 
 
@@ -600,6 +612,8 @@ def test_a_log_without_a_scene_has_plots(browser: Browser, tmp_path: Path) -> No
             "Observation",
         ]
         assert "0.5" in browser.run("document.querySelector('.bars').innerText")
+        # The name of a bar is not far from the bar.
+        assert browser.run("document.querySelector('.bars').clientWidth") < 300
         assert browser.problems == []
 
 

@@ -339,7 +339,7 @@ const KEYS = {
   PageUp: () => turn(-1),
   PageDown: () => turn(1),
   ...LABEL_KEYS,
-  f: () => follow(get("follow").getAttribute("aria-pressed") !== "true"),
+  f: () => follow(get("follow").getAttribute("aria-pressed") !== "true" || scene?.isTurned),
   a: () => above(get("above").getAttribute("aria-pressed") !== "true"),
 };
 

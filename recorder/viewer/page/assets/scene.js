@@ -23,6 +23,7 @@ class SceneView {
     this.camera.up.set(0, 0, 1);
     this.controls = new libraries.OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", () => this.render());
+    this.controls.addEventListener("end", () => { this.isTurned = true; });
     const sun = new libraries.DirectionalLight(0xffffff, 1.8);
     sun.position.set(-0.4, -0.6, 1);
     this.scene.add(new libraries.HemisphereLight(0xffffff, 0x8a8f94, 1.7), sun);
@@ -137,6 +138,7 @@ class SceneView {
 
   /** Place the camera behind the vehicle; without a vehicle, in front of all shapes. */
   placeCamera() {
+    this.isTurned = false;
     const now = this.vehicle(), tilt = this.log.tilt_deg * Math.PI / 180;
     let distance = this.log.distance_m, heading = 0;
     if (now) {
@@ -231,8 +233,9 @@ function shapeObject(shapes, index) {
   return object;
 }
 
+/** The walls of a closed shape are not drawn from inside, so that a camera in a building sees out. */
 function material(look) {
-  return new libraries.MeshLambertMaterial({ ...look, flatShading: true, side: libraries.DoubleSide });
+  return new libraries.MeshLambertMaterial({ ...look, flatShading: true });
 }
 
 function mesh(geometry, look) {
@@ -243,7 +246,7 @@ function trianglesObject(points, look) {
   const geometry = new libraries.BufferGeometry();
   geometry.setAttribute("position", new libraries.BufferAttribute(points, 3));
   geometry.computeVertexNormals();
-  return mesh(geometry, look);
+  return mesh(geometry, { ...look, side: libraries.DoubleSide });
 }
 
 function linesObject(kind, points, look, width) {
