@@ -67,13 +67,15 @@ def layout_of(
     without_q: Collection[str] = (),
     episodes: int = 0,
     sensors: Mapping[str, str] | None = None,
+    agreement: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Return the layout for a log with these topics."""
     # `training`: titles of live metrics by field. `sensors`: types of a robot's topics by name.
+    # `agreement`: share of the steps at which a policy takes the logged action, by its topic.
     # A policy with Q-values is shown first.
     ordered = sorted(topics, key=lambda topic: (is_values_topic(topic), topic in without_q))
     found = (metadata, ordered, telemetry_names, follow_frame, training or {}, without_q, episodes)
-    screens = _Screens(*found, sensors or {})
+    screens = _Screens(*found, sensors or {}, agreement or {})
     nodes = {"Drive": screens.drive(), "Learning": screens.learning(), "Data": screens.data()}
     return {
         "configById": {"Tab!screens": panels.tabs(nodes), **screens.found},
@@ -106,6 +108,7 @@ class _Screens:
     without_q: Collection[str]
     episodes: int
     sensors: Mapping[str, str]
+    agreement: Mapping[str, float]
     found: dict[str, Panel] = field(default_factory=dict)
 
     def drive(self) -> Node:
@@ -259,8 +262,10 @@ class _Screens:
         if _MEAN_RETURN in self.training:
             # Viewers keep live data of the panels on the screen alone.
             returns = {self.training[_MEAN_RETURN]: f"{TRAINING_TOPIC}.{_MEAN_RETURN}"}
+        # As a line, rewards of 0 and 1 fill the plot of a long log.
+        reward = panels.points(panels.plot("reward", {"reward": f"{panels.STEPS}.reward"}), 2)
         plots: list[Node] = [
-            self._plot("reward", "reward", {"reward": f"{panels.STEPS}.reward"}),
+            self._put("Plot!reward", reward),
             self._plot("return", next(iter(returns)), returns),
         ]
         rows = [[*lights, *plots]] if len(lights) < 2 else [lights, plots]
@@ -346,13 +351,14 @@ class _Screens:
 
     def _returns(self) -> list[tuple[Node, float]]:
         """Add the return of each episode, and an overview of the episodes."""
-        paths = {"return": f"{EPISODE_TOPIC}.total_reward"}
+        path = f"{EPISODE_TOPIC}.total_reward"
+        returns = panels.points(panels.plot("return of each episode", {"return": path}), 4)
         rows: dict[str, str] = {"episode": f"{panels.STEPS}.episode"}
         rows["how the episode before ended"] = f"{EPISODE_TOPIC}.reason"
         overview = panels.state_transitions("episodes", rows)
         share = panels.share_of_transitions(len(rows))
         return [
-            (self._plot("returns", "return of each episode", paths), 0.4),
+            (self._put("Plot!returns", returns), 0.4),
             (self._put("StateTransitions!episodes", overview), share),
         ]
 
@@ -404,8 +410,9 @@ class _Screens:
             self._put(f"Plot!{title} now", now),
             self._plot(f"{title} errors", f"{title}: {label}", errors),
         ]
+        share = f"{self.agreement[topic]:.0%} of " if topic in self.agreement else ""
         agreement = panels.state_transitions(
-            f"{title}: agreement with the actions of the log", {"agrees": f"{topic}.agrees"}
+            f"{title}: agrees with {share}the actions of the log", {"agrees": f"{topic}.agrees"}
         )
         rows = [
             (self._put(f"Tab!{title} over time", panels.tabs(over_time)), 0.46),

@@ -159,9 +159,13 @@ def plot(title: str, paths: Mapping[str, str], *, values: bool = False, **option
 
 def points_by_index(title: str, paths: Mapping[str, str]) -> Panel:
     """Return a plot of arrays in the latest message, with one point for each element."""
-    panel = plot(title, paths, xAxisVal="index", isSynced=False)
+    return points(plot(title, paths, xAxisVal="index", isSynced=False), 4)
+
+
+def points(panel: Panel, size: float) -> Panel:
+    """Show the series of a plot as points instead of lines."""
     for series in panel["paths"]:
-        series |= {"showLine": False, "lineSize": 4}
+        series |= {"showLine": False, "lineSize": size}
     return panel
 
 

@@ -343,6 +343,7 @@ def layout_of_log(
     topics: Sequence[str] | None = None,
     shown: ShownTopics | None = None,
     without_q: Collection[str] = (),
+    agreement: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Return a layout that shows the topics of a log and plots its series."""
     own = sorted({channel.topic for channel in reader.channels.values()})
@@ -351,7 +352,9 @@ def layout_of_log(
         names, frame = telemetry, _first_frame(reader)
     else:
         names, frame = list(shown.telemetry_names), shown.follow_frame
-    empty = [topic for topic in own if is_values_topic(topic) and not _has_q(reader, topic)]
+    values = [topic for topic in own if is_values_topic(topic)]
+    empty = [topic for topic in values if not _has_q(reader, topic)]
+    shares = {topic: _agreement(reader, topic) for topic in values}
     return layout_of(
         describe(reader),
         own if topics is None else topics,
@@ -364,6 +367,8 @@ def layout_of_log(
             for channel in reader.channels.values()
             if channel.schema_id in reader.schemas and not channel.topic.startswith("/rl/")
         },
+        agreement={topic: share for topic, share in shares.items() if share is not None}
+        | dict(agreement or {}),
     )
 
 
@@ -372,6 +377,14 @@ def _has_q(reader: McapReader, topic: str) -> bool:
     values = Topic(reader, topic)
     found = values.read(("q",), np.arange(min(1, len(values.times))))["q"]
     return bool(np.isfinite(found.astype(np.float64)).any())
+
+
+def _agreement(reader: McapReader, topic: str) -> float | None:
+    """Return the share of steps at which a policy agrees with the log; None of Box actions."""
+    values = Topic(reader, topic)
+    if "agrees" not in values.fields or not len(values):
+        return None
+    return float(values.read(("agrees",))["agrees"].mean())
 
 
 def attached_layout(reader: McapReader) -> dict[str, Any]:
@@ -422,6 +435,7 @@ class AnnotatedCopy:
         self._topics = {channel.topic for channel in source.channels.values()}
         self._display: Display | None = None
         self._without_q: set[str] = set()
+        self._agreement: dict[str, float] = {}
 
     def add_values(
         self, topic: str, episodes: Sequence[tuple[NDArray[np.int64], Mapping[str, Any]]]
@@ -437,6 +451,9 @@ class AnnotatedCopy:
         rows = self._log.values_rows(topic)
         if not any(np.isfinite(columns["q"]).any() for _, columns in episodes):
             self._without_q.add(topic)
+        agrees = [columns["agrees"] for _, columns in episodes if "agrees" in columns]
+        if agrees:
+            self._agreement[topic] = float(np.concatenate(agrees).mean())
         for times_ns, columns in episodes:
             rows.write_columns(times_ns, columns)
 
@@ -497,7 +514,7 @@ class AnnotatedCopy:
         mcap = self._log.mcap
         topics = sorted({channel.topic for channel in mcap.channels.values()})
         shown = None if self._display is None else self._display.shown
-        layout = layout_of_log(self._source, topics, shown, self._without_q)
+        layout = layout_of_log(self._source, topics, shown, self._without_q, self._agreement)
         data, time_ns = layout_bytes(layout), mcap.end_time_ns
         mcap.announce(Attachment(time_ns, time_ns, LAYOUT_NAME, "application/json", data))
 

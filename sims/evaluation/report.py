@@ -57,7 +57,7 @@ def comparison_figure(
 ) -> Any:
     """Draw mean returns with intervals, a dot per training seed, and `behavior` as a band."""
     # `notes` are lines below the axis.
-    figure, axes = new_figure((width, 0.62 * len(scores) + 1.8))
+    figure, axes = new_figure((width, 0.62 * len(scores) + (1.8 if notes else 1.2)))
     if behavior is not None:
         mean, low, high = behavior
         axes.axvspan(low, high, color=PALE, alpha=0.45, lw=0)

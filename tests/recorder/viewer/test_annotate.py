@@ -27,7 +27,12 @@ from mcaprl.offline.estimate.values import (
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.topic import Topic
 from mcaprl.recorder.record.layout import LAYOUT_NAME
-from mcaprl.recorder.viewer.annotate import annotated_copy, values_topics
+from mcaprl.recorder.viewer.annotate import (
+    annotated_copy,
+    attached_layout,
+    layout_of_log,
+    values_topics,
+)
 from mcaprl.recorder.viewer.surprises import moments_of
 from mcaprl.sims import make_sim
 from tests.support.layouts import check_layout
@@ -260,6 +265,10 @@ def test_annotating_keeps_all_messages_and_adds_values(plain: Path, tmp_path: Pa
         copy.add_values("/rl/values", columns)
     assert mcaprl.open(out).fingerprint == data.fingerprint
     old, new = McapReader(plain), McapReader(out)
+    even = np.concatenate([each["agrees"] for _, each in columns]).mean()
+    for layout in (attached_layout(new), layout_of_log(new)):
+        title = layout["configById"]["StateTransitions!values"]["foxglovePanelTitle"]
+        assert title == f"values: agrees with {even:.0%} of the actions of the log"
     assert new.metadata == old.metadata
     assert new.complete
     head = old.summary_start - 13

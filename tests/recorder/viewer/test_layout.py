@@ -269,8 +269,13 @@ def test_policies_with_values_are_first(tmp_path: Path) -> None:
     path = annotated(recorded(tmp_path / "log.mcap", "lane"), tmp_path / "annotated.mcap", names)
     reader = McapReader(path)
     metadata, topics = describe(reader), ["/rl/values/a", "/rl/values/b"]
-    layout = layout_of(metadata, topics, without_q=["/rl/values/a"], episodes=7)
+    layout = layout_of(
+        metadata, topics, without_q=["/rl/values/a"], episodes=7, agreement={topics[1]: 0.834}
+    )
     panels = layout["configById"]
+    titles = [panels[f"StateTransitions!values/{each}"]["foxglovePanelTitle"] for each in "ab"]
+    assert titles[0] == "values/a: agrees with the actions of the log"
+    assert titles[1] == "values/b: agrees with 83% of the actions of the log"
     shown = [tab["title"] for tab in panels["Tab!policies"]["tabs"]]
     assert shown == ["values/b", "values/a"]
     # The policy without values has plots of its probabilities alone.
