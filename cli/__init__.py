@@ -12,6 +12,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import click
@@ -102,6 +103,10 @@ def run(arguments: Sequence[str] | None = None) -> int:
         click.echo(error.format_message(), err=True)
         return error.exit_code
     except click.UsageError as error:
+        if isinstance(error, click.NoSuchOption):
+            # Click names options that are less alike.
+            near = get_close_matches(error.option_name, error.possibilities or (), cutoff=0.75)
+            error.possibilities = near
         command = error.ctx.command_path if error.ctx else "mcaprl"
         return _fail(f"{error.format_message()} (see {command} --help)", error.exit_code)
     except click.ClickException as error:

@@ -113,8 +113,8 @@ class _Screens:
 
     def drive(self) -> Node:
         """Return views of the scene and instruments, for watching the vehicle while it drives."""
-        beside = self._instruments()
         views = self._images()
+        beside = self._instruments(is_wide=not views and _SCENE not in self.topics)
         if _SCENE not in self.topics:
             if not views:
                 return beside
@@ -253,8 +253,11 @@ class _Screens:
         last = {topic: re.split(r"[/.]", kind)[-1] for topic, kind in self.sensors.items()}
         return [topic for topic, kind in sorted(last.items()) if kind in kinds]
 
-    def _instruments(self) -> Node:
-        """Add the gauge, the indicator, plots of reward, return and telemetry, and the actions."""
+    def _instruments(self, is_wide: bool) -> Node:
+        """Add the gauge, the indicator, plots of reward, return and telemetry, and the actions.
+
+        In a wide area without a gauge, the indicator is a narrow strip.
+        """
         lights = [*self._gauge(), *self._indicator()]
         returns = {"return of each episode": f"{EPISODE_TOPIC}.total_reward"}
         if RETURN_SO_FAR in self.telemetry:
@@ -268,15 +271,17 @@ class _Screens:
             self._put("Plot!reward", reward),
             self._plot("return", next(iter(returns)), returns),
         ]
-        rows = [[*lights, *plots]] if len(lights) < 2 else [lights, plots]
+        rows = [panels.stack(lights, "row"), panels.stack(plots, "row")]
+        if len(lights) < 2:
+            rows = [panels.split(*rows, "row", 16.0 if is_wide else 33.3)]
         watched = [name for name in self.telemetry if name.endswith(_WATCHED)]
         if watched:
             title = "offsets, steering" if len(watched) > 1 else watched[0]
-            rows.insert(1, [self._plot("drive", title, panels.telemetry_series(watched))])
+            rows.insert(1, self._plot("drive", title, panels.telemetry_series(watched)))
         elif observed := panels.observation_series(self.metadata):
-            rows.append([self._plot("drive", "observation", observed)])
+            rows.append(self._plot("drive", "observation", observed))
         actions, share = self._actions()
-        sizes = [(panels.stack(row, "row"), (1 - share) / len(rows)) for row in rows]
+        sizes = [(row, (1 - share) / len(rows)) for row in rows]
         return panels.weighted([*sizes, (actions, share)], "column")
 
     def _gauge(self) -> list[Node]:

@@ -431,6 +431,7 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         (["train"], 2, "did you mean train-online or train-offline?"),
         (["xyz"], 2, "No such command 'xyz'"),
         (["info", "--jsn", str(LANE_LOG)], 2, "--json"),
+        (["record", "lane", "--json"], 2, "No such option '--json'. (see mcaprl record"),
     ],
 )  # fmt: skip
 def test_mistakes_are_one_line(

@@ -401,6 +401,8 @@ def test_the_browser_shows_an_episode(browser: Browser, log: Path) -> None:
         # The bars of a step range from its worst action to its best.
         widths = browser.run("[...document.querySelectorAll('.bar')].map((e) => e.style.width)")
         assert widths == ["0%", "50%", "100%"] * 2
+        # Names of bins differ in their ends.
+        assert browser.run("cut('x from 0.9 and z from 0.2', 22)") == "x from 0.9\u2026 z from 0.2"
         # The last reward has a width: it lasts until the end of the episode.
         assert browser.run("[...plots[0].plot.data[1]]") == [0.5, 1, 1.5, 2, 2.5, 2.5]
 

@@ -260,6 +260,11 @@ def test_the_window_of_actions_has_80_steps(tmp_path: Path) -> None:
     for sim, last_s in (("lane", 20.0), ("racer", 8.0), ("CartPole-v1", 1.6)):
         panels = check_layout(recorded(tmp_path / f"{sim}.mcap", sim))["configById"]
         actions = panels["StateTransitions!actions"]
+        root = panels["Tab!screens"]["tabs"][0]["layout"]
+        if sim == "CartPole-v1":
+            # Without a gauge and images, the indicator is a strip beside the plots.
+            assert root["first"]["first"] == "Indicator!state"
+            assert root["first"]["splitPercentage"] == 16
         assert (actions["xAxisRange"], actions["isSynced"]) == (last_s, False)
         assert actions["foxglovePanelTitle"] == f"the last {last_s:g} s"
 

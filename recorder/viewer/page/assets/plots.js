@@ -56,7 +56,7 @@ class TimePlot {
     const [ink, pale] = ["--ink", "--pale"].map((name) => style.getPropertyValue(name).trim());
     const axis = { stroke: ink, grid: { stroke: pale, width: 0.5 }, ticks: { stroke: pale, width: 0.5 } };
     const { names } = this.options;
-    const labels = names?.map((name) => cut(name, 20));
+    const labels = names?.map((name) => cut(name, 22));
     const vertical = labels
       ? {
         size: 16 + 6.5 * Math.max(...labels.map(({ length }) => length)),
@@ -114,8 +114,9 @@ class TimePlot {
   }
 }
 
+/** Shorten the middle of a text: names of bins differ in their ends. */
 function cut(text, most) {
-  return text.length > most ? `${text.slice(0, most - 1)}\u2026` : text;
+  return text.length > most ? `${text.slice(0, most / 2 - 1)}\u2026${text.slice(-most / 2)}` : text;
 }
 
 /** Create the plots of an episode. */
