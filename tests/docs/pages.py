@@ -63,6 +63,8 @@ ADDED = {
 # Without one of these options, `replay` runs until Ctrl-C.
 REPLAY_ENDS = {"--verify", "--video", "--contact-sheet", "--save"}
 SERVER_STARTS = "press Ctrl-C"
+# CPU time from which on a block of commands is slow, and distance of the words that announce it.
+SLOW_S, NEAR = 90.0, 500
 LONGEST_SERVICE_S = 120.0
 # A command that ends before it serves ends like other commands.
 INTERRUPTED = "interrupted"
@@ -121,6 +123,7 @@ class Run:
         In a quick run, run them in this process.
         """
         script: list[str] = []
+        began_s = _cpu_s()
         for line in commands(example.parsed):
             words = shlex.split(line)
             if self._other_program(words):
@@ -133,6 +136,11 @@ class Run:
             else:
                 script.append(line)
         _sh(script)
+        spent_s, region = _cpu_s() - began_s, example.region
+        near = example.document.text[max(region.start - NEAR, 0) : region.end + NEAR]
+        assert self.quick or spent_s < SLOW_S or re.search(r"\b(minute|hour)s?\b", near), (
+            f"{example.path}:{example.line}: {spent_s:.0f} s of CPU time are not announced"
+        )
 
     def compare(self, example: Example) -> None:
         """Compare an `output` block with the output of the last block."""
@@ -247,6 +255,12 @@ def _serve(words: list[str]) -> int:
 def _allow_interrupts() -> None:
     """Restore Ctrl-C, which shells disable for programs in the background."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _cpu_s() -> float:
+    """Return the CPU time of all processes that this one has started and that have ended."""
+    spent = os.times()
+    return spent.children_user + spent.children_system
 
 
 def _query(example: Example) -> None:

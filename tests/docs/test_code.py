@@ -6,6 +6,7 @@ import re
 import shlex
 import sys
 import tomllib
+from contextlib import nullcontext
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -61,6 +62,15 @@ def test_a_page_runs_with_small_numbers(
 @pytest.mark.parametrize("page", with_code())
 def test_a_page_runs_as_written(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run_page(page, tmp_path, monkeypatch, quick=False)
+
+
+def test_slow_commands_are_announced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.docs.pages.SLOW_S", 0.05)
+    page = tmp_path / "page.md"
+    for text, is_announced in (("", False), ("  # about two minutes", True)):
+        page.write_text(f"```sh\npython -c 'sum(range(10**7))'{text}\n```\n")
+        with nullcontext() if is_announced else pytest.raises(AssertionError, match="announced"):
+            Run(quick=False).page(page)
 
 
 def test_the_readme_code_runs_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
