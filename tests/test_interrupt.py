@@ -84,6 +84,13 @@ def test_elsewhere_a_signal_acts_at_once() -> None:
         signal.raise_signal(signal.SIGTERM)
 
 
+def test_windows_sends_signals_to_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.delattr(signal, "pthread_kill")
+    with pytest.raises(KeyboardInterrupt):
+        _interrupt.send_to_main_thread(signal.SIGTERM)
+
+
 def test_other_lost_exceptions_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     class Finalized:
         def __del__(self) -> None:

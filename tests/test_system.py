@@ -33,6 +33,11 @@ for module, names in {
     for name in names:
         vars(module).pop(name, None)
 
+def link(*_arguments, **_options):
+    raise OSError("this file system has no links")
+
+os.link = link
+
 from mcaprl import system
 
 # The standard library's processes need masks of signals.
@@ -94,6 +99,17 @@ def test_the_logs_are_those_of_this_system(there: Path, tmp_path: Path) -> None:
     here, elsewhere = mcaprl.open(tmp_path / "log.mcap"), mcaprl.open(there / "log.mcap")
     assert (here.actions == elsewhere.actions[: len(here)]).all()
     assert (here.rewards == elsewhere.rewards[: len(here)]).all()
+
+
+def test_a_log_is_kept_by_a_copy_where_files_cannot_be_linked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = pytest.importorskip("mcaprl.online.recording")
+    monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(OSError("no links")))
+    (tmp_path / "log").write_bytes(b"all")
+    recording._keep(tmp_path / "log", tmp_path / "log.uncut")
+    (tmp_path / "log").write_bytes(b"cut")
+    assert (tmp_path / "log.uncut").read_bytes() == b"all"
 
 
 @pytest.mark.parametrize("display", ["", ":0"])
