@@ -273,7 +273,7 @@ class _Screens:
         ]
         rows = [panels.stack(lights, "row"), panels.stack(plots, "row")]
         if len(lights) < 2:
-            rows = [panels.split(*rows, "row", 16.0 if is_wide else 33.3)]
+            rows = [panels.split(rows[0], rows[1], "row", 16.0 if is_wide else 33.3)]
         watched = [name for name in self.telemetry if name.endswith(_WATCHED)]
         if watched:
             title = "offsets, steering" if len(watched) > 1 else watched[0]
