@@ -106,7 +106,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         if isinstance(error, click.NoSuchOption):
             # Click names options that are less alike.
             near = get_close_matches(error.option_name, error.possibilities or (), cutoff=0.75)
-            error.possibilities = near
+            error = click.NoSuchOption(error.option_name, possibilities=near, ctx=error.ctx)
         command = error.ctx.command_path if error.ctx else "mcaprl"
         return _fail(f"{error.format_message()} (see {command} --help)", error.exit_code)
     except click.ClickException as error:
