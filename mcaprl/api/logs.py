@@ -27,7 +27,7 @@ from mcaprl.page import PAGE_NAME
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.dataset.open import find_logs
-from mcaprl.recorder.dataset.quality import Flaw, flaws, ranked, topic_flaws
+from mcaprl.recorder.dataset.quality import Flaw, flaws
 from mcaprl.recorder.dataset.statistics import Calibration, calibration
 from mcaprl.recorder.format.behavior import PROBABILITY
 from mcaprl.recorder.format.metadata import METADATA_NAME
@@ -39,8 +39,9 @@ from mcaprl.storage.remote import is_url
 from mcaprl.texts import counted, size
 
 if TYPE_CHECKING:
-    from mcaprl.recorder.bags.bag import Bag
+    from mcaprl.recorder.bags.bag import OpenBag
     from mcaprl.recorder.bags.overview import Recording, TopicOverview
+    from mcaprl.recorder.mapping.topic_quality import Looked
     from mcaprl.recorder.repair.recover import Recovery
 
 _LONGEST_SPACE = 90
@@ -179,14 +180,13 @@ def info(
             docs/bags.md.
         quality: Whether to look for faults of the data, which become `quality` of the result,
             ranked by the share of the data; see docs/howto/quality.md. Of a bag without a mapping,
-            the times of its topics are evaluated.
+            the topics are evaluated: times, repeated messages, and frames of cameras.
         test: Data that is held out, as `data`: its episodes must not be in `data`. Needs `quality`.
 
     Raises:
         LogError: A log or bag cannot be read.
         SpaceError: `test` has other spaces than `data`.
-        UsageError: A report is requested for a bag without a mapping, or `test` without `quality`
-            or for such a bag.
+        UsageError: `test` is passed without `quality`, or for a bag without a mapping.
         MissingExtraError: The packages of the `report` extra are not installed.
         ReportError: The report cannot be written.
     """
@@ -200,11 +200,12 @@ def info(
         contents = _dataset_or_bag(data, threads, definitions, quality=quality)
     warned = [str(warning.message) for warning in caught]
     if isinstance(contents, BagInfo):
-        if report is not None:
-            raise UsageError("a report of a bag needs a mapping: pass `mapping=FILE`")
         if test is not None:
             raise UsageError("test data of a bag need a mapping: pass `mapping=FILE`")
-        return replace(contents, problems=[*warned, *contents.problems])
+        bag = replace(contents, problems=[*warned, *contents.problems])
+        if report is not None:
+            _bag_report(Path(report), bag)
+        return bag
     if contents.origin.report is not None:
         warned = list(dict.fromkeys([*warned, *map(str, contents.origin.report.problems())]))
     found = _describe(contents, warned)
@@ -223,6 +224,17 @@ def info(
         findings = [*(found.quality or ()), *found.findings]
         dataset_page(folder / PAGE_NAME, contents, found.title, found.rows(), findings)
     return found
+
+
+def _bag_report(folder: Path, bag: BagInfo) -> None:
+    from mcaprl.recorder.viewer.report import bag_page
+
+    write_json(folder / "bag.json", bag.to_json(), ReportError)
+    problems = [Problem(text, "") for text in bag.problems]
+    tables = {"Topics": (bag.topic_columns, bag.topic_rows())}
+    if len(bag.recordings) > 1:
+        tables["Recordings"] = (bag.recording_columns, bag.recording_rows())
+    bag_page(folder / PAGE_NAME, bag.title, bag.rows(), tables, [*(bag.quality or ()), *problems])
 
 
 def _dataset_or_bag(
@@ -453,7 +465,9 @@ class BagInfo:
         topics: Topics by name.
         problems: Files that were cut off, warnings of the reader, and topics that cannot be read.
         next: Command to run next.
-        quality: What is wrong with the times of the topics; None if it was not asked for.
+        quality: What is wrong with the topics, ranked; None if it was not asked for.
+        looked: Numbers of messages, and of those that were compared and decoded, of each topic
+            that `quality` compared.
     """
 
     sources: tuple[Path, ...]
@@ -463,6 +477,7 @@ class BagInfo:
     problems: list[str]
     next: str
     quality: list[Flaw] | None = None
+    looked: dict[str, Looked] = field(default_factory=dict, repr=False)
 
     topic_columns: ClassVar = [
         "topic",
@@ -485,6 +500,7 @@ class BagInfo:
 
     def to_json(self) -> dict[str, Any]:
         """Return what `info --json` prints for a bag."""
+        looked = {name: each._asdict() for name, each in self.looked.items()}
         recordings = [
             {**asdict(each), "paths": list(map(str, each.paths))} for each in self.recordings
         ]
@@ -497,6 +513,7 @@ class BagInfo:
             "problems": self.problems,
             "next": self.next,
             **_quality_json(self.quality),
+            **({} if self.quality is None else {"looked": looked}),
         }
 
     def rows(self) -> list[tuple[str, str]]:
@@ -511,6 +528,14 @@ class BagInfo:
         ]
         if used:
             rows.append(("begins", _date(min(each.first_ns for each in used))))
+        looked = list(self.looked.values())
+        if looked:
+            compared, among = sum(each.compared for each in looked), [e.messages for e in looked]
+            rows.append(("compared", f"{compared} of {counted(sum(among), 'message')}"))
+        if any(each.decoded for each in looked):
+            frames = [(e.decoded, e.messages) for e in looked if e.decoded]
+            decoded, among = (sum(each) for each in zip(*frames, strict=True))
+            rows.append(("decoded", f"{decoded} of {counted(among, 'frame')}"))
         return rows
 
     def topic_rows(self) -> list[list[str]]:
@@ -564,7 +589,7 @@ def bag_info(
             topics={topic.info.name: BagTopic.of(topic) for topic in topics},
             problems=_problems(bag, topics),
             next=_next(data, topics),
-            quality=_quality_of(topics) if quality else None,
+            **_quality_of(bag, topics, quality=quality),
         )
 
 
@@ -572,12 +597,16 @@ def _quality_json(quality: list[Flaw] | None) -> dict[str, Any]:
     return {} if quality is None else {"quality": [flaw.to_json() for flaw in quality]}
 
 
-def _quality_of(topics: list[TopicOverview]) -> list[Flaw]:
-    found = [topic_flaws(one.info.name, one.times_ns, one.recordings) for one in topics]
-    return ranked([flaw for each in found for flaw in each])
+def _quality_of(bag: OpenBag, topics: list[TopicOverview], *, quality: bool) -> dict[str, Any]:
+    if not quality:
+        return {}
+    from mcaprl.recorder.mapping.topic_quality import bag_flaws
+
+    found, looked = bag_flaws(bag, topics)
+    return {"quality": found, "looked": looked}
 
 
-def _opened(data: Paths, definitions: Definitions = ()) -> Bag | None:
+def _opened(data: Paths, definitions: Definitions = ()) -> OpenBag | None:
     from mcaprl.recorder.bags.bag import open_bag
 
     if any(map(is_url, [data] if isinstance(data, str | Path) else data)):
@@ -592,7 +621,7 @@ def _opened(data: Paths, definitions: Definitions = ()) -> Bag | None:
     return bag
 
 
-def _problems(bag: Bag, topics: list[TopicOverview]) -> list[str]:
+def _problems(bag: OpenBag, topics: list[TopicOverview]) -> list[str]:
     found = [
         f"{path} has no end, because its writer was killed or is still running: messages after its"
         f" last whole record are lost, unless `mcaprl recover {path} OUT` finds some"

@@ -362,6 +362,14 @@ class _Topic:
             time_ns, raw = next(messages[k])
             yield time_ns, sources[k], raw
 
+    def payloads(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, bytes]]:
+        chosen = self._order[rows]
+        for k, (_, source) in enumerate(self._used):
+            mine = np.flatnonzero(chosen[:, 2] == k)
+            for row, raw in zip(rows[mine].tolist(), source.raw(chosen[mine, 3]), strict=True):
+                if not raw.problem:
+                    yield row, raw.data
+
     def messages(self) -> Iterator[BagMessage]:
         """Yield the messages that can be decoded, in the order of recording."""
         for time_ns, source, raw in self.raw():
@@ -577,6 +585,17 @@ class OpenBag:
             LogError: The file is damaged, or no message of the topic can be decoded.
         """
         return self._readable(topic).failures()
+
+    def payloads(self, topic: str, rows: NDArray[np.int64]) -> Iterator[tuple[int, bytes]]:
+        """Yield index and bytes of each of the messages `rows`, which are distinct and ascending.
+
+        Messages that cannot be decompressed are left out. If the topic has several channels or
+        files, the messages of one come after those of the other.
+
+        Raises:
+            LogError: The file is damaged.
+        """
+        return self._topic(topic).payloads(rows)
 
     def checksum(self, recording: int) -> str:
         """Return the SHA-256 of what the files of a recording list of their messages."""

@@ -34,21 +34,21 @@ Rows = NDArray[np.int64]
 
 LAGS: Final = 8
 """Longest lag that is sought between a command and its effect, steps."""
-_NS_PER_S: Final = 1e9
-_SHOWN: Final = 3
-_PLACES: Final = 20
+NS_PER_S: Final = 1e9
+SHOWN: Final = 3
+PLACES: Final = 20
 _IMAGE: Final = 256
 _ELEMENTS: Final = 64
 _ROWS: Final = 20_000
 _KNOWN: Final = 4_000
 _USUAL: Final = 0.95
 """Share of steps in which a value must change so that a pause of it is strange."""
-_HELD: Final = 5
+HELD: Final = 5
 _DEAD: Final = 10
-_DROP: Final = 1.75
-_JITTER: Final = 0.1
+DROP: Final = 1.75
+JITTER: Final = 0.1
 _CLOCK: Final = 20.0
-_DARK: Final = 4
+DARK: Final = 4
 _CLIPPED: Final = 0.2
 _LEAK: Final = 0.95
 _EFFECT: Final = 0.02
@@ -74,6 +74,22 @@ class Place(NamedTuple):
             return f"episode {self.episode} step {self.first}, {self.from_s:.2f} s"
         steps = f"steps {self.first} to {self.last}, {self.from_s:.2f} to {self.to_s:.2f} s"
         return f"episode {self.episode} {steps}"
+
+
+class TopicPlace(NamedTuple):
+    """Messages of a topic, both included, and their times since the bag's beginning, seconds."""
+
+    topic: str
+    first: int
+    last: int
+    from_s: float
+    to_s: float
+
+    def __str__(self) -> str:
+        """Return messages and times."""
+        if self.first == self.last:
+            return f"message {self.first}, {self.from_s:.2f} s"
+        return f"messages {self.first} to {self.last}, {self.from_s:.2f} to {self.to_s:.2f} s"
 
 
 class Plot(NamedTuple):
@@ -104,7 +120,7 @@ class Flaw(Problem):
     share: float = 0.0
     figure: float = 0.0
     unit: str = ""
-    places: tuple[Place, ...] = ()
+    places: tuple[Place | TopicPlace, ...] = ()
     plot: Plot | None = None
 
     def to_json(self) -> dict[str, Any]:
@@ -164,7 +180,7 @@ class _Table:
         """Return the place of two rows of steps in one episode."""
         start = self.times_ns[self.of_step[first] - self.step[first]]
         ends = self.times_ns[self.of_step[[first, last]]] - start
-        from_s, to_s = (ends / _NS_PER_S).tolist()
+        from_s, to_s = (ends / NS_PER_S).tolist()
         index = self.episodes[self.owner[first]].index
         return Place(index, int(self.step[first]), int(self.step[last]), from_s, to_s)
 
@@ -189,18 +205,24 @@ class _Table:
 
 def _flaw(table: _Table, runs: Sequence[tuple[int, int]], what: str, **more: Any) -> Flaw:
     """Return the flaw of some runs of steps."""
-    places = tuple(table.place(*run) for run in runs[:_PLACES])
-    rest = f" and {len(runs) - _SHOWN} more" if len(runs) > _SHOWN else ""
+    places = tuple(table.place(*run) for run in runs[:PLACES])
     share = sum(last - first + 1 for first, last in runs) / len(table.dataset)
     return Flaw(
         what,
-        "; ".join(map(str, places[:_SHOWN])) + rest or "all steps",
+        shown(places, len(runs)) or "all steps",
         places=places,
         **{"share": share} | more,
     )
 
 
-def _longest(runs: Sequence[tuple[int, int]]) -> tuple[int, int]:
+def shown(places: Sequence[Place | TopicPlace], count: int) -> str:
+    """Return the first of `count` places as text."""
+    rest = f" and {count - SHOWN} more" if count > SHOWN else ""
+    return "; ".join(map(str, places[:SHOWN])) + rest
+
+
+def longest(runs: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """Return the longest of runs, given as first and last row."""
     return max(runs, key=lambda run: run[1] - run[0])
 
 
@@ -212,8 +234,8 @@ def _images(table: _Table) -> Iterator[Flaw]:
             spread.append(np.ptp(frames.astype(np.float32), axis=1)[:-1])
             still.append((frames[1:] == frames[:-1]).all(1))
         ranges, same = np.concatenate(spread), np.concatenate(still)
-        blank = ranges <= _DARK
-        if blank.all() or (blank.any() and np.median(ranges[~blank]) > 5 * _DARK):
+        blank = ranges <= DARK
+        if blank.all() or (blank.any() and np.median(ranges[~blank]) > 5 * DARK):
             runs = table.runs(blank)
             yield _flaw(
                 table,
@@ -224,15 +246,15 @@ def _images(table: _Table) -> Iterator[Flaw]:
                 unit="range of the pixels",
                 next="check exposure, lens cap and cable, and leave these steps out:"
                 " `Dataset.without`",
-                plot=table.around(ranges, *_longest(runs), "range of the pixels"),
+                plot=table.around(ranges, *longest(runs), "range of the pixels"),
             )
         same &= ~blank
         runs = table.runs(same, 2)
-        if runs and _usual(same, runs):
+        if runs and is_usual(same, runs):
             yield _frozen(table, runs, f"frames of {leaf.name}", 1.0 - same, "1 if it changes")
 
 
-def _usual(same: Flags, runs: Sequence[tuple[int, int]]) -> bool:
+def is_usual(same: Flags, runs: Sequence[tuple[int, int]]) -> bool:
     """Return whether the value changes in nearly all steps that are in no run."""
     held = sum(last - first + 1 for first, last in runs)
     return bool(same.sum() - held <= (1 - _USUAL) * (len(same) - held))
@@ -241,8 +263,8 @@ def _usual(same: Flags, runs: Sequence[tuple[int, int]]) -> bool:
 def _frozen(
     table: _Table, runs: Sequence[tuple[int, int]], name: str, values: Floats, label: str
 ) -> Flaw:
-    longest = _longest(runs)
-    steps = longest[1] - longest[0] + 1
+    worst = longest(runs)
+    steps = worst[1] - worst[0] + 1
     return _flaw(
         table,
         runs,
@@ -252,7 +274,7 @@ def _frozen(
         unit="steps",
         next="check the driver and the time limit of the topic (`gap_s`), and leave these steps"
         " out: `Dataset.without`",
-        plot=table.around(values, *longest, label),
+        plot=table.around(values, *worst, label),
     )
 
 
@@ -265,7 +287,7 @@ def _held(table: _Table) -> Iterator[Flaw]:
     size = np.abs(table.changes[:, moving] / table.frames[:, moving].std(0)).sum(1)
     runs = [
         run
-        for run in table.runs(same, _HELD)
+        for run in table.runs(same, HELD)
         if _jumps(table, size, run) and _others_move(table, run)
     ]
     if runs and same.mean() <= 1 - _USUAL:
@@ -342,14 +364,14 @@ def _dead(table: _Table) -> Iterator[Flaw]:
 
 
 def _times(table: _Table) -> Iterator[Flaw]:
-    intervals_s = table.intervals_ns / _NS_PER_S
+    intervals_s = table.intervals_ns / NS_PER_S
     usual_s = float(np.median(intervals_s))
     if usual_s <= 0 or len(intervals_s) < 10:
         return
     sizes = np.linalg.norm(table.changes / np.maximum(table.frames.std(0), 1e-12), axis=1)
     calm = sizes <= 3 * np.median(sizes)
     clock = (intervals_s < 0) | ((intervals_s > _CLOCK * usual_s) & calm & (sizes > 0))
-    drops = ~clock & (intervals_s > _DROP * usual_s)
+    drops = ~clock & (intervals_s > DROP * usual_s)
     if clock.any():
         runs = table.runs(clock)
         worst = float(intervals_s[clock][np.abs(intervals_s[clock]).argmax()])
@@ -362,7 +384,7 @@ def _times(table: _Table) -> Iterator[Flaw]:
             figure=worst,
             unit="s",
             next="set the clock before recording, or take other times: `time` in the mapping",
-            plot=table.around(intervals_s, *_longest(runs), _INTERVAL),
+            plot=table.around(intervals_s, *longest(runs), _INTERVAL),
         )
     if drops.any():
         runs = table.runs(drops)
@@ -376,15 +398,15 @@ def _times(table: _Table) -> Iterator[Flaw]:
             unit="steps",
             share=lost / (len(table.dataset) + lost),
             next="record with less load, or divide episodes at gaps: `gap_s` in the mapping",
-            plot=table.around(intervals_s, *_longest(runs), _INTERVAL),
+            plot=table.around(intervals_s, *longest(runs), _INTERVAL),
         )
     yield from _jitter(intervals_s, usual_s, intervals_s[~clock & ~drops], table)
 
 
 def _jitter(intervals_s: Floats, usual_s: float, rest: Floats, table: _Table) -> Iterator[Flaw]:
     jitter = robust_spread(rest) / usual_s
-    if jitter > _JITTER:
-        far = np.abs(intervals_s - usual_s) > _JITTER * usual_s
+    if jitter > JITTER:
+        far = np.abs(intervals_s - usual_s) > JITTER * usual_s
         counts, edges = np.histogram(rest, 30)
         yield _flaw(
             table,
@@ -403,75 +425,6 @@ def _jitter(intervals_s: Floats, usual_s: float, rest: Floats, table: _Table) ->
 def robust_spread(values: Floats) -> float:
     """Return the median absolute deviation in the scale of a standard deviation."""
     return float(1.4826 * np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
-
-
-def topic_flaws(name: str, times_ns: Rows, recordings: Rows) -> list[Flaw]:
-    """Return what is wrong with the times of a topic of a bag.
-
-    Topics without a steady rate, such as events, are not evaluated: half of the intervals
-    must be within a tenth of the median.
-
-    Args:
-        name: Name of the topic.
-        times_ns: (N,) log_time of each message, in the order of recording.
-        recordings: (N,) index of the recording of each message.
-    """
-    intervals_s = np.diff(times_ns) / _NS_PER_S
-    inside = np.diff(recordings) == 0
-    ahead = intervals_s[inside & (intervals_s > 0)]
-    if len(ahead) < 10:
-        return []
-    usual_s = float(np.median(ahead))
-    jitter = robust_spread(ahead) / usual_s
-    back = inside & (intervals_s < -usual_s)
-    steady = float((np.abs(ahead - usual_s) <= _JITTER * usual_s).mean()) >= 0.5
-    drops = inside & (intervals_s > _DROP * usual_s) & steady
-    lost = int(np.rint(intervals_s[drops] / usual_s - 1).sum())
-    found = []
-    for kind, flags, what, figure, share, todo in (
-        (
-            "clock",
-            back,
-            f"{name}: the time goes back {int(back.sum())} times",
-            -float(intervals_s.min(initial=0.0)),
-            float(back.mean()),
-            "take other times (`time: header` in the mapping), or split the bag there",
-        ),
-        (
-            "drops",
-            drops,
-            f"{name}: about {counted(lost, 'message')} are missing at {1 / usual_s:.3g} Hz",
-            float(lost),
-            lost / (len(times_ns) + lost),
-            "record with less load, or with a larger queue",
-        ),
-    ):
-        rows = np.flatnonzero(flags)
-        if len(rows):
-            seconds = (times_ns[rows] - times_ns[0]) / _NS_PER_S
-            where = ", ".join(f"{one:.2f} s" for one in seconds[:_SHOWN])
-            more = f" and {len(rows) - _SHOWN} more" if len(rows) > _SHOWN else ""
-            unit = "s" if kind == "clock" else "messages"
-            found.append(
-                Flaw(
-                    what, where + more, next=todo, kind=kind, figure=figure, unit=unit, share=share
-                )
-            )
-    if steady and jitter > _JITTER:
-        found.append(_topic_jitter(name, ahead, usual_s, jitter))
-    return found
-
-
-def _topic_jitter(name: str, ahead_s: Floats, usual_s: float, jitter: float) -> Flaw:
-    return Flaw(
-        f"{name}: the intervals vary by {jitter:.0%} of {usual_s:.4g} s",
-        "all messages",
-        next="take a fixed rate: `clock.rate_hz` in the mapping",
-        kind="jitter",
-        figure=jitter,
-        unit="of the median",
-        share=float((np.abs(ahead_s - usual_s) > _JITTER * usual_s).mean()),
-    )
 
 
 def _saturated(table: _Table) -> Iterator[Flaw]:
@@ -501,7 +454,7 @@ def _saturated(table: _Table) -> Iterator[Flaw]:
                 next="check the limits of the controller"
                 if inside
                 else "unless this is bang-bang control, widen the limits of the controller",
-                plot=table.around(part.astype(np.float64), *_longest(runs), name),
+                plot=table.around(part.astype(np.float64), *longest(runs), name),
             )
 
 
@@ -576,7 +529,7 @@ def _lag(table: _Table) -> Iterator[Flaw]:
             plot=plot,
         )
     elif best > 0 and effects[best] > max(3 * effects[0], _EFFECT):
-        seconds = best * float(np.median(table.intervals_ns)) / _NS_PER_S
+        seconds = best * float(np.median(table.intervals_ns)) / NS_PER_S
         yield _flaw(
             table,
             [],
@@ -762,10 +715,10 @@ def _copied(dataset: Dataset, indexes: list[int], what: str) -> Flaw:
         figure=float(len(copies)),
         unit="episodes",
         places=tuple(
-            Place(one.index, 0, len(one) - 1, 0.0, float(np.ptp(one.log_time_ns)) / _NS_PER_S)
+            Place(one.index, 0, len(one) - 1, 0.0, float(np.ptp(one.log_time_ns)) / NS_PER_S)
             for one in dataset.episodes
             if one.index in copies
-        )[:_PLACES],
+        )[:PLACES],
         plot=Plot("episode", "copy", list(range(len(flags))), flags, is_bars=True),
     )
 

@@ -445,7 +445,7 @@ class ImageReader:
         needed, places = np.unique(rows, return_inverse=True)
         wanted = needed
         if poses is None:
-            images = self._images(needed)
+            images = self.images(needed)
         else:
             pairs = np.column_stack([rows.reshape(-1), poses.reshape(rows.size, -1)])
             pairs, places = np.unique(pairs, axis=0, return_inverse=True)
@@ -590,8 +590,11 @@ class ImageReader:
             f" {first.log_time_ns} ns: {first.reason}"
         )
 
-    def _images(self, rows: NDArray[np.int64]) -> Decoded:
-        """Yield the messages with readable images among `rows`, which ascend."""
+    def images(self, rows: NDArray[np.int64]) -> Decoded:
+        """Yield the messages with readable images among `rows`, which ascend.
+
+        With B-frames of a video, the result does not ascend.
+        """
         if self._video is not None:
             yield from self._frames(self._video, rows)
             return

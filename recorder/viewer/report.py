@@ -83,6 +83,23 @@ def dataset_page(
     write_page(path, title, lead, sections)
 
 
+def bag_page(
+    path: Path,
+    title: str,
+    facts: Sequence[tuple[str, str]],
+    tables: Mapping[str, tuple[Sequence[str], Sequence[Sequence[str]]]],
+    findings: Sequence[Problem],
+) -> None:
+    """Write an HTML page about a bag: facts, findings with their plots, and tables by title."""
+    sections = [
+        Section("Overview", table=Table(("", ""), facts)),
+        _findings_section(findings),
+        *_plots_section(findings),
+        *(Section(name, table=Table(*table)) for name, table in tables.items()),
+    ]
+    write_page(path, title, "Topics of a bag, without a mapping", sections)
+
+
 def _findings_section(findings: Sequence[Problem]) -> Section:
     if not findings:
         return Section("Findings", text="No problems were found.")

@@ -12,7 +12,7 @@ from mcap.writer import Writer
 import mcaprl
 from mcaprl.api.logs import BagInfo
 from mcaprl.cli import run
-from mcaprl.errors import LogError, NotMcapError, UsageError
+from mcaprl.errors import LogError, NotMcapError
 from tests.support.bags import (
     START_NS,
     STEP_NS,
@@ -195,8 +195,6 @@ def test_logs_are_shown_as_before(tmp_path: Path) -> None:
     assert found.episodes > 0
     assert found.to_json()["kind"] == "log"
     assert not mcaprl.check(GOLDEN / "discrete.mcap").notes
-    with pytest.raises(UsageError, match="a report of a bag needs a mapping"):
-        mcaprl.info(write_rosbag1(tmp_path / "one.bag"), report=tmp_path / "report")
     (tmp_path / "garbage.bag").write_bytes(b"garbage")
     with pytest.raises(LogError, match="cannot be read as a bag"):
         mcaprl.info(tmp_path / "garbage.bag")

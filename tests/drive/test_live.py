@@ -252,7 +252,7 @@ def compare(sent: list[Sent], tree: dict[str, Any]) -> int:
     plan = Plan(bag, mapping, Place(), trust_code=False)
     for name, reader in plan.images.items():
         rows = np.arange(len(bag.times(reader.topic)))
-        list(reader._images(rows))
+        list(reader.images(rows))
         if reader.packets_ns is not None:
             # Frames of another size are found as they are put into an array.
             reader.read(rows)
