@@ -64,13 +64,14 @@ def info(
     """
     with working("reading data"):
         source = bag_reader(data, bag := bag_options(request))
+        request["test"] = test
+        if test is not None and bag["mapping"] is not None:
+            request["test"] = mcaprl.open(test, **bag)
         selection = {name: request.pop(name) for name in ("only", "mask")}
         if any(selection.values()):
             source = partial(mcaprl.select, source, **selection)
-        if test is not None and bag["mapping"] is not None:
-            request["test"] = mcaprl.open(test, **bag)
-        else:
-            request["test"] = test
+            if test is not None:
+                request["test"] = partial(mcaprl.select, request["test"], **selection)
         found = mcaprl.info(source, report=report, definitions=bag["definitions"], **request)
     if as_json:
         print_json(found.to_json())

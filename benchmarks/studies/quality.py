@@ -4,12 +4,16 @@
 
 Clean data are episodes of sims and of Gymnasium, with other seeds each time. Into each, every
 fault of tests/support/damage/planted.py for which the data are enough is planted at a random place.
+Clean bags are those of a robot that drives and rests, with and without noise, and of the steps of
+the sims; faults are those of tests/support/damage/planted_bags.py, and are found if their messages
+are named exactly.
 A finding in clean data is false if it is a problem; notes are not counted.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import tempfile
 import warnings
 from collections import Counter
@@ -20,6 +24,8 @@ import numpy as np
 
 import mcaprl
 from tests.support.damage.planted import FAULTS, IMAGE_FAULTS, fits
+from tests.support.damage.planted_bags import BAG_FAULTS, clean_robot
+from tests.support.robots import Robot, Topic, write_mcap
 
 CLEAN: Final[dict[str, dict[str, Any]]] = {
     f"{sim}{', continuous' if actions else ''}, {name}": {
@@ -56,7 +62,44 @@ def clean(name: str, seed: int, path: Path) -> mcaprl.Dataset:
     return mcaprl.open(path)
 
 
-def problems(data: mcaprl.Dataset) -> list[Any]:
+BAGS: Final = {"bag, robot": False, "bag, robot without noise": True}
+TOGETHER: Final = (
+    [each for each in BAG_FAULTS if each not in ("black, /camera", "frozen, /camera/compressed")],
+    ["black, /camera", "frozen, /camera/compressed"],
+)
+"""Faults that are planted into a bag together, because they are in different topics."""
+
+
+def steps_of(data: mcaprl.Dataset) -> Robot:
+    """Return a robot with the observations and actions of a log as topics, 10 times a second."""
+    rows = {"/action": data.actions, "/observation": data.observations}
+    found = Robot([])
+    for name, columns in rows.items():
+        parts = columns.values() if isinstance(columns, dict) else [columns]
+        table = np.concatenate([np.asarray(part).reshape(len(data), -1) for part in parts], axis=1)
+        values = [(0.1 * k, {"data": row.tolist()}) for k, row in enumerate(table[:, :64] * 1.0)]
+        found.topics.append(Topic(name, "std_msgs/msg/Float64MultiArray", values))
+    return found
+
+
+def bag_faults(seed: int, path: Path, *, is_sim: bool) -> tuple[list[Any], dict[str, bool]]:
+    """Return the findings in a clean bag, and whether each planted fault is found."""
+    robot, found = clean_robot(seed, is_sim=is_sim), dict[str, bool]()
+    base = problems(write_mcap(robot, path))
+    for names in TOGETHER:
+        bag = copy.deepcopy(robot)
+        planted = {name: BAG_FAULTS[name](bag, np.random.default_rng(seed)) for name in names}
+        flaws = problems(write_mcap(bag, path))
+        hits = {(one.kind, *place[:3]) for one in flaws for place in one.places}
+        found |= {
+            name: (name.partition(",")[0], *place) in hits
+            for name, place in planted.items()
+            if place is not None
+        }
+    return base, found
+
+
+def problems(data: mcaprl.Dataset | Path) -> list[Any]:
     """Return the findings that are no notes."""
     return [flaw for flaw in mcaprl.info(data, quality=True).quality if flaw.severity == "problem"]
 
@@ -76,9 +119,26 @@ def main() -> None:
     found: Counter[str] = Counter()
     print("| clean data | logs | false findings |")
     print("|---|---|---|")
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    for name in (one for one in BAGS if arguments.data in one):
+        wrong = []
+        for seed in seeds:
+            base, hits = bag_faults(seed, path, is_sim=BAGS[name])
+            wrong += base
+            planted.update(f"{kind}, {name}" for kind in hits)
+            found.update(f"{kind}, {name}" for kind, hit in hits.items() if hit)
+            if arguments.show:
+                print("  not found:", seed, [kind for kind, hit in hits.items() if not hit])
+        print(f"| {name} | {arguments.seeds} | {len(wrong)} |", flush=True)
+    for name in (one for one in CLEAN if arguments.data in f"bag of {one}"):
+        robots = (steps_of(clean(name, seed, path)) for seed in seeds)
+        wrong = [one for robot in robots for one in problems(write_mcap(robot, path))]
+        print(f"| bag of {name} | {arguments.seeds} | {len(wrong)} |", flush=True)
+        if arguments.show:
+            print("  false:", *wrong, sep="\n")
     for name in (one for one in (*CLEAN, *IMAGES) if arguments.data in one):
         wrong = []
-        for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
+        for seed in seeds:
             data = clean(name, seed, path)
             base = problems(data)
             wrong += base

@@ -234,6 +234,9 @@ def _images(table: _Table) -> Iterator[Flaw]:
             spread.append(np.ptp(frames.astype(np.float32), axis=1)[:-1])
             still.append((frames[1:] == frames[:-1]).all(1))
         ranges, same = np.concatenate(spread), np.concatenate(still)
+        if leaf.dtype != np.uint8:
+            # Depth has no codes: its largest range counts as the full one.
+            ranges = ranges * (255 / max(float(ranges.max()), 1e-12))
         blank = ranges <= DARK
         if blank.all() or (blank.any() and np.median(ranges[~blank]) > 5 * DARK):
             runs = table.runs(blank)

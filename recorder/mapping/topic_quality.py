@@ -4,10 +4,11 @@ A message is compared with the one before it, without stamps and sequence number
 stands still may repeat its message, too. So a repetition is a fault only if the topic changes in
 nearly all other messages, has the same content nowhere else, and
 
-- jumps afterwards, as what it measures has moved on meanwhile: one of its numbers by at least 1.5
-  times its changes before and after, although a value at rest begins with small or equal ones; or
+- jumps afterwards, as what it measures has moved on meanwhile: half of its moving numbers by at
+  least 1.5 times their changes before and after, while a value at rest begins with small ones; or
 - its numbers are noise, which does not stand still: what they change in two messages is not more
-  than in one. They must change as usual before and after the repetition.
+  than in one, and no other message is like the one before it. They must change as usual before and
+  after the repetition.
 
 Numbers that are held at 0, or at a value that they have elsewhere, prove nothing. Of an
 image, a small copy is read. Frames of videos are compared by this copy, other messages by their
@@ -70,6 +71,7 @@ _LIVELY: Final = 0.95
 _ROUGH: Final = 1.2
 """Ratio of changes in two messages to those in one below which numbers are noise: 1 for white
 noise, 1.4 for a random walk, 2 for a constant speed."""
+_STRAY: Final = 0.001
 _JUMP: Final = 1.5
 _ABRUPT: Final = 0.1
 """Change before and after a repetition, in usual changes, below which the value came to rest."""
@@ -563,6 +565,8 @@ class _Motion:
         order = np.argsort(known)
         at, self._values = np.searchsorted(compared.rows, known[order]), found[order]
         self._place = {row: k for k, row in enumerate(at.tolist())}
+        # Noise is never the same twice, but what stops now and then is.
+        self._is_restless = compared.same[~inside].mean() <= _STRAY
         self._joined, self._outside = compared.joined, self._values[~inside[at]]
         single, double = (
             [
@@ -575,8 +579,8 @@ class _Motion:
         )
         self._is_enough = len(single) >= _FEWEST // 2 and len(double) >= _FEWEST // 4
         if self._is_enough:
-            self._typical, self._top = _median(np.array(single)), np.max(single, axis=0)
-            self._is_rough = _median(np.array(double)) < _ROUGH * self._typical
+            self._typical = _median(single)
+            self._is_rough = _median(double) < _ROUGH * self._typical
 
     def change(self, row: int, steps: int = 1) -> Floats | None:
         """Return the changes (G,) from a message to a later one, if all between them were read."""
@@ -592,7 +596,7 @@ class _Motion:
         if not self._is_enough or last not in self._place:
             return False
         typical, held = self._typical, self._values[self._place[last]]
-        is_noise = self._is_rough
+        is_noise = self._is_rough & self._is_restless
         earlier, before, after, later, latest = map(
             self.change, (first - 3, first - 2, last, last + 1, last + 2)
         )
@@ -610,12 +614,16 @@ class _Motion:
         speeds = [each for each in (before, later) if each is not None]
         if after is None or not speeds:
             return False
-        jumps = usable & ~self._is_rough & (after >= _JUMP * np.max(speeds, axis=0))
-        jumps &= (after >= typical) & (after <= 2 * (last - first + 2) * self._top)
-        return bool((jumps if before is None else jumps & (before >= _ABRUPT * typical)).any())
+        smooth = usable & ~self._is_rough
+        speed, steps = np.max(speeds, axis=0), last - first + 2
+        # A jump that is larger than what was missed is a reset, or a new estimate of the position.
+        jumps = (after >= _JUMP * speed) & (after >= typical) & (after <= _JUMP * steps * speed)
+        if before is not None:
+            jumps &= before >= _ABRUPT * typical
+        return bool(smooth.any() and jumps[smooth].mean() >= 0.5)
 
 
-def _median(changes: Floats) -> Floats:
-    """Return the median (G,) of changes (P, G) that are not 0; 0 if there are none."""
-    parts = [column[column > 0] for column in changes.T]
+def _median(changes: Sequence[Floats]) -> Floats:
+    """Return the median (G,) of changes (G,) that are not 0; 0 if there are none."""
+    parts = [column[column > 0] for column in np.array(changes).T]
     return np.array([np.median(part) if len(part) else 0.0 for part in parts])

@@ -22,7 +22,7 @@ from tests.support.damage import planted as faults
 EPISODES, STEPS = 24, 30
 
 
-def arm(seed: int = 0, *, camera: bool = False) -> Dataset:
+def arm(seed: int = 0, *, camera: bool = False, is_depth: bool = False) -> Dataset:
     """Return episodes of two joints that follow velocity commands with a first-order lag."""
     random = np.random.default_rng(seed)
     columns: dict[str, list[Any]] = {"observations": [], "next_observations": [], "actions": []}
@@ -44,12 +44,15 @@ def arm(seed: int = 0, *, camera: bool = False) -> Dataset:
     arrays: dict[str, Any] = {name: np.array(rows, np.float32) for name, rows in columns.items()}
     space: spaces.Space[Any] = spaces.Box(-np.inf, np.inf, (4,), np.float32)
     if camera:
-        image = spaces.Box(0, 255, (16, 16, 1), np.uint8)
+        dtype: Any = np.float32 if is_depth else np.uint8
+        image = spaces.Box(0, 255, (16, 16, 1), dtype)
         space = spaces.Dict({"camera": image, "joints": space})
         for name in ("observations", "next_observations"):
             joints = arrays[name]
             across = np.arange(256).reshape(16, 16, 1) + 640 * joints[:, :1, None, None]
             pixels = (across % 256).astype(np.uint8)
+            # Of depth, in meters, the whole range is 2.55 m.
+            pixels = (pixels / np.float32(100)).astype(dtype) if is_depth else pixels
             arrays[name] = {"camera": pixels, "joints": joints}
     return Dataset.from_arrays(
         **arrays,
@@ -88,9 +91,10 @@ def test_a_planted_fault_is_found_and_tells_what_to_do(clean: Dataset, kind: str
         assert len(flaw.plot.x) == len(flaw.plot.y)
 
 
+@pytest.mark.parametrize("is_depth", [False, True])
 @pytest.mark.parametrize("kind", faults.IMAGE_FAULTS)
-def test_faults_of_a_camera_are_found_and_a_clean_one_is_not(kind: str) -> None:
-    data = arm(camera=True)
+def test_faults_of_a_camera_are_found_and_a_clean_one_is_not(kind: str, is_depth: bool) -> None:
+    data = arm(camera=True, is_depth=is_depth)
     assert problems(data) == []
     (flaw,) = problems(faults.IMAGE_FAULTS[kind](data, np.random.default_rng(1)))
     assert flaw.kind == kind
@@ -207,6 +211,12 @@ def test_the_command_the_function_and_the_page(
     page = (tmp_path / "page" / "index.html").read_text()
     assert "Plots of the findings" in page
     assert "leave these steps out" in page
+    clean.save(test := tmp_path / "test.mcap")
+    options = ["info", str(log), "--quality", "--json", "--test", str(test)]
+    for more, copies in ([], EPISODES - 1), (["--only", "episode < 2"], 2):
+        facts = json.loads(CliRunner().invoke(cli, [*options, *more]).stdout)
+        (same,) = [one for one in facts["quality"] if one["kind"] == "duplicates"]
+        assert abs(same["figure"] - copies) <= 1
     assert mcaprl.info(log).quality is None
     with pytest.raises(UsageError, match="quality=True"):
         mcaprl.info(log, test=log)

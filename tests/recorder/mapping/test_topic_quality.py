@@ -237,6 +237,28 @@ def test_large_topics_are_read_in_part_and_it_is_said(
     assert text["decoded"] == f"{camera.decoded} of {size} frames"
 
 
+def test_a_mapped_bag_and_its_log_have_the_same_faults_of_the_camera(
+    robot: Robot, tmp_path: Path
+) -> None:
+    """Message k is step k of the episode: the camera is the clock."""
+    bag = part(robot, "/odom", "/cmd_vel", "/camera")
+    repeat(bag, "/camera", 91, 12)
+    blacken(bag, "/camera", 30, 5)
+    path = robots.write_mcap(bag, tmp_path / "bag.mcap")
+    mapping = {
+        "clock": {"topic": "/camera"},
+        "observation": {"camera": {"image": "/camera"}},
+        "action": {"fields": ["/cmd_vel.linear.x"], "box": {"low": -1, "high": 1}},
+    }
+    data = mcaprl.open(path, mapping=mapping)
+    data.save(log := tmp_path / "log.mcap")
+    for source in (data, log):
+        flaws = mcaprl.info(source, quality=True).quality or []
+        places = {one.kind: one.places[0][1:3] for one in flaws if "image" in one.what}
+        assert places == {"black": (30, 34), "frozen": (90, 101)}
+    assert found_in(path) == [("black", "/camera", 30, 34), ("frozen", "/camera", 91, 102)]
+
+
 def test_what_cannot_be_decoded_is_a_note(robot: Robot, tmp_path: Path) -> None:
     bag = part(robot, "/camera")
     for _, values in topic_of(bag, "/camera").messages:
