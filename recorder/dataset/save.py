@@ -18,7 +18,7 @@ from mcaprl.recorder.dataset.packets import Packets
 from mcaprl.recorder.dataset.transitions import Transitions, ranges
 from mcaprl.recorder.format.log_writer import InfoTopics, LogWriter, Message, info_array
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
-from mcaprl.recorder.format.schema import BYTES_PER_CHUNK, STEPS_PER_CHUNK
+from mcaprl.recorder.format.schema import BYTES_PER_CHUNK, LOG_TOPIC, STEPS_PER_CHUNK
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 from mcaprl.recorder.format.video_messages import VIDEO_TEXT, VIDEO_TYPE, video_message
 from mcaprl.recorder.format.writing import McapWriter
@@ -53,12 +53,14 @@ def save_log(
     with replacing(path, LogError, overwrite=overwrite) as unfinished:
         log = LogWriter(unfinished, metadata, compression=compression)
         try:
-            _write_images(path, log, columns)
-            _write_infos(path, log, columns)
-            log.write_episodes([e._replace(episode=k) for k, e in enumerate(columns.episodes)])
-            _write_steps(log, columns)
             if add_topics is not None:
                 add_topics(log.mcap)
+            log.adds_lines = LOG_TOPIC not in {each.topic for each in log.mcap.channels.values()}
+            _write_images(path, log, columns)
+            _write_infos(path, log, columns)
+            summaries = [e._replace(episode=k) for k, e in enumerate(columns.episodes)]
+            log.write_episodes(summaries, log_lines=True)
+            _write_steps(log, columns)
             log.close()
         finally:
             log.mcap.abandon()

@@ -115,6 +115,9 @@ class MessageSink(Protocol):
 class LogTopics:
     """Topics of a log, which are announced and written to a sink."""
 
+    # Whether starts and ends of episodes are written to `/rosout`; not beside a robot's own lines.
+    adds_lines = True
+
     def __init__(
         self, metadata: LogMetadata, sink: MessageSink, *, names_actions: bool = True
     ) -> None:
@@ -133,7 +136,7 @@ class LogTopics:
         sink.add_metadata(METADATA_NAME, strings)
         self._step_channel = sink.add_channel(STEP_TOPIC, name, self._step_text, strings)
         self._episode_channel = self.add_channel(EPISODE_TOPIC, messages.EPISODE_TYPE)
-        self._line_channels: list[int] | None = None
+        self._line_channels: list[int | None] | None = None
 
     def add_channel(self, topic: str, type_name: str) -> int:
         """Announce a topic of a known ROS type and return its channel id."""
@@ -197,13 +200,11 @@ class LogTopics:
         self, time_ns: int, text: str, phase: str, level: int = messages.INFO
     ) -> list[Message]:
         if self._line_channels is None:
-            topics = ((LOG_TOPIC, messages.LOG_TYPE), (PHASE_TOPIC, messages.TEXT_TYPE))
-            self._line_channels = [self.add_channel(*topic) for topic in topics]
-        log, phases = self._line_channels
-        return [
-            (log, time_ns, messages.log_message(time_ns, text, level)),
-            (phases, time_ns, messages.text_message(phase)),
-        ]
+            log = self.add_channel(LOG_TOPIC, messages.LOG_TYPE) if self.adds_lines else None
+            self._line_channels = [log, self.add_channel(PHASE_TOPIC, messages.TEXT_TYPE)]
+        data = messages.log_message(time_ns, text, level), messages.text_message(phase)
+        pairs = zip(self._line_channels, data, strict=True)
+        return [(channel, time_ns, each) for channel, each in pairs if channel is not None]
 
 
 class LogWriter(LogTopics):

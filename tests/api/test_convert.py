@@ -47,6 +47,7 @@ reward: next(speed) - speed
 episodes: {terminated: speed > 5}
 meta: {policy: operator}
 """
+OWN_TOPICS = {"/rl/step", "/rl/episode", "/rl/phase", "/rosout"}
 
 
 @pytest.fixture
@@ -167,7 +168,7 @@ def mixed(tmp_path: Path) -> Path:
         scan = writer.register_schema("sensor_msgs/msg/LaserScan", "ros2msg", b"float32 range_min")
         for topic, encoding, number in (
             *(("/battery", "json", 0), ("/secret", "weird", 0), ("/rl/step", "json", 0)),
-            *(("/front", "json", image), ("/scan", "cdr", scan)),
+            *(("/front", "json", image), ("/scan", "cdr", scan), ("/rosout", "json", 0)),
         ):
             channel_id = writer.register_channel(topic, encoding, number)
             for k in range(3):
@@ -182,7 +183,8 @@ def test_a_converted_bag_keeps_its_own_topics(mixed: Path, tmp_path: Path) -> No
     assert run(["convert", str(mixed), str(plain), *mapping]) == 0
     assert run(["convert", str(mixed), str(out), *mapping, "--keep-topics"]) == 0
     topics = {"/odom", "/tf", "/cmd_vel", "/camera/depth", "/joints", "/battery", "/secret"}
-    topics |= {"/front", "/scan"}
+    # The lines of the robot remain alone on their topic.
+    topics |= {"/front", "/scan", "/rosout"}
     for topic in topics:
         assert _stored(out, topic) == _stored(mixed, topic) != []
     with out.open("rb") as file:
@@ -190,7 +192,7 @@ def test_a_converted_bag_keeps_its_own_topics(mixed: Path, tmp_path: Path) -> No
         in_file = reader.iter_messages(topics, log_time_order=False)
         times = [one.log_time for _, _, one in in_file]
     assert times == sorted(times)
-    assert set(mcaprl.open_bag(out).topics) == {*topics, "/rl/step", "/rl/episode"}
+    assert set(mcaprl.open_bag(out).topics) == {*topics, *OWN_TOPICS}
     # As a dataset, the log is the one without these topics.
     data = mcaprl.open(out)
     assert data.fingerprint == mcaprl.open(plain).fingerprint
@@ -199,7 +201,7 @@ def test_a_converted_bag_keeps_its_own_topics(mixed: Path, tmp_path: Path) -> No
     kept = ["--keep-topic", "/c*", "--keep-topic", "/tf"]
     assert run(["convert", str(mixed), str(some), *mapping, *kept]) == 0
     kept_topics = {"/cmd_vel", "/camera/depth", "/tf"}
-    assert set(mcaprl.open_bag(some).topics) == {*kept_topics, "/rl/step", "/rl/episode"}
+    assert set(mcaprl.open_bag(some).topics) == {*kept_topics, *OWN_TOPICS}
     # The layout shows the camera beside the values.
     panels = mcaprl.layout(out)["configById"]
     assert panels["Image!/front"]["imageMode"]["imageTopic"] == "/front"
@@ -217,6 +219,40 @@ def test_a_converted_bag_keeps_its_own_topics(mixed: Path, tmp_path: Path) -> No
         assert mcaprl.open(tmp_path / "values.mcap").fingerprint == data.fingerprint
 
 
+@pytest.mark.parametrize("kind", ["mcap", "ros1"])
+def test_a_converted_bag_says_how_each_episode_ended(kind: str, tmp_path: Path) -> None:
+    # Episode 0 ends after 3 of the 11 steps with a reason, episode 1 at the next steps.
+    text = MAPPING.replace("speed > 5", "speed == 1.5").replace(
+        "episodes: {", "episodes: {reasons: {fast: speed > 1}, max_steps: 5, "
+    )
+    (tmp_path / "robot.yaml").write_text(text)
+    write = write_rosbag1 if kind == "ros1" else write_rosbag2
+    data = mcaprl.open(write(tmp_path / f"{kind}.bag"), mapping=tmp_path / "robot.yaml")
+    out, again, some = (tmp_path / f"{name}.mcap" for name in ("out", "again", "some"))
+    mcaprl.convert(data, out)
+    mcaprl.convert(out, again)
+    at_ns = [START_NS + k * STEP_NS for k in (0, 3, 4, 9)]
+    lines = [
+        "episode 0 begins, operator acts",
+        "episode 0 ends after 3 steps: fast, return 1.5",
+        "episode 1 begins, operator acts",
+        "episode 1 ends after 5 steps: fast, return 2.5",
+    ]
+    for path in (out, again):
+        with path.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            found = [
+                (one.channel.topic, one.message.log_time, one.decoded_message)
+                for one in reader.iter_decoded_messages(["/rosout", "/rl/phase"])
+            ]
+        assert [(t, m.msg) for name, t, m in found if name == "/rosout"] == [*zip(at_ns, lines)]
+        phases = [(t, m.data) for name, t, m in found if name == "/rl/phase"]
+        assert phases == [*zip(at_ns, ["running", "fast", "running", "fast"])]
+        assert not mcaprl.check(path).problems
+    mcaprl.filter("episode == 1", out, some)
+    assert [one[0] for one in _stored(some, "/rosout")] == at_ns[2:]
+
+
 @pytest.mark.parametrize("kind", ["sqlite3", "zstd", "ros1"])
 def test_topics_of_older_bags_are_kept_with_their_definitions(kind: str, tmp_path: Path) -> None:
     (tmp_path / "robot.yaml").write_text(MAPPING)
@@ -228,7 +264,7 @@ def test_topics_of_older_bags_are_kept_with_their_definitions(kind: str, tmp_pat
     data = mcaprl.open(bag, mapping=tmp_path / "robot.yaml")
     data.save(tmp_path / "out.mcap", keep_topics=["/odom", "/camera/*"])
     kept = mcaprl.open_bag(tmp_path / "out.mcap")
-    assert list(kept.topics) == ["/camera/depth", "/odom", "/rl/episode", "/rl/step"]
+    assert set(kept.topics) == {"/camera/depth", "/odom", *OWN_TOPICS}
     odometry = kept.read("/odom", ["twist.twist.linear.x"])
     assert odometry.columns["twist.twist.linear.x"].tolist() == [speed(k) for k in range(STEPS)]
     assert odometry.log_time_ns.tolist() == [START_NS + k * STEP_NS for k in range(STEPS)]
