@@ -109,11 +109,17 @@ def keep_options(command: F) -> F:
     """Add the options for the topics of a bag that are kept, as the parameter `keep_topics`."""
 
     @functools.wraps(command)
-    def with_topics(*args: Any, keep_all: bool, keep_topic: tuple[str, ...], **given: Any) -> Any:
-        return command(*args, keep_topics=keep_all or keep_topic, **given)
+    def with_topics(
+        *args: Any, keep_all: bool | None, keep_topic: tuple[str, ...], **given: Any
+    ) -> Any:
+        return command(*args, keep_topics=keep_all or keep_topic or keep_all, **given)
 
     every = click.option(
-        "--keep-topics", "keep_all", is_flag=True, help="Keep the bag's own topics beside /rl/*."
+        "--keep-topics/--no-keep-topics",
+        "keep_all",
+        default=None,
+        help="Keep all topics of the bag beside /rl/*, or none. Default: those of `keep` in the"
+        " mapping.",
     )
     some = click.option(
         "--keep-topic",

@@ -126,7 +126,7 @@ def convert(
     lossy: bool = False,
     overwrite: bool = False,
     upload: str | None = None,
-    keep_topics: bool | str | Sequence[str] = False,
+    keep_topics: bool | str | Sequence[str] | None = None,
 ) -> Conversion:
     """Read logs, a bag, or a dataset of another tool, and write a log or a dataset.
 
@@ -140,7 +140,8 @@ def convert(
         overwrite: Whether an existing file or folder is replaced.
         upload: URL to which the written file is copied when it is complete.
         keep_topics: Topics of the bag that are copied to the log, beside `/rl/*`: True for all, or
-            names and patterns such as `/camera/*`.
+            names and patterns such as `/camera/*`; None for those of the mapping's `keep`, False
+            for none.
 
     Raises:
         UsageError: The format to write is not clear, or topics are kept without a bag or a log.

@@ -311,7 +311,7 @@ def annotate(
     trust_env: bool = False,
     trust_code: bool = False,
     sim_options: Mapping[str, Any] | None = None,
-    keep_topics: bool | str | Sequence[str] = False,
+    keep_topics: bool | str | Sequence[str] | None = None,
     overwrite: bool = False,
     progress: ProgressBar = no_progress,
 ) -> Annotation:

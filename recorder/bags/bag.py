@@ -7,7 +7,7 @@ import hashlib
 import heapq
 import operator
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -622,36 +622,48 @@ class OpenBag:
 OpenBag.__module__ = "mcaprl"
 
 
+def matching_topics(topics: Iterable[str], patterns: Sequence[str], where: str = "") -> list[str]:
+    """Return the topics of a bag that patterns such as `/camera/*` select, sorted by name.
+
+    Topics below `/rl/`, which a log writes itself, are left out.
+
+    Raises:
+        UnknownNameError: A pattern has no topic; `where` says where the pattern is from.
+    """
+    names = [name for name in topics if not name.startswith(_OWN_TOPICS)]
+    chosen = set[str]()
+    for pattern in patterns:
+        found = [name for name in names if fnmatch.fnmatchcase(name, pattern)]
+        if not found:
+            raise UnknownNameError(f"topic{where}", pattern, names)
+        chosen |= {*found}
+    return sorted(chosen)
+
+
 def copy_topics(
     paths: Sequence[Path],
     definitions: Sequence[str | Path],
     patterns: Sequence[str],
     mcap: McapWriter,
+    where: str = "",
 ) -> None:
     """Copy topics of a bag to another file: bytes, schemas and times, in the order of log_time.
 
-    Topics below `/rl/`, which a log writes itself, are left out. The messages in memory are
-    bounded; their index is not.
+    The messages in memory are bounded; their index is not.
 
     Args:
         paths: Files of the bag.
         definitions: Files and folders with definitions of ROS types that the bag lacks.
-        patterns: Names of topics, or patterns such as `/camera/*`.
+        patterns: Names of topics, or patterns such as `/camera/*`; see `matching_topics`.
         mcap: Writer of the file.
+        where: Where the patterns are from, for errors.
 
     Raises:
         UnknownNameError: A pattern has no topic.
         LogError: The bag cannot be read, or the type of a topic is not known.
     """
     with open_bag(paths, definitions=definitions) as bag:
-        names = [name for name in bag._topics if not name.startswith(_OWN_TOPICS)]
-        chosen = set[str]()
-        for pattern in patterns:
-            found = [name for name in names if fnmatch.fnmatchcase(name, pattern)]
-            if not found:
-                raise UnknownNameError("topic", pattern, names)
-            chosen |= {*found}
-        topics = [bag._topics[name] for name in sorted(chosen)]
+        topics = [bag._topics[name] for name in matching_topics(bag._topics, patterns, where)]
         ids, undone = dict[TopicSource, int](), 0
         for topic in topics:
             for source in topic.sources:

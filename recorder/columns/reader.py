@@ -204,6 +204,11 @@ class McapReader:
             )
         return found[0] if found else None
 
+    def type_of(self, channel: Channel) -> str:
+        """Return the name of the type of a channel's messages; empty if it has no schema."""
+        schema = self.schemas.get(channel.schema_id)
+        return schema.name if schema is not None else ""
+
     def schema_of(self, channel: Channel) -> Schema:
         """Return the schema of a channel."""
         schema = self.schemas.get(channel.schema_id)

@@ -614,7 +614,7 @@ class Dataset(Conversions):
         *,
         compression: str = "zstd",
         overwrite: bool = False,
-        keep_topics: bool | str | Sequence[str] = False,
+        keep_topics: bool | str | Sequence[str] | None = None,
     ) -> None:
         """Write the dataset as one log; `mcaprl.open` reads back an equal dataset.
 
@@ -624,7 +624,7 @@ class Dataset(Conversions):
             overwrite: Whether to replace an existing file.
             keep_topics: Topics of the bag that the data was read from, to be copied beside
                 `/rl/*` with their bytes, schemas and times: True for all, or names and patterns
-                such as `/camera/*`.
+                such as `/camera/*`; None for those of the mapping's `keep`, False for none.
 
         Raises:
             OutputExistsError: The file exists and `overwrite` is not set.
@@ -634,18 +634,20 @@ class Dataset(Conversions):
         """
         from mcaprl.recorder.dataset.save import save_log
 
-        add_topics, copy = None, self.origin.copy_topics
+        add_topics, copy, where = None, self.origin.copy_topics, ""
+        if keep_topics is None:
+            keep_topics, where = self.origin.keep, " in `keep` of the mapping"
         if keep_topics:
             if copy is None:
                 raise UsageError("keep_topics is for data that were read from a bag by a mapping")
             if self.origin.is_shifted:
                 raise LogError(
                     f"{path}: the topics of the bag cannot be kept, because its recordings overlap"
-                    " in time: convert them one by one"
+                    " in time: convert them one by one, or keep none"
                 )
             patterns = ["*"] if keep_topics is True else keep_topics
             patterns = [patterns] if isinstance(patterns, str) else list(patterns)
-            add_topics = partial(copy, patterns)
+            add_topics = partial(copy, patterns, where=where)
         save_log(
             path,
             self._transitions,

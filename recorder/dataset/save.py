@@ -41,6 +41,11 @@ def save_log(
     if not columns.episodes:
         raise LogError(f"nothing to write to {path}: the dataset has no episodes")
     if metadata.times == NO_TIMES or (np.diff(columns.log_time_ns) <= 0).any():
+        if add_topics is not None:
+            raise LogError(
+                f"{path}: the topics of the bag cannot be kept, because the episodes are in another"
+                " order: keep none, or sort the episodes"
+            )
         columns = with_fresh_times(columns, time.time_ns(), metadata.step_duration_ns)
         metadata = dataclasses.replace(metadata, times="")
     if columns.log_time_ns[0] < 0:

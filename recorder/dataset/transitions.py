@@ -40,7 +40,8 @@ class Origin:
         grow: Function that returns the data with the episodes that have ended since; None if the
             logs are not followed.
         copy_topics: Function that copies topics of the bag, by names or patterns, to the writer of
-            another file; None for other data.
+            another file; None for other data. Its `where` is for errors.
+        keep: Names and patterns of the topics that are copied by default.
         is_shifted: Whether recordings of the bag overlapped, and have later times in the data.
         labels: For a bag with labels, a function that returns or refuses them, and the (E,) lengths
             of their episodes.
@@ -54,7 +55,8 @@ class Origin:
     mapping: Mapping[str, Any] | None = None
     report: Any = None
     grow: Callable[[], Any] | None = None
-    copy_topics: Callable[[Sequence[str], Any], None] | None = None
+    copy_topics: Callable[..., None] | None = None
+    keep: tuple[str, ...] = ()
     is_shifted: bool = False
     labels: tuple[Callable[[], Any], NDArray[np.int64]] | None = None
     labeled: tuple[Any, ...] = ()

@@ -1,4 +1,4 @@
-"""Names of the package `columns`, re-exported for packages that read MCAP files."""
+"""Names of the package `columns`, re-exported for packages that read MCAP files, and telemetry."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import MESSAGE_HEADER, MessageRange, prefetch, release
 from mcaprl.recorder.columns.summary import check_chunk, check_file, check_statistics, place
 from mcaprl.recorder.columns.topic import LOG_TIME, Columns, Decoder, Topic
+from mcaprl.recorder.format.schema import TELEMETRY_TOPIC, TELEMETRY_TYPE
 
 __all__ = [
     "LOG_TIME",
@@ -44,4 +45,13 @@ __all__ = [
     "place",
     "prefetch",
     "release",
+    "telemetry_names",
 ]
+
+
+def telemetry_names(reader: McapReader) -> list[str]:
+    """Return the fields of `/telemetry`; none if a robot has a topic of this name."""
+    types = [reader.type_of(channel) for channel in reader.channels_of(TELEMETRY_TOPIC)]
+    if not all(name.startswith(TELEMETRY_TYPE) for name in types):
+        return []
+    return [name for name in Topic(reader, TELEMETRY_TOPIC).fields if name != "encapsulation"]

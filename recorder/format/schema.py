@@ -55,6 +55,8 @@ PHASE_TOPIC = "/rl/phase"
 RUNNING = "running"
 """Phase of a running episode. At its end, the phase changes to the reason of the end."""
 LABELS_TOPIC = "/rl/labels"  # Labels of the running episode and step in annotated logs, as text
+TELEMETRY_TOPIC, TELEMETRY_TYPE = "/telemetry", "mcaprl_msgs/msg/Telemetry"
+RETURN_SO_FAR = "return_so_far"  # Sum of the rewards of the running episode, in the telemetry
 # Maximum number of /rl/step rows, of images, and of bytes in one chunk.
 STEPS_PER_CHUNK = 4096
 IMAGES_PER_CHUNK = 100

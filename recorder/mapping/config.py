@@ -698,6 +698,13 @@ class Mapping(_Part):
     drive: Drive = Field(
         default=Drive(), description="What a policy may command when it drives the robot."
     )
+    keep: list[str] = Field(
+        default=[],
+        description="Topics of the bag that `convert` and `annotate` copy into the log beside"
+        " `/rl/*`, with their times, such as `[/camera/depth, /tf, /odom]`; `/camera/*` are all"
+        " that begin so. Viewers show them. `--keep-topic` replaces them, `--no-keep-topics` leaves"
+        " them out.",
+    )
     meta: Meta = Field(default=Meta(), description="Facts that the bag does not contain.")
     strict: bool = Field(
         default=False,

@@ -49,6 +49,13 @@ _MAX_OBSERVED, _MAX_PER_TOPIC = 12, 5
 _LISTED, _MAX_OTHERS = 5, 100
 # YAML reads these paths and words as text without quotes.
 _PLAIN = re.compile(r"/[\w/.-]+|(?!(?i:true|false|null|yes|no|on|off|y|n)$)[a-z_]+", re.ASCII)
+_SHOWN = {
+    *IMAGES,
+    *("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/OccupancyGrid"),
+    *("foxglove.LaserScan", "foxglove.PointCloud", "foxglove.Grid", "foxglove.FrameTransforms"),
+    *("nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage", "foxglove.FrameTransform"),
+}
+"""Types of topics that viewers show."""
 _NOTHING: dict[str, Any] = {"fields": ["/TOPIC.FIELD"], "box": {"low": [-1], "high": [1]}}
 
 
@@ -317,6 +324,14 @@ class _Draft:
         ]
         if first:
             lines += [f'  # terminated: "{first} > 1"', f'  # begin: "{first} != 0"']
+        shown = [
+            name
+            for name, topic in self._topics.items()
+            if topic.info.count and _PLAIN.fullmatch(name) and kind_of(topic.info) in _SHOWN
+        ]
+        if shown:
+            some = ", ".join(shown[:_LISTED])
+            lines.append(f"# keep: [{some}]  # topics that `convert` copies for viewers")
         lines += [
             f"# {topic.info.name} cannot be read: {why}"
             for topic in self._topics.values()

@@ -17,8 +17,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, Problem
-from mcaprl.recorder.bags.bag import Bag, OpenBag, copy_topics, open_bag
+from mcaprl.errors import LogError, Problem, UnknownNameError
+from mcaprl.recorder.bags.bag import Bag, OpenBag, copy_topics, matching_topics, open_bag
 from mcaprl.recorder.bags.overview import instants_of, is_fresh
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.images import Storage
@@ -269,7 +269,8 @@ def read_bag(
         options: Any = {"trust_code": trust_code, "images": images, "to_label": to_label}
         found = read_open_bag(bag, mapping, place, **options)
     copy = partial(copy_topics, [path.absolute() for path in bag.paths], others)
-    found.dataset.origin = replace(found.dataset.origin, copy_topics=copy)
+    keep = tuple(mapping.keep)
+    found.dataset.origin = replace(found.dataset.origin, copy_topics=copy, keep=keep)
     return found
 
 
@@ -514,6 +515,11 @@ def _left_out(plan: Plan, runs: Runs) -> list[Problem]:
         )
         for name in runs.mixed
     ]
+    try:
+        matching_topics(plan.bag.topics, plan.mapping.keep)
+    except UnknownNameError as error:
+        remedy = "correct or remove it, because the bag cannot be converted to a log"
+        found.append(Problem(str(error), plan.place.of("keep"), next=remedy))
     return found
 
 

@@ -28,11 +28,16 @@ import gymnasium as gym
 
 from mcaprl.recorder.format.log_writer import LogTopics
 from mcaprl.recorder.format.messages import EpisodeSummary
-from mcaprl.recorder.format.schema import telemetry_message, telemetry_schema
+from mcaprl.recorder.format.schema import (
+    RETURN_SO_FAR,
+    TELEMETRY_TOPIC,
+    telemetry_message,
+    telemetry_schema,
+)
 from mcaprl.recorder.format.video_messages import VIDEO_TEXT, VIDEO_TYPE
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.camera import VIDEO, VIDEO_PERIOD_NS, VideoEncoder, rendered
-from mcaprl.recorder.record.layout import AROUND_M, RETURN_SO_FAR
+from mcaprl.recorder.record.layout import AROUND_M
 from mcaprl.recorder.record.scene import (
     DepthSource,
     Frame,
@@ -54,7 +59,7 @@ from mcaprl.recorder.record.step_rows import ImageColumn
 
 SCENE, SCENE_STATIC, TRACKS = "/scene", "/scene/static", "/scene/tracks"
 MAP = "/scene/map"
-TF, TF_STATIC, TELEMETRY = "/tf", "/tf_static", "/telemetry"
+TF, TF_STATIC, TELEMETRY = "/tf", "/tf_static", TELEMETRY_TOPIC
 DEPTH, CAMERA_INFO = "/camera/depth", "/camera/camera_info"
 # Buffered display messages are written when their total size exceeds this number of bytes, and at
 # the end of an episode.

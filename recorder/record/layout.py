@@ -17,7 +17,13 @@ from gymnasium import spaces
 
 from mcaprl.recorder.format.messages import INTERRUPTED
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.schema import EPISODE_TOPIC, IMAGE_FRAME, LOG_TOPIC, STEP_TOPIC
+from mcaprl.recorder.format.schema import (
+    EPISODE_TOPIC,
+    IMAGE_FRAME,
+    LOG_TOPIC,
+    RETURN_SO_FAR,
+    STEP_TOPIC,
+)
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.record import panels
 from mcaprl.recorder.record.camera import VIDEO
@@ -26,7 +32,6 @@ from mcaprl.recorder.record.panels import Node, Panel
 LAYOUT_NAME = "foxglove-layout.json"
 VALUES_TOPIC = "/rl/values"
 TRAINING_TOPIC = "/rl/training"
-RETURN_SO_FAR = "return_so_far"
 _SCENE, _STATIC, _TRACKS, _DEPTH = "/scene", "/scene/static", "/scene/tracks", "/camera/depth"
 _MAP = "/scene/map"
 _WORLD = "map"
@@ -47,7 +52,18 @@ _REASONS = (
     *("terminated", "time_limit"),
 )
 _IMAGES = ("Image", "RawImage", "CompressedImage", "CompressedVideo")
-_SPATIAL = ("LaserScan", "PointCloud2", "PointCloud", "OccupancyGrid", "Grid")
+_SPATIAL = (
+    *("LaserScan", "PointCloud2", "PointCloud", "OccupancyGrid", "Grid", "MarkerArray", "Marker"),
+    *(
+        "SceneUpdate",
+        "Path",
+        "PoseStamped",
+        "PoseWithCovarianceStamped",
+        "PoseArray",
+        "PoseInFrame",
+    ),
+)
+_TRANSFORMS = ("TFMessage", "FrameTransform", "FrameTransforms", "TransformStamped")
 _MOST_CAMERAS = 3
 _LAST_STEPS = 80
 _MAX_EPISODE = 100
@@ -238,14 +254,24 @@ class _Screens:
             if leaf.encoding is not None:
                 panel = panels.image(f"observation: {leaf.name}", leaf.topic)
                 names.append(self._put(f"Image!{leaf.name}", panel))
-        own = (VIDEO, _DEPTH)
+        own = self._of(VIDEO, _DEPTH)
         for topic in [each for each in self._sensors(_IMAGES) if each not in own][:_MOST_CAMERAS]:
             names.append(self._put(f"Image!{topic}", panels.image(topic, topic)))
+        return names if _SCENE in self.topics else names + self._robot()
+
+    def _robot(self) -> list[Node]:
+        """Add what a robot's own topics show: its surroundings from above, and its odometry."""
+        names: list[Node] = []
         spatial = self._sensors(_SPATIAL)
-        if spatial and _SCENE not in self.topics:
+        if spatial or self._sensors(_TRANSFORMS):
             shown = dict.fromkeys(spatial, _NONE)
             camera = {"perspective": False, "distance": AROUND_M / 4, "phi": 0}
-            names.append(self._put("3D!robot", panels.three_d("robot", shown, camera, _STILL)))
+            followed = (self.follow_frame, "follow-position") if self.follow_frame else _STILL
+            names.append(self._put("3D!robot", panels.three_d("robot", shown, camera, followed)))
+        # 3D panels draw no odometry.
+        for topic in self._sensors(("Odometry",))[:1]:
+            paths = {axis: f"{topic}.pose.pose.position.{axis}" for axis in "xy"}
+            names.append(self._plot(topic, f"{topic}: position in m", paths))
         return names
 
     def _sensors(self, kinds: Sequence[str]) -> list[str]:

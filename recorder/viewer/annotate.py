@@ -33,12 +33,12 @@ from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.log_writer import LogWriter
 from mcaprl.recorder.format.messages import INTERRUPTED, TEXT_TYPE
-from mcaprl.recorder.format.reading import McapReader, Topic
+from mcaprl.recorder.format.reading import McapReader, Topic, telemetry_names
 from mcaprl.recorder.format.schema import EPISODE_TOPIC, LABELS_TOPIC, LOG_TOPIC
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 from mcaprl.recorder.format.writing import McapWriter
 from mcaprl.recorder.record.camera import VIDEO, rendering_env
-from mcaprl.recorder.record.display import SCENE, TELEMETRY, TF, Display, ShownTopics
+from mcaprl.recorder.record.display import DEPTH, SCENE, TF, Display, ShownTopics
 from mcaprl.recorder.record.layout import (
     LAYOUT_NAME,
     VALUES_TOPIC,
@@ -348,24 +348,26 @@ def layout_of_log(
     """Return a layout that shows the topics of a log and plots its series."""
     own = sorted({channel.topic for channel in reader.channels.values()})
     if shown is None:
-        telemetry = [name for name in Topic(reader, TELEMETRY).fields if name != "encapsulation"]
-        names, frame = telemetry, _first_frame(reader)
+        names, frame = telemetry_names(reader), _first_frame(reader)
     else:
         names, frame = list(shown.telemetry_names), shown.follow_frame
     values = [topic for topic in own if is_values_topic(topic)]
     empty = [topic for topic in values if not _has_q(reader, topic)]
     shares = {topic: _agreement(reader, topic) for topic in values}
+    shown_topics = own if topics is None else topics
+    if not _has_depth(reader):
+        shown_topics = [topic for topic in shown_topics if topic != DEPTH]
     return layout_of(
         describe(reader),
-        own if topics is None else topics,
+        shown_topics,
         names,
         frame,
         without_q={*without_q, *empty},
         episodes=len(Topic(reader, EPISODE_TOPIC).times),
         sensors={
-            channel.topic: reader.schemas[channel.schema_id].name
+            channel.topic: reader.type_of(channel)
             for channel in reader.channels.values()
-            if channel.schema_id in reader.schemas and not channel.topic.startswith("/rl/")
+            if not channel.topic.startswith("/rl/")
         },
         agreement={topic: share for topic, share in shares.items() if share is not None}
         | dict(agreement or {}),
@@ -403,12 +405,26 @@ def attached_layout(reader: McapReader) -> dict[str, Any]:
 
 def _first_frame(reader: McapReader) -> str:
     """Return the name of the first moving coordinate frame; empty if there is none."""
-    channel = reader.channel_of(TF)
-    first = next(reader.messages(channel), None) if channel is not None else None
-    if first is None:
-        return ""
-    found = messages.decode(first[1], "tf2_msgs/msg/TFMessage").transforms
-    return str(found[0].child_frame_id) if found else ""
+    kind = "tf2_msgs/msg/TFMessage"
+    for channel in reader.channels_of(TF):
+        # A robot's own transforms may have any encoding.
+        if channel.message_encoding == "cdr" and reader.type_of(channel) == kind:
+            first = next(reader.messages(channel), None)
+            found = messages.decode(first[1], kind).transforms if first is not None else []
+            if found:
+                return str(found[0].child_frame_id)
+    return ""
+
+
+def _has_depth(reader: McapReader) -> bool:
+    """Return whether `/camera/depth` may have depth images in millimeters."""
+    channels = reader.channels_of(DEPTH)
+    kinds = {(channel.message_encoding, reader.type_of(channel)) for channel in channels}
+    if kinds != {("cdr", "sensor_msgs/msg/Image")}:
+        return all(re.split(r"[/.]", kind)[-1] in ("Image", "RawImage") for _, kind in kinds)
+    depth = Topic(reader, DEPTH)
+    found = depth.read(("encoding",), np.arange(min(1, len(depth.times))))["encoding"]
+    return all(str(each) in ("16UC1", "mono16") for each in found.astype(np.str_))
 
 
 @contextmanager

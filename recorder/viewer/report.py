@@ -31,7 +31,7 @@ from mcaprl.recorder.dataset.quality import Flaw, Plot
 from mcaprl.recorder.dataset.statistics import calibration
 from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.reading import McapReader, Topic
+from mcaprl.recorder.format.reading import McapReader, Topic, telemetry_names
 from mcaprl.recorder.record.display import TELEMETRY
 from mcaprl.recorder.record.panels import action_parts, bounded_actions
 from mcaprl.recorder.source import open_data
@@ -312,8 +312,9 @@ def tracks_of(dataset: Dataset) -> list[Positions]:
 
 def _positions_in(path: Path) -> tuple[NDArray[np.int64], Positions] | None:
     """Return the times (M,) and positions (M, 2) in a log; None if it has no positions."""
-    topic = Topic(McapReader(path), TELEMETRY)
-    if not len(topic) or not set(_POSITION) <= set(topic.fields):
+    reader = McapReader(path)
+    topic = Topic(reader, TELEMETRY)
+    if not set(_POSITION) <= set(telemetry_names(reader)) or not len(topic):
         return None
     columns = topic.read(list(_POSITION))
     return topic.times, np.column_stack([columns[name] for name in _POSITION]).astype(np.float64)

@@ -206,6 +206,8 @@ def test_a_converted_bag_keeps_its_own_topics(mixed: Path, tmp_path: Path) -> No
     panels = mcaprl.layout(out)["configById"]
     assert panels["Image!/front"]["imageMode"]["imageTopic"] == "/front"
     assert list(panels["3D!robot"]["topics"]) == ["/scan"]
+    assert panels["3D!robot"]["followTf"] == "base"
+    assert panels["Plot!/odom"]["paths"][0]["value"] == "/odom.pose.pose.position.x"
     # Annotating keeps them, those of a log as those of a bag.
     mcaprl.train(data, tmp_path / "run", algo="bc", updates=2, batch_size=4)
     annotated: dict[str, Any] = {"policy": tmp_path / "run", "overwrite": True}
@@ -217,6 +219,59 @@ def test_a_converted_bag_keeps_its_own_topics(mixed: Path, tmp_path: Path) -> No
             assert _stored(tmp_path / "values.mcap", topic) == _stored(mixed, topic)
         assert len(_stored(tmp_path / "values.mcap", "/rl/values")) == len(data)
         assert mcaprl.open(tmp_path / "values.mcap").fingerprint == data.fingerprint
+
+
+@pytest.mark.parametrize("kind", ["mcap", "ros1"])
+def test_the_mapping_names_topics_to_keep(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = MAPPING.replace("terminated: speed > 5", "max_steps: 4")
+    (tmp_path / "robot.yaml").write_text(f'{text}keep: [/odom, "/c*/depth", /tf]\n')
+    write = write_rosbag1 if kind == "ros1" else write_rosbag2
+    bag = write(tmp_path / f"{kind}.bag")
+    mapping = ["--mapping", str(tmp_path / "robot.yaml")]
+    kept = {"/odom", "/tf", "/camera/depth"}
+    for options, expected in (
+        ([], kept),
+        (["--keep-topic", "/joints"], {"/joints"}),
+        (["--keep-topics"], {*kept, "/joints", "/cmd_vel"}),
+        (["--no-keep-topics"], set()),
+    ):
+        out = tmp_path / "out.mcap"
+        assert run(["convert", str(bag), str(out), "--overwrite", *mapping, *options]) == 0
+        assert set(mcaprl.open_bag(out).topics) == {*expected, *OWN_TOPICS}
+    out, some, part, both = (tmp_path / f"{name}.mcap" for name in ("kept", "some", "part", "both"))
+    data = mcaprl.open(bag, mapping=tmp_path / "robot.yaml")
+    mcaprl.convert(data, out)
+    mcaprl.filter("episode == 1", out, some)
+    mcaprl.slice(out, part, steps=(1, 6))
+    mcaprl.filter("episode == 0", out, tmp_path / "first.mcap")
+    mcaprl.merge([some, tmp_path / "first.mcap"], both)
+    assert _stored(both, "/camera/depth") == _stored(out, "/camera/depth")
+    # The last episode has all messages from its first step on.
+    times = [one[0] for one in _stored(some, "/odom")]
+    assert times == [START_NS + k * STEP_NS for k in range(5, STEPS)]
+    for path in (out, some, part, both):
+        assert not mcaprl.check(path).problems
+        assert _stored(path, "/camera/depth")
+        assert "Image!depth" in mcaprl.layout(path)["configById"]
+    capsys.readouterr()
+    # Wrong names are reported before anything is written, and a log is not written then.
+    (tmp_path / "robot.yaml").write_text(f"{text}keep: [/tf, /camera/deth]\n")
+    assert run(["convert", str(bag), *mapping, "--dry-run"]) == 0
+    assert "unknown topic '/camera/deth': did you mean /camera/depth" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    assert run(["convert", str(bag), str(tmp_path / "new.mcap"), *mapping]) == 2
+    expected_line = "unknown topic in `keep` of the mapping '/camera/deth': did you mean"
+    assert expected_line in capsys.readouterr().err
+    assert not (tmp_path / "new.mcap").exists()
+    with pytest.warns(UserWarning, match="unknown topic '/camera/deth'"):
+        data = mcaprl.open(bag, mapping=tmp_path / "robot.yaml")
+    data.save(tmp_path / "plain.mcap", keep_topics=False)
+    backwards = data._take([1, 0])
+    with pytest.raises(LogError, match="the episodes are in another order"):
+        backwards.save(tmp_path / "back.mcap", keep_topics="/tf")
 
 
 @pytest.mark.parametrize("kind", ["mcap", "ros1"])
@@ -245,9 +300,11 @@ def test_a_converted_bag_says_how_each_episode_ended(kind: str, tmp_path: Path) 
                 (one.channel.topic, one.message.log_time, one.decoded_message)
                 for one in reader.iter_decoded_messages(["/rosout", "/rl/phase"])
             ]
-        assert [(t, m.msg) for name, t, m in found if name == "/rosout"] == [*zip(at_ns, lines)]
+        assert [(t, m.msg) for name, t, m in found if name == "/rosout"] == [
+            *zip(at_ns, lines, strict=True)
+        ]
         phases = [(t, m.data) for name, t, m in found if name == "/rl/phase"]
-        assert phases == [*zip(at_ns, ["running", "fast", "running", "fast"])]
+        assert phases == [*zip(at_ns, ["running", "fast"] * 2, strict=True)]
         assert not mcaprl.check(path).problems
     mcaprl.filter("episode == 1", out, some)
     assert [one[0] for one in _stored(some, "/rosout")] == at_ns[2:]
@@ -333,6 +390,7 @@ def test_a_suggested_mapping_gives_a_dataset(bag: Path, tmp_path: Path) -> None:
     assert mapping.action.fields == ["/cmd_vel.linear.x", "/cmd_vel.angular.z"]
     assert mapping.clock.rate_hz == 10
     assert "# camera: {image: /camera/depth, resize: [84, 84]}" in text
+    assert "# keep: [/camera/depth, /odom, /tf]  # topics" in text
     data = mcaprl.open(bag, mapping=path)
     assert len(data) == STEPS - 1
     assert "odom_linear_x" in data.observation_names

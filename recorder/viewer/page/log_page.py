@@ -42,9 +42,10 @@ from mcaprl.recorder.bags.decoders import decoder_of
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.transitions import Episode
 from mcaprl.recorder.dataset.video import Converter, Decoded, VideoDecoder
+from mcaprl.recorder.format.messages import LOG_TYPE
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.reading import McapReader, Topic
-from mcaprl.recorder.format.schema import LOG_TOPIC
+from mcaprl.recorder.format.reading import McapReader, Topic, telemetry_names
+from mcaprl.recorder.format.schema import LOG_TOPIC, RETURN_SO_FAR
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.format.video_messages import VIDEO_TYPE
 from mcaprl.recorder.record.camera import VIDEO
@@ -59,7 +60,6 @@ from mcaprl.recorder.record.display import (
 from mcaprl.recorder.record.layout import (
     CAMERA_M,
     DEPTH_M,
-    RETURN_SO_FAR,
     TILT_DEG,
     VALUES_TOPIC,
     is_values_topic,
@@ -331,9 +331,9 @@ class LogPage:
                 values = _rows(_at(dataset.frames, leaf.path))
                 names = list(dataset.observation_names) if len(leaves) == 1 else []
                 yield _plot("/".join(("observation", *leaf.path)), names, values)
-        telemetry = self._at_steps(TELEMETRY, episode.log_time_ns)
-        telemetry.pop(RETURN_SO_FAR, None)
-        for title, group in telemetry_groups(list(telemetry)).items():
+        names = [name for name in telemetry_names(self._reader) if name != RETURN_SO_FAR]
+        telemetry = self._at_steps(TELEMETRY, episode.log_time_ns) if names else {}
+        for title, group in telemetry_groups([n for n in names if n in telemetry]).items():
             yield _plot(title, list(group), np.column_stack([telemetry[name] for name in group]))
         infos = {
             name: np.ma.filled(info.astype(np.float64), np.nan)
@@ -361,9 +361,15 @@ class LogPage:
         if _type_of(self._reader, DEPTH) != "sensor_msgs/msg/Image":
             return
         topic = Topic(self._reader, DEPTH)
-        found, steps = _rows_at(topic, episode.log_time_ns)
+        # A robot's own images have other times than the steps.
+        times_ns = episode.log_time_ns
+        found = np.flatnonzero((topic.times >= times_ns[0]) & (topic.times <= times_ns[-1]))
         if not len(found):
             return
+        found = found[np.argsort(topic.times[found], kind="stable")]
+        latest = np.searchsorted(topic.times[found], times_ns, side="right") - 1
+        seen, steps = np.unique(np.maximum(latest, 0), return_index=True)
+        found, steps = found[seen], steps.astype(np.int32)
         first = topic.read(("height", "width", "encoding"), found[:1])
         if first["encoding"][0] not in ("16UC1", b"16UC1"):
             return
@@ -424,7 +430,9 @@ class LogPage:
 
     def _lines(self, start_ns: int, end_ns: int) -> dict[str, Any]:
         """Return the log lines of an episode."""
-        topic = Topic(self._reader, LOG_TOPIC)
+        # A robot's own lines may have another type.
+        is_known = _type_of(self._reader, LOG_TOPIC) == LOG_TYPE
+        topic = Topic(self._reader, LOG_TOPIC if is_known else "")
         rows = np.flatnonzero((topic.times >= start_ns) & (topic.times <= end_ns))
         if not len(rows) or not {"msg", "level"} <= set(topic.fields):
             return {"times": np.empty(0), "levels": np.empty(0, np.int32), "texts": []}
@@ -495,7 +503,7 @@ def _type_of(reader: McapReader, topic: str) -> str:
 
     If there is not exactly one type, the string is empty.
     """
-    names = {reader.schema_of(channel).name for channel in reader.channels_of(topic)}
+    names = {reader.type_of(channel) for channel in reader.channels_of(topic)}
     return names.pop() if len(names) == 1 else ""
 
 

@@ -13,14 +13,19 @@ from gymnasium import spaces
 
 import mcaprl
 from mcaprl.recorder.dataset.log_reader import describe
+from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.format.writing import McapWriter
 from mcaprl.recorder.record.layout import layout_of
 from mcaprl.recorder.record.panels import share_of_transitions
 from mcaprl.recorder.viewer.annotate import annotated_copy, layout_of_log
 from mcaprl.recorder.viewer.foxglove_server import side_by_side
+from mcaprl.recorder.viewer.page.log_page import LogPage
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.evaluate import make_pilot
+from tests.recorder.viewer.test_browser_page import unpacked
+from tests.support.bags import STEPS, write_rosbag2
 from tests.support.layouts import (
     AREA_PX,
     Topics,
@@ -103,6 +108,53 @@ def test_paths_are_in_annotated_logs(sim: str, names: list[str], tmp_path: Path)
     if sim == "lane":
         constants = Topics.of_log(path).constants(names[0])
         assert (constants["BRAKE"], constants["SLIGHTLY_LEFT"]) == (0, 5)
+
+
+def test_the_topics_of_a_robot_are_shown(tmp_path: Path) -> None:
+    mapping = {
+        "clock": {"rate_hz": 10},
+        "observation": {"speed": {"field": "/odom.twist.twist.linear.x"}},
+        "action": {"fields": ["/cmd_vel.angular.z"], "box": {"low": -1, "high": 1}},
+        "keep": ["/odom", "/tf", "/camera/*"],
+    }
+    path = tmp_path / "robot.mcap"
+    mcaprl.convert(mcaprl.open(write_rosbag2(tmp_path / "bag"), mapping=mapping), path)
+    layout = layout_of_log(McapReader(path))
+    check_panels(layout, Topics.of_log(path))
+    shown = {name for name in layout["configById"] if "/odom" in name or name[:2] in ("3D", "Im")}
+    assert shown == {"Plot!/odom", "3D!robot", "Image!depth"}
+    # The page shows, at each step, the last depth image up to it: of 1000 + k millimeters.
+    (image,) = unpacked(LogPage(path).episode(0))["images"]
+    assert image["title"] == "depth, 0 to 50 m"
+    assert image["steps"].tolist() == list(range(STEPS))
+    assert np.ravel(image["pixels"][:, 0, 0]).tolist() == [
+        1 + round((1 + k / 1000) / 50 * 254) for k in range(STEPS)
+    ]
+
+
+@pytest.mark.parametrize("kind", ["json", "32FC1"])
+def test_what_viewers_cannot_show_is_not_in_the_layout(kind: str, tmp_path: Path) -> None:
+    """Topics of a robot that have the name, but not the type, of those of a recording."""
+    path = recorded(tmp_path / "log.mcap", "CartPole-v1")
+    mcap = McapWriter(path, append=True)
+    for topic in ("/tf", "/telemetry", "/camera/depth"):
+        if kind == "json":
+            mcap.write_messages([(mcap.add_topic(topic, "json", ("", "", b"")), 1, b"{}")])
+        elif topic == "/camera/depth":
+            name = "sensor_msgs/msg/Image"
+            channel = mcap.add_channel(topic, name, messages.definition(name))
+            image = messages.new(
+                name,
+                header=messages.header(1, "camera"),
+                **{"height": 1, "width": 1, "encoding": kind, "is_bigendian": 0, "step": 4},
+                data=np.zeros(4, np.uint8),
+            )
+            mcap.write_messages([(channel, 1, messages.encode(image))])
+    mcap.close()
+    panels = layout_of_log(McapReader(path))["configById"]
+    assert "Image!depth" not in panels
+    assert ("Image!/camera/depth" in panels) == (kind == "32FC1")
+    assert unpacked(LogPage(path).episode(0))["images"] == []
 
 
 @pytest.mark.parametrize("prefixes", [["a", "b"], ["1_lane", "2_lane"]])
