@@ -655,6 +655,7 @@ class Dataset(Conversions):
             compression=compression,
             overwrite=overwrite,
             add_topics=add_topics,
+            telemetry=self.origin.telemetry,
         )
 
     def to_arrow(

@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.files import replacing
@@ -18,7 +19,16 @@ from mcaprl.recorder.dataset.packets import Packets
 from mcaprl.recorder.dataset.transitions import Transitions, ranges
 from mcaprl.recorder.format.log_writer import InfoTopics, LogWriter, Message, info_array
 from mcaprl.recorder.format.metadata import NO_TIMES, LogMetadata
-from mcaprl.recorder.format.schema import BYTES_PER_CHUNK, LOG_TOPIC, STEPS_PER_CHUNK
+from mcaprl.recorder.format.schema import (
+    BYTES_PER_CHUNK,
+    LOG_TOPIC,
+    RETURN_SO_FAR,
+    STEPS_PER_CHUNK,
+    TELEMETRY_TOPIC,
+    TopicRows,
+    shortened,
+    telemetry_schema,
+)
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 from mcaprl.recorder.format.video_messages import VIDEO_TEXT, VIDEO_TYPE, video_message
 from mcaprl.recorder.format.writing import McapWriter
@@ -32,14 +42,19 @@ def save_log(
     compression: str = "zstd",
     overwrite: bool = False,
     add_topics: Callable[[McapWriter], None] | None = None,
+    telemetry: tuple[NDArray[np.int64], Mapping[str, NDArray[np.float32]]] | None = None,
 ) -> None:
     """Write columns as a log; `add_topics` writes other topics beside them.
+
+    `telemetry` has log_times, and the columns of `/telemetry` at these times, which are written
+    where they are those of frames.
 
     If the data has no times, or if they do not increase from frame to frame, they are replaced by
     times that start at the current time. Episodes are numbered from 0.
     """
     if not columns.episodes:
         raise LogError(f"nothing to write to {path}: the dataset has no episodes")
+    frames_ns = columns.log_time_ns
     if metadata.times == NO_TIMES or (np.diff(columns.log_time_ns) <= 0).any():
         if add_topics is not None:
             raise LogError(
@@ -66,6 +81,8 @@ def save_log(
             summaries = [e._replace(episode=k) for k, e in enumerate(columns.episodes)]
             log.write_episodes(summaries, log_lines=True)
             _write_steps(log, columns)
+            if telemetry is not None:
+                _write_telemetry(log, columns, frames_ns, *telemetry)
             log.close()
         finally:
             log.mcap.abandon()
@@ -159,6 +176,30 @@ def _write_steps(log: LogWriter, columns: Transitions) -> None:
             rows.put(name, has_transition, values[steps])
         rows.finish(ends)
         rows.write(where, columns.log_time_ns[frames])
+
+
+def _write_telemetry(
+    log: LogWriter,
+    columns: Transitions,
+    frames_ns: NDArray[np.int64],
+    times_ns: NDArray[np.int64],
+    found: Mapping[str, NDArray[np.float32]],
+) -> None:
+    """Write numbers to plot, and the return so far, at the frames with these times."""
+    rows = np.minimum(np.searchsorted(times_ns, frames_ns), len(times_ns) - 1)
+    frames = np.flatnonzero(times_ns[rows] == frames_ns)
+    topics = {channel.topic for channel in log.mcap.channels.values()}
+    if not len(frames) or TELEMETRY_TOPIC in topics:
+        return
+    parts = np.split(columns.rewards, columns.first_steps[1:])
+    returns = np.concatenate([np.append(0.0, np.cumsum(part)) for part in parts])
+    name, text = telemetry_schema([RETURN_SO_FAR, *found])
+    channel = log.sink.add_channel(TELEMETRY_TOPIC, name, text)
+    shown = {RETURN_SO_FAR: returns[frames]}
+    shown |= {name: column[rows[frames]] for name, column in found.items()}
+    TopicRows.of_text(text, channel, STEPS_PER_CHUNK, log.sink.write_rows).write_columns(
+        columns.log_time_ns[frames], {name: shortened(each) for name, each in shown.items()}
+    )
 
 
 def _leaves(log: LogWriter, columns: Transitions) -> Iterable[tuple[Leaf, Frames]]:

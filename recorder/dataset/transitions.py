@@ -41,6 +41,8 @@ class Origin:
             logs are not followed.
         copy_topics: Function that copies topics of the bag, by names or patterns, to the writer of
             another file; None for other data. Its `where` is for errors.
+        telemetry: For a bag, the (F,) log_times of its frames, and what viewers show of its
+            quantities, (F,) numbers by name.
         keep: Names and patterns of the topics that are copied by default.
         is_shifted: Whether recordings of the bag overlapped, and have later times in the data.
         labels: For a bag with labels, a function that returns or refuses them, and the (E,) lengths
@@ -56,6 +58,7 @@ class Origin:
     report: Any = None
     grow: Callable[[], Any] | None = None
     copy_topics: Callable[..., None] | None = None
+    telemetry: tuple[NDArray[np.int64], Mapping[str, NDArray[np.float32]]] | None = None
     keep: tuple[str, ...] = ()
     is_shifted: bool = False
     labels: tuple[Callable[[], Any], NDArray[np.int64]] | None = None

@@ -129,10 +129,16 @@ def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
     return _named("Telemetry", [("float32", 0, name) for name in names])
 
 
+def shortened(values: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Round values to 16 significant bits, enough for plots, which compress better."""
+    mantissas, exponents = np.frexp(values.astype(np.float64))
+    found: NDArray[np.float64] = np.ldexp(np.rint(mantissas * 2**16), exponents - 16)
+    return found
+
+
 def telemetry_message(values: Iterable[float]) -> bytes:
-    """Encode a message of `telemetry_schema`, in 16 significant bits, which compress better."""
-    mantissas, exponents = np.frexp(np.fromiter(values, np.float64))
-    rounded = np.ldexp(np.rint(mantissas * 2**16), exponents - 16)
+    """Encode a message of `telemetry_schema`, with values that are `shortened`."""
+    rounded = shortened(np.fromiter(values, np.float64))
     return struct.pack(f"<I{len(rounded)}f", ENCAPSULATION, *rounded.tolist())
 
 

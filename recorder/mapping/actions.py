@@ -15,6 +15,7 @@ from mcaprl.errors import UsageError
 from mcaprl.recorder.format.spaces import MAX_ACTIONS
 from mcaprl.recorder.mapping.config import Action
 
+_POSITION = {r"position\.[xyz]": "m"}
 _TWIST = {r"linear\.[xyz]": "m/s", r"angular\.[xyz]": "rad/s"}
 _DRIVE = {
     "steering_angle": "rad",
@@ -26,6 +27,11 @@ _DRIVE = {
 _UNITS: Final = {
     "Twist": _TWIST,
     "TwistStamped": _TWIST,
+    "TwistWithCovarianceStamped": _TWIST,
+    "Odometry": _TWIST | _POSITION,
+    **dict.fromkeys(("Pose", "PoseStamped", "PoseWithCovarianceStamped"), _POSITION),
+    "Imu": {r"angular_velocity\.[xyz]": "rad/s", r"linear_acceleration\.[xyz]": "m/s^2"},
+    "Range": {"range": "m"},
     "Accel": {r"linear\.[xyz]": "m/s^2", r"angular\.[xyz]": "rad/s^2"},
     "Wrench": {r"force\.[xyz]": "N", r"torque\.[xyz]": "N m"},
     "AckermannDrive": _DRIVE,

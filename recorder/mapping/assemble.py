@@ -5,9 +5,11 @@ from __future__ import annotations
 import difflib
 import itertools
 import math
+import re
 import warnings
+from collections.abc import Container, Sequence
 from collections.abc import Mapping as MappingOf
-from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -27,11 +29,13 @@ from mcaprl.recorder.format.metadata import (
     Command,
     LogMetadata,
 )
+from mcaprl.recorder.format.schema import RETURN_SO_FAR
 from mcaprl.recorder.format.spaces import leaves_of
+from mcaprl.recorder.mapping.actions import unit_of
 from mcaprl.recorder.mapping.align import NS_PER_S, as_numbers
 from mcaprl.recorder.mapping.config import Action, Limits, Mapping, Quantity
 from mcaprl.recorder.mapping.observe import place_of
-from mcaprl.recorder.mapping.plan import Plan
+from mcaprl.recorder.mapping.plan import Plan, Wanted
 from mcaprl.recorder.mapping.robot import Robot
 from mcaprl.recorder.mapping.runs import Segment
 from mcaprl.recorder.mapping.steps import Steps
@@ -143,6 +147,9 @@ def _of_bins(
 
 Array = NDArray[Any]
 
+_MOST_SHOWN = 8
+"""Number of elements of a vector up to which viewers show them."""
+_UNITS_OF_PARTS = {**dict.fromkeys("xyz", "m"), **dict.fromkeys(("roll", "pitch", "yaw"), "rad")}
 _STATE = "state"
 """Key of the vector in an observation that also has images."""
 
@@ -227,7 +234,69 @@ def assembled(
             if leaf.path in observed.packets
         },
     )
-    return Dataset(transitions, metadata, origin=Origin(plan.bag.paths, is_shifted=is_shifted))
+    telemetry = _telemetry(plan, runs, np.concatenate(frames))
+    origin = Origin(plan.bag.paths, is_shifted=is_shifted)
+    if telemetry:
+        origin = replace(origin, telemetry=(transitions.log_time_ns, telemetry))
+    return Dataset(transitions, metadata, origin=origin)
+
+
+def _telemetry(
+    plan: Plan, runs: list[Steps], rows: NDArray[np.int64]
+) -> dict[str, NDArray[np.float32]]:
+    """Return what viewers show of the quantities at the frames (F,), by name with unit.
+
+    These are the quantities with a known unit, in this unit, and all `fields`, which the
+    observation lacks; of both, those of at most `_MOST_SHOWN` elements.
+    """
+    found = dict[str, NDArray[np.float32]]()
+    for name, wanted in plan.quantities.items():
+        parts = [run.quantities[name] for run in runs if len(run.times_ns)]
+        kinds = {(part.values.dtype.kind, part.values.shape[1:]) for part in parts}
+        if wanted.quantity.pixels is not None or len(kinds) > 1 or kinds.pop()[0] == "O":
+            continue
+        values = _joined([each.values for each in parts], rows)
+        unscaled = _joined([each.unscaled for each in parts], rows)
+        if wanted.quantity.as_ == "yaw":
+            # Interpolated angles do not jump at pi.
+            unscaled = (unscaled + math.pi) % (2 * math.pi) - math.pi
+        units = _units(plan, wanted, count := values.shape[1])
+        for k, element in enumerate(element_names(name, wanted.quantity, count)):
+            if count <= _MOST_SHOWN and (units[k] or name in plan.mapping.fields):
+                with np.errstate(over="ignore", invalid="ignore"):
+                    column = (unscaled if units[k] else values)[:, k].astype(np.float32)
+                found[_shown_name(element, units[k], found)] = column
+    return found
+
+
+def _joined(parts: Sequence[NDArray[Any] | None], rows: NDArray[np.int64]) -> NDArray[Any]:
+    """Return the rows (F,) of numbers in several parts as (F, K)."""
+    found = np.concatenate([each for each in parts if each is not None])[rows]
+    return found.reshape(len(rows), -1)
+
+
+def _units(plan: Plan, wanted: Wanted, count: int) -> list[str]:
+    """Return the unit of each element of a quantity in its messages; empty if it is not known."""
+    quantity, source = wanted.quantity, wanted.source
+    if quantity.transform is not None:
+        return [_UNITS_OF_PARTS.get(part, "") for part in quantity.parts]
+    unit = quantity.unit
+    if not unit and quantity.as_ is None and source.path is not None:
+        field = str(source.path).removeprefix(source.topic).lstrip(".")
+        unit = "m" if quantity.scan else unit_of(plan.bag.topics[source.topic].type_name, field)
+    return [unit or ("rad" if quantity.as_ == "yaw" else "")] * count
+
+
+def _shown_name(name: str, unit: str, taken: Container[str]) -> str:
+    """Return a name of a field of `/telemetry`: the words of `name`, and its unit."""
+    words, suffix = (re.sub(r"[^a-z0-9]+", "_", part.lower()).strip("_") for part in (name, unit))
+    found = words if words[:1].isalpha() else f"n_{words}".rstrip("_")
+    if suffix and f"_{found}".endswith(f"_{suffix}"):
+        suffix = ""
+    found += f"_{suffix}" if suffix else ""
+    while found in taken or found == RETURN_SO_FAR:
+        found += "_2"
+    return found
 
 
 def _robot(
@@ -490,8 +559,14 @@ def element_names(name: str, quantity: Quantity, count: int) -> list[str]:
     """Return the names of the `count` elements of a quantity in the vector of observations."""
     if quantity.transform is not None:
         return [f"{name}_{part}" for part in quantity.parts]
-    if isinstance(quantity.names, list) and quantity.names:
-        return [f"{name}_{element}" for element in quantity.names]
+    names = quantity.elements or quantity.names
+    if quantity.elements and len(quantity.elements) != count:
+        raise UsageError(
+            f"{name}: `elements` has {counted(len(quantity.elements), 'name')}, but the value has"
+            f" {counted(count, 'element')}"
+        )
+    if isinstance(names, list) and names:
+        return [f"{name}_{element}" for element in names]
     return [name] if count == 1 else [f"{name}_{k}" for k in range(count)]
 
 

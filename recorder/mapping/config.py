@@ -111,6 +111,12 @@ class Quantity(_Part):
         description="Field of the message that contains the names, such as `joint_names` or"
         " `items[:].id`. By default, it is found next to the field.",
     )
+    elements: list[str] = Field(
+        default=[],
+        description="Names of the elements of a vector, in their order, such as `[forward, left]`,"
+        " for the names of the observation: `NAME_forward`. Unlike `names`, they select nothing."
+        " Default: their indexes, or `names`.",
+    )
     pad: _Count | None = Field(
         default=None,
         description="Number of elements to which an array of any length is cut, or filled with the"
@@ -245,6 +251,12 @@ class Quantity(_Part):
         " The cells of a grid are clipped before they are scaled by `range`.",
     )
     wrap_angle: bool = Field(default=False, description="Whether to wrap radians into [-pi, pi).")
+    unit: str = Field(
+        default="",
+        description="Unit of the numbers in the messages, before `scale`, such as `m`, `m/s` or"
+        " `rad`. Viewers then show them in this unit, as `NAME_m_s` of `/telemetry`. Default: the"
+        " unit of common ROS types, of transforms, scans and `as: yaw`.",
+    )
     undistort: str | None = Field(
         default=None,
         description="Topic of the camera's calibration (CameraInfo, foxglove.CameraCalibration), by"
@@ -361,6 +373,9 @@ class Quantity(_Part):
             raise ValueError("give one of names, pad and pool")
         if self.pad is not None and self.missing is None:
             raise ValueError("pad needs `missing`, the number that fills the array")
+        if self.elements and (not is_field or self.names):
+            raise ValueError("elements is for a `field` without `as` and without `names`")
+        _check_names(self.elements, None)
         _check_names(self.names, self.names_from)
 
 

@@ -261,11 +261,14 @@ class Values(NamedTuple):
             indexes of their messages.
         missing: (N,) bool: whether there is no value.
         age_s: (N,) age of the value in seconds, NaN where missing.
+        unscaled: Numbers of the messages, before `scale`, `offset`, `clip` and `missing`; None for
+            images and texts.
     """
 
     values: NDArray[Any]
     missing: NDArray[np.bool_]
     age_s: NDArray[np.float64]
+    unscaled: NDArray[np.float64] | None = None
 
 
 class Source(NamedTuple):
@@ -567,6 +570,7 @@ def shaped(
     age_s: NDArray[np.float64],
 ) -> Values:
     """Scale, wrap and clip values, and replace missing values."""
+    unscaled = found
     found = found * quantity.scale + quantity.offset
     if quantity.wrap_angle or (quantity.as_ == "yaw" and quantity.align == "linear"):
         wrapped = (found + math.pi) % (2 * math.pi) - math.pi
@@ -583,4 +587,4 @@ def shaped(
     missing = missing | has_gap
     if quantity.missing is not None:
         found = np.where(is_missing, quantity.missing, found)
-    return Values(found, missing, age_s)
+    return Values(found, missing, age_s, unscaled)

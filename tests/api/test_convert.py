@@ -47,7 +47,7 @@ reward: next(speed) - speed
 episodes: {terminated: speed > 5}
 meta: {policy: operator}
 """
-OWN_TOPICS = {"/rl/step", "/rl/episode", "/rl/phase", "/rosout"}
+OWN_TOPICS = {"/rl/step", "/rl/episode", "/rl/phase", "/rosout", "/telemetry"}
 
 
 @pytest.fixture
@@ -272,6 +272,63 @@ def test_the_mapping_names_topics_to_keep(
     backwards = data._take([1, 0])
     with pytest.raises(LogError, match="the episodes are in another order"):
         backwards.save(tmp_path / "back.mcap", keep_topics="/tf")
+
+
+@pytest.mark.parametrize("kind", ["mcap", "ros1"])
+def test_a_converted_bag_has_its_quantities_in_their_units(kind: str, tmp_path: Path) -> None:
+    tree: dict[str, Any] = {
+        "clock": {"rate_hz": 10},
+        "observation": {
+            "speed": {"field": "/odom.twist.twist.linear.x", "scale": 0.1, "clip": [0, 0.2]},
+            "place": {"transform": "base", "in": "odom", "parts": ["x", "yaw", "qw"]},
+            "hip": {"field": "/joints.position", "names": "hip"},
+            "Knee__": {"field": "/joints.position", "names": "knee", "unit": "rad", "scale": 7},
+            "joints": {"field": "/joints.position", "names": [], "elements": ["first", "second"]},
+        },
+        "fields": {
+            "doubled": {"field": "/odom.pose.pose.position.x", "scale": 2},
+            "hip_2": {"field": "/joints.position", "names": "hip", "scale": 2},
+            "cov": {"field": "/odom.pose.covariance"},
+        },
+        "action": {"fields": ["/cmd_vel.angular.z"], "box": {"low": -1, "high": 1}},
+        "reward": "next(speed)",
+        "episodes": {"max_steps": 5},
+    }
+    write = write_rosbag1 if kind == "ros1" else write_rosbag2
+    data = mcaprl.open(write(tmp_path / f"{kind}.bag"), mapping=tree)
+    assert data.observation_names[-2:] == ("joints_first", "joints_second")
+    data.save(tmp_path / "out.mcap")
+    with mcaprl.open_bag(tmp_path / "out.mcap") as bag:
+        assert bag.times("/telemetry").tolist() == bag.times("/rl/step").tolist()
+        found = bag.read("/telemetry").columns
+    expected: dict[str, list[float]] = {
+        # The observed speed is at most 0.2, and so are the rewards.
+        "return_so_far": [*np.cumsum([0, 0.05, 0.1, 0.15, 0.2, 0.2])],
+        "speed_m_s": [speed(k) for k in range(STEPS)],
+        "place_x_m": list(range(STEPS)),
+        "place_yaw_rad": [0.1 * k for k in range(STEPS)],
+        "knee_rad": [2.0] * STEPS,
+        "doubled_m": list(range(STEPS)),
+        "hip_2": [0.2 * k for k in range(STEPS)],
+    }
+    assert list(found) == list(expected)
+    for name, values in expected.items():
+        count = min(len(values), len(found[name]))
+        np.testing.assert_allclose(found[name][:count], values[:count], rtol=1e-4, atol=1e-6)
+    # Parts of the data have the numbers of their steps, and returns from 0.
+    data._take([1]).save(tmp_path / "part.mcap")
+    with mcaprl.open_bag(tmp_path / "part.mcap") as bag:
+        part = bag.read("/telemetry").columns
+    assert part["place_x_m"].tolist() == list(range(6, len(data) + 2))
+    assert part["return_so_far"][0] == 0
+    mcaprl.open(tmp_path / "out.mcap").save(tmp_path / "again.mcap")
+    assert not mcaprl.check(tmp_path / "again.mcap").problems
+    tree["observation"]["joints"]["elements"] = ["first"]
+    with pytest.raises(UsageError, match="`elements` has 1 name, but the value has 2 elements"):
+        mcaprl.open(tmp_path / f"{kind}.bag", mapping=tree)
+    tree["observation"]["joints"]["names"] = ["hip"]
+    with pytest.raises(UsageError, match="elements is for a `field`"):
+        mcaprl.open(tmp_path / f"{kind}.bag", mapping=tree)
 
 
 @pytest.mark.parametrize("kind", ["mcap", "ros1"])

@@ -13,6 +13,7 @@ from gymnasium import spaces
 import mcaprl
 from mcaprl.cli import run
 from tests.drive.test_driver import Fixed, compared
+from tests.support.layouts import Topics, check_panels
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "05_robot_bag"
 
@@ -56,6 +57,7 @@ def assert_same_drives(recorded: mcaprl.Dataset, read: mcaprl.Dataset) -> None:
     assert np.delete(differences, speed).max() < 1e-6
     np.testing.assert_array_equal(read.actions, recorded.actions)
     assert read.action_space == recorded.action_space
+    assert read.observation_names == recorded.observation_names
     # The lane detector's distance along the route, up to 1,000 m, is rounded to float32.
     assert np.abs(read.rewards - recorded.rewards).max() < 1e-4
     assert (read.terminated == recorded.terminated).all()
@@ -77,6 +79,23 @@ def test_the_bag_gives_the_transitions_of_the_native_log(native: Path, form: str
     read = mcaprl.open(bag, mapping=EXAMPLE / "robot.yaml")
     assert_driver_sees(bag, read)
     assert_same_drives(mcaprl.open(native), read)
+    # Viewers show the camera, the odometry, and the quantities in their units.
+    log = bag.with_name(f"{form}-log.mcap")
+    mcaprl.convert(read, log)
+    assert not mcaprl.check(log).problems
+    panels = mcaprl.layout(log)["configById"]
+    shown = {"Gauge!speed", "Plot!offsets", "Plot!angles", "RosOut!log"}
+    shown |= {"ros2": {"Image!depth", "Plot!/odom"}, "protobuf": {"Image!depth"}, "json": set()}[
+        form
+    ]
+    assert panels.keys() >= shown
+    if form == "ros2":
+        check_panels(mcaprl.layout(log), Topics.of_log(log))
+    with mcaprl.open_bag(log) as kept, mcaprl.open_bag(bag) as own:
+        for topic in ("/camera/depth", "/odom"):
+            assert kept.times(topic).tolist() == own.times(topic).tolist()
+        offset = kept.read("/telemetry", ["lateral_offset_m"]).columns["lateral_offset_m"]
+    np.testing.assert_allclose(offset, 3.5 * read.frames[:, 0], rtol=1e-4)
     assert read.action_labels == (
         "linear.x (-1 full brake, 1 full throttle)",
         "angular.z (-1 full right, 1 full left)",
