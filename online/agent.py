@@ -149,7 +149,7 @@ class Agent(ABC):
         self._envs.close()
 
     def learn(self, report: ProgressCallback) -> None:
-        """Train and evaluate to the end; report every `LOG_INTERVAL` steps and around evaluations."""
+        """Train and evaluate to the end; report each `LOG_INTERVAL` steps and each evaluation."""
         self.resumed_at = self.steps
         if self.steps >= self._task.config.steps:
             return
