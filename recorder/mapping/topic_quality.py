@@ -492,7 +492,7 @@ def _repeated(
     }
     starts = np.flatnonzero(~same)
     repeats = np.arange(len(rows)) - starts[np.cumsum(~same) - 1] if len(starts) else rows
-    label = f"messages since the {what} changed"
+    label = "repetitions so far"
     if regular := _regular(compared):
         run = (int(rows[0]), int(rows[min(len(rows), 20 * int(regular)) - 1]))
         yield times.flaw(

@@ -180,7 +180,7 @@ def test_two_recordings_are_not_compared_with_each_other(robot: Robot, tmp_path:
     assert problems(tmp_path) == []
 
 
-def film(frames: list[np.ndarray[Any, Any]]) -> Robot:
+def video_of(frames: list[np.ndarray[Any, Any]]) -> Robot:
     """Return a robot with a video in H.264."""
     context: Any = av.CodecContext.create("libx264", "w")
     context.height, context.width = frames[0].shape[:2]
@@ -204,12 +204,12 @@ def film(frames: list[np.ndarray[Any, Any]]) -> Robot:
 def test_frames_of_a_video_are_compared_after_decoding(robot: Robot, tmp_path: Path) -> None:
     bag = part(robot, "/camera")
     frames = [v["data"].reshape(36, 48, 3) for _, v in topic_of(bag, "/camera").messages]
-    assert problems(robots.write_mcap(film(frames), tmp_path / "clean.mcap")) == []
+    assert problems(robots.write_mcap(video_of(frames), tmp_path / "clean.mcap")) == []
     name, first, last = BAG_FAULTS["frozen, /camera"](bag, np.random.default_rng(0)) or ("", 0, 0)
     dark = 5 if first > 20 else 100
     blacken(bag, name, dark, 6)
     frames = [v["data"].reshape(36, 48, 3) for _, v in topic_of(bag, "/camera").messages]
-    path = robots.write_mcap(film(frames), tmp_path / "bad.mcap")
+    path = robots.write_mcap(video_of(frames), tmp_path / "bad.mcap")
     assert found_in(path) == [
         ("black", "/video", dark, dark + 5),
         ("frozen", "/video", first, last),

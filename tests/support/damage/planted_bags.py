@@ -94,7 +94,9 @@ def clean_robot(seed: int, *, is_sim: bool = False, seconds: float = 20) -> Robo
         lines = scene[:36]
         seen = lines[:, low % 256] * (1 - share) + lines[:, (low + 1) % 256] * share
         seen = 30 + 0.7 * seen + rough(2.0, 36 * 48).reshape(36, 48)
-        return np.clip(np.stack([seen, seen, 0.5 * seen], -1), 0, 255).astype(np.uint8)
+        colors = np.stack([seen, seen, 0.5 * seen], -1).clip(0, 255)
+        pixels: NDArray[np.uint8] = colors.astype(np.uint8)
+        return pixels
 
     def raw(t: float) -> dict[str, Any]:
         return raw_image(t, view(t))
