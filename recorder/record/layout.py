@@ -66,6 +66,8 @@ _SPATIAL = (
 _TRANSFORMS = ("TFMessage", "FrameTransform", "FrameTransforms", "TransformStamped")
 _MOST_CAMERAS = 3
 _LAST_STEPS = 80
+_SHOWN_STEPS = 4
+_RUNNING = {"episode": f"{panels.STEPS}.episode", "step": f"{panels.STEPS}.step"}
 _MAX_EPISODE = 100
 _MEAN_RETURN = "mean_return"
 _FIRST_METRICS = (_MEAN_RETURN, "score")
@@ -337,11 +339,7 @@ class _Screens:
         title = f"the last {last_s:g} s"
         if not self.metadata.action_names():
             return self._commands(last_s)
-        rows = {
-            "episode": f"{panels.STEPS}.episode",
-            "step": f"{panels.STEPS}.step",
-            "action": f"{panels.STEPS}.action",
-        }
+        rows = {**_RUNNING, "action": f"{panels.STEPS}.action"}
         for topic in self._values_topics():
             name = topic.removeprefix(VALUES_TOPIC).removeprefix("/")
             rows[f"{name} would take".strip()] = f"{topic}.policy_action"
@@ -350,7 +348,7 @@ class _Screens:
         return self._put("StateTransitions!actions", panel), share
 
     def _commands(self, last_s: float) -> tuple[Node, float]:
-        """Add a plot of logged and policy commands, and dials of a Box action's elements."""
+        """Add a plot of logged and policy commands, the step, and dials of a Box's elements."""
         logged = panels.action_series(self.metadata)
         paths = dict(logged)
         bounded = panels.bounded_actions(self.metadata)[:_MOST_DIALS]
@@ -366,7 +364,14 @@ class _Screens:
             title = f"actions of the last {last_s:g} s"
             options = {"isSynced": False, "followingViewWidth": last_s}
         panel = panels.plot(title, shown, **options)
-        plot: Node = self._put("Plot!action", panel)
+        # A few steps only, so that each has the width of its number.
+        steps_s = _SHOWN_STEPS * self.metadata.step_duration_ns / 1e9
+        running = panels.state_transitions("episode, step", _RUNNING, round(steps_s, 3))
+        pair: list[tuple[Node, float]] = [
+            (self._put("Plot!action", panel), 0.6),
+            (self._put("StateTransitions!running", running), 0.4),
+        ]
+        plot = panels.weighted(pair, "row")
         if not bounded:
             return plot, 0.25
         dials: list[Node] = []

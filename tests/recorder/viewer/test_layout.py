@@ -385,6 +385,8 @@ def test_commands_have_names_limits_and_dials(tmp_path: Path, sim: str) -> None:
     paths = [f"/rl/step{{final==false}}.action[{k}]" for k in range(len(names))]
     assert [dial["path"] for dial in dials] == paths_of(panels["Plot!action"]) == paths
     assert ("Tab!actions" in panels) == (len(names) > 2)
+    steps = "/rl/step{final==false}"
+    assert paths_of(panels["StateTransitions!running"]) == [f"{steps}.episode", f"{steps}.step"]
 
 
 def test_images_of_any_environment_are_shown(tmp_path: Path) -> None:
