@@ -215,7 +215,7 @@ class ActorCriticConfig(ReplayConfig):
     """updates of the critics before the first one of the actor of a policy that is continued"""
     actor_rate: float = 0.1
     """learning rate of the actor of a policy that is continued, as a multiple of the critics'"""
-    anchor: float = 0.1
+    anchor: float = 0.3
     """weight that keeps the actions of a continued policy close to what they were; 0: none"""
 
     def __post_init__(self) -> None:
