@@ -717,8 +717,7 @@ class Mapping(_Part):
         default=[],
         description="Topics of the bag that `convert` and `annotate` copy into the log beside"
         " `/rl/*`, with their times, such as `[/camera/depth, /tf, /odom]`; `/camera/*` are all"
-        " that begin so. Viewers show them. `--keep-topic` replaces them, `--no-keep-topics` leaves"
-        " them out.",
+        " that begin so. Viewers show them. The argument `keep_topics` of both replaces this list.",
     )
     meta: Meta = Field(default=Meta(), description="Facts that the bag does not contain.")
     strict: bool = Field(

@@ -77,7 +77,7 @@ def test_with_lost_packets_a_frame_is_right_or_missing(
     wanted = sorted(data.draw(st.sets(st.integers(0, len(rows) - 1), min_size=1)))
     reader, expected = reader_of(video_bag(name, rows)), images_of(name)
     readable = [k for k in wanted if k not in reader.failures]
-    if readable and (found := dict(reader._images(np.array(readable)))):
+    if readable and (found := dict(reader.images(np.array(readable)))):
         for k, image in found.items():
             np.testing.assert_array_equal(image, expected[rows[k]])
         assert found.keys() | reader.failures.keys() >= set(wanted)
@@ -215,7 +215,7 @@ def test_damaged_packets() -> None:
     for damage in (b"", stream[14][: len(stream[14]) // 2], bytes(50)):
         columns = {"data": [*stream[:14], damage, *stream[15:]]}
         reader = reader_of(video_bag("h264", **columns))
-        found = dict(reader._images(np.arange(40)))
+        found = dict(reader.images(np.arange(40)))
         assert list(reader.failures) == list(range(14, 20))
         expected = images_of("h264")
         assert all((image == expected[k]).all() for k, image in found.items())
