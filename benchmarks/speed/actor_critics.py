@@ -1,11 +1,13 @@
 """Measure updates per second of SAC and TD3 relative to Stable-Baselines3's.
 
     python -m benchmarks.speed.actor_critics [--rounds 5] [--turn-s 2.0] [--size 256] [--algo sac]
+    python -m benchmarks.speed.actor_critics --parts
 
 Both libraries take turns in one process, on the same random transitions (17 numbers, actions of 6)
 and with networks of 256x256. The measure is CPU time on one thread, the best of several turns. The
 table is printed, with the ratios, their goals, and the ratios that our update would reach if it
-consisted of its matrix products alone.
+consisted of its matrix products alone. --parts prints the time of the parts of our update, by
+PyTorch's profiler.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from benchmarks.speed.continuous import (
     HIDDEN,
     ROWS,
     WIDTH,
+    parts,
     rates_and_limit,
     transitions,
 )
@@ -85,11 +88,18 @@ def main() -> None:
     parser.add_argument("--turn-s", type=float, default=2.0)
     parser.add_argument("--size", type=int, choices=GOALS)
     parser.add_argument("--algo", choices=OURS)
+    parser.add_argument("--parts", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    print("| what | updates per CPU second | SB3's times | goal | limit |\n|---|---|---|---|---|")
+    if not given.parts:
+        print(
+            "| what | updates per CPU second | SB3's times | goal | limit |\n|---|---|---|---|---|"
+        )
     for size in [given.size] if given.size else GOALS:
         for algo in [given.algo] if given.algo else OURS:
+            if given.parts:
+                parts(f"{algo}, batch {size}", ours(algo, size))
+                continue
             turns = Turns(given.rounds, given.turn_s)
             mine, theirs, limit = rates_and_limit(ours(algo, size), sb3s(algo, size), size, turns)
             line = f"| {algo}, batch {size} | {mine:.0f} | {mine / theirs:.2f} | {GOALS[size]} |"

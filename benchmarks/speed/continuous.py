@@ -133,9 +133,8 @@ def ratios(algo: str, size: int, turns: Turns) -> tuple[float, float, float]:
     return mine, mine / theirs, limit / theirs
 
 
-def parts(algo: str, size: int, updates: int = 100) -> None:
+def parts(name: str, update: Update, updates: int = 100) -> None:
     """Print the milliseconds of an update, and of its parts."""
-    update = ours(transitions(), algo, size)
     for _ in range(updates):
         update()
     rate = best_rates({"ours": (update, 1)}, Turns(5, 0.5))["ours"]
@@ -147,7 +146,7 @@ def parts(algo: str, size: int, updates: int = 100) -> None:
         named = (part for part, names in OPERATIONS.items() if any(n in event.key for n in names))
         spent[next(named, "other")] += event.self_cpu_time_total / updates / 1e3
     columns = " | ".join(f"{time_ms:.2f}" for time_ms in spent.values())
-    print(f"| {algo}, batch {size} | {1e3 / rate:.2f} | {columns} |", flush=True)
+    print(f"| {name} | {1e3 / rate:.2f} | {columns} |", flush=True)
 
 
 def whole(algo: str, rows: int = 200_000, updates: int = 100_000) -> None:
@@ -178,7 +177,7 @@ def main() -> None:
             if given.whole:
                 whole(algo)
             for size in sizes if given.parts else ():
-                parts(algo, size)
+                parts(f"{algo}, batch {size}", ours(transitions(), algo, size))
         return
     turns = Turns(given.rounds, given.turn_s)
     found = {f"{algo}, batch {size}": ratios(algo, size, turns) for size in sizes for algo in algos}

@@ -167,7 +167,7 @@ class _Screens:
         ]
         others = [name for name in self.telemetry if name != RETURN_SO_FAR]
         numbers = {
-            "observations": panels.observation_series(self.metadata),
+            **panels.observation_groups(self.metadata),
             "actions": panels.action_series(self.metadata),
             **panels.telemetry_groups(others),
         }
@@ -306,8 +306,12 @@ class _Screens:
         if watched:
             title = "offsets, steering" if len(watched) > 1 else watched[0]
             rows.insert(1, self._plot("drive", title, panels.telemetry_series(watched)))
-        elif observed := panels.observation_series(self.metadata):
-            rows.append(self._plot("drive", "observation", observed))
+        elif observed := panels.observation_groups(self.metadata):
+            parts: dict[str, Node] = {
+                title: self._plot(f"drive {title}", title, part) for title, part in observed.items()
+            }
+            tabs = self._put("Tab!drive", panels.tabs(parts)) if len(parts) > 1 else ""
+            rows.append(tabs or next(iter(parts.values())))
         actions, share = self._actions()
         sizes = [(row, (1 - share) / len(rows)) for row in rows]
         return panels.weighted([*sizes, (actions, share)], "column")

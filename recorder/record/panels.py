@@ -20,6 +20,7 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import action_leaf, observation_leaves, part_names
 
 MAX_SERIES = 24  # Maximum number of series in a plot; further series are left out
+_GROUP = 6  # Series in one of several plots of an observation: more lines cannot be told apart
 STEPS = "/rl/step{final==false}"
 EPISODE_VARIABLE = "episode"
 """Variable of a layout with the number of the episode that the viewer's user chooses."""
@@ -103,7 +104,17 @@ def bounded_actions(metadata: LogMetadata) -> list[Bounded]:
     ]
 
 
-def observation_series(metadata: LogMetadata) -> dict[str, str]:
+def observation_groups(metadata: LogMetadata) -> dict[str, dict[str, str]]:
+    """Return titles of plots of the vector observations, and up to `_GROUP` series of each."""
+    paths = list(_observation_series(metadata).items())
+    if len(paths) <= _GROUP + 2:
+        return {"observations": dict(paths)} if paths else {}
+    starts = range(0, len(paths), _GROUP)
+    parts = {k: dict(paths[k : k + _GROUP]) for k in starts}
+    return {f"observations {k} to {k + len(part) - 1}": part for k, part in parts.items()}
+
+
+def _observation_series(metadata: LogMetadata) -> dict[str, str]:
     """Return a series per component of the vector observations, up to `MAX_SERIES`."""
     paths = {}
     for leaf in observation_leaves(metadata.observation_space):

@@ -389,6 +389,28 @@ def test_commands_have_names_limits_and_dials(tmp_path: Path, sim: str) -> None:
     assert paths_of(panels["StateTransitions!running"]) == [f"{steps}.episode", f"{steps}.step"]
 
 
+def test_long_observations_are_shown_in_plots_of_six_numbers(tmp_path: Path) -> None:
+    data = mcaprl.Dataset.from_arrays(
+        observations=np.zeros((4, 14), np.float32),
+        next_observations=np.zeros((4, 14), np.float32),
+        actions=np.zeros(4, np.int64),
+        rewards=np.zeros(4),
+        terminated=np.arange(4) == 3,
+        truncated=np.zeros(4, bool),
+        action_space=spaces.Discrete(2),
+    )
+    data.save(tmp_path / "log.mcap")
+    found = check_layout(tmp_path / "log.mcap", layout_of_log(McapReader(tmp_path / "log.mcap")))
+    panels = found["configById"]
+    for place in ("", "drive "):
+        plots = [
+            panels[f"Plot!{place}observations {part}"] for part in ("0 to 5", "6 to 11", "12 to 13")
+        ]
+        paths = [path for plot in plots for path in paths_of(plot)]
+        numbers = [f"/rl/step{{final==false}}.observation[{k}]" for k in range(14)]
+        assert paths == numbers
+
+
 def test_images_of_any_environment_are_shown(tmp_path: Path) -> None:
     class Images(gym.Env[Any, Any]):
         observation_space = spaces.Dict(
